@@ -74,8 +74,9 @@ class SeenBody:
         """
         x, y = other.foot
         (x0, y0, x1, y1), (left, top, right, _) = self.bbox, other.bbox
-        wide, high = self.shape in ("box", "cylinder") and x1 - x0 > WIDER * (right - left), ON_TOP * (y1 - y0)
-        if not (wide and x0 < x < x1 and y0 < y < y0 + high and top < y0):
+        if self.shape not in ("box", "cylinder") or x1 - x0 <= WIDER * (right - left):
+            return False
+        if not (x0 < x < x1 and y0 < y < y0 + ON_TOP * (y1 - y0) and top < y0):
             return False
         shown, mask = math.inf, self.mask
         for column in (left - BESIDE, right + BESIDE):

@@ -83,9 +83,11 @@ def compose(layers: Layers, index: int) -> Image:
 
 def _far_to_near(layers: Layers, index: int) -> list[tuple[MovingBody, Sprite]]:
     """The bodies before the camera at a frame, in the order in which they are drawn."""
-    depths = [np.array(body.path.states)[[0, index], 2] for body in layers.moving]
-    drawn = zip(layers.moving, layers.sprites, depths, strict=True)
-    there = [(body, sprite) for body, sprite, (first, now) in drawn if not has_passed(now, first)]
+    there = [
+        (body, sprite)
+        for body, sprite in zip(layers.moving, layers.sprites, strict=True)
+        if not has_passed(np.array([body.path.states[index][2]]), body.path.states[0][2])[0]
+    ]
 
     def order(a: tuple[MovingBody, Sprite], b: tuple[MovingBody, Sprite]) -> int:
         for one, other, sign in ((a[0], b[0], 1), (b[0], a[0], -1)):
