@@ -9,7 +9,7 @@ from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question, ask_first, gate_of
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
-from cow_service.stages.keys import FirstAnswers, Verdicts
+from cow_service.stages.keys import Verdicts
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
@@ -54,7 +54,13 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     gate = None if first is None else gate_of(first, request.imagine_threshold)
     wanted = request.imagine == "always" if gate is None else gate.imagined
     simulation, failure = _imagine(run) if wanted else (None, None)
-    verdicts, warnings = _verdicts(run, first, simulation)
+    if simulation is None and first is not None and first.verdict is not None:
+        # Where there is nothing to look at, the answer is that of the gate: asked once is enough.
+        verdicts = Verdicts(verdict=first.verdict, baseline=first.verdict if request.baseline else None)
+        warnings = run.warnings("gating")
+    else:
+        verdicts = run.stage("answering", answer_question, run.grounding, simulation, first)
+        warnings = run.warnings("answering")
     if failure is not None:
         why = f"{failure.code}: {failure.detail}"
         warnings = (f"Nothing was imagined, the answer is from the image alone. {why}", *warnings)
@@ -74,17 +80,6 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         **run.accounts("gating", *SIMULATION_STAGES, "answering"),
         warnings=warnings,
     )
-
-
-def _verdicts(
-    run: Run[AnswerRequest], first: FirstAnswers | None, simulation: Simulation | None
-) -> tuple[Verdicts, tuple[str, ...]]:
-    """The answer and its warnings. Where there is nothing to look at it is that of the gate: asked once is enough."""
-    if simulation is None and first is not None and first.verdict is not None:
-        baseline = first.verdict if run.request.baseline else None
-        return Verdicts(verdict=first.verdict, baseline=baseline), run.warnings("gating")
-    verdicts = run.stage("answering", answer_question, run.grounding, simulation, first)
-    return verdicts, run.warnings("answering")
 
 
 def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, CowError | None]:

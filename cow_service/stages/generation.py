@@ -110,7 +110,7 @@ def generate(
         with run.device():
             frames, video = _render(run, given, artifacts, encoder)
             factual: list[EncodedFrame] = []
-            # On a device of its own they are made only where they are asked for: they cost as much as the clip.
+            # Those of the scene as it is cost as much as the clip: on a device, made only where they are asked for.
             wanted, is_cheap = run.request.frames, run.generator.concurrency is None
             if as_it_is is not None and (is_cheap if wanted.factual is None else wanted.factual):
                 indices = [frame.index for frame in frames]

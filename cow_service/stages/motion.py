@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -15,7 +15,7 @@ from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GR
 from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.prompts import load_prompt
-from cow_service.records import BBox, Grounding, Law, Motion, MotionKind, Source, Vector
+from cow_service.records import BBox, Grounding, Law, LocatedObject, Motion, MotionKind, Source, Vector
 from cow_service.requests import CameraRequest, MotionRequest, SimulateRequest
 from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
@@ -150,41 +150,6 @@ def _quantity(value: float | None, unit: Literal["px", "px/s"]) -> Quantity | No
 # --- in pixels and seconds
 
 
-@dataclass(frozen=True)
-class Measures:
-    """What turns numbers with units into pixels."""
-
-    image_width: int  # px
-    scale: records.MetresPerPixel
-    law: Law
-
-    def pixels(self, quantity: Quantity) -> float:
-        """px, or px/s."""
-        match quantity.unit:
-            case "px" | "px/s":
-                return quantity.value
-            case "m" | "m/s":
-                return quantity.value / self.scale.value
-            case "widths" | "widths/s":
-                return quantity.value * self.image_width
-
-    def speed(self, kind: MotionKind, bbox: BBox, said: SpeedWord | Quantity | None) -> float:
-        """px/s of an object in a box; 0 for kinds of motion that have no speed."""
-        if kind not in records.DIRECTED_KINDS:
-            return 0.0
-        if isinstance(said, Quantity):
-            return self.pixels(said)
-        thrown = kind == "projectile" and self.law == "contact"
-        usual = throw_speed(bbox, self.scale) if thrown else DEFAULT_SPEED * self.image_width
-        return usual if said is None else SPEED_FACTORS[said] * usual
-
-    def speed_deviation(self, kind: MotionKind, said: SpeedWord | Quantity | None) -> float:
-        """Of the speed's natural logarithm: 0 for a number in pixels, else that of what is assumed."""
-        if not isinstance(said, Quantity):
-            return SPEED_DEVIATIONS.get(kind, 0.0)
-        return SCALE_DEVIATION if said.unit == "m/s" and self.scale.source == "default" else 0.0
-
-
 def throw_speed(bbox: BBox, scale: records.MetresPerPixel) -> float:
     """px/s of a throw whose speed nobody gave: v^2 / (g R) as of a toy of radius 0.15 m thrown at 1.8 m/s.
 
@@ -203,6 +168,44 @@ def _unit(vector: Vector) -> Vector:
     return vector[0] / length, vector[1] / length
 
 
+def _pixels(quantity: Quantity, scale: records.MetresPerPixel, image_width: int) -> float:
+    """px, or px/s."""
+    match quantity.unit:
+        case "px" | "px/s":
+            return quantity.value
+        case "m" | "m/s":
+            return quantity.value / scale.value
+        case "widths" | "widths/s":
+            return quantity.value * image_width
+
+
+def _moving(
+    thing: LocatedObject,
+    said: MotionReading | OtherMotionReading,
+    scale: records.MetresPerPixel,
+    law: Law,
+    image_width: int,
+) -> records.AlsoMoving:
+    """What a thing does; kinds of motion that have no direction have no speed either."""
+    moves, speed = said.kind in records.DIRECTED_KINDS, DEFAULT_SPEED * image_width
+    deviation = SPEED_DEVIATIONS.get(said.kind, 0.0)  # of what is assumed; 0 for a number in pixels
+    if said.kind == "projectile" and law == "contact":
+        speed = throw_speed(thing.bbox, scale)
+    if isinstance(said.speed, Quantity):
+        speed = _pixels(said.speed, scale, image_width)
+        deviation = SCALE_DEVIATION if said.speed.unit == "m/s" and scale.source == "default" else 0.0
+    elif said.speed is not None:
+        speed *= SPEED_FACTORS[said.speed]
+    return records.AlsoMoving(
+        object=thing,
+        kind=said.kind,
+        direction=_unit(said.direction) if moves and said.direction is not None else None,
+        depth=said.depth if moves else 0.0,
+        speed=speed if moves else 0.0,
+        speed_deviation=deviation,
+    )
+
+
 def _complete(image_width: int, grounding: Grounding, reading: MotionReading, source: Source, law: Law) -> Motion:
     """Adds what a reading leaves open: scale, speed, deviations, gravity and the sentence."""
     scale = reading.metres_per_pixel or records.MetresPerPixel(
@@ -210,12 +213,11 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         source="default",
         note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
     )
-    measures = Measures(image_width, scale, law)
     moves, falls = reading.kind in records.DIRECTED_KINDS, reading.kind in records.FALLING_KINDS
-    direction = _unit(reading.direction) if moves and reading.direction is not None else None
-    depth = reading.depth if moves else 0.0
+    thing = LocatedObject(object=grounding.object, bbox=grounding.bbox)
+    mover = _moving(thing, reading, scale, law, image_width)
     depth_deviation = THROW_DEPTH_DEVIATION if reading.kind == "projectile" else 0.0
-    speed_deviation = measures.speed_deviation(reading.kind, reading.speed) if moves else 0.0
+    speed_deviation = mover.speed_deviation if moves else 0.0
     if moves and reading.depth_deviation is not None:
         depth_deviation = reading.depth_deviation
     if moves and reading.speed_deviation is not None:
@@ -224,25 +226,13 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         records.MotionStep(
             direction=_unit(step.direction),
             depth=step.depth,
-            distance=None if step.distance is None else measures.pixels(step.distance),
+            distance=None if step.distance is None else _pixels(step.distance, scale, image_width),
             duration=step.duration,
         )
         for step in reading.steps
     )
-    others: list[records.AlsoMoving] = []
     also: list[str] = []
     for other in reading.others:
-        is_directed = other.kind in records.DIRECTED_KINDS
-        others.append(
-            records.AlsoMoving(
-                object=other.object,
-                kind=other.kind,
-                direction=_unit(other.direction) if is_directed and other.direction is not None else None,
-                depth=other.depth if is_directed else 0.0,
-                speed=measures.speed(other.kind, other.object.bbox, other.speed),
-                speed_deviation=measures.speed_deviation(other.kind, other.speed),
-            )
-        )
         verb = {"projectile": "is thrown", "fall": "falls", "static": "stays where it is"}.get(other.kind, "moves")
         way = "" if other.kind in ("fall", "static") else direction_words(other.direction, other.depth)
         also.append(f"{bare_name(other.object.object)} {verb} {way}".rstrip())
@@ -250,27 +240,27 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
     return Motion(
         kind=reading.kind,
         law=law,
-        direction=direction,
-        depth=depth,
+        direction=mover.direction,
+        depth=mover.depth,
         depth_deviation=depth_deviation,
         cue=reading.cue,
         along_arrow=reading.along_arrow,
-        speed=measures.speed(reading.kind, grounding.bbox, reading.speed),
+        speed=mover.speed,
         speed_deviation=speed_deviation,
-        distance=None if reading.distance is None else measures.pixels(reading.distance),
+        distance=None if reading.distance is None else _pixels(reading.distance, scale, image_width),
         duration=reading.duration,
         until=reading.until,
         steps=steps,
         trail=reading.trail,
-        others=tuple(others),
+        others=tuple(_moving(other.object, other, scale, law, image_width) for other in reading.others),
         gravity=(reading.down[0] * gravity, reading.down[1] * gravity) if falls else (0.0, 0.0),
         down=reading.down,
         metres_per_pixel=scale,
         sentence=motion_sentence(
             grounding.object,
             reading.kind,
-            direction,
-            depth,
+            mover.direction,
+            mover.depth,
             reading.sentence,
             further=[direction_words(step.direction, step.depth) for step in reading.steps],
             stops=any(value is not None for value in (reading.distance, reading.duration, reading.until)),

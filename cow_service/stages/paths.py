@@ -59,11 +59,10 @@ def record_trajectory(
     anchors = None if given is None else given.anchors
     if anchors is None:
         starts = [
-            path.points[0] if path.body in shown.put else shown.start_of(path.body, shown.bodies) for path in paths
+            np.array(each.points[0]) if each.body in shown.put else shown.start_of(each.body, shown.bodies)
+            for each in paths
         ]
-        movable = projection.swept(
-            [shown.bodies[path.body].mask for path in paths], [np.array(at) for at in starts], paths
-        )
+        movable = projection.swept([shown.bodies[each.body].mask for each in paths], starts, paths)
         for body in shown.bodies:
             body.mask.add_to(movable)
         anchors = projection.spread_anchors(movable)

@@ -47,6 +47,11 @@ class Situation:
     obstacles: Sequence[Obstacle]
     removed: Sequence[Obstacle] = ()
 
+    @staticmethod
+    def of(scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest) -> Situation:
+        """With the obstacles that the scene shows."""
+        return Situation(scene, grounding, motion, request, *obstacles_of(scene, grounding))
+
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the image, px."""

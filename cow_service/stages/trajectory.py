@@ -13,7 +13,7 @@ from cow_service.records import Asked, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.paths import record_trajectory
-from cow_service.stages.reconstruction import Situation, obstacles_of, reconstruct
+from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
 
 BY_ENCOUNTERS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that encounters and paths decide
@@ -24,8 +24,7 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
         scene = run.scene_of(grounding, motion.cue)
-        situation = Situation(scene, grounding, motion, run.request, *obstacles_of(scene, grounding))
-        trajectory = simulate_world(situation)
+        trajectory = simulate_world(Situation.of(scene, grounding, motion, run.request))
     return StageResult(value=trajectory, warnings=_warnings(run.request, grounding, trajectory))
 
 
@@ -52,14 +51,19 @@ def simulate_world(situation: Situation) -> Trajectory:
     told = [
         record_trajectory(situation, result, outcome, path) for result, outcome in zip(results, outcomes, strict=True)
     ]
-    facts = [facts_of(grounding.object, each) for each in told if each.outcome is not None]
-    if len(facts) > 1:
-        changes = tuple(each for each in grounding.interventions if each is not situation.carried)
-        facts[0] = facts_of_both(changes, grounding.object, *told)
-    for index, (outcome, said) in enumerate(zip(outcomes, facts, strict=False)):
-        told[index] = told[index].model_copy(update={"outcome": outcome and outcome.model_copy(update={"facts": said})})
+    if asked is not None:
+        facts = [facts_of(grounding.object, each) for each in told]
+        if len(told) > 1:
+            changes = tuple(each for each in grounding.interventions if each is not situation.carried)
+            facts[0] = facts_of_both(changes, grounding.object, *told)
+        told = list(map(_with_facts, told, facts))
     factual = told[1].model_copy(update={"anchors": ()}) if len(told) > 1 else None
     return told[0].model_copy(update={"factual": factual})
+
+
+def _with_facts(trajectory: Trajectory, facts: str) -> Trajectory:
+    assert trajectory.outcome is not None
+    return trajectory.model_copy(update={"outcome": trajectory.outcome.model_copy(update={"facts": facts})})
 
 
 def judge(asked: Asked | None, query: Query | None, result: EnsembleResult) -> Outcome | None:
