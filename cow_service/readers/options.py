@@ -205,8 +205,11 @@ def _places(question: str, begins: Sequence[int], texts: Sequence[str]) -> tuple
 
 def reply_text(prompt: str, reply: Reply) -> str:
     """The reply to a prompt, in the form that it asks for: a JSON template, "ANSWER: X", a letter, an option's text."""
-    keys = _template_keys(prompt)
-    if keys:
+    # The last JSON template that has a place for the answer.
+    templates = reversed(_TEMPLATE.findall(prompt)) if "json" in prompt.lower() else ()
+    named = (dict.fromkeys(key.strip() for key in _KEY.findall(template)) for template in templates)
+    keys = next((keys for keys in named if any(_ANSWERS.search(key) for key in keys)), None)
+    if keys is not None:
         listed = reply.option is not None and reply.source == "question-list"
         answer = reply.option if listed else reply.answer
         values = {a: reply.reasoning if _REASONS.search(a) else answer if _ANSWERS.search(a) else None for a in keys}
@@ -219,14 +222,3 @@ def reply_text(prompt: str, reply: Reply) -> str:
     if reply.option is not None and (wants_text or reply.source == "question-list"):
         return reply.option
     return reply.answer
-
-
-def _template_keys(prompt: str) -> tuple[str, ...]:
-    """The keys of the last JSON template of a prompt that has a place for the answer; empty where there is none."""
-    if "json" not in prompt.lower():
-        return ()
-    for template in reversed(_TEMPLATE.findall(prompt)):
-        keys = tuple(dict.fromkeys(key.strip() for key in _KEY.findall(template)))
-        if any(_ANSWERS.search(key) for key in keys):
-            return keys
-    return ()

@@ -132,19 +132,16 @@ def _has_handle(mask: Mask) -> bool:
         at_side = abs((x + across / 2) / mask.shape[1] - 0.5) > _SIDE
         if level[3] >= 0 and at_side and cv2.contourArea(hole) > _HOLE * np.count_nonzero(mask):
             return True
-    filled = mask.any(axis=1)
-    left = np.where(filled, mask.argmax(axis=1), mask.shape[1])
-    right = np.where(filled, mask[:, ::-1].argmax(axis=1), mask.shape[1])
+    # How far in it begins on the left and on the right [2, h], and from which line through its ends it reaches out.
+    width, filled = mask.shape[1], mask.any(axis=1)
+    sides = np.where(filled, [mask.argmax(axis=1), mask[:, ::-1].argmax(axis=1)], width)
     down = (np.arange(len(mask)) + 0.5) / len(mask)
-    out: list[float] = []
-    ends = [
-        [float(side[(low <= down) & (down < high)].min(initial=mask.shape[1])) for side in (left, right)]
-        for low, high in (_UPPER, _LOWER)
-    ]
-    body = max(1.0, mask.shape[1] - max(ends[0][0], ends[1][0]) - max(ends[0][1], ends[1][1]))
-    for at, side in enumerate((left, right)):
-        share = (down - sum(_UPPER) / 2) / (sum(_LOWER) / 2 - sum(_UPPER) / 2)
-        line = ends[0][at] + (ends[1][at] - ends[0][at]) * share
-        between = (line - side)[(down > _BETWEEN[0]) & (down < _BETWEEN[1])]
-        out.append(float(between.max(initial=0.0)) / body)
-    return max(out) > _REACHES and min(out) < _BARE
+    upper, lower = (
+        sides[:, (low <= down) & (down < high)].min(axis=1, initial=width) for low, high in (_UPPER, _LOWER)
+    )
+    share = (down - sum(_UPPER) / 2) / (sum(_LOWER) / 2 - sum(_UPPER) / 2)
+    lines = upper[:, None] + (lower - upper)[:, None] * share
+    between = (down > _BETWEEN[0]) & (down < _BETWEEN[1])
+    body = max(1.0, width - float(np.maximum(upper, lower).sum()))
+    out = (lines - sides)[:, between].max(axis=1, initial=0.0) / body
+    return bool(out.max() > _REACHES and out.min() < _BARE)
