@@ -189,12 +189,15 @@ class WordReader(Protocol):
 
     def read_question(self, question: str) -> QuestionReading:
         """What a question says in words that it understands."""
+        ...
 
     def read_name(self, name: str) -> ObjectPrior:
         """What the name of an object says of its shape."""
+        ...
 
     def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
         """Those of some names that a phrase for several things means, such as "both mugs"; else the phrase itself."""
+        ...
 
 
 class Reader(Protocol):
@@ -214,15 +217,18 @@ class Reader(Protocol):
 
         Where not, its answers are samples: none is handed to two requests. Readers without this method are sampled.
         """
+        ...
 
     def ground(self, given: ReaderInput) -> GroundingReading:
         """Which object moves and where it is. Raises `CannotGround` where that cannot be told."""
+        ...
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
         """How the grounded object moves. `hints` are those of `ground`, where this reader grounded the object.
 
         Raises `CannotReadDirection` where that cannot be told.
         """
+        ...
 
     def answer(
         self,
@@ -236,3 +242,4 @@ class Reader(Protocol):
 
         `grounding` is what stage 1 came to, also where a later stage failed and nothing was imagined.
         """
+        ...

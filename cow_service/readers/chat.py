@@ -33,9 +33,11 @@ class ChatReader(Protocol):
     @property
     def upstream(self) -> Upstream | None:
         """Where chats can be sent on as they are; None where its MLLM does not speak OpenAI's protocol."""
+        ...
 
     async def chat(self, body: dict[str, Any]) -> ChatTurn:
         """The reply to a chat (the JSON object of OpenAI's chat completions), as far as it can be sent.
 
         Raises `InvalidRequest` for what can neither be sent nor left out, and `MllmUnavailable`.
         """
+        ...
