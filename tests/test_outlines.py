@@ -11,7 +11,7 @@ from drawn import Image, ball, block, floor, jpeg
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
-from cow_service.readers.embedded.english.questions import parse_noun_phrase
+from cow_service.readers.embedded.english.noun_phrases import parse_noun_phrase
 from cow_service.readers.embedded.matching import best_matches, match_one
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.regions import Region, find_regions

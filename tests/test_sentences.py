@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from cow_service.readers.base import Quantity
 from cow_service.readers.embedded.english import lexicon
-from cow_service.readers.embedded.english.questions import Question, parse, parse_noun_phrase
+from cow_service.readers.embedded.english.noun_phrases import parse_noun_phrase
+from cow_service.readers.embedded.english.questions import Question, parse
 from cow_service.readers.embedded.motions import quantities
 from cow_service.readers.options import split_options
 

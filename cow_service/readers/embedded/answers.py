@@ -15,8 +15,7 @@ from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.asked import Unread
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
-from cow_service.readers.embedded.english.nouns import may_name
-from cow_service.readers.embedded.english.questions import parse_noun_phrase
+from cow_service.readers.embedded.english.noun_phrases import may_name, parse_noun_phrase
 from cow_service.readers.options import not_sure_option, plain, says_not_sure
 from cow_service.records import AnswerOption, Asked, Doubt, Outcome
 

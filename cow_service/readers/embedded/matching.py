@@ -12,8 +12,7 @@ from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, words
-from cow_service.readers.embedded.english.noun_phrases import TABLES
-from cow_service.readers.embedded.english.nouns import Kind, kind_of, may_name
+from cow_service.readers.embedded.english.noun_phrases import TABLES, Kind, kind_of, may_name
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.outlines import contradicts, form_of, is_cut, log_ratio
 from cow_service.readers.remedies import GIVE_OBJECT

@@ -14,11 +14,11 @@ from cow_service.readers import base
 from cow_service.readers.base import MotionReading, ReaderInput
 from cow_service.readers.embedded import changes, matching, motions
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
-from cow_service.readers.embedded.english import nouns
+from cow_service.readers.embedded.english import noun_phrases
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked, unread
 from cow_service.readers.embedded.english.lexicon import ARROWS, ObjectPhrase
 from cow_service.readers.embedded.english.motion import MotionWords
-from cow_service.readers.embedded.english.questions import Question, parse, parse_noun_phrase
+from cow_service.readers.embedded.english.questions import Question, parse
 from cow_service.readers.embedded.facing import facing
 from cow_service.readers.embedded.matching import describe
 from cow_service.readers.options import plain
@@ -59,20 +59,20 @@ class EmbeddedReader:
 
     def read_name(self, name: str) -> ObjectPrior:
         """By its noun."""
-        opening = nouns.container_form(name)
+        opening = noun_phrases.container_form(name)
         return ObjectPrior(
-            shape=nouns.shape_of(name),
-            elongated=nouns.is_vehicle(name),
-            equal_sided=nouns.is_cube(name),
+            shape=noun_phrases.shape_of(name),
+            elongated=noun_phrases.is_vehicle(name),
+            equal_sided=noun_phrases.is_cube(name),
             opening=None if opening == "unknown" else opening,
         )
 
     def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
         """Those of a kind such as "both mugs", where there are as many as is said; else the words themselves."""
-        kind = nouns.kind_of(words)
+        kind = noun_phrases.kind_of(words)
         if kind is None or any(plain(name) == plain(words) for name in names):
             return (words,)
-        found = tuple(name for name in names if nouns.may_name(kind.phrase, name))
+        found = tuple(name for name in names if noun_phrases.may_name(kind.phrase, name))
         return found if found and kind.count in (None, len(found)) else (words,)
 
     def ground(self, given: ReaderInput) -> base.GroundingReading:
@@ -98,7 +98,7 @@ class EmbeddedReader:
             # The other things of the question, and those that the caller wants located under other words.
             words = [phrase.text for phrase in (mover, *question.others)]
             sought = [name for name in given.sought if not any(same_name(name, each) for each in words)]
-            phrases = [(name, parse_noun_phrase(name)) for name in sought]
+            phrases = [(name, noun_phrases.parse_noun_phrase(name)) for name in sought]
             wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in phrases if phrase is not None)]
             others: dict[BBox, LocatedObject] = {}
             for phrase in wanted:
@@ -239,7 +239,7 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         return motions.along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
     # Forward or backward, by the way that a vehicle is seen to face.
     told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
-    if not nouns.is_vehicle(name):
+    if not noun_phrases.is_vehicle(name):
         raise CannotReadDirection(
             f"{told} The embedded reader sees only of vehicles with wheels which way they face. {GIVE_DIRECTION}"
         )

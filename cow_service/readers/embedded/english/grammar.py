@@ -117,50 +117,37 @@ def terminals(word: str) -> Set[str]:
     return _grammar().terminals.get(word, frozenset())
 
 
-def may_begin(start: str, word: Word) -> bool:
-    """Whether a word may be the first one of a rule."""
-    return not _grammar().firsts[start].isdisjoint(_grammar().names(word))
+def parse_ends(start: str, words: Sequence[Word]) -> dict[int, Node]:
+    """The trees of a rule over the first words, by their number; of several that end alike, the first."""
+    grammar = _grammar()
+    if not words or grammar.firsts[start].isdisjoint(grammar.names(words[0])):
+        return {}
+    names = [*map(grammar.names, words[:MAX_WORDS]), frozenset[str]()]
+    known: dict[tuple[str, int], dict[int, _Nodes]] = {}
 
-
-class _Parse:
-    """What the rules make of some words, by rule and place: where each may end, with the first tree that ends there."""
-
-    def __init__(self, words: Sequence[Word]) -> None:
-        self.grammar, self.words = _grammar(), words
-        self.names = [*map(self.grammar.names, words), frozenset[str]()]
-        self.known: dict[tuple[str, int], dict[int, _Nodes]] = {}
-
-    def ends(self, name: str, start: int) -> dict[int, _Nodes]:
-        if (name, start) not in self.known:
+    def ends(name: str, at: int) -> dict[int, _Nodes]:
+        if (name, at) not in known:
             found: dict[int, _Nodes] = {}
-            for expansion in self.grammar.expansions(name, self.names[start]):
-                for end, nodes in self._follow(expansion, start).items():
+            for expansion in grammar.expansions(name, names[at]):
+                for end, nodes in follow(expansion, at).items():
                     found.setdefault(end, nodes)
-            if not name.startswith("_"):
-                found = {end: (Node(name, nodes),) for end, nodes in found.items()}
-            self.known[name, start] = found
-        return self.known[name, start]
+            known[name, at] = found if name.startswith("_") else {end: (Node(name, n),) for end, n in found.items()}
+        return known[name, at]
 
-    def _follow(self, expansion: Sequence[Symbol], start: int) -> dict[int, _Nodes]:
+    def follow(expansion: Sequence[Symbol], start: int) -> dict[int, _Nodes]:
         reached: dict[int, _Nodes] = {start: ()}
         for symbol in expansion:
             behind: dict[int, _Nodes] = {}
             for at, nodes in reached.items():
                 if not isinstance(symbol, Terminal):
-                    for end, more in self.ends(symbol.name, at).items():
+                    for end, more in ends(symbol.name, at).items():
                         behind.setdefault(end, nodes + more)
-                elif symbol.name in self.names[at]:
-                    behind.setdefault(at + 1, nodes if symbol.filter_out else (*nodes, self.words[at]))
+                elif symbol.name in names[at]:
+                    behind.setdefault(at + 1, nodes if symbol.filter_out else (*nodes, words[at]))
             reached = behind
         return reached
 
-
-def parse_ends(start: str, words: Sequence[Word]) -> dict[int, Node]:
-    """The trees of a rule over the first words, by their number."""
-    if not words or not may_begin(start, words[0]):
-        return {}
-    ends = _Parse(words[:MAX_WORDS]).ends(start, 0)
-    return {end: node for end, (node, *_) in ends.items() if isinstance(node, Node)}
+    return {end: node for end, (node, *_) in ends(start, 0).items() if isinstance(node, Node)}
 
 
 def parse_all(start: str, words: Sequence[Word]) -> Node | None:

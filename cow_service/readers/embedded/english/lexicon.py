@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from cow_service.readers.base import Quantity, SpeedWord
 from cow_service.records import MotionKind, Until, Vector
@@ -244,8 +244,7 @@ def object_phrase(text: str, keys: tuple[str, ...]) -> ObjectPhrase:
     )
 
 
-@dataclass(frozen=True)
-class Word:
+class Word(NamedTuple):
     """What rules are made of. `kind` is the terminal of a noun phrase or a pronoun; `at`, its place in the items."""
 
     kind: str

@@ -27,6 +27,7 @@ _STAYS, _UNKNOWN_VERB, _CONTACT = 5, 15, 16  # ranks, too
 _EVENTS = lex.TOUCH | lex.OCCLUDE | lex.LAND
 _WINDOW = 60  # items: no clause is longer
 _PARTICLES = lex.words("up down away off out over go loose of")
+_SUBJECTS = lex.MOVER_PRONOUNS | {"", "there", "i", "you", "we"}  # a noun phrase, too
 _STILL = lex.words("still stationary motionless unmoved immobile")
 _BETWEEN = lex.words("to be being on of in by slowly quickly suddenly going about allowed")
 
@@ -37,13 +38,6 @@ class _Clause:
     start: int
     subject: ObjectPhrase | None = None
     verbs: int = 0
-
-    def offer(self, phrase: ObjectPhrase) -> None:
-        """Takes the first noun phrase for the subject; scenery gives way to a thing ("on the table the ball rolls")."""
-        if self.verbs or phrase.head in lex.ABSTRACT or (phrase.noun is None and phrase.colour is None):
-            return
-        if self.subject is None or (self.subject.head in lex.SCENERY and phrase.head not in lex.SCENERY):
-            self.subject = phrase
 
 
 @dataclass(frozen=True)
@@ -72,34 +66,33 @@ class MotionCandidate:
         return self.kind not in {None, "static"}
 
 
-@dataclass
-class Clauses:
-    """What one pass over the clauses finds; the subjects of its questions are given with their places."""
-
-    candidates: list[MotionCandidate] = field(default_factory=list[MotionCandidate])
-    question_subjects: list[tuple[int, ObjectPhrase]] = field(default_factory=list[tuple[int, ObjectPhrase]])
-
-
-def read_clauses(found: Sequence[Item]) -> Clauses:
-    """One pass over the clauses: every verb of motion with its subject, and the subjects of the questions."""
-    clauses, clause = Clauses(), _Clause("plain", 0)
-    candidates = clauses.candidates
+def read_clauses(found: Sequence[Item]) -> tuple[list[MotionCandidate], list[tuple[int, ObjectPhrase]]]:
+    """Every verb of motion with its subject, and the subjects of the questions with their places."""
+    candidates: list[MotionCandidate] = []
+    question_subjects: list[tuple[int, ObjectPhrase]] = []
+    clause = _Clause("plain", 0)
     for at in range(len(found) + 1):
-        opened = _opened(found, at, clause)
+        opened, phrase = _opened(found, at, clause), phrase_at(found, at)
         if opened:
             known = bool(candidates) and candidates[-1].start == clause.start
             if clause.kind == "cond" and clause.subject and not known:
                 start = clause.start
                 candidates.append(MotionCandidate(start, start, "", None, clause.subject, _UNKNOWN_VERB))
             clause = _Clause(opened, at)
-        elif (phrase := phrase_at(found, at)) is not None:
+        elif phrase is not None:
             if clause.kind == "question" and clause.subject is None and not is_vague(found[at]):
-                clauses.question_subjects.append((at, phrase))
-            clause.offer(phrase)
+                question_subjects.append((at, phrase))
+            # The first thing is the subject; scenery gives way to it ("on the table the ball rolls").
+            names = phrase.head not in lex.ABSTRACT and (phrase.noun is not None or phrase.colour is not None)
+            gives_way = clause.subject is None or (
+                clause.subject.head in lex.SCENERY and phrase.head not in lex.SCENERY
+            )
+            if names and gives_way and not clause.verbs:
+                clause.subject = phrase
         elif candidate := _candidate(found, at, clause):
             candidates.append(candidate)
         clause.verbs += key_at(found, at) in lex.VERBS
-    return clauses
+    return candidates, question_subjects
 
 
 def _opened(found: Sequence[Item], at: int, clause: _Clause) -> _ClauseKind | None:
@@ -127,10 +120,9 @@ def is_during(found: Sequence[Item], at: int) -> bool:
 
 def _is_inversion(found: Sequence[Item], at: int) -> bool:
     key, after = found[at].key, at + 2 if key_at(found, at + 1) in lex.NEGATIONS else at + 1
-    subjects = lex.MOVER_PRONOUNS | {"", "there", "i", "you", "we"}
-    behind_subject = at > 0 and key_at(found, at - 1) in subjects
+    behind_subject = at > 0 and key_at(found, at - 1) in _SUBJECTS
     inverted = key in lex.AUXILIARIES or (key in lex.BE and key != "'s" and not behind_subject)
-    return inverted and key_at(found, after) in subjects
+    return inverted and key_at(found, after) in _SUBJECTS
 
 
 def _candidate(found: Sequence[Item], at: int, clause: _Clause) -> MotionCandidate | None:
@@ -139,13 +131,14 @@ def _candidate(found: Sequence[Item], at: int, clause: _Clause) -> MotionCandida
         return MotionCandidate(at, clause.start, "let go", "fall", _subject(found, at, "drop", clause), rank)
     if key in _STILL and before in lex.BE and clause.kind != "question":
         return MotionCandidate(at, clause.start, "stay", "static", clause.subject, rank)
-    verb, passive = lex.VERBS.get(key), is_passive(found, at)
+    verb = lex.VERBS.get(key)
+    if verb is None or before == "nobody" or _is_idle(found, at, verb):
+        return None
     acting = phrase_at(found, at - 2 if before in lex.BE else at - 1)
     # "Assume the camera stays still": nothing in the scene is meant.
-    about_picture = clause.subject is None and acting is not None and acting.head in lex.ABSTRACT
-    if verb is None or before == "nobody" or about_picture or _is_idle(found, at, verb):
+    if clause.subject is None and acting is not None and acting.head in lex.ABSTRACT:
         return None
-    kind = verb.kind
+    kind, passive = verb.kind, is_passive(found, at)
     if kind is None:
         struck = verb.lemma in {"hit", "strike", "knock", "bump"} and verb.form in {"past", "base"} and passive
         if not struck or clause.kind != "cond":
@@ -248,6 +241,7 @@ _ADVERBIAL = 14  # words of one
 _MAX_TRIES = 16  # of one motion: each takes a part of a ms
 _FIRST_LEG_ONLY = frozenset({"along", "against", "reversed", "towards", "forward", "backward"})
 _THEN = lex.words("then afterwards finally")
+_BEFORE_VERB = lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}
 _KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
@@ -323,6 +317,39 @@ class _Leg:
     marks: set[str] = field(default_factory=set[str])
     quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
 
+    def take(self, node: Node, mover: ObjectPhrase | None, open_end: bool, arrow: bool) -> bool:
+        """Takes an adverbial; false where it says nothing here."""
+        match node.name:
+            case "heading":
+                weight = SLIGHTLY if "slight" in node else 1.0
+                said = [lex.DIRECTIONS[word.text] for ways in node.find("ways") for word in ways.words]
+                self.ways += [(weight * x, weight * y) for x, y in said]
+            case "away" | "near":
+                self.depths.add(1 if node.name == "away" else -1)
+            case "along" | "against":
+                self.senses.add(node.name)
+            case "reversed" if arrow:
+                self.senses.add("against")
+            case "forward" | "backward":
+                self.ahead.add(node.name == "forward")
+            case "reversed" | "beside_it":
+                return False
+            case "airborne":
+                self.marks.add(node.name)
+                flies = self.verb in lex.VERBS and lex.VERBS[self.verb].kind in {"projectile", "fall"}
+                return flies or self.verb in _KICKED  # "rolls through the air": the worlds have nothing that does
+            case "stops":
+                return bool(self.quantities)
+            case "towards":
+                phrase = node.words[0].phrase
+                named = phrase is not None and (phrase.is_thing or (phrase.noun is None and phrase.colour is not None))
+                aims = named and phrase != mover and not (open_end and "to_goal" in node)
+                self.towards = self.towards or (phrase if aims else None)
+                return aims and self.towards == phrase
+            case _:
+                self.marks.add(node.name)
+        return True
+
     def way(self, kind: MotionKind | None) -> tuple[Vector | None, float]:
         """A unit vector in the image, and the depth."""
         x, y = (sum(way[axis] for way in self.ways) for axis in (0, 1))
@@ -374,7 +401,7 @@ def read_motion(
             later = len(legs) > 1 and node.name in _FIRST_LEG_ONLY
             if node.name == "stops" and len(legs) > 1 and not leg.says_more():
                 leg = legs[-2]
-            if later or aside or not _apply(leg, node, found, mover, asked or kind == "fall", arrow):
+            if later or aside or not leg.take(node, mover, asked or kind == "fall", arrow):
                 continue
         elif item.quantity is not None and item.quantity.within is not None:
             continue
@@ -460,7 +487,7 @@ def _adverbials(found: Sequence[Item], start: int) -> Iterator[tuple[Node | None
     while at < len(found):
         item, verb, before, parsed = found[at], lex.VERBS.get(found[at].key), at - 1, None
         # "And then drops", "then it rolls": the verb of a further leg.
-        while key_at(found, before) in lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}:
+        while verb is not None and key_at(found, before) in _BEFORE_VERB:
             before -= 1
         next_verb = verb is not None and verb.kind is not None and key_at(found, before) in _THEN | {"and", "so"}
         # "Sends the ball rolling", "sets it sliding".
@@ -475,39 +502,3 @@ def _adverbials(found: Sequence[Item], start: int) -> Iterator[tuple[Node | None
         if node is not None:
             yield node, found[at:end]
         at = end
-
-
-def _apply(
-    leg: _Leg, node: Node, found: Sequence[Item], mover: ObjectPhrase | None, open_end: bool, arrow: bool
-) -> bool:
-    """Takes one adverbial into a leg; false where it says nothing there."""
-    match node.name:
-        case "heading":
-            weight = SLIGHTLY if "slight" in node else 1.0
-            said = [lex.DIRECTIONS[word.text] for ways in node.find("ways") for word in ways.words]
-            leg.ways += [(weight * x, weight * y) for x, y in said]
-        case "away" | "near":
-            leg.depths.add(1 if node.name == "away" else -1)
-        case "along" | "against":
-            leg.senses.add(node.name)
-        case "reversed" if arrow:
-            leg.senses.add("against")
-        case "forward" | "backward":
-            leg.ahead.add(node.name == "forward")
-        case "reversed" | "beside_it":
-            return False
-        case "airborne":
-            leg.marks.add(node.name)
-            flies = leg.verb in lex.VERBS and lex.VERBS[leg.verb].kind in {"projectile", "fall"}
-            return flies or leg.verb in _KICKED  # "rolls through the air": the worlds have nothing that does
-        case "stops":
-            return bool(leg.quantities)
-        case "towards":
-            phrase = node.words[0].phrase
-            named = phrase is not None and (phrase.is_thing or (phrase.noun is None and phrase.colour is not None))
-            aims = named and phrase != mover and not (open_end and "to_goal" in node)
-            leg.towards = leg.towards or (phrase if aims else None)
-            return aims and leg.towards == phrase
-        case _:
-            leg.marks.add(node.name)
-    return True

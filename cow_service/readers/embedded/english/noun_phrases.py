@@ -1,28 +1,28 @@
-"""Cuts a sentence into noun phrases, quantities and the words between them, without a list of nouns.
+"""Cuts a sentence into noun phrases, quantities and the words between them; and what a noun says of a shape.
 
-A phrase runs from its determiner up to a word that cannot be inside one: a function word, a verb form, a direction
-behind the noun. Positions are those of the question's own characters.
+Nouns have no list. A phrase runs from its determiner up to a word that cannot be inside one: a function word, a verb
+form, a direction behind the noun. Positions are those of the question's own characters.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import takewhile
+from typing import Literal
 
 from cow_service.readers.base import Quantity, SpeedWord, Unit
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import Node, may_begin, read_from, terminals
+from cow_service.readers.embedded.english.grammar import Node, read_from, terminals
 from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, QuantityWords, key_at
+from cow_service.readers.options import plain
+from cow_service.records import Shape
 
-_MAX_TRIES = 6  # quantities of one question: each takes some ms
 _QUANTITY_WINDOW, _PLACE_WINDOW = 14, 9  # words
 _MEASURES = frozenset({"_SLOWLY", "_QUICKLY", "_SECOND", "_TEMPO", "LENGTH", "WIDTH"})  # terminals
 _BARE = lex.words("width diameter height halfway midway way until till push shove")  # measures, too
 _ADJECTIVE_BEHIND = lex.DETERMINERS | lex.COLOURS.keys() | lex.SETS["adjectives"] | lex.words("how as so is are be")
 _PARTS = {"half": 0.5, "halfway": 0.5, "quarter": 0.25, "third": 1 / 3, "two_thirds": 2 / 3, "twice": 2.0}
-_WITH_UNIT = re.compile(r"\d+(\.\d+)?[a-z]+")
 
 
 def _joined(found: Sequence[Item], join: Callable[[int], tuple[Item, int] | None]) -> list[Item]:
@@ -37,25 +37,18 @@ def _joined(found: Sequence[Item], join: Callable[[int], tuple[Item, int] | None
 
 def _with_quantities(found: Sequence[Item]) -> list[Item]:
     """The words of a question, each quantity in them joined to one item."""
-    tries = 0
-    measures = [
-        item.key in _BARE or bool(_WITH_UNIT.fullmatch(item.key)) or not _MEASURES.isdisjoint(terminals(item.key))
-        for item in found
-    ]
+    measures = [item.key[0].isdigit() or item.key in _BARE or bool(_MEASURES & terminals(item.key)) for item in found]
 
     def join(at: int) -> tuple[Item, int] | None:
-        nonlocal tries
         key, before = found[at].key, key_at(found, at - 1)
         adjective = key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND
-        if adjective or before == "number" or (key in _PARTS and key_at(found, at + 1) == "between"):
-            return None
         if (
-            tries == _MAX_TRIES
-            or not any(measures[at : at + 8])
-            or not may_begin("quantity", next(lex.plain_words([key], at)))
+            not any(measures[at : at + 8])
+            or adjective
+            or before == "number"
+            or (key in _PARTS and key_at(found, at + 1) == "between")
         ):
             return None
-        tries += 1
         parsed = read_from("quantity", found, at, _QUANTITY_WINDOW)
         if parsed is None:
             return None
@@ -252,6 +245,15 @@ def _with_mark(text: str, item: Item, links: Sequence[str], mark: Item) -> Item 
     return replace(item, end=mark.end, phrase=longer)
 
 
+def parse_noun_phrase(text: str) -> ObjectPhrase | None:
+    """The first noun phrase of a text such as "the red toy car"; None where there is none."""
+    found = items("the " + text.removeprefix("the "))
+    phrase = next((item.phrase for item in found if item.phrase is not None), None)
+    if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
+        return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
+    return phrase
+
+
 TABLES = lex.words("table desk tabletop")
 _PLACE = lex.words(
     "on onto upon off across over along around above atop at from to in through within under beneath below underneath"
@@ -358,3 +360,84 @@ def with_places(found: Sequence[Item]) -> list[Item]:
         return replace(item, end=found[end - 1].end, phrase=replace(thing, text=text, place=place)), end
 
     return _joined(found, join)
+
+
+_NOUNS = {shape: lex.words(text) for shape, text in lex.TABLES["shapes"].items()}
+_SHAPES: dict[Shape, frozenset[str]] = {
+    "sphere": _NOUNS["sphere"], "box": _NOUNS["box"] | _NOUNS["vehicle"], "cone": _NOUNS["cone"],
+    "cylinder": _NOUNS["cylinder"],
+}  # fmt: skip
+
+
+def _head(name: str) -> str | None:
+    phrase = parse_noun_phrase(name)
+    return None if phrase is None else phrase.head
+
+
+def shape_of(name: str) -> Shape | None:
+    """The shape of what is called so; None where the noun does not say."""
+    head = _head(name)
+    return next((shape for shape, nouns in _SHAPES.items() if head in nouns), None)
+
+
+def is_vehicle(name: str) -> bool:
+    """Whether it is longer along its heading than across."""
+    return _head(name) in _NOUNS["vehicle"]
+
+
+def is_cube(name: str) -> bool:
+    """Whether it is a box as wide as high."""
+    return _head(name) in _NOUNS["cube"]
+
+
+_SAID = lex.words("any every each all no none some many a an both either neither other the")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What one of the things is called, and how many there are, where that is said."""
+
+    phrase: ObjectPhrase
+    count: int | None
+
+
+def kind_of(name: str) -> Kind | None:
+    """The kind that a name such as "both mugs" or "mugs" is of; None for the name of one thing."""
+    said = name.lower().split()
+    numbers = dict.fromkeys(("both", "either", "neither"), 2) | lex.NUMBER_WORDS
+    counts = [int(word) if word.isdecimal() else numbers[word] for word in said if word.isdecimal() or word in numbers]
+    rest = [word for word in said if word not in _SAID | numbers.keys() and not word.isdecimal()]
+    head = lex.singular(rest[-1]) if rest else ""
+    if not rest or (said[0] not in _SAID - {"the", "other"} and head == rest[-1]):
+        return None
+    phrase = parse_noun_phrase(" ".join([*rest[:-1], head]))
+    return None if phrase is None else Kind(phrase, counts[0] if counts else None)
+
+
+ContainerForm = Literal["round", "square", "none", "unknown"]
+
+
+def container_form(name: str) -> ContainerForm:
+    """Round or square for what is called a container, `none` for a solid thing, `unknown` where the noun says nothing.
+
+    A box is a container: whoever means a solid one does not ask what goes into it.
+    """
+    head = _head(name)
+    if head in lex.SETS["round"]:
+        return "round"
+    if head in _NOUNS["square"]:
+        return "square"
+    return "unknown" if shape_of(name) is None else "none"
+
+
+def may_name(phrase: ObjectPhrase, name: str) -> bool:
+    """Whether a phrase may mean the object of that name: they share a colour, noun or number, and differ in none."""
+    other = parse_noun_phrase(name)
+    if other is None:
+        return False
+    if plain(phrase.text) == plain(name):
+        return True
+    nouns = [each.head if each.head not in lex.GENERIC else None for each in (phrase, other)]
+    pairs = ((phrase.colour, other.colour), tuple(nouns), (phrase.number, other.number))
+    said = [(one, two) for one, two in pairs if one is not None and two is not None]
+    return bool(said) and all(one == two for one, two in said)

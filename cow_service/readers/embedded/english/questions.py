@@ -15,7 +15,7 @@ from cow_service.readers.embedded.english import interventions, motion, noun_phr
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.interventions import InterventionWords, TrailWords
 from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, key_at, phrase_at
-from cow_service.readers.embedded.english.motion import Clauses, MotionCandidate, MotionWords, OtherWords
+from cow_service.readers.embedded.english.motion import MotionCandidate, MotionWords, OtherWords
 from cow_service.readers.options import plain, split_options
 
 MAX_WORDS = 240  # of a question that are read
@@ -80,10 +80,10 @@ def parse(question: str) -> Question:
     found = noun_phrases.with_nouns(noun_phrases.with_tables(noun_phrases.items(text)))
     changes, found = interventions.split_interventions(noun_phrases.with_places(found))
     trail, found = interventions.split_trail(found)
-    clauses = motion.read_clauses(found)
-    best = _best(found, clauses)
-    mover = _mover(found, clauses, best, changes)
-    clause, told = _motion(found, clauses, best, mover, arrow, changes)
+    candidates, subjects = motion.read_clauses(found)
+    best = _best(found, candidates)
+    mover = _mover(found, subjects, best, changes)
+    clause, told = _motion(found, candidates, best, mover, arrow, changes)
     if trail is not None and trail.near is None and trail.side is None:
         trail = replace(trail, side=told.direction)  # "on along its trail to the right": its last end is there
     told, fitted = replace(told, trail=trail), frozenset[int]()
@@ -96,7 +96,7 @@ def parse(question: str) -> Question:
     carried = put is not None and lifted == put.object
     if carried:
         read = read.union(item.start for item in found[clause.start : clause.stop])
-    way = best is None and told.arrow is not None and bool(clauses.question_subjects)  # "on its way along the arrow"
+    way = best is None and told.arrow is not None and bool(subjects)  # "on its way along the arrow"
     if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
         mover, told = put.object, replace(told, kind="place", verb="put")
     return Question(
@@ -115,24 +115,15 @@ def parse(question: str) -> Question:
     )
 
 
-def parse_noun_phrase(text: str) -> ObjectPhrase | None:
-    """The first noun phrase of a text such as "the red toy car"; None where there is none."""
-    found = noun_phrases.items("the " + text.removeprefix("the "))
-    phrase = next((item.phrase for item in found if item.phrase is not None), None)
-    if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
-        return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
-    return phrase
-
-
-def _best(found: Sequence[Item], clauses: Clauses) -> MotionCandidate | None:
+def _best(found: Sequence[Item], candidates: Sequence[MotionCandidate]) -> MotionCandidate | None:
     """The verb that tells the motion: the first of the highest rank."""
-    best = max(clauses.candidates, key=lambda candidate: candidate.rank, default=None)
+    best = max(candidates, key=lambda candidate: candidate.rank, default=None)
     if best is None or best.asked or not best.moves or found[best.start].key != "while":
         return best
     # In front of "while", where both are told: "the mug slides left by 20 px while the ball drops".
     told = [
         each
-        for each in clauses.candidates
+        for each in candidates
         if each.at < best.start and not each.asked and each.moves and motion.clause_end(found, each.at) == best.start
         and each.subject is not None and each.subject.is_thing and each.subject.head not in lex.AGENTS
     ]  # fmt: skip
@@ -140,7 +131,10 @@ def _best(found: Sequence[Item], clauses: Clauses) -> MotionCandidate | None:
 
 
 def _mover(
-    found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None, changes: Sequence[InterventionWords]
+    found: Sequence[Item],
+    subjects: Sequence[tuple[int, ObjectPhrase]],
+    best: MotionCandidate | None,
+    changes: Sequence[InterventionWords],
 ) -> ObjectPhrase | None:
     """What moves, as it is worded most fully."""
     at = best.at if best else len(found)
@@ -154,7 +148,7 @@ def _mover(
             if place > 1 and found[place - 1].key == "by" and motion.is_passive(found, place - 2)
             and phrase.head not in lex.ABSTRACT | lex.AGENTS
         ]  # fmt: skip
-        asked = [each for each in clauses.question_subjects if each[1].head not in lex.ABSTRACT]
+        asked = [each for each in subjects if each[1].head not in lex.ABSTRACT]
         named = [(place, phrase) for place, phrase in certain if phrase.is_thing]
         before = [phrase for each in (asked, named) for place, phrase in each if place < at]
         mover = next(iter([*acting, *before, *(phrase for _, phrase in asked + named)]), None)
@@ -169,7 +163,7 @@ def _mover(
 
 def _motion(
     found: Sequence[Item],
-    clauses: Clauses,
+    candidates: Sequence[MotionCandidate],
     best: MotionCandidate | None,
     mover: ObjectPhrase | None,
     arrow: bool,
@@ -186,7 +180,7 @@ def _motion(
         lands = removed and any(lex.lemma(item.key) in {"land", "happen"} for item in found)
         if down or lands or (mover is not None and "falling" in mover.text.lower().split()[:-1]):
             verb, kind = "fall", "fall"
-    beside = _movers_beside(found, clauses, best)
+    beside = _movers_beside(found, candidates, best)
     end = min([motion.clause_end(found, at) if best else at, *(other.start for other in beside)])
     shared: int | None = None  # "the ball moves left and the car to the right"
     for place in range(at + 1, end - 2):
@@ -210,14 +204,16 @@ def _motion(
     return range(start if best else at, end), told
 
 
-def _movers_beside(found: Sequence[Item], clauses: Clauses, best: MotionCandidate | None) -> list[MotionCandidate]:
+def _movers_beside(
+    found: Sequence[Item], candidates: Sequence[MotionCandidate], best: MotionCandidate | None
+) -> list[MotionCandidate]:
     """Motions of other things than the mover's, said in the same way: "the ball moves left and the car goes right"."""
     if best is None or best.asked or best.subject is None or best.subject.head in lex.AGENTS:
         return []
     while_it = found[best.start].key == "while"  # "while the ball rolls right, the mug slides left"
     return [
         each
-        for each in clauses.candidates
+        for each in candidates
         if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
         and each.at > best.at and each.start > best.at and each.moves
         and each.subject is not None and (each.subject.noun or each.subject.colour)
