@@ -11,47 +11,72 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
 import pytest
 
 REQUIRED = "COW_TEST_POSTGRES"  # set where a missing PostgreSQL is a fault and not a reason to skip
 
 
-def _programs() -> Path | None:
-    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
-    told = shutil.which("initdb")
-    return found[-1].parent if found else Path(told).parent if told else None
+class PostgresServer:
+    """An empty database, whose server can be killed and started again."""
+
+    def __init__(self, programs: Path, folder: Path) -> None:
+        self._programs, self._folder, self._data = programs, folder, str(folder / "data")
+        self._as_user = ["runuser", "-u", "postgres", "--"] if os.getuid() == 0 else []  # it refuses to run as root
+        if self._as_user:
+            shutil.chown(folder, "postgres")
+        with socket.socket() as one:
+            one.bind(("127.0.0.1", 0))
+            self.port = one.getsockname()[1]
+        self.url = f"postgresql://cow@127.0.0.1:{self.port}/cow"
+        self._run("initdb", "-D", self._data, "-U", "cow", "-A", "trust", "--no-sync")
+        self.start()
+        self._run("createdb", "-h", "127.0.0.1", "-p", str(self.port), "-U", "cow", "cow")
+
+    def start(self) -> None:
+        options = f"-p {self.port} -h 127.0.0.1 -k {self._folder}"
+        self._run("pg_ctl", "-D", self._data, "-l", str(self._folder / "log"), "-w", "-o", options, "start")
+
+    def kill(self) -> None:
+        """Ends every process of the server at once. What it had not handed to the system is gone."""
+        pid = int((self._folder / "data" / "postmaster.pid").read_text().split()[0])
+        postmaster = psutil.Process(pid)
+        processes = [postmaster, *postmaster.children(recursive=True)]
+        for process in processes:
+            process.kill()
+        psutil.wait_procs(processes)
+
+    def stop(self) -> None:
+        command = [*self._as_user, str(self._programs / "pg_ctl"), "-D", self._data, "-m", "immediate", "stop"]
+        subprocess.run(command, check=False, cwd="/")
+
+    def _run(self, program: str, *arguments: str) -> None:
+        # Nobody reads the server's output: it would keep a pipe open.
+        command = [*self._as_user, str(self._programs / program), *arguments]
+        subprocess.run(command, check=True, cwd="/", stdout=subprocess.DEVNULL, timeout=60)
 
 
 @contextmanager
-def postgres_server() -> Iterator[str]:
-    """The URL of an empty database; the server is gone afterwards. Skips the test where there is no PostgreSQL."""
-    programs = _programs()
+def postgres() -> Iterator[PostgresServer]:
+    """A server, which is gone afterwards. Skips the test where there is no PostgreSQL."""
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    in_path = shutil.which("initdb")
+    programs = found[-1].parent if found else Path(in_path).parent if in_path else None
     if programs is None:
         if os.environ.get(REQUIRED):
             pytest.fail("PostgreSQL is not installed: apt-get install postgresql")
         pytest.skip("PostgreSQL is not installed: apt-get install postgresql")
     folder = Path(tempfile.mkdtemp(prefix="cow-postgres-"))
-    as_user = ["runuser", "-u", "postgres", "--"] if os.getuid() == 0 else []  # it refuses to run as root
-    if as_user:
-        shutil.chown(folder, "postgres")
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        port = one.getsockname()[1]
-
-    def run(program: str, *arguments: str) -> None:
-        # Nobody reads the server's output: it would keep a pipe open.
-        subprocess.run(
-            [*as_user, str(programs / program), *arguments], check=True, cwd="/", stdout=subprocess.DEVNULL, timeout=60
-        )
-
-    data, control = str(folder / "data"), ("-D", str(folder / "data"), "-l", str(folder / "log"), "-w")
-    run("initdb", "-D", data, "-U", "cow", "-A", "trust", "--no-sync")
+    server = PostgresServer(programs, folder)
     try:
-        run("pg_ctl", *control, "-o", f"-p {port} -h 127.0.0.1 -k {folder}", "start")
-        run("createdb", "-h", "127.0.0.1", "-p", str(port), "-U", "cow", "cow")
-        yield f"postgresql://cow@127.0.0.1:{port}/cow"
+        yield server
     finally:
-        subprocess.run(
-            [*as_user, str(programs / "pg_ctl"), "-D", data, "-m", "immediate", "stop"], check=False, cwd="/"
-        )
+        server.stop()
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def postgres_server() -> Iterator[str]:
+    """The URL of an empty database; the server is gone afterwards. Skips the test where there is no PostgreSQL."""
+    with postgres() as server:
+        yield server.url

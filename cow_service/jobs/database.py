@@ -216,10 +216,23 @@ class Database:
         return (postgresql if self.file is None else sqlite).insert(table)
 
     @contextmanager
-    def transaction(self) -> Generator[sa.Connection]:
-        """A connection whose statements are committed together at the end of the block."""
-        with database_errors(), self.engine.begin() as connection:
-            yield connection
+    def transaction(self, *, durable: bool = False) -> Generator[sa.Connection]:
+        """A connection whose statements are committed together at the end of the block.
+
+        With `durable` they are on the disk by then, before anybody can read them. Without it they outlive this process,
+        but not a crash of PostgreSQL or of the machine within the next second: `flush` waits for them.
+        """
+        with database_errors(), self.engine.connect() as connection:
+            if durable and self.file is not None:  # not within a transaction
+                connection.connection.execute("PRAGMA synchronous=FULL")
+            try:
+                with connection.begin():
+                    if durable and self.file is None:
+                        connection.execute(sa.text("SET LOCAL synchronous_commit = on"))
+                    yield connection
+            finally:
+                if durable and self.file is not None:
+                    connection.connection.execute("PRAGMA synchronous=NORMAL")
 
     def give_room_back(self, stop: Callable[[], bool]) -> None:
         """Returns the room of removed rows to the disk, in steps between which others write.
@@ -261,7 +274,8 @@ class Database:
         if self.file is None:
             with self.transaction() as connection:
                 connection.execute(sa.text("SET LOCAL synchronous_commit = on"))
-                connection.execute(sa.text("SELECT txid_current()"))  # a commit that waits for all before it
+                # Only a transaction that wrote something to the log waits for the disk, and then for all before it.
+                connection.execute(sa.text("SELECT pg_logical_emit_message(true, 'cow', '')"))
             return
         log = self.file.with_name(self.file.name + "-wal")
         try:

@@ -366,7 +366,7 @@ class JobTable:
 
     def delete(self, jobs: list[str]) -> set[str]:
         """Deletes jobs with all that belongs to them; returns the artifacts that no other job needs."""
-        with self._database.transaction() as connection:
+        with self._database.transaction(durable=True) as connection:  # their artifacts are removed next
             theirs = sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(jobs)).distinct()
             artifacts = set(connection.execute(theirs).scalars())
             connection.execute(sa.delete(JOBS).where(JOBS.c.id.in_(jobs)))
@@ -376,7 +376,7 @@ class JobTable:
         """Ends an open job, and has its webhook called. Of an attempt: only if it is the latest."""
         this = [JOBS.c.id == job_id] if run is None else [JOBS.c.id == job_id, JOBS.c.run == run]
         ended = sa.update(JOBS).where(*this, JOBS.c.status.in_(OPEN)).values(status=status, ended=time.time(), **values)
-        with self._database.transaction() as connection:
+        with self._database.transaction(durable=True) as connection:
             row = connection.execute(ended.returning(JOBS.c.webhook)).one_or_none()
             if row is not None and row.webhook is not None:
                 self._on_end(connection, job_id, row.webhook)

@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol, TypeVar
+from typing import IO, Any, Protocol, TypeVar
 from uuid import uuid4
 
 from filelock import FileLock
@@ -186,7 +186,11 @@ class DiskArtifacts(ArtifactStore):
             self._folder.mkdir(parents=True, exist_ok=True)
             with FileLock(self._folder / "name.lock"):
                 if not name.exists():
-                    name.write_text(uuid4().hex)
+                    with self.scratch() as temporary:
+                        with temporary.open("x") as file:
+                            file.write(uuid4().hex)
+                            _sync(file)
+                        _move(temporary, name)
                 return f"folder:{name.read_text()}"
 
     def put(self, data: bytes, media_type: str) -> Artifact:
@@ -218,7 +222,7 @@ class DiskArtifacts(ArtifactStore):
             if stored is None:
                 stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
                 stored.parent.mkdir(parents=True, exist_ok=True)
-                temporary.replace(stored)
+                _move(temporary, stored)
                 self._note_verified(sha256, _version(stored))
             else:
                 temporary.unlink()
@@ -343,9 +347,19 @@ def _version(path: Path) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def _sync(file: BinaryIO) -> None:
+def _sync(file: IO[Any]) -> None:
     file.flush()
     os.fsync(file.fileno())
+
+
+def _move(temporary: Path, stored: Path) -> None:
+    """Gives a file that is on the disk its name there."""
+    temporary.replace(stored)
+    folder = os.open(stored.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
 
 
 @contextmanager
