@@ -7,14 +7,16 @@ import shutil
 import subprocess
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from conftest import SCALE
+from conftest import SCALE, SLOWNESS
 from postgres import postgres
-from servers import ASYNC, BODY, Served, eventually
+from proxy import proxy
+from servers import ASYNC, BODY, Served, eventually, problem
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.timeout(900 * SCALE)]
 CALLERS = 2
@@ -119,3 +121,34 @@ def test_nothing_acknowledged_is_lost_with_the_power(tmp_path: Path) -> None:
     with Served(folder) as server:
         load.server = server
         load.check()
+
+
+def test_a_network_that_loses_every_byte_is_an_answer_within_ten_seconds(tmp_path: Path) -> None:
+    with (
+        postgres() as database,
+        proxy(database.port) as network,
+        Served(tmp_path, COW_DATABASE_URL=database.url.replace(str(database.port), str(network.port))) as server,
+    ):
+        job_id = server.submit(BODY)["id"]
+        server.ended(job_id)
+        for _ in range(CRASHES):
+            network.hold()
+            requests = [
+                ("GET", f"/jobs/{job_id}", None),
+                ("POST", "/simulate", BODY | {"seed": 1}),
+                ("GET", "/jobs", None),
+            ]
+            with ThreadPoolExecutor() as callers:
+                began = time.monotonic()
+                responses = list(callers.map(lambda one: server.http.request(one[0], one[1], json=one[2]), requests))
+            assert time.monotonic() - began < 10 * SLOWNESS
+            for response in responses:
+                problem(response, 503, "storage-unavailable")
+                assert response.headers["Retry-After"]
+            network.restore()
+            eventually(lambda: server.http.get("/readyz").is_success)
+            assert server.job(job_id)["status"] == "succeeded"
+        network.hold()
+        began = time.monotonic()
+        server.stop()
+        assert time.monotonic() - began < 30 * SLOWNESS

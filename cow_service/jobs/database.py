@@ -5,13 +5,17 @@ Results, references and finished stages belong to a job, and are deleted with it
 
 from __future__ import annotations
 
+import logging
+import math
 import os
+import socket
 import sqlite3
 import sys
+import threading
 import time
 import zlib
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -20,7 +24,7 @@ import sqlalchemy as sa
 from pydantic_core import from_json
 from sqlalchemy import event
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import DisconnectionError, SQLAlchemyError
 
 from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.settings import Settings, SettingsError
@@ -31,6 +35,8 @@ if TYPE_CHECKING:
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
 MAX_IDS = 500  # in one statement
 CONNECT_SECONDS = 4  # for a connection to PostgreSQL
+STALLED_SECONDS = 5.0  # that one may be in use at a time, of which a transaction needs milliseconds
+IDLE_SECONDS = 1.0  # after which it is asked for a sign of life before it is used again
 MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cut when it begins anew
 TABLES_LOCK = 0x434F5701  # of PostgreSQL, held while tables are created
 INCREMENTAL = 2  # SQLite's number of that mode
@@ -55,6 +61,8 @@ _SAVE_TRAJECTORY = (
 )
 _DONE = "INSERT INTO cow_stages_of_jobs (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
 _ADD_REFERENCES = "INSERT INTO cow_references (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
+
+log = logging.getLogger("cow_service")
 
 METADATA = sa.MetaData()
 JOBS = sa.Table(
@@ -155,6 +163,7 @@ class Database:
     def __init__(self, settings: Settings) -> None:
         self.url, self.file = _address(settings)
         self._use(_engine(self.url, self.file is not None))
+        self._stalled: StalledConnections | None = None
 
     def _use(self, engine: sa.Engine) -> None:
         self.engine = engine
@@ -260,7 +269,14 @@ class Database:
 
     def close(self) -> None:
         """Closes its connections."""
+        if self._stalled is not None:
+            self._stalled.stop()
         self.engine.dispose()
+
+    def watch(self) -> None:
+        """From now on no statement waits for ever for an answer. Work on the tables themselves may take longer."""
+        if self.file is None:
+            self._stalled = StalledConnections(self.engine)
 
     def session(self) -> psycopg.Connection[Any]:
         """A connection to PostgreSQL of the caller's own. Raises `psycopg.Error`."""
@@ -387,6 +403,52 @@ class Database:
             cursor.execute(self._plain(_ADD_REFERENCES.format(", ".join(["(?, ?)"] * (len(rows) // 2)))), rows)
 
 
+class StalledConnections:
+    """Ends connections to PostgreSQL that are in use for too long: a network may lose answers without a sign.
+
+    Whoever waits for such an answer has an error then. A connection that was idle is tried before it is used.
+    """
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._guard, self._stop = threading.Lock(), threading.Event()
+        self._in_use: dict[sa.pool.ConnectionPoolEntry, float] = {}
+        for name, react in (("checkout", self._begin), ("checkin", self._end), ("invalidate", self._end)):
+            event.listen(engine, name, react)
+        self._thread = threading.Thread(target=self._watch, name="cow-stalled-connections", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Watches no more."""
+        self._stop.set()
+        self._thread.join()
+
+    def _begin(self, connection: psycopg.Connection[Any], entry: sa.pool.ConnectionPoolEntry, _: object) -> None:
+        with self._guard:
+            self._in_use[entry] = time.monotonic()
+        if time.monotonic() - entry.info.get("idle_since", math.inf) > IDLE_SECONDS:
+            try:
+                connection.execute("")
+                connection.rollback()
+            except _driver_errors() as error:  # it is replaced, as all that were made before it
+                raise DisconnectionError from error
+
+    def _end(self, _: object, entry: sa.pool.ConnectionPoolEntry, error: object = None) -> None:
+        entry.info["idle_since"] = time.monotonic()
+        with self._guard:
+            self._in_use.pop(entry, None)
+
+    def _watch(self) -> None:
+        while not self._stop.wait(STALLED_SECONDS / 10):
+            with self._guard:  # so that it is not closed meanwhile, and its number given to another file
+                late = time.monotonic() - STALLED_SECONDS
+                for entry in [entry for entry, since in self._in_use.items() if since < late]:
+                    del self._in_use[entry]
+                    log.warning("a connection to the job database gives no answer, and is closed")
+                    connection: Any = entry.dbapi_connection
+                    with suppress(OSError), socket.socket(fileno=os.dup(connection.pgconn.socket)) as stalled:
+                        stalled.shutdown(socket.SHUT_RDWR)
+
+
 def packed(json: str) -> bytes:
     """A JSON text as the database keeps it: a trajectory is tens of kilobytes of digits."""
     return zlib.compress(json.encode(), DEFLATE_LEVEL)
@@ -433,8 +495,15 @@ def _address(settings: Settings) -> tuple[str, Path | None]:
 
 def _engine(url: str, is_file: bool) -> sa.Engine:
     if not is_file:
-        # A commit survives the end of this process at once; `flush` waits for the disk where that matters.
-        options = {"options": "-c synchronous_commit=off", "connect_timeout": CONNECT_SECONDS}
+        options = {
+            # A commit outlives the end of this process at once, and is on the disk where that matters (`transaction`).
+            "options": "-c synchronous_commit=off -c statement_timeout=60s -c lock_timeout=20s",
+            "connect_timeout": CONNECT_SECONDS,
+            "keepalives_idle": 10,
+            "keepalives_interval": 3,
+            "keepalives_count": 3,
+            "tcp_user_timeout": int(1000 * STALLED_SECONDS),
+        }
         return sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True, connect_args=options)
     engine = sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True)
 

@@ -79,6 +79,7 @@ class JobEngine:
             launch(self.database, self._parts.executor, migrate=settings.migrate)
             self.database.claim(self.service.artifacts.address)
             self.webhooks.register_queue()
+            self.database.watch()
         except BaseException:
             DBOS.destroy()
             self._lease.release()
