@@ -2,82 +2,70 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
+from typing import Self
 
 
 class Proxy:
-    """Listens on a port of its own for a server on this machine. Its methods may be called from any thread."""
+    """Listens on a port of its own before a port of this machine, until the end of the `with` block."""
 
     def __init__(self, port: int) -> None:
         self._target = port
-        self.started = threading.Event()
-        self._passing = asyncio.Event()
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._passing = threading.Event()
+        self._passing.set()
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listener.getsockname()[1]
+        self.port: int = self._listener.getsockname()[1]
+        self._sockets: list[socket.socket] = []
+        self._threads = [threading.Thread(target=self._accept)]
 
     def hold(self) -> None:
-        """Loses every byte from now on, and says nothing: neither side learns of it."""
-        self._loop.call_soon_threadsafe(self._passing.clear)
+        """Passes no byte on from now on, and says nothing: neither side learns of it."""
+        self._passing.clear()
 
     def restore(self) -> None:
         """Passes bytes on again. What was held before arrives now."""
-        self._loop.call_soon_threadsafe(self._passing.set)
+        self._passing.set()
 
     def cut(self) -> None:
-        """Ends all connections with a reset."""
+        """Ends all connections."""
+        for one in self._sockets:
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
 
-        def abort() -> None:
-            for writer in self._writers:
-                writer.transport.abort()
+    def __enter__(self) -> Self:
+        self._threads[0].start()
+        return self
 
-        self._loop.call_soon_threadsafe(abort)
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self.restore()
+        self.cut()
+        for thread in self._threads:
+            thread.join()
+        for one in (self._listener, *self._sockets):
+            one.close()
 
-    def stop(self) -> None:
-        """Ends it."""
-        self._loop.call_soon_threadsafe(self._stopping.set)
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                caller, _ = self._listener.accept()
+                self._sockets.append(caller)
+                with suppress(ConnectionRefusedError):
+                    server = socket.create_connection(("127.0.0.1", self._target))
+                    self._sockets.append(server)
+                    for pair in ((caller, server), (server, caller)):
+                        self._threads.append(threading.Thread(target=self._pass, args=pair))
+                        self._threads[-1].start()
 
-    async def serve(self) -> None:
-        """Listens until it is stopped."""
-        self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
-        self._passing.set()
-        await asyncio.start_server(self._connected, sock=self._listener)
-        self.started.set()
-        await self._stopping.wait()
-
-    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await self._passing.wait()
-        there, back = await asyncio.open_connection("127.0.0.1", self._target)
-        self._writers |= {writer, back}
-        with suppress(ConnectionError):
-            async with asyncio.TaskGroup() as both:
-                both.create_task(self._pass(reader, back))
-                both.create_task(self._pass(there, writer))
-
-    async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            while data := await reader.read(65536):
-                await self._passing.wait()
-                writer.write(data)
-                await writer.drain()
-        finally:
-            writer.transport.abort()
-            self._writers.discard(writer)
-
-
-@contextmanager
-def proxy(port: int) -> Iterator[Proxy]:
-    """A proxy before a port of this machine."""
-    between = Proxy(port)
-    thread = threading.Thread(target=asyncio.run, args=(between.serve(),), daemon=True)
-    thread.start()
-    between.started.wait()
-    try:
-        yield between
-    finally:
-        between.stop()
-        thread.join()
+    def _pass(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(65536):
+                self._passing.wait()
+                target.sendall(data)
+        self._passing.wait()
+        for one in (source, target):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)

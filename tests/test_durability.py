@@ -15,7 +15,7 @@ import httpx
 import pytest
 from conftest import SCALE, SLOWNESS
 from postgres import postgres
-from proxy import proxy
+from proxy import Proxy
 from servers import ASYNC, BODY, Served, eventually, problem
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.timeout(900 * SCALE)]
@@ -126,7 +126,7 @@ def test_nothing_acknowledged_is_lost_with_the_power(tmp_path: Path) -> None:
 def test_a_network_that_loses_every_byte_is_an_answer_within_ten_seconds(tmp_path: Path) -> None:
     with (
         postgres() as database,
-        proxy(database.port) as network,
+        Proxy(database.port) as network,
         Served(tmp_path, COW_DATABASE_URL=database.url.replace(str(database.port), str(network.port))) as server,
     ):
         job_id = server.submit(BODY)["id"]

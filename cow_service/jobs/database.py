@@ -26,6 +26,7 @@ from sqlalchemy import event
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DisconnectionError, SQLAlchemyError
 
+from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.settings import Settings, SettingsError
 
@@ -163,7 +164,7 @@ class Database:
     def __init__(self, settings: Settings) -> None:
         self.url, self.file = _address(settings)
         self._use(_engine(self.url, self.file is not None))
-        self._stalled: StalledConnections | None = None
+        self.stalled = None if self.file is not None else StalledConnections(self.engine)
 
     def _use(self, engine: sa.Engine) -> None:
         self.engine = engine
@@ -269,14 +270,14 @@ class Database:
 
     def close(self) -> None:
         """Closes its connections."""
-        if self._stalled is not None:
-            self._stalled.stop()
+        if self.stalled is not None:
+            self.stalled.stop()
         self.engine.dispose()
 
     def watch(self) -> None:
         """From now on no statement waits for ever for an answer. Work on the tables themselves may take longer."""
-        if self.file is None:
-            self._stalled = StalledConnections(self.engine)
+        if self.stalled is not None:
+            self.stalled.start()
 
     def session(self) -> psycopg.Connection[Any]:
         """A connection to PostgreSQL of the caller's own. Raises `psycopg.Error`."""
@@ -403,49 +404,61 @@ class Database:
             cursor.execute(self._plain(_ADD_REFERENCES.format(", ".join(["(?, ?)"] * (len(rows) // 2)))), rows)
 
 
-class StalledConnections:
+class StalledConnections(BackgroundThread):
     """Ends connections to PostgreSQL that are in use for too long: a network may lose answers without a sign.
 
-    Whoever waits for such an answer has an error then. A connection that was idle is tried before it is used.
+    Whoever waits for such an answer has an error then. A pooled connection that was idle is tried before it is used.
     """
 
     def __init__(self, engine: sa.Engine) -> None:
-        self._guard, self._stop = threading.Lock(), threading.Event()
-        self._in_use: dict[sa.pool.ConnectionPoolEntry, float] = {}
-        for name, react in (("checkout", self._begin), ("checkin", self._end), ("invalidate", self._end)):
-            event.listen(engine, name, react)
-        self._thread = threading.Thread(target=self._watch, name="cow-stalled-connections", daemon=True)
-        self._thread.start()
+        super().__init__("cow-stalled-connections")
+        self._guard = threading.Lock()
+        self._in_use: dict[psycopg.Connection[Any], float] = {}
+        event.listen(engine, "checkout", self._take)
+        event.listen(engine, "checkin", self._give_back)
+        event.listen(engine, "invalidate", lambda connection, *_: self._end(connection))
 
-    def stop(self) -> None:
-        """Watches no more."""
-        self._stop.set()
-        self._thread.join()
+    @contextmanager
+    def limited(self, connection: psycopg.Connection[Any]) -> Generator[None]:
+        """Limits the time that the block takes with a connection."""
+        self._begin(connection)
+        try:
+            yield
+        finally:
+            self._end(connection)
 
-    def _begin(self, connection: psycopg.Connection[Any], entry: sa.pool.ConnectionPoolEntry, _: object) -> None:
+    def _begin(self, connection: psycopg.Connection[Any]) -> None:
         with self._guard:
-            self._in_use[entry] = time.monotonic()
+            self._in_use[connection] = time.monotonic()
+
+    def _end(self, connection: psycopg.Connection[Any] | None) -> None:
+        with self._guard:
+            self._in_use.pop(connection, None)  # type: ignore[arg-type] # None: it was ended before
+
+    def _take(self, connection: psycopg.Connection[Any], entry: sa.pool.ConnectionPoolEntry, _: object) -> None:
+        self._begin(connection)
         if time.monotonic() - entry.info.get("idle_since", math.inf) > IDLE_SECONDS:
             try:
                 connection.execute("")
                 connection.rollback()
-            except _driver_errors() as error:  # it is replaced, as all that were made before it
+            except _driver_errors() as error:  # the pool makes another one
                 raise DisconnectionError from error
 
-    def _end(self, _: object, entry: sa.pool.ConnectionPoolEntry, error: object = None) -> None:
+    def _give_back(self, connection: psycopg.Connection[Any] | None, entry: sa.pool.ConnectionPoolEntry) -> None:
         entry.info["idle_since"] = time.monotonic()
-        with self._guard:
-            self._in_use.pop(entry, None)
+        self._end(connection)
 
-    def _watch(self) -> None:
+    def _run(self) -> None:
         while not self._stop.wait(STALLED_SECONDS / 10):
-            with self._guard:  # so that it is not closed meanwhile, and its number given to another file
-                late = time.monotonic() - STALLED_SECONDS
-                for entry in [entry for entry, since in self._in_use.items() if since < late]:
-                    del self._in_use[entry]
-                    log.warning("a connection to the job database gives no answer, and is closed")
-                    connection: Any = entry.dbapi_connection
-                    with suppress(OSError), socket.socket(fileno=os.dup(connection.pgconn.socket)) as stalled:
+            late = time.monotonic() - STALLED_SECONDS
+            with self._guard:  # its socket is not closed meanwhile, nor the number of that given to another one
+                for connection in [one for one, since in self._in_use.items() if since < late]:
+                    del self._in_use[connection]
+                    log.warning("a connection to the job database gives no answer, and is ended")
+                    with (
+                        suppress(OSError, *_driver_errors()),
+                        socket.socket(fileno=os.dup(connection.fileno())) as stalled,
+                    ):
                         stalled.shutdown(socket.SHUT_RDWR)
 
 

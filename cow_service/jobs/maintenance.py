@@ -123,15 +123,14 @@ class SessionLease(BackgroundThread):
             try:
                 with database_errors():
                     for one in set(executors) - {self._executor}:
-                        row = session.execute("SELECT pg_try_advisory_lock(%s)", (_key(one),)).fetchone()
-                        free |= {one} if row is not None and row[0] else set()
+                        free |= {one} if self._ask(session, "SELECT pg_try_advisory_lock(%s)", _key(one)) else set()
                 now = time.monotonic()
                 self._free_since = {one: self._free_since.get(one, now) for one in free}
                 yield [one for one, since in self._free_since.items() if now - since >= CONFIRM_SECONDS]
             finally:
                 with suppress(psycopg.Error):  # with the session its locks end, too
                     for one in free:
-                        session.execute("SELECT pg_advisory_unlock(%s)", (_key(one),))
+                        self._ask(session, "SELECT pg_advisory_unlock(%s)", _key(one))
 
     def release(self) -> None:
         """As that of a folder."""
@@ -149,7 +148,7 @@ class SessionLease(BackgroundThread):
                     if self._session is None:
                         self._open()
                     else:
-                        self._session.execute("SELECT 1")
+                        self._ask(self._session, "SELECT 1")
                 except psycopg.Error:
                     log.warning("the lease of this process was lost: it is taken again when the database is back")
                     if self._session is not None:
@@ -160,9 +159,16 @@ class SessionLease(BackgroundThread):
 
     def _open(self) -> None:
         session = self._database.session()
-        session.execute("SELECT set_config('idle_session_timeout', %s, false)", (f"{SILENCE_SECONDS:g}s",))
-        session.execute("SELECT pg_advisory_lock(%s)", (_key(self._executor),))  # held by who looks at it, for a moment
+        self._ask(session, "SELECT set_config('idle_session_timeout', %s, false)", f"{SILENCE_SECONDS:g}s")
+        self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held by who looks at it, for a moment
         self._session = session
+
+    def _ask(self, session: psycopg.Connection[Any], statement: str, *values: object) -> object:
+        """The value that a statement returns. Raises `psycopg.Error`, also where no answer comes."""
+        assert self._database.stalled is not None, "leases of sessions are PostgreSQL's"
+        with self._database.stalled.limited(session):
+            row = session.execute(statement, values).fetchone()
+        return None if row is None else row[0]
 
 
 def _key(executor: str) -> int:
