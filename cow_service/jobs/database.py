@@ -411,7 +411,10 @@ class StalledConnections(BackgroundThread):
     """
 
     def __init__(self, engine: sa.Engine) -> None:
+        import psycopg  # noqa: PLC0415 # costly to import where it is not needed
+
         super().__init__("cow-stalled-connections")
+        self._driver_error = psycopg.Error
         self._guard = threading.Lock()
         self._in_use: dict[psycopg.Connection[Any], float] = {}
         event.listen(engine, "checkout", self._take)
@@ -441,14 +444,14 @@ class StalledConnections(BackgroundThread):
             try:
                 connection.execute("")
                 connection.rollback()
-            except _driver_errors() as error:  # the pool makes another one
+            except self._driver_error as error:  # the pool makes another one
                 raise DisconnectionError from error
 
     def _give_back(self, connection: psycopg.Connection[Any] | None, entry: sa.pool.ConnectionPoolEntry) -> None:
         entry.info["idle_since"] = time.monotonic()
         self._end(connection)
 
-    def _run(self) -> None:
+    def run(self) -> None:
         while not self._stop.wait(STALLED_SECONDS / 10):
             late = time.monotonic() - STALLED_SECONDS
             with self._guard:  # its socket is not closed meanwhile, nor the number of that given to another one
@@ -456,7 +459,7 @@ class StalledConnections(BackgroundThread):
                     del self._in_use[connection]
                     log.warning("a connection to the job database gives no answer, and is ended")
                     with (
-                        suppress(OSError, *_driver_errors()),
+                        suppress(OSError, self._driver_error),
                         socket.socket(fileno=os.dup(connection.fileno())) as stalled,
                     ):
                         stalled.shutdown(socket.SHUT_RDWR)
