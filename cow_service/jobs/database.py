@@ -419,7 +419,7 @@ class StalledConnections(BackgroundThread):
         self._in_use: dict[psycopg.Connection[Any], float] = {}
         event.listen(engine, "checkout", self._take)
         event.listen(engine, "checkin", self._give_back)
-        event.listen(engine, "invalidate", lambda connection, *_: self._end(connection))
+        event.listen(engine, "invalidate", self._give_back)
 
     @contextmanager
     def limited(self, connection: psycopg.Connection[Any]) -> Generator[None]:
@@ -447,11 +447,14 @@ class StalledConnections(BackgroundThread):
             except self._driver_error as error:  # the pool makes another one
                 raise DisconnectionError from error
 
-    def _give_back(self, connection: psycopg.Connection[Any] | None, entry: sa.pool.ConnectionPoolEntry) -> None:
+    def _give_back(
+        self, connection: psycopg.Connection[Any] | None, entry: sa.pool.ConnectionPoolEntry, _: object = None
+    ) -> None:
         entry.info["idle_since"] = time.monotonic()
         self._end(connection)
 
     def run(self) -> None:
+        """Looks at what is in use."""
         while not self._stop.wait(STALLED_SECONDS / 10):
             late = time.monotonic() - STALLED_SECONDS
             with self._guard:  # its socket is not closed meanwhile, nor the number of that given to another one

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, LiteralString
 from uuid import uuid4
 
 import psycopg
@@ -163,7 +163,7 @@ class SessionLease(BackgroundThread):
         self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held by who looks at it, for a moment
         self._session = session
 
-    def _ask(self, session: psycopg.Connection[Any], statement: str, *values: object) -> object:
+    def _ask(self, session: psycopg.Connection[Any], statement: LiteralString, *values: object) -> object:
         """The value that a statement returns. Raises `psycopg.Error`, also where no answer comes."""
         assert self._database.stalled is not None, "leases of sessions are PostgreSQL's"
         with self._database.stalled.limited(session):

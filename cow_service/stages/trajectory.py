@@ -1,14 +1,14 @@
 """Stage 3: what the mover and everything it meets do over the clip, and how sure that is."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Sequence
 
 from cow_service.narration import doubts_of, facts_of, facts_of_both
 from cow_service.physics.bodies import supports_of
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
 from cow_service.physics.layout import flies
 from cow_service.physics.outcome import KIND_OF, Query
+from cow_service.physics.world import WorldInput
 from cow_service.records import Asked, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
@@ -33,37 +33,47 @@ def simulate_world(situation: Situation) -> Trajectory:
 
     Simulates what the mover and everything it meets do, many times, within what the picture leaves open.
     """
-    grounding, asked = situation.grounding, situation.grounding.asked
     world, query, path = reconstruct(situation)
-    # Worlds can decide nothing of what is removed, and not that something lands that stands on the floor.
-    decidable = None
-    if query is not None and situation.is_separated and query.subject < len(world.bodies):
-        subject, relation = world.bodies[query.subject], query.asked.relation
-        in_air = subject.is_flying if query.subject else flies(subject, situation.motion)
-        on_floor = not in_air and supports_of((*world.bodies, *world.removed))[query.subject] is None
-        is_decided = relation in BY_ENCOUNTERS or (world.placement is not None and relation == "inside")
-        decidable = query if is_decided and not (on_floor and relation == "lands") else None
-    if world.placement is not None and asked is None:
-        # Where the mover is put somewhere, whether it gets there: shown is what it does in most worlds.
-        decidable = Query(Asked(relation="inside"), world.placement.targets[0])
-    results = run_ensemble(world, decidable, situation.request.ensemble)
-    outcomes = [judge(asked, query, each) for each in results]
-    told = [
+    results = run_ensemble(world, decidable(situation, world, query), situation.request.ensemble)
+    outcomes = [judge(situation.grounding.asked, query, each) for each in results]
+    trajectories = [
         record_trajectory(situation, result, outcome, path) for result, outcome in zip(results, outcomes, strict=True)
     ]
-    if asked is not None:
-        facts = [facts_of(grounding.object, each) for each in told]
-        if len(told) > 1:
-            changes = tuple(each for each in grounding.interventions if each is not situation.carried)
-            facts[0] = facts_of_both(changes, grounding.object, *told)
-        told = list(map(_with_facts, told, facts))
-    factual = told[1].model_copy(update={"anchors": ()}) if len(told) > 1 else None
-    return told[0].model_copy(update={"factual": factual})
+    first, *as_it_is = add_facts(situation, trajectories)
+    factual = as_it_is[0].model_copy(update={"anchors": ()}) if as_it_is else None
+    return first.model_copy(update={"factual": factual})
 
 
-def _with_facts(trajectory: Trajectory, facts: str) -> Trajectory:
-    assert trajectory.outcome is not None
-    return trajectory.model_copy(update={"outcome": trajectory.outcome.model_copy(update={"facts": facts})})
+def decidable(situation: Situation, world: WorldInput, query: Query | None) -> Query | None:
+    """What worlds can decide: nothing of what is removed, and not that something lands that stands on the floor.
+
+    Where the mover is put somewhere and nothing is asked, whether it gets there: shown is what it does in most worlds.
+    """
+    if world.placement is not None and situation.grounding.asked is None:
+        return Query(Asked(relation="inside"), world.placement.targets[0])
+    if query is None or not situation.is_separated or query.subject >= len(world.bodies):
+        return None
+    subject, relation = world.bodies[query.subject], query.asked.relation
+    in_air = subject.is_flying if query.subject else flies(subject, situation.motion)
+    on_floor = not in_air and supports_of((*world.bodies, *world.removed))[query.subject] is None
+    is_decided = relation in BY_ENCOUNTERS or (world.placement is not None and relation == "inside")
+    return query if is_decided and not (on_floor and relation == "lands") else None
+
+
+def add_facts(situation: Situation, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    """The trajectories with their outcomes in words; of two, the first one's words compare both."""
+    grounding = situation.grounding
+    if grounding.asked is None:
+        return list(trajectories)
+    facts = [facts_of(grounding.object, each) for each in trajectories]
+    if len(trajectories) > 1:
+        changes = tuple(each for each in grounding.interventions if each is not situation.carried)
+        facts[0] = facts_of_both(changes, grounding.object, *trajectories)
+    outcomes = [
+        each.outcome and each.outcome.model_copy(update={"facts": said})
+        for each, said in zip(trajectories, facts, strict=True)
+    ]
+    return [each.model_copy(update={"outcome": outcome}) for each, outcome in zip(trajectories, outcomes, strict=True)]
 
 
 def judge(asked: Asked | None, query: Query | None, result: EnsembleResult) -> Outcome | None:
