@@ -129,6 +129,14 @@ class TestOpenings:
         assert x1 - x0 > 140
         assert seen.inner * (x1 - x0) / 2 == pytest.approx(54, rel=0.06)
 
+    @pytest.mark.parametrize("half", [4, 6, 8])
+    def test_a_bowl_too_small_to_be_measured_has_a_common_opening(self, half) -> None:
+        plain = floor()
+        image = bowl(plain, (320, 180), half, 2 * half, (60, 160, 60))
+        seen = measure_opening(image, CroppedMask.of(np.abs(image.astype(int) - plain).max(axis=2) > 20))
+        assert 0.8 < seen.inner < 1
+        assert not seen.has_edge
+
     def test_what_has_no_rim_has_a_common_one_with_more_doubt(self) -> None:
         image = floor()
         mask = np.zeros(image.shape[:2], bool)
