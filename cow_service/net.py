@@ -17,7 +17,7 @@ import ssl
 from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, InitVar, dataclass
 from functools import cached_property
 from ipaddress import IPv4Address, IPv4Network, IPv6Network, ip_address
 from threading import Thread
@@ -171,6 +171,7 @@ class HostList:
         return any(name in ("*", host, *above) and port in ports for name, ports in self._entries)
 
 
+@dataclass
 class Egress:
     """Sends requests to URLs of callers. Safe to use from several threads.
 
@@ -180,26 +181,20 @@ class Egress:
     Raises `ValueError` for an entry of `allow` that cannot be read.
     """
 
-    def __init__(
-        self,
-        allow: Iterable[str] | None,
-        *,
-        seconds: float = 10.0,
-        connect_seconds: float = 5.0,
-        resolve: Callable[[str, int], list[str]] = look_up,
-        permitted: Callable[[str], bool] = is_public,
-        tls: ssl.SSLContext | None = None,
-    ) -> None:
+    allow: InitVar[Iterable[str] | None]
+    _: KW_ONLY
+    seconds: float = 10.0
+    connect_seconds: float = 5.0
+    resolve: Callable[[str, int], list[str]] = look_up
+    permitted: Callable[[str], bool] = is_public
+    tls: ssl.SSLContext | None = None
+
+    def __post_init__(self, allow: Iterable[str] | None) -> None:
         self._allow = None if allow is None else HostList(allow)
-        self._seconds = seconds
-        self._connect_seconds = connect_seconds
-        self._resolve = resolve
-        self._permitted = permitted
-        self._given_tls = tls
 
     def fetch(self, url: str, most_bytes: int) -> bytes:
         """The body at a URL, at most so long. Raises `NotAllowed` or `Unreachable`."""
-        deadline = _Deadline(monotonic() + self._seconds)
+        deadline = _Deadline(monotonic() + self.seconds)
         target = self._target(url, "The URL")
         for _ in range(MAX_REDIRECTS + 1):
             with _translated(target.host), self._exchange("GET", target, deadline) as response:
@@ -218,7 +213,7 @@ class Egress:
         `headers` says its type and whatever else; host, length and encoding are put in here. Raises `NotAllowed` or
         `Unreachable`.
         """
-        target, deadline = self._target(url, "The URL"), _Deadline(monotonic() + self._seconds)
+        target, deadline = self._target(url, "The URL"), _Deadline(monotonic() + self.seconds)
         with _translated(target.host), self._exchange("POST", target, deadline, body, headers) as response:
             return response.status
 
@@ -259,8 +254,9 @@ class Egress:
         headers: Mapping[str, str] | None = None,
     ) -> Generator[httpcore.Response]:
         """One request, and the beginning of its answer."""
+        host = f"[{target.host}]" if ":" in target.host else target.host
         ours = {
-            "host": target.netloc,
+            "host": host if target.port == _DEFAULT_PORTS[target.url.scheme] else f"{host}:{target.port}",
             "user-agent": f"cow-service/{__version__}",
             "accept-encoding": "identity",
             "connection": "close",
@@ -271,7 +267,7 @@ class Egress:
             scheme=target.url.raw_scheme, host=target.host.encode(), port=target.port, target=target.url.raw_path
         )
         tls = self._tls if target.url.scheme == "https" else None
-        backend = _PinnedBackend(self._addresses(target, deadline), deadline, self._connect_seconds)
+        backend = _PinnedBackend(self._addresses(target, deadline), deadline, self.connect_seconds)
         with (
             httpcore.ConnectionPool(ssl_context=tls, network_backend=backend) as pool,
             pool.stream(method, url, headers=coded, content=body) as response,
@@ -284,7 +280,7 @@ class Egress:
 
         def ask() -> None:
             try:
-                answer.set_result(self._resolve(target.host, target.port))
+                answer.set_result(self.resolve(target.host, target.port))
             except Exception as error:  # noqa: BLE001 - raised where the answer is waited for
                 answer.set_exception(error)
 
@@ -299,13 +295,13 @@ class Egress:
         return addresses
 
     def _check_addresses(self, target: _Target, addresses: list[str]) -> None:
-        if not all(self._permitted(address) for address in addresses):
+        if not all(self.permitted(address) for address in addresses):
             raise NotAllowed(f"{target.what} leads to the host '{target.host}', whose address is not a public one.")
 
     @cached_property
     def _tls(self) -> ssl.SSLContext:
         """Whose certificates are trusted: those of certifi, or of SSL_CERT_FILE. Slow to make, so made when needed."""
-        return self._given_tls or httpx.create_ssl_context()
+        return self.tls or httpx.create_ssl_context()
 
 
 @dataclass(frozen=True)
@@ -316,12 +312,6 @@ class _Target:
     host: str  # normalised: lower case, IDNA, no trailing dot, no brackets
     port: int
     what: str  # how messages call it
-
-    @property
-    def netloc(self) -> str:
-        """The Host header."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return host if self.port == _DEFAULT_PORTS[self.url.scheme] else f"{host}:{self.port}"
 
 
 @dataclass(frozen=True)

@@ -215,8 +215,8 @@ def test_apps_count_for_themselves(tmp_path: Path) -> None:
 
 def test_stages_jobs_and_queues(caplog: pytest.LogCaptureFixture) -> None:
     metrics = Metrics()
-    metrics.stage("grounding", 0.2)
-    metrics.job("simulate", "failed")
+    metrics.stage_seconds.labels("grounding").observe(0.2)
+    metrics.jobs.labels("simulate", "failed").inc()
     metrics.stage_cache("generation", hit=True)
     metrics.stage_cache("generation", hit=False)
     metrics.queue_depth = lambda: {("light", "ati", "queued"): 3, ("light", "ati", "running"): 1}

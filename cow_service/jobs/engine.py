@@ -223,7 +223,7 @@ class JobEngine:
             self._notifications.send(Notification("canceled", job_id))
             self.active.notify_ended(job_id, None)
             self._dispatcher.wake()
-            self.service.metrics.job(kind, "canceled")
+            self.service.metrics.jobs.labels(kind, "canceled").inc()
         return self.find(job_id, owner)
 
     def delete(self, job_id: str, owner: str | None) -> None:

@@ -112,20 +112,20 @@ class Webhooks:
             status = self._egress.post(url, body, headers)
         except NotAllowed as error:
             log.warning("webhook of job %s: %s", job.id, error)
-            self._metrics.webhook("not-allowed")
+            self._metrics.webhooks.labels("not-allowed").inc()
             return None  # a retry would not be allowed either
         except Unreachable as error:
             log.info("webhook of job %s, attempt %d: %s", job.id, attempt, error)
             status = None
         if status in SUCCESS or status == GONE:
-            self._metrics.webhook("delivered" if status in SUCCESS else "gone")
+            self._metrics.webhooks.labels("delivered" if status in SUCCESS else "gone").inc()
             return None
-        self._metrics.webhook("unreachable" if status is None else "refused")
+        self._metrics.webhooks.labels("unreachable" if status is None else "refused").inc()
         if attempt > len(RETRY_SECONDS):
             log.warning(
                 "webhook of job %s: given up after %d attempts, the last answer was %s", job.id, attempt, status
             )
-            self._metrics.webhook_given_up()
+            self._metrics.webhooks_given_up.inc()
             return None
         return RETRY_SECONDS[attempt - 1] * random.uniform(1 - JITTER, 1 + JITTER)  # so that retries spread
 

@@ -143,7 +143,7 @@ class Runner:
                 stored = patient.wait_through(lambda: self._jobs.fail(job, outcome))
             else:
                 for stage, seconds in computed.timings.items():
-                    metrics.stage(stage, seconds)
+                    metrics.stage_seconds.labels(stage).observe(seconds)
                 outcome = computed.result
                 kept = job, computed.kept, computed.trajectory_key
                 stored = patient.wait_through(lambda: self._jobs.succeed(*kept))
@@ -153,7 +153,7 @@ class Runner:
             return None
         if not stored:
             return None
-        metrics.job(job.spec.kind, "succeeded" if isinstance(outcome, str) else "failed")
+        metrics.jobs.labels(job.spec.kind, "succeeded" if isinstance(outcome, str) else "failed").inc()
         return outcome
 
 

@@ -85,14 +85,12 @@ def add_ids(record: logging.LogRecord) -> bool:
 class TextFormatter(logging.Formatter):
     """`2026-01-31 12:00:00 INFO cow_service: message request_id=...`; a trace follows on lines of its own."""
 
-    def format(self, record: logging.LogRecord) -> str:
+    def formatMessage(self, record: logging.LogRecord) -> str:
         """One line. Control characters are escaped: no value can forge a second one."""
         shown = "".join(f" {name}={value}" for name in _SHOWN if (value := getattr(record, name, None)) is not None)
         text = _CONTROL.sub(lambda found: repr(found[0])[1:-1], record.getMessage() + shown)
         name = record.name.removesuffix(".error")  # uvicorn's name for whatever is no request
-        line = f"{self.formatTime(record, '%Y-%m-%d %H:%M:%S')} {record.levelname} {name}: {text}"
-        trace = _trace_of(self, record)
-        return f"{line}\n{trace}" if trace else line
+        return f"{self.formatTime(record, '%Y-%m-%d %H:%M:%S')} {record.levelname} {name}: {text}"
 
 
 class JsonFormatter(logging.Formatter):
@@ -106,8 +104,10 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        if trace := _trace_of(self, record):
-            fields["exception"] = trace
+        exception = self.formatException(record.exc_info) if record.exc_info else record.exc_text
+        stack = self.formatStack(record.stack_info) if record.stack_info else None
+        if exception or stack:
+            fields["exception"] = "\n".join(filter(None, (exception, stack)))
         extra = {name: value for name, value in vars(record).items() if name not in _NOT_EXTRA and value is not None}
         return json.dumps(extra | fields, default=str, ensure_ascii=False)
 
@@ -136,9 +136,3 @@ def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None 
     engine.filters = [lambda record: not str(record.msg).startswith(_FAILED_JOB)]
     engine.setLevel(logging.WARNING)
     logging.captureWarnings(True)
-
-
-def _trace_of(formatter: logging.Formatter, record: logging.LogRecord) -> str:
-    parts = [formatter.formatException(record.exc_info) if record.exc_info else record.exc_text or ""]
-    parts += [formatter.formatStack(record.stack_info) if record.stack_info else ""]
-    return "\n".join(filter(None, parts))

@@ -37,13 +37,14 @@ QueueDepth = Callable[[], Mapping[tuple[str, str, str], int]]  # (queue, generat
 QueueUnserved = Callable[[], Mapping[tuple[str, str], int]]  # (queue, reason) -> jobs that no process takes
 QueueOldest = Callable[[], Mapping[str, float]]  # queue -> seconds that its oldest queued job has waited
 ListWorkers = Callable[[], Iterable[WorkerInfo]]
+Samples = Iterable[tuple[Sequence[str], float]]  # the values of labels, and the value of the gauge
 OWN_PROCESS = ""  # the label `worker` of what this process itself uses
 BYTES = 1e6  # of the MB in which records tell memory
 
 log = logging.getLogger("cow_service")
 
 
-class Metrics:
+class Metrics(Collector):
     """Counters and histograms, from several threads, and gauges that are read on request.
 
     The job engine sets `queue_depth`, `queue_oldest`, `queue_unserved` and `workers`.
@@ -64,91 +65,43 @@ class Metrics:
             ("route",),
             buckets=_REQUEST_BUCKETS,
         )
-        self._stage_seconds = histogram("cow_stage_seconds", "Time in a stage, s.", ("stage",), buckets=_STAGE_BUCKETS)
-        self._jobs = counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"))
+        self.stage_seconds = histogram("cow_stage_seconds", "Time in a stage, s.", ("stage",), buckets=_STAGE_BUCKETS)
+        # The outcome of a job is `succeeded`, `failed` or `canceled`.
+        self.jobs = counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"))
         self._stage_cache = counter("cow_stage_cache", "Stages looked for among earlier results.", ("stage", "result"))
-        self._worker_ends = counter("cow_worker_ends", "Worker processes that ended, and why.", ("reason",))
-        self._webhooks = counter(
+        self.worker_ends = counter("cow_worker_ends", "Worker processes that ended, and why.", ("reason",))
+        self.webhooks = counter(
             "cow_webhook_attempts", "Attempts to call a webhook, and what came of them.", ("outcome",)
         )
-        self._webhooks_given_up = counter(
+        self.webhooks_given_up = counter(
             "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt."
         )
-        prometheus.ProcessCollector(registry=registry)
-        registry.register(_Gauges(self))
-
-    def request(self, method: str, route: str, status: int, seconds: float) -> None:
-        """One HTTP request. `route` is a template, never a path: there must be few of them."""
-        self._requests.labels(method, route, str(status)).inc()
-        self._request_seconds.labels(route).observe(seconds)
-
-    def stage(self, name: str, seconds: float) -> None:
-        """One stage that was computed."""
-        self._stage_seconds.labels(name).observe(seconds)
-
-    def job(self, kind: str, outcome: str) -> None:
-        """One job (`simulate`, `answer`) that `succeeded`, `failed` or was `canceled`."""
-        self._jobs.labels(kind, outcome).inc()
-
-    def stage_cache(self, stage: str, hit: bool) -> None:
-        """One stage whose earlier result was looked for."""
-        self._stage_cache.labels(stage, "hit" if hit else "miss").inc()
-
-    def worker_ended(self, reason: str) -> None:
-        """One worker process that `crashed`, was `frozen`, took too much `memory`, ... or was `stopped`."""
-        self._worker_ends.labels(reason).inc()
-
-    def webhook(self, outcome: str) -> None:
-        """One attempt that was `delivered`, `refused`, `unreachable`, `gone` or `not-allowed`."""
-        self._webhooks.labels(outcome).inc()
-
-    def webhook_given_up(self) -> None:
-        """One webhook whose last attempt has failed."""
-        self._webhooks_given_up.inc()
-
-    def serve(self, host: str, port: int) -> None:
-        """Serves the exposition over HTTP, on every path, until the process ends. Raises `OSError`."""
-        prometheus.start_http_server(port, host, self._registry)
-
-    def exposition(self) -> bytes:
-        """Everything in Prometheus' text format, as `MEDIA_TYPE`."""
-        return prometheus.generate_latest(self._registry)
-
-
-Samples = Iterable[tuple[Sequence[str], float]]  # the values of labels, and the value of the gauge
-
-
-class _Gauges(Collector):
-    """Gauges that are computed when the metrics are read."""
-
-    def __init__(self, metrics: Metrics) -> None:
-        self._metrics = metrics
         # Name, description, labels, and what reads the values.
         self._gauges: tuple[tuple[str, str, tuple[str, ...], Callable[[], Samples]], ...] = (
             (
                 "cow_queue_depth",
                 "Jobs on the job database that wait or run.",
                 ("queue", "generator", "state"),
-                lambda: metrics.queue_depth().items(),
+                lambda: self.queue_depth().items(),
             ),
             (
                 "cow_queue_oldest_seconds",
                 "How long the oldest job has waited in a queue, s; 0 where none waits.",
                 ("queue",),
-                lambda: [((queue,), seconds) for queue, seconds in metrics.queue_oldest().items()],
+                lambda: [((queue,), seconds) for queue, seconds in self.queue_oldest().items()],
             ),
             (
                 "cow_queue_unserved",
                 "Jobs that wait, and that no process takes: none has their queue, or their workflow version.",
                 ("queue", "reason"),
-                lambda: metrics.queue_unserved().items(),
+                lambda: self.queue_unserved().items(),
             ),
             ("cow_workers", "Workers of this process.", ("queue", "state"), self._count_workers),
             (
                 "cow_worker_memory_bytes",
                 "Resident memory of a worker.",
                 ("worker",),
-                lambda: [((worker.name,), worker.memory_mb * BYTES) for worker in metrics.workers()],
+                lambda: [((worker.name,), worker.memory_mb * BYTES) for worker in self.workers()],
             ),
             (
                 "cow_gpu_memory_bytes",
@@ -157,6 +110,25 @@ class _Gauges(Collector):
                 self._measure_gpus,
             ),
         )
+        prometheus.ProcessCollector(registry=registry)
+        registry.register(self)
+
+    def request(self, method: str, route: str, status: int, seconds: float) -> None:
+        """One HTTP request. `route` is a template, never a path: there must be few of them."""
+        self._requests.labels(method, route, str(status)).inc()
+        self._request_seconds.labels(route).observe(seconds)
+
+    def stage_cache(self, stage: str, hit: bool) -> None:
+        """One stage whose earlier result was looked for."""
+        self._stage_cache.labels(stage, "hit" if hit else "miss").inc()
+
+    def serve(self, host: str, port: int) -> None:
+        """Serves the exposition over HTTP, on every path, until the process ends. Raises `OSError`."""
+        prometheus.start_http_server(port, host, self._registry)
+
+    def exposition(self) -> bytes:
+        """Everything in Prometheus' text format, as `MEDIA_TYPE`."""
+        return prometheus.generate_latest(self._registry)
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
         """The gauges without values, so that registering them computes nothing."""
@@ -176,13 +148,13 @@ class _Gauges(Collector):
 
     def _count_workers(self) -> Samples:
         number: Counts[tuple[str, str]] = Counts()
-        for worker in self._metrics.workers():
+        for worker in self.workers():
             queue = worker.queue or "all"
             number.update({(queue, "busy"): bool(worker.jobs), (queue, "idle"): not worker.jobs})
         return number.items()
 
     def _measure_gpus(self) -> Samples:
-        of_workers = [(worker.name, gpu) for worker in self._metrics.workers() for gpu in worker.gpus]
+        of_workers = [(worker.name, gpu) for worker in self.workers() for gpu in worker.gpus]
         for name, gpu in of_workers or [(OWN_PROCESS, gpu) for gpu in gpu_memory()]:
             yield (name, gpu.device, "allocated"), gpu.allocated_mb * BYTES
             yield (name, gpu.device, "reserved"), gpu.reserved_mb * BYTES

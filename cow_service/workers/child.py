@@ -24,7 +24,6 @@ from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import error_as_json
 from cow_service.jobs.readiness import warm_up
 from cow_service.observability import logging as context
-from cow_service.observability import logging as logs
 from cow_service.observability import tracing
 from cow_service.observability.metrics import gpu_memory
 from cow_service.requests import Stage
@@ -157,7 +156,7 @@ def main(descriptor: int) -> None:
     try:
         first = pipe.recv()
         assert isinstance(first, Settings)
-        logs.set_up(first)
+        context.set_up(first)
         tracing.start()
         WorkerProcess(pipe, first).run()
     except (EOFError, OSError):

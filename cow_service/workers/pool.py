@@ -112,7 +112,7 @@ class Group:
             dead.close()
         names = {one.name for one in self._taken}
         name = next(name for number in count(1) if (name := f"{self.name}-{number}") not in names)
-        worker = Worker(name, self._settings, self._metrics.worker_ended)
+        worker = Worker(name, self._settings, lambda reason: self._metrics.worker_ends.labels(reason).inc())
         self.workers.append(worker)
         self._taken[worker] = 0
         return worker

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from cow_service.errors import CowError, FieldError, InvalidRequest
 
@@ -132,23 +132,19 @@ def locate_in_chat(error: CowError, own: Mapping[str, str]) -> CowError:
     return located
 
 
-class ChatMessage(BaseModel):
+class ChatMessage(BaseModel, extra="allow"):
     """One message. It goes on to the MLLM unchanged; imagined frames are added behind the last one of a user."""
-
-    model_config = ConfigDict(extra="allow")
 
     role: str | None = None
     content: str | list[str | dict[str, Any]] | None = Field(default=None, description="Text, or parts.")
 
 
-class ChatRequest(BaseModel):
+class ChatRequest(BaseModel, extra="allow"):
     """A chat, as OpenAI's chat completions have it. All other fields go on to the MLLM unchanged, too.
 
     A model without an MLLM behind it, such as `cow/embedded`, answers the last user message about exactly one image;
     it uses no other field than these, and a warning names those that ask for something.
     """
-
-    model_config = ConfigDict(extra="allow")
 
     model: str = Field(description="One of `GET /v1/models`.")
     messages: list[ChatMessage] = Field(min_length=1)
@@ -162,10 +158,8 @@ class ChatRequest(BaseModel):
     )
 
 
-class ResponsesRequest(BaseModel):
+class ResponsesRequest(BaseModel, extra="allow"):
     """A request of OpenAI's responses, without state. All other fields go on to the MLLM unchanged."""
-
-    model_config = ConfigDict(extra="allow")
 
     model: str = Field(description="One of `GET /v1/models`.")
     input: str | list[dict[str, Any]] = Field(description="Text, or items: messages, function calls and their outputs.")

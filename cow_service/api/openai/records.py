@@ -6,7 +6,7 @@ Replies of an MLLM go on as they came: of those, these records say only what COW
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from cow_service.errors import FieldError, ModelNotFound, shortened
 from cow_service.records import Answer, Frame, JobStatus, Record, Usage
@@ -87,18 +87,14 @@ class ChatImagination(Record):
     warnings: tuple[str, ...] = ()
 
 
-class MllmCompletion(BaseModel):
+class MllmCompletion(BaseModel, extra="allow"):
     """What `POST /v1/chat/completions` returns of an MLLM: the reply as it came, and `cow`."""
-
-    model_config = ConfigDict(extra="allow")
 
     cow: ChatImagination
 
 
-class ResponseReply(BaseModel):
+class ResponseReply(BaseModel, extra="allow"):
     """What `POST /v1/responses` returns: a response as OpenAI has it, and `cow` as in a chat."""
-
-    model_config = ConfigDict(extra="allow")
 
     id: str
     object: Literal["response"]
@@ -148,10 +144,8 @@ class ChatChunk(Record):
     )
 
 
-class UpstreamError(BaseModel):
+class UpstreamError(BaseModel, extra="allow"):
     """An error of the MLLM's server, with its status, in OpenAI's form."""
-
-    model_config = ConfigDict(extra="allow")
 
     error: dict[str, Any] = Field(description="`message`, `type`, `param` and `code`, as far as the server gave them.")
 
