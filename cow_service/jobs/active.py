@@ -3,12 +3,12 @@
 import asyncio
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from cow_service.errors import Canceled, CowError
-from cow_service.records import JobKind
+from cow_service.records import JobKind, WorkerJob
 from cow_service.requests import Stage
 
 STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
@@ -100,6 +100,17 @@ class ActiveJobs:
         """The state of a job that this process runs."""
         with self._lock:
             return self._running.get(job)
+
+    def describe(self, jobs: Iterable[str]) -> tuple[WorkerJob, ...]:
+        """Those of some jobs that this process runs and whose first stage has begun."""
+        found: list[WorkerJob] = []
+        for job_id in jobs:
+            active = self.get(job_id)
+            if active is not None and active.begun is not None:
+                stage, done = active.at
+                progress, seconds = share_done(active.kind, stage, done), round(time.monotonic() - active.begun, 1)
+                found.append(WorkerJob(id=job_id, kind=active.kind, stage=stage, progress=progress, seconds=seconds))
+        return tuple(found)
 
     def at(self, job: str) -> At | None:
         """The stage and the share of it that is done, of a job that any process runs; None where that is not known."""

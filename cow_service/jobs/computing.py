@@ -25,7 +25,7 @@ from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import DecodedImage
 from cow_service.observability.metrics import gpu_memory
 from cow_service.pipeline import answer, simulate
-from cow_service.records import Answer, GpuMemory
+from cow_service.records import Answer, WorkerInfo
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 from cow_service.service import Service
 from cow_service.stages.keys import RESULT_TYPES, StageKey, StageResult, digest_of
@@ -187,19 +187,6 @@ class Outcome:
     timings: dict[str, float]
 
 
-@dataclass(frozen=True)
-class WorkerState:
-    """What computes jobs, as it is now."""
-
-    name: str
-    queue: str | None  # whose jobs it computes; None: of all queues
-    pid: int
-    memory_bytes: int
-    jobs_done: int
-    jobs: tuple[str, ...]  # at hand
-    gpus: tuple[GpuMemory, ...] = ()
-
-
 class Computer:
     """Computes jobs, some at the same time."""
 
@@ -217,8 +204,8 @@ class Computer:
         """Computes one job. Raises the `CowError` that it fails with, `Canceled` where it was canceled."""
         raise NotImplementedError
 
-    def workers(self) -> tuple[WorkerState, ...]:
-        """What computes the jobs."""
+    def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
+        """What computes the jobs, of which `active` says how far they are."""
         return ()
 
 
@@ -244,10 +231,18 @@ class InProcess(Computer):
         finally:
             self._jobs_done += 1
 
-    def workers(self) -> tuple[WorkerState, ...]:
+    def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
         """The process itself."""
-        memory, jobs = psutil.Process().memory_info().rss, tuple(self._parts.active.runs())
-        return (WorkerState("server", None, os.getpid(), memory, self._jobs_done, jobs, gpu_memory()),)
+        own = WorkerInfo(
+            name="server",
+            queue=None,
+            pid=os.getpid(),
+            memory_mb=round(psutil.Process().memory_info().rss / 1e6, 1),
+            jobs_done=self._jobs_done,
+            jobs=active.describe(active.runs()),
+            gpus=gpu_memory(),
+        )
+        return (own,)
 
 
 def compute(work: Work, service: Service, database: Database, hold_key: HoldKey) -> Outcome:

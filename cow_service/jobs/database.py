@@ -161,14 +161,15 @@ PROCESSES = sa.Table(
 class Database:
     """One engine for DBOS and for our own tables. Every method raises `StorageUnavailable` where it cannot be used."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, read_only: bool = False) -> None:
+        """`read_only`: a file must exist, and is not changed."""
         self.url, self.file = _address(settings)
-        self._use(_engine(self.url, self.file is not None))
+        if read_only and self.file is not None:
+            self.engine = sa.create_engine(f"sqlite:///file:{quote(str(self.file.resolve()))}?mode=ro&uri=true")
+        else:
+            self.engine = _engine(self.url, self.file is not None)
         self.stalled = None if self.file is not None else StalledConnections(self.engine)
-
-    def _use(self, engine: sa.Engine) -> None:
-        self.engine = engine
-        self._reading = engine.execution_options(isolation_level="AUTOCOMMIT")  # single statements
+        self._reading = self.engine.execution_options(isolation_level="AUTOCOMMIT")  # single statements
 
     def create_tables(self) -> None:
         """Makes our tables where they are missing, and the folder of a file."""
@@ -179,22 +180,10 @@ class Database:
                 connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": TABLES_LOCK})
             METADATA.create_all(connection)
 
-    def open_read_only(self) -> None:
-        """Uses the file, which exists, without changing it."""
-        assert self.file is not None
-        self._use(sa.create_engine(f"sqlite:///file:{quote(str(self.file.resolve()))}?mode=ro&uri=true"))
-
-    def has_tables(self) -> bool:
-        """Whether a server of this version has used the database."""
+    def missing_tables(self) -> set[str]:
+        """Those of ours that are not there."""
         with database_errors():
-            return METADATA.tables.keys() <= set(sa.inspect(self.engine).get_table_names())
-
-    def check_tables(self) -> None:
-        """Raises `StorageUnavailable` where a table of ours is missing."""
-        with database_errors():
-            missing = METADATA.tables.keys() - set(sa.inspect(self.engine).get_table_names())
-        if missing:
-            raise StorageUnavailable(f"The job database has no table {min(missing)}: run `cow migrate` first.")
+            return METADATA.tables.keys() - set(sa.inspect(self.engine).get_table_names())
 
     def claim(self, address: str) -> None:
         """Notes where the artifacts of all jobs are. Raises `StorageUnavailable` where they are elsewhere.

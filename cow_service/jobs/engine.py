@@ -19,7 +19,7 @@ from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, EngineParts, InProcess
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.job_table import JobFilters, JobSpec, JobState, JobTable, TakenJob
-from cow_service.jobs.maintenance import Maintenance, lease_of
+from cow_service.jobs.maintenance import FolderLease, Maintenance, SessionLease
 from cow_service.jobs.notifications import Notification, PolledNotifications, PostgresNotifications
 from cow_service.jobs.processes import Processes
 from cow_service.jobs.queues import queue_of, step_of
@@ -46,11 +46,14 @@ class JobEngine:
         self.jobs = JobTable(self.database, self.webhooks.enqueue)
         self._parts = EngineParts(service, self.database, self.jobs, self.active)
         self._computer = computer or InProcess(self._parts)
-        notifications = PostgresNotifications if self.database.file is None else PolledNotifications
-        self._notifications = notifications(self._parts, self._receive)
+        if self.database.file is None:
+            self._lease = SessionLease(self.database)
+            self._notifications = PostgresNotifications(self._parts, self._receive)
+        else:
+            self._lease = FolderLease(service.settings.data_dir / "executors")
+            self._notifications = PolledNotifications(self._parts, self._receive)
         self._runner = Runner(self._parts, self._computer, self.webhooks, self._notifications, self._attempt_ended)
         self._dispatcher = Dispatcher(self._parts, self._computer.capacity, self._runner.start)
-        self._lease = lease_of(self.database, service.settings.data_dir / "executors")
         self._maintenance = Maintenance(self._parts, self.webhooks, self._lease, self.remove)
         self.processes = Processes(self._parts, self._computer, role)
         self.storage = StorageCheck(lambda: self.service.artifacts)
@@ -100,7 +103,7 @@ class JobEngine:
             self._grace = threading.Timer(self.service.settings.shutdown_grace, self._interrupt)
             self._grace.daemon = True
             self._grace.start()
-        self._notify_stopping(set(self.active.awaited()) - self.active.runs().keys())
+        self._notify_stopping(self.active.awaited_elsewhere())
 
     def close(self) -> None:
         """Waits for running jobs during the grace period, then interrupts them: they continue after the next start."""

@@ -8,7 +8,7 @@ import binascii
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, cast
 from uuid import uuid4
@@ -159,7 +159,6 @@ class JobTable:
 
     def load(self, owner: str | None, queue: str = "") -> Load:
         """What a new job of an owner adds to."""
-
         (row,) = self._database.read(_LOAD, {"owner": owner, "queue": queue})
         return Load(*row)
 
@@ -177,13 +176,10 @@ class JobTable:
             jobs: Sequence[Any] = connection.execute(_TURNS_OF_OWNER, given).all()
             turn = next_turn([*first, *jobs], owner, spec.priority, step)
             spec = spec.model_copy(update={"turn": turn})
-            row = {
-                **{name: getattr(spec, name) for name in ("kind", "created_at", "priority", "turn", "generator")},
-                **{"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION},
-                **{"question": spec.request["question"], "image": spec.image, "webhook": spec.webhook},
-                **{"executor": executor, "run": None if executor is None else run, "starts": int(executor is not None)},
-                "spec": packed(spec.model_dump_json()),
-            }
+            row = spec.model_dump(include={"kind", "created_at", "priority", "turn", "generator", "webhook"})
+            row |= {"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION}
+            row |= {"question": spec.request["question"], "image": spec.image, "spec": packed(spec.model_dump_json())}
+            row |= {"executor": executor, "run": None if executor is None else run, "starts": int(executor is not None)}
             added = self._database.insert(JOBS).on_conflict_do_nothing().returning(JOBS.c.id)
             if connection.execute(added, row).one_or_none() is None:
                 return None
@@ -204,8 +200,7 @@ class JobTable:
 
         Jobs of one owner are taken only while fewer than `limit_per_owner` of theirs are taken, in any process.
         """
-        order = JOBS.c.turn, JOBS.c.created_at, JOBS.c.id
-        wanted = sa.select(JOBS.c.id).where(JOBS.c.queue == queue, *_WAITS).order_by(*order).limit(number)
+        wanted = sa.select(JOBS.c.id).where(JOBS.c.queue == queue, *_WAITS).order_by(*_ORDER).limit(number)
         if limit_per_owner is not None:
             wanted = wanted.where(JOBS.c.id.in_(_within_limit(queue, limit_per_owner)))
         chosen = wanted.with_for_update(skip_locked=True).cte()  # as a subquery, PostgreSQL might run it several times
@@ -359,10 +354,8 @@ class JobTable:
     def ended_lately(self) -> dict[str, int]:
         """How many jobs of each queue ended, well or not, in the last `RATE_SECONDS`."""
         lately = JOBS.c.ended > time.time() - RATE_SECONDS, JOBS.c.status.in_(("succeeded", "failed"))
-        rows = self._database.read(
-            sa.select(JOBS.c.queue, sa.func.count().label("jobs")).where(*lately).group_by(JOBS.c.queue)
-        )
-        return {row.queue: row.jobs for row in rows}
+        counts = sa.select(JOBS.c.queue, sa.func.count()).where(*lately).group_by(JOBS.c.queue)
+        return dict(self._database.read(counts))
 
     def delete(self, jobs: list[str]) -> set[str]:
         """Deletes jobs with all that belongs to them; returns the artifacts that no other job needs."""
@@ -399,6 +392,7 @@ class JobTable:
 
 
 _WAITS = JOBS.c.status == "queued", JOBS.c.executor.is_(None), JOBS.c.version == VERSION
+_ORDER = JOBS.c.turn, JOBS.c.created_at, JOBS.c.id
 _RELEASED = {"status": "queued", "executor": None, "run": None}
 _OF_OWNER = JOBS.c.owner.is_not_distinct_from(sa.bindparam("owner", type_=sa.Text))
 _OF_QUEUE = JOBS.c.queue == sa.bindparam("queue", type_=sa.Text)
@@ -417,7 +411,7 @@ _SHOWN = [
 
 def error_as_json(error: CowError) -> dict[str, Any]:
     """Its code, detail, fields and usage, as JSON values."""
-    fields = [{"pointer": field.pointer, "detail": field.detail} for field in error.errors]
+    fields = [asdict(field) for field in error.errors]
     return {"code": error.code, "detail": error.detail, "errors": fields, "usage": error.usage}
 
 
@@ -437,8 +431,7 @@ def _within_limit(queue: str, limit: int) -> sa.Select[Any]:
         .group_by(JOBS.c.owner)
         .subquery()
     )
-    order = JOBS.c.turn, JOBS.c.created_at, JOBS.c.id
-    place = sa.func.row_number().over(partition_by=JOBS.c.owner, order_by=order)
+    place = sa.func.row_number().over(partition_by=JOBS.c.owner, order_by=_ORDER)
     waiting = sa.select(JOBS.c.id, JOBS.c.owner, place.label("place")).where(JOBS.c.queue == queue, *_WAITS).subquery()
     number = waiting.c.place + sa.func.coalesce(taken.c.number, 0)
     return (

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, LiteralString
@@ -175,19 +176,15 @@ def _key(executor: str) -> int:
     return int.from_bytes(hashlib.sha256(executor.encode()).digest()[:8], signed=True)
 
 
-Lease = FolderLease | SessionLease
-
-
-def lease_of(database: Database, folder: Path) -> Lease:
-    """The lease of a process on a database; `folder` is that of the lock files."""
-    return SessionLease(database) if database.file is None else FolderLease(folder)
-
-
 class Maintenance(BackgroundThread):
     """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time."""
 
     def __init__(
-        self, parts: EngineParts, hooks: Webhooks, lease: Lease, remove: Callable[[list[str], float], None]
+        self,
+        parts: EngineParts,
+        hooks: Webhooks,
+        lease: FolderLease | SessionLease,
+        remove: Callable[[list[str], float], None],
     ) -> None:
         super().__init__("cow-maintenance", JOIN_TIMEOUT_SECONDS)
         self._parts, self._hooks, self._lease, self._remove = parts, hooks, lease, remove
@@ -200,18 +197,26 @@ class Maintenance(BackgroundThread):
             collect_artifacts(self._parts.service, self._parts.database, self._stop.is_set)
 
     def run(self) -> None:
-        """Does each kind of work when it is due."""
-        looked = cleaned = time.monotonic()  # recovered jobs refer to their artifacts before anything is removed
+        """Does each kind of work when it is due. Errors are logged only: maintenance continues whatever happens."""
+        kinds = {
+            self._recover: 0.0,
+            self._notice_cancellations: 0.0,
+            self._release_stalled: STALLED_SECONDS,
+            self._clean_up_in_turn: CLEAN_UP_SECONDS,
+        }
+        begun = dict.fromkeys(kinds, time.monotonic())  # recovered jobs refer to their artifacts before any are removed
         while not self._stop.is_set():
-            self._logged(self._recover)
-            self._logged(self._notice_cancellations)
-            now = time.monotonic()
-            if now - looked > STALLED_SECONDS:
-                looked = now
-                self._logged(self._release_stalled)
-            if now - cleaned > CLEAN_UP_SECONDS:
-                cleaned = now
-                self._logged(self._clean_up_in_turn)
+            for work, seconds in kinds.items():
+                now = time.monotonic()
+                if now - begun[work] < seconds:
+                    continue
+                begun[work] = now
+                try:
+                    work()
+                except (CowError, dbos_error.DBOSException, SQLAlchemyError) as error:
+                    log.warning("maintenance: %s", getattr(error, "detail", type(error).__name__))
+                except Exception:
+                    log.exception("maintenance failed")
             self._stop.wait(POLL_SECONDS)
 
     def _recover(self) -> None:
@@ -260,22 +265,14 @@ class Maintenance(BackgroundThread):
         while not self._stop.is_set() and (jobs := self._parts.jobs.ended_before(before, MAX_REMOVED_JOBS)):
             self._remove(jobs, before)
         # The records that DBOS keeps of attempts: those of jobs are of no use once they are over.
-        client = self._hooks.client
+        client, limit = self._hooks.client, MAX_REMOVED_JOBS
         for name, until in ((workflows.WORKFLOW, time.time()), (webhooks.WORKFLOW, before)):
-            found = partial(workflows.ended_workflows, client, name, until, MAX_REMOVED_JOBS)
-            while not self._stop.is_set() and (records := found()):
-                client.delete_workflows(records)
+            moment = datetime.fromtimestamp(until, UTC).isoformat()
+            ended = partial(client.list_workflows, name=name, completed_before=moment, limit=limit)
+            while not self._stop.is_set() and (records := ended(load_input=False, load_output=False)):
+                client.delete_workflows([record.workflow_id for record in records])
         if not self._stop.is_set():
             self._parts.database.give_room_back(self._stop.is_set)
-
-    def _logged(self, work: Callable[[], None]) -> None:
-        """Errors are logged only: maintenance continues whatever happens."""
-        try:
-            work()
-        except (CowError, dbos_error.DBOSException, SQLAlchemyError) as error:
-            log.warning("maintenance: %s", getattr(error, "detail", type(error).__name__))
-        except Exception:
-            log.exception("maintenance failed")
 
 
 def collect_artifacts(service: Service, database: Database, stop: Callable[[], bool], now: float | None = None) -> None:

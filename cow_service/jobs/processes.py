@@ -6,7 +6,8 @@ import platform
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from functools import partial
 from typing import Literal, TypeVar
 
@@ -15,13 +16,12 @@ import sqlalchemy as sa
 from cow_service import __version__
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, NotReady
-from cow_service.jobs.active import share_done
 from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import PROCESSES, Database
 from cow_service.jobs.job_table import RATE_SECONDS, VERSION, JobTable, OpenCount
 from cow_service.jobs.queues import LIGHT, known_queues, queue_of
 from cow_service.observability.logging import rfc3339
-from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, WorkerInfo, WorkerJob, Workers
+from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, WorkerInfo, Workers
 from cow_service.settings import Settings
 
 TELL_SECONDS = 2.0  # between two rows
@@ -112,27 +112,7 @@ class Processes(BackgroundThread):
 
     def workers(self) -> tuple[WorkerInfo, ...]:
         """What computes jobs in this process and its worker processes."""
-        return tuple(
-            WorkerInfo(
-                name=state.name,
-                queue=state.queue,
-                pid=state.pid,
-                memory_mb=round(state.memory_bytes / 1e6, 1),
-                jobs_done=state.jobs_done,
-                jobs=tuple(self._jobs(state.jobs)),
-                gpus=state.gpus,
-            )
-            for state in self._computer.workers()
-        )
-
-    def _jobs(self, jobs: Iterable[str]) -> Generator[WorkerJob]:
-        """Those of some jobs whose first stage has begun."""
-        for job_id in jobs:
-            active = self._parts.active.get(job_id)
-            if active is not None and active.begun is not None:
-                stage, done = active.at
-                progress, seconds = share_done(active.kind, stage, done), round(time.monotonic() - active.begun, 1)
-                yield WorkerJob(id=job_id, kind=active.kind, stage=stage, progress=progress, seconds=seconds)
+        return self._computer.workers(self._parts.active)
 
     def run(self) -> None:
         """Writes the row of this process, again and again."""
@@ -168,21 +148,16 @@ class Overview:
         self._settings = settings
         self._table, self._jobs = ProcessTable(database), JobTable(database)
         self._lock = threading.Lock()
-        self._counts: list[OpenCount] = []
-        self._workers = Workers(processes=(), queues=())
+        self._picture: tuple[Workers, list[OpenCount]] = Workers(processes=(), queues=()), []
         self._read_at = -MAX_AGE_SECONDS
 
     def workers(self) -> Workers:
         """What `GET /workers` returns. Raises `StorageUnavailable`."""
-        with self._lock:
-            self._read()
-            return self._workers
+        return self._latest()[0]
 
     def counts(self) -> list[OpenCount]:
         """The jobs that wait or run. Raises `StorageUnavailable`."""
-        with self._lock:
-            self._read()
-            return self._counts
+        return self._latest()[1]
 
     def check_served(self) -> None:
         """Raises `NotReady` where nobody takes the jobs of the default request, or those of another version."""
@@ -194,19 +169,16 @@ class Overview:
             if one.reason == "version":
                 raise NotReady(f"{describe_unserved(one)} {remedy(one)}")
 
-    def _read(self) -> None:
-        if time.monotonic() - self._read_at < MAX_AGE_SECONDS:
-            return
-        processes, counts = self._table.alive(), self._jobs.open_counts()
-        if self._settings.api_keys:
-            processes = tuple(map(_without_ids, processes))
-        self._counts = counts
-        self._workers = Workers(
-            processes=processes,
-            queues=_queues(processes, counts, self._jobs.ended_lately()),
-            unserved=unserved(processes, counts),
-        )
-        self._read_at = time.monotonic()
+    def _latest(self) -> tuple[Workers, list[OpenCount]]:
+        with self._lock:
+            if time.monotonic() - self._read_at >= MAX_AGE_SECONDS:
+                processes, counts = self._table.alive(), self._jobs.open_counts()
+                if self._settings.api_keys:
+                    processes = tuple(map(_without_ids, processes))
+                queues = _queues(processes, counts, self._jobs.ended_lately())
+                found = Workers(processes=processes, queues=queues, unserved=unserved(processes, counts))
+                self._picture, self._read_at = (found, counts), time.monotonic()
+            return self._picture
 
 
 def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> tuple[Unserved, ...]:
@@ -223,17 +195,10 @@ def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> t
 
 def unserved_jobs(settings: Settings) -> tuple[Unserved, ...]:
     """Queued jobs that no live process takes, of a database that is not changed. Raises `StorageUnavailable`."""
-    database = Database(settings)
-    if database.file is not None:
-        if not database.file.exists():
-            return ()
-        database.open_read_only()
-    try:
-        if not database.has_tables():
-            return ()
+    with closing(Database(settings, read_only=True)) as database:
+        if (database.file is not None and not database.file.exists()) or database.missing_tables():
+            return ()  # no server of this version has used it
         return unserved(ProcessTable(database).alive(), JobTable(database).open_counts())
-    finally:
-        database.close()
 
 
 def describe_unserved(one: Unserved) -> str:
@@ -272,10 +237,7 @@ def _queues(
     processes: Sequence[ProcessInfo], counts: Sequence[OpenCount], ended: dict[str, int]
 ) -> tuple[QueueInfo, ...]:
     jobs = _sums(((one.queue, one.state), one.jobs) for one in counts)
-    oldest: dict[str, float] = {}
-    for one in counts:
-        if one.state == "queued":
-            oldest[one.queue] = max(one.oldest_seconds, oldest.get(one.queue, 0.0))
+    waiting = [one for one in counts if one.state == "queued"]
     served = {name for process in processes for name in process.queues}
     names = {LIGHT} | served | {queue for queue, _ in jobs} | ended.keys()
     return tuple(
@@ -284,7 +246,7 @@ def _queues(
             queued=jobs[name, "queued"],
             running=jobs[name, "running"],
             capacity=sum(process.queues.get(name, 0) for process in processes),
-            oldest_seconds=oldest.get(name),
+            oldest_seconds=max((one.oldest_seconds for one in waiting if one.queue == name), default=None),
             jobs_per_minute=ended.get(name, 0) * 60 / RATE_SECONDS,
         )
         for name in sorted(names, key=lambda name: (name != LIGHT, name))

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import AsyncGenerator, Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from weakref import WeakKeyDictionary
 
 from cow_service.errors import JobNotFound
@@ -128,15 +128,7 @@ async def follow(engine: JobEngine, job_id: str, after: int) -> AsyncGenerator[J
     Whether the caller may hear of it was found out before: here is no way left to refuse it.
     """
     sent, reported, number = after, (None, 0.0), 0
-
-    def read() -> JobView:
-        try:
-            found = engine.find(job_id, None, full=False)
-        except JobNotFound:
-            return JobView(None)
-        return JobView(found, _durable(engine, found), JobEvent("progress", None, found.job))
-
-    with subscribed(engine.active, job_id, read) as subscription:
+    with subscribed(engine.active, job_id, partial(view_of, engine, job_id)) as subscription:
         while True:
             view, number = await subscription.after(number)
             if view.found is None:
@@ -146,17 +138,21 @@ async def follow(engine: JobEngine, job_id: str, after: int) -> AsyncGenerator[J
                 if event.number is not None and event.number > sent:
                     sent = event.number
                     yield event
-            job = view.found.job
             if view.is_last:
                 return
+            job = view.found.job
             now = (job.stage, job.progress)
             if now != reported and job.status == "running" and view.progress is not None:
                 reported = now
                 yield view.progress
 
 
-def _durable(engine: JobEngine, found: JobState) -> tuple[JobEvent, ...]:
-    """The numbered events of a job so far."""
+def view_of(engine: JobEngine, job_id: str) -> JobView:
+    """A job as the database has it."""
+    try:
+        found = engine.find(job_id, None, full=False)
+    except JobNotFound:
+        return JobView(None)
     job = found.job
     begun = job.model_copy(
         update={"status": "running", "progress": 0.0, "stage": None, "problem": None, "finished_at": None}
@@ -171,4 +167,4 @@ def _durable(engine: JobEngine, found: JobState) -> tuple[JobEvent, ...]:
         events.append(JobEvent("stage", FIRST_STAGE + place, done))
     if job.status in TERMINAL:
         events.append(JobEvent(job.status, END, job))
-    return tuple(events)
+    return JobView(found, tuple(events), JobEvent("progress", None, job))

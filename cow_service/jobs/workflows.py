@@ -10,9 +10,8 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
 from uuid import uuid4
 
@@ -187,8 +186,8 @@ def launch(database: Database, executor: str, *, migrate: bool, queues: tuple[st
     """
     if migrate:
         database.create_tables()
-    else:
-        database.check_tables()
+    elif missing := database.missing_tables():
+        raise StorageUnavailable(f"The job database has no table {min(missing)}: run `cow migrate` first.")
     config = DBOSConfig(
         name=webhooks.APPLICATION,
         system_database_url=database.url,
@@ -230,24 +229,14 @@ def recover(client: DBOSClient, jobs: JobTable, ended: list[str]) -> list[str]:
     return recovered
 
 
-def ended_workflows(client: DBOSClient, name: str, before: float, limit: int) -> list[str]:
-    """Some workflows of a name that ended before a time (Unix time, s)."""
-    moment = datetime.fromtimestamp(before, UTC).isoformat()
-    found = client.list_workflows(name=name, completed_before=moment, limit=limit, load_input=False, load_output=False)
-    return [workflow.workflow_id for workflow in found]
-
-
 def migrate(settings: Settings) -> None:
     """Creates the tables of the job database that are missing, and updates those of an older DBOS.
 
     Raises `StorageUnavailable`.
     """
-    database = Database(settings)
-    try:
+    with closing(Database(settings)) as database:
         launch(database, f"migrate-{uuid4().hex}", migrate=True, queues=())
         DBOS.destroy()
-    finally:
-        database.close()
 
 
 class Dispatcher(BackgroundThread):

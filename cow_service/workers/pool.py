@@ -15,9 +15,11 @@ import psutil
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import DeviceFailed, ShuttingDown, WorkerEnded
-from cow_service.jobs.computing import Computer, KeyLocks, Outcome, Work, WorkerState
+from cow_service.jobs.active import ActiveJobs
+from cow_service.jobs.computing import Computer, KeyLocks, Outcome, Work
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.observability.metrics import Metrics
+from cow_service.records import WorkerInfo
 from cow_service.settings import Settings
 from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
@@ -86,14 +88,10 @@ class Group:
         if ends:
             threading.Thread(target=worker.close, args=("renewed",), name="cow-worker-end", daemon=True).start()
 
-    def states(self) -> list[WorkerState]:
+    def alive(self) -> list[Worker]:
         """Its workers that are alive."""
         with self._lock:
-            alive = [one for one in self._taken if one.is_alive]
-        return [
-            WorkerState(one.name, self.name, one.pid, one.memory_bytes, one.jobs_done, one.jobs, one.gpus)
-            for one in alive
-        ]
+            return [one for one in self._taken if one.is_alive]
 
     def close(self) -> None:
         """Ends all workers."""
@@ -167,9 +165,21 @@ class WorkerPool(Computer):
         group = self._group(name)
         return group.size * group.jobs_each
 
-    def workers(self) -> tuple[WorkerState, ...]:
+    def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
         """All that are alive."""
-        return tuple(state for group in self.groups for state in group.states())
+        return tuple(
+            WorkerInfo(
+                name=one.name,
+                queue=group.name,
+                pid=one.pid,
+                memory_mb=round(one.memory_bytes / 1e6, 1),
+                jobs_done=one.jobs_done,
+                jobs=active.describe(one.jobs),
+                gpus=one.gpus,
+            )
+            for group in self.groups
+            for one in group.alive()
+        )
 
     def check(self) -> None:
         """Waits until the default backends were loaded once. Raises the `CowError` for which they cannot be."""
