@@ -30,8 +30,8 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit, FloorCamera, fit_shadow, prior
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import RigidShape, run_worlds
+from cow_service.physics.ensemble import SURE
 from cow_service.physics.events import find_world_events
-from cow_service.physics.outcome import SURE
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
 from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed

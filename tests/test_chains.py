@@ -16,8 +16,8 @@ from cow_service.narration import facts_of
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import Meeting, WorldRun
+from cow_service.physics.ensemble import Query, answers_of, decide
 from cow_service.physics.events import WorldEvents, encounters, find_world_events, set_off
-from cow_service.physics.outcome import Query, answers_of, decide
 from cow_service.physics.world import WorldInput, Worlds, run_world
 from cow_service.records import Asked, MetresPerPixel, Motion, Trajectory
 from cow_service.vision.masks import CroppedMask

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from worlds import energy, rigid
 
 from cow_service.physics.draws import COLUMN, likeliest
-from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, hollow_of, run_worlds
-from cow_service.physics.placement import PlacementGoal, classify
+from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, run_worlds
+from cow_service.physics.placement import PlacementGoal, classify, hollow_of
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.openings import SeenOpening, measure_opening
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.physics.projection import SeenPaths, Shares
-from cow_service.physics.projection import shares as shares_of
+from cow_service.physics.events import SeenPaths, Shares
+from cow_service.physics.events import shares as shares_of
 from cow_service.vision.masks import CroppedMask
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from cow_service.physics.draws import COLUMN, NAMES, PARAMETERS, ensemble
+from cow_service.physics.ensemble import ROBUST, SURE, Decided, Query, answers_of, decide
 from cow_service.physics.events import KINDS, NEVER, Events, WorldEvents
-from cow_service.physics.outcome import ROBUST, SURE, Decided, Query, answers_of, decide
 from cow_service.records import Asked, AskedForm, AskedRelation
 
 COUNT = 100

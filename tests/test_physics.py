@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.physics.ballistic import GRAVITY, FreePath, ballistic_path, given_path, roll_out
-from cow_service.physics.camera import Camera, depth_motion
-from cow_service.physics.projection import points_inside, spread_anchors, swept
+from cow_service.physics.ballistic import GRAVITY, Camera, FreePath, ballistic_path, given_path, has_passed, roll_out
+from cow_service.physics.camera import depth_motion
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Path
 from cow_service.requests import TrajectoryRequest
+from cow_service.stages.paths import points_inside, spread_anchors, swept
 from cow_service.vision.masks import CroppedMask
 
 number = st.floats(-50, 50)
@@ -57,7 +57,7 @@ def test_behind_the_camera_there_is_no_image() -> None:
     camera = Camera(800, 600, 0.004)
     positions = np.array([[0, 0, camera.depth], [0, 0, -1.0]])
     points, sizes = camera.project(positions)
-    assert camera.has_passed(positions).tolist() == [False, True]
+    assert has_passed(positions[:, 2], camera.depth).tolist() == [False, True]
     assert np.isfinite(points).all()
     assert np.isfinite(sizes).all()
 

@@ -18,9 +18,8 @@ from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.ensemble import run_ensemble
+from cow_service.physics.ensemble import Query, run_ensemble
 from cow_service.physics.events import find_world_events
-from cow_service.physics.outcome import Query
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import Asked, Clip, Frame, Grounding, MetresPerPixel, Motion, Trajectory
 from cow_service.settings import Settings

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cow_service.physics.camera import Camera
+from cow_service.physics.camera import FOCAL_WIDTHS
 from cow_service.records import Grounding, Motion, Vector
 from cow_service.requests import TrajectoryRequest
 from cow_service.vision.types import Floats, Mask
@@ -18,6 +18,45 @@ from cow_service.vision.types import Floats, Mask
 GRAVITY = 9.81  # m/s^2
 DEFAULT_SPEED = 0.26  # image widths per second
 DEFAULT_SCENE_WIDTH = 3.0  # m across the image at the object's depth, where nothing tells the scale
+NEAREST_FREE = 0.08  # of the first depth: closer than this the object has passed the camera
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera at the origin: x right, y down, z depth. Its scale is fixed by the first depth of the object."""
+
+    width: int  # px
+    height: int  # px
+    metres_per_pixel: float  # at the object's first depth
+
+    @property
+    def focal(self) -> float:
+        """Focal length, px."""
+        return FOCAL_WIDTHS * self.width
+
+    @property
+    def depth(self) -> float:
+        """Depth of the object at the first frame, m."""
+        return self.focal * self.metres_per_pixel
+
+    def lift(self, point: tuple[float, float]) -> Floats:
+        """Position [3] (m) of an image point (px) at the object's first depth."""
+        x, y = point[0] - self.width / 2, point[1] - self.height / 2
+        return np.array([x * self.metres_per_pixel, y * self.metres_per_pixel, self.depth])
+
+    def project(self, positions: Floats) -> tuple[Floats, Floats]:
+        """Image points [F, 2] (px) and apparent sizes [F] (1 at the first depth) of positions [F, 3] (m).
+
+        Positions nearer than `NEAREST_FREE` are projected as if they were there: behind the camera there is no image.
+        """
+        z = np.maximum(positions[:, 2], NEAREST_FREE * self.depth)
+        points = positions[:, :2] * (self.focal / z)[:, None] + np.array([self.width / 2, self.height / 2])
+        return points, self.depth / z
+
+
+def has_passed(depths: Floats, first: float) -> Mask:
+    """Which of the depths [F] of an object are so small, against its first one, that the camera has been passed."""
+    return depths <= NEAREST_FREE * first
 
 
 def roll_out(position: Floats, velocity: Floats, acceleration: Floats, times: Floats) -> Floats:
@@ -145,4 +184,4 @@ def latest(given: TrajectoryRequest, times: Floats) -> list[int]:
 def _seen(camera: Camera, states: Floats) -> FreePath:
     points, scale = camera.project(states[:, :3])
     inside = np.all((points >= 0) & (points < [camera.width, camera.height]), axis=1)
-    return FreePath(states, points, scale, inside & ~camera.has_passed(states[:, :3]))
+    return FreePath(states, points, scale, inside & ~has_passed(states[:, 2], camera.depth))

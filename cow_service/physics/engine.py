@@ -15,17 +15,11 @@ import numpy as np
 import rapier3d as rapier
 
 from cow_service.physics.ballistic import GRAVITY, Course
-from cow_service.physics.draws import COLUMN
 from cow_service.records import Shape
-from cow_service.vision.openings import SeenOpening
 from cow_service.vision.types import Floats, Mask
 
 ROUND_SIDES = 16  # wall segments of a round container: the opening is wider by at most 2% at their joints
 BOX_SIDES = 4
-THINNEST = 0.03  # of the half width: a thinner wall would let fast things through
-LEAST_OPENING = 0.3  # of the half width
-FLOOR_SHARE = 0.08  # of the height: how thick the floor of a container is
-NARROWEST = 0.3  # of the opening: its floor
 
 
 @dataclass(frozen=True)
@@ -36,16 +30,6 @@ class Hollow:
     bottom: float  # m: the same at the floor
     depth: float  # m: from the rim down to the floor
     sides: int = ROUND_SIDES
-
-
-def hollow_of(seen: SeenOpening, half_width: float, half_height: float, row: Floats) -> Hollow:
-    """The space inside a body of outer half width and height (m), as a draw [P] has the width of the opening."""
-    drawn = seen.inner * math.exp(seen.deviation * float(row[COLUMN["opening"]]))
-    opening = half_width * min(max(drawn, LEAST_OPENING), 1 - THINNEST)
-    wall = half_width - opening
-    bottom = min(opening, max(NARROWEST * opening, seen.bottom * half_width - wall))
-    sides = BOX_SIDES if seen.square else ROUND_SIDES
-    return Hollow(opening, bottom, 2 * half_height * (1 - FLOOR_SHARE), sides)
 
 
 RESTS = 0.3  # of the lower body's half height: how far apart the ends of two bodies may be that stand on each other

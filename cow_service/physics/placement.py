@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import BOX_SIDES, RigidShape, WorldRun, hollow_of, run_worlds
+from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, run_worlds
 from cow_service.records import PlacementResult, PlaceRelation
 from cow_service.vision.openings import SeenOpening
 from cow_service.vision.types import Floats, Mask
@@ -33,6 +33,10 @@ STICKS_OUT = 1.0  # of the container's depth: how far the upper end is above the
 GONE_IN = 0.1  # of the container's depth: how far below the rim the lower end of what is inside is
 TIPPED = math.cos(math.radians(45))  # upright component of an axis that was upright
 SUNK = 0.1  # of the smaller half height: how far below a top the lower end of what lies on it may seem to be
+THINNEST = 0.03  # of the half width: a thinner wall would let fast things through
+LEAST_OPENING = 0.3  # of the half width
+FLOOR_SHARE = 0.08  # of the height: how thick the floor of a container is
+NARROWEST = 0.3  # of the opening: its floor
 OVERLAPPING = 0.02  # of the half width: so much too close, bodies are taken to touch, not to overlap
 
 STAYING: tuple[PlacementResult, ...] = ("inside", "sticks-out", "on-the-rim", "on-top", "beside")
@@ -191,6 +195,16 @@ def new_supports(goals: Sequence[PlacementGoal], supports: Sequence[int | None])
         under = found.get(target, supports[target])
         found[goal.body] = target if goal.relation in ("into", "onto") else None if under == goal.body else under
     return found
+
+
+def hollow_of(seen: SeenOpening, half_width: float, half_height: float, row: Floats) -> Hollow:
+    """The space inside a body of outer half width and height (m), as a draw [P] has the width of the opening."""
+    drawn = seen.inner * math.exp(seen.deviation * float(row[COLUMN["opening"]]))
+    opening = half_width * min(max(drawn, LEAST_OPENING), 1 - THINNEST)
+    wall = half_width - opening
+    bottom = min(opening, max(NARROWEST * opening, seen.bottom * half_width - wall))
+    sides = BOX_SIDES if seen.square else ROUND_SIDES
+    return Hollow(opening, bottom, 2 * half_height * (1 - FLOOR_SHARE), sides)
 
 
 def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:

@@ -14,8 +14,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
-from cow_service.physics.layout import VEHICLE_WIDTH, Layout, flies, lay_out, speed_factors
-from cow_service.physics.lift import BOX_SIDE, FARTHEST
+from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, flies, lay_out, speed_factors
 from cow_service.physics.placement import PlacementGoal, Placements, Settled, carry, new_supports, settle
 from cow_service.records import FALLING_KINDS, Motion
 from cow_service.vision.types import Floats, Mask

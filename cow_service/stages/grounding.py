@@ -16,8 +16,7 @@ from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObj
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
-from cow_service.vision.masks import bbox_of, iou
-from cow_service.vision.regions import is_among, is_same_object
+from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Mask
 

@@ -8,23 +8,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from cow_service import records
 from cow_service.errors import CannotGround
 from cow_service.narration import cannot_stay, place_words
-from cow_service.physics import projection
+from cow_service.physics import events
 from cow_service.physics.ballistic import FreePath, latest, sampled
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import FloorCamera
 from cow_service.physics.ensemble import EnsembleResult
-from cow_service.physics.events import encounters
 from cow_service.physics.placement import Placements
 from cow_service.records import BBox, Path, Placement, Point, Trajectory
 from cow_service.records.world import BAND_PERCENTILES
 from cow_service.stages.reconstruction import Situation
-from cow_service.vision.masks import turning
-from cow_service.vision.types import Floats
+from cow_service.vision.masks import CroppedMask, dilated, scaled_size, turning
+from cow_service.vision.types import Floats, Mask
 
 UPRIGHT = 1.0  # degrees: with less, the box of what leans stays that of what stands upright
 MOVED = 0.5  # px: what moves less in the image stays where it is
@@ -34,6 +34,11 @@ LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
 MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
 FUTURE_DECIMALS, BAND_DECIMALS, POINT_DECIMALS = 1, 2, 3  # px: more digits say nothing and are half of a result
 STATE_DECIMALS, SCALE_DECIMALS, ROTATION_DECIMALS = 5, 6, 3  # m and m/s; of the size at first; degrees
+WORKING_SIDE = 320  # px: paths are swept at this size
+ANCHORS = 8
+TRACKS = 5
+GRID = 14  # candidates along the longer side
+CLEARANCE = 0.02  # of the shorter side, kept between an anchor and what may move
 LEAST_STAYING = 0.5  # of the worlds: what stays in fewer where it is put is refused
 
 
@@ -62,10 +67,10 @@ def record_trajectory(
             np.array(each.points[0]) if each.body in shown.put else shown.start_of(each.body, shown.bodies)
             for each in paths
         ]
-        movable = projection.swept([shown.bodies[each.body].mask for each in paths], starts, paths)
+        movable = swept([shown.bodies[each.body].mask for each in paths], starts, paths)
         for body in shown.bodies:
             body.mask.add_to(movable)
-        anchors = projection.spread_anchors(movable)
+        anchors = spread_anchors(movable)
     return Trajectory(
         law="contact" if path is None else "ballistic",
         fps=request.fps,
@@ -76,7 +81,7 @@ def record_trajectory(
         light=(float(light[0, 0]), float(light[0, 1])) if result.world.fit.source == "shadow" else None,
         moving_until=until,
         anchors=anchors,
-        encounters=encounters(
+        encounters=events.encounters(
             result.shown.events,
             None if result.ensemble is None else result.ensemble.events,
             shown.bodies,
@@ -100,7 +105,7 @@ class _Shown:
         self.worlds, self.events = result.shown.worlds, result.shown.events
         self.ensemble = None if result.ensemble is None else result.ensemble.worlds
         self.seen = result.world.bodies  # as the image shows them
-        self.paths = [projection.seen_paths(self.worlds, index) for index in range(len(self.seen))]
+        self.paths = [events.seen_paths(self.worlds, index) for index in range(len(self.seen))]
         # As they are when the motion begins: some are put elsewhere, or pushed away by that.
         self.put = {index for index in range(len(self.seen)) if self._was_put(index)}
         self.bodies = tuple(self._where_put(i) if i in self.put else body for i, body in enumerate(self.seen))
@@ -113,7 +118,7 @@ class _Shown:
 
     def _where_put(self, index: int) -> SeenBody:
         """A body of the image with its box and mask where it is when the motion begins."""
-        body, path, degrees = self.seen[index], self.paths[index], projection.rotation_where_put(self.worlds, index)
+        body, path, degrees = self.seen[index], self.paths[index], events.rotation_where_put(self.worlds, index)
         start, to, scale = path.seen[0], path.points[0, 0], float(path.scale[0, 0])
         mask, corners = body.mask, np.array(body.bbox).reshape(2, 2)
         if abs(degrees) > UPRIGHT and mask.area:  # then its box is that of its pixels
@@ -158,7 +163,7 @@ class _Shown:
                     size=(2 * shape.half_width, 2 * shape.half_height, 2 * shape.half_depth),
                     position=(x, y, z),
                     support=self.bodies[on].name if on is not None else "floor" if stands else "air",
-                    rotation=projection.rotation_where_put(self.worlds, index) if index in self.put else 0.0,
+                    rotation=events.rotation_where_put(self.worlds, index) if index in self.put else 0.0,
                     source=seen.source,
                     confidence=seen.confidence,
                 )
@@ -207,9 +212,9 @@ class _Shown:
             start, scale = points[0], scale / scale[0]
         band, futures = self._spread(index, points - path.points[0])
         points, scale = np.round(points, POINT_DECIMALS), np.round(scale, SCALE_DECIMALS)
-        turned = np.round(projection.rotation(worlds, index), ROTATION_DECIMALS)
+        turned = np.round(events.rotation(worlds, index), ROTATION_DECIMALS)
         visible = np.all((points >= 0) & (points < np.array(self.world.size)), axis=1) & ~path.passed[0]
-        states = np.round(projection.states(worlds, index), STATE_DECIMALS)
+        states = np.round(events.states(worlds, index), STATE_DECIMALS)
         return Path(
             body=index,
             states=tuple(tuple(state) for state in states.tolist()),
@@ -232,7 +237,7 @@ class _Shown:
         """
         if self.ensemble is None:
             return (), ()
-        worlds = projection.seen_paths(self.ensemble, index).points
+        worlds = events.seen_paths(self.ensemble, index).points
         stamps, frames = np.arange(worlds.shape[1]), np.arange(len(shift)) / self.ensemble.every
 
         def at_frames(points: Floats) -> Floats:  # which are recorded at every few frames
@@ -303,7 +308,7 @@ class _Shown:
         x0, y0, x1, y1 = self.bodies[index].bbox
         inside = max(0.0, min(x1, width) - max(x0, 0)) * max(0.0, min(y1, height) - max(y0, 0))
         hidden = [
-            float(projection.shares(self.seen[index].mask, path, other.mask, self.paths[i]).covered[0, 0])
+            float(events.shares(self.seen[index].mask, path, other.mask, self.paths[i]).covered[0, 0])
             for i, other in enumerate(self.seen)
             if i != index and self.worlds.layout.supports[index] != i
         ]
@@ -329,7 +334,7 @@ def tracks(seen: SeenBody, start: Floats, points: Floats, scale: Floats, turned:
     angle = np.radians(turned)
     cosine, sine = np.cos(angle), np.sin(angle)
     found: list[Floats] = []
-    for x, y in projection.points_inside(seen.mask, (float(start[0]), float(start[1]))):
+    for x, y in points_inside(seen.mask, (float(start[0]), float(start[1]))):
         dx, dy = x - start[0], y - start[1]
         offset = np.stack([cosine * dx - sine * dy, sine * dx + cosine * dy], axis=1)
         found.append(points + scale[:, None] * offset)
@@ -352,3 +357,63 @@ def moving_until(paths: Sequence[Path], fps: float) -> float:
 def pairs(points: Floats) -> tuple[Point, ...]:
     """Rows [F, 2] as tuples."""
     return tuple((x, y) for x, y in points.tolist())
+
+
+def swept(masks: Sequence[CroppedMask], starts: Sequence[Floats], paths: Sequence[Path]) -> Mask:
+    """Mask [H, W] of every place that bodies cover on their paths: those of `masks`, first at `starts` [2] (px)."""
+    height, width = masks[0].shape
+    factor = min(1.0, WORKING_SIDE / max(height, width))
+    size = scaled_size(width, height, factor)
+    canvas = np.zeros((size[1], size[0]), np.uint8)
+    for mask, start, path in zip(masks, starts, paths, strict=True):
+        contours, _ = cv2.findContours(mask.patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        if not contours:
+            continue
+        outline = np.asarray(max(contours, key=len)[:, 0], np.float64) - start
+        outline += np.array([mask.columns.start, mask.rows.start])
+        for point, scale in zip(path.points, path.scale, strict=True):
+            moved = (np.array(point) + scale * outline) * factor
+            if np.all(np.abs(moved) < 4 * max(size)):
+                cv2.fillPoly(canvas, [np.round(moved).astype(np.int32)], 1)
+    return cv2.resize(canvas, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, float], ...]:
+    """At most `count` points (px), far from each other, off a mask [H, W] of everything that may move."""
+    height, width = movable.shape
+    side = 2 * max(2, int(CLEARANCE * min(height, width))) + 1
+    blocked = dilated(movable, side)
+    step = max(height, width) / GRID
+    xs = np.arange(step / 2, width, step)
+    ys = np.arange(step / 2, height, step)
+    grid = np.array([(x, y) for y in ys for x in xs if not blocked[int(y), int(x)]]).reshape(-1, 2)
+    chosen = _farthest(grid, np.array([0.0, 0.0]), count)
+    return tuple((float(x), float(y)) for x, y in chosen)
+
+
+def points_inside(
+    mask: CroppedMask, centre: tuple[float, float], count: int = TRACKS
+) -> tuple[tuple[float, float], ...]:
+    """The centre and points inside a mask away from its rim (px), spread out; at least one point."""
+    if not mask.area:
+        return (centre,)
+    deep = cv2.distanceTransform(np.pad(mask.patch, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    rows, columns = np.nonzero(deep >= 0.35 * deep.max())
+    candidates = np.stack([columns + mask.columns.start + 0.5, rows + mask.rows.start + 0.5], axis=1)
+    start = candidates[int(np.linalg.norm(candidates - np.array(centre), axis=1).argmin())]
+    return tuple((float(x), float(y)) for x, y in [start, *_farthest(candidates, start, count - 1)])
+
+
+def _farthest(candidates: Floats, start: Floats, count: int) -> list[Floats]:
+    """Up to `count` candidates [N, 2], each as far as can be from `start` and from those before it."""
+    chosen: list[Floats] = []
+    if not len(candidates):
+        return chosen
+    gap = np.linalg.norm(candidates - start, axis=1)
+    for _ in range(count):
+        best = int(gap.argmax())
+        if gap[best] < 1.0:
+            break
+        chosen.append(candidates[best])
+        gap = np.minimum(gap, np.linalg.norm(candidates - candidates[best], axis=1))
+    return chosen

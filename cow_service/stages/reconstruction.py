@@ -11,20 +11,19 @@ import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.narration import place_words
-from cow_service.physics.ballistic import FreePath, ballistic_path, given_path
+from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.camera import Camera, CameraFit, fit_shadow, prior
+from cow_service.physics.camera import CameraFit, fit_shadow, prior
+from cow_service.physics.ensemble import Query
 from cow_service.physics.layout import flies
-from cow_service.physics.outcome import Query
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.readers.options import plain
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import CameraRequest, SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
-from cow_service.vision.masks import CroppedMask, iou
+from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
-from cow_service.vision.regions import is_same_object
 from cow_service.vision.scene import Obstacle, Scene
 from cow_service.vision.shadows import find_shadow
 

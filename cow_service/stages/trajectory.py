@@ -5,9 +5,8 @@ from collections.abc import Sequence
 
 from cow_service.narration import doubts_of, facts_of, facts_of_both
 from cow_service.physics.bodies import supports_of
-from cow_service.physics.ensemble import EnsembleResult, run_ensemble
+from cow_service.physics.ensemble import KIND_OF, EnsembleResult, Query, run_ensemble
 from cow_service.physics.layout import flies
-from cow_service.physics.outcome import KIND_OF, Query
 from cow_service.physics.world import WorldInput
 from cow_service.records import Asked, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
+SAME_OBJECT_IOU = 0.5  # intersection over union from which two boxes are of one object
 _FIRST_PIXEL = slice(0, 1), slice(0, 1)  # the window that stands for an empty mask
 
 
@@ -68,6 +70,16 @@ def iou(a: BBox, b: BBox) -> float:
         return 0.0
     both = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - width * height
     return width * height / both
+
+
+def is_same_object(a: BBox, b: BBox) -> bool:
+    """Whether two boxes are of one object."""
+    return iou(a, b) >= SAME_OBJECT_IOU
+
+
+def is_among(bbox: BBox, others: Iterable[BBox]) -> bool:
+    """Whether a box is of the same object as one of some others."""
+    return any(is_same_object(bbox, other) for other in others)
 
 
 def dilated(mask: Mask, width: int = 3, times: int = 1) -> Mask:

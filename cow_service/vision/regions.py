@@ -6,7 +6,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 """
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -26,7 +26,6 @@ BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shad
 MIN_AREA = 0.0004  # of the image
 MAX_AREA = 0.25
 ALONG_BORDER = 0.5  # of the height or width of something bright and pale that runs along the image's border: a wall
-SAME_OBJECT_IOU = 0.5  # intersection over union from which a region is the object of a box
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
 CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
 SPLIT_HUE = 36.0  # degrees: another colour, hence another object
@@ -131,20 +130,10 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
-def is_same_object(a: BBox, b: BBox) -> bool:
-    """Whether two boxes are of one object."""
-    return masks.iou(a, b) >= SAME_OBJECT_IOU
-
-
-def is_among(bbox: BBox, others: Iterable[BBox]) -> bool:
-    """Whether a box is of the same object as one of some others."""
-    return any(is_same_object(bbox, other) for other in others)
-
-
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     """The region that best overlaps a box [x0, y0, x1, y1], if it is the same object."""
     best = max(regions, key=lambda region: masks.iou(region.bbox, bbox), default=None)
-    return best if best is not None and is_same_object(best.bbox, bbox) else None
+    return best if best is not None and masks.is_same_object(best.bbox, bbox) else None
 
 
 def disc_region(image: Image, disc: Mask) -> Region:

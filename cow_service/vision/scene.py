@@ -15,8 +15,8 @@ from cow_service.errors import CannotReadDirection
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import CroppedMask, bbox_of, dilated, without_holes
-from cow_service.vision.regions import Region, disc_region, find_regions, is_among, is_same_object, region_of
+from cow_service.vision.masks import CroppedMask, bbox_of, dilated, is_among, is_same_object, without_holes
+from cow_service.vision.regions import Region, disc_region, find_regions, region_of
 from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows

@@ -12,7 +12,8 @@ from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.matching import describe, match_one, match_several
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, Intervention, LocatedObject
-from cow_service.vision.regions import Region, is_among
+from cow_service.vision.masks import is_among
+from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene
 
 

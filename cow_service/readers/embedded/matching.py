@@ -17,7 +17,8 @@ from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.outlines import contradicts, form_of, is_cut, log_ratio
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, LocatedObject
-from cow_service.vision.regions import Region, is_same_object
+from cow_service.vision.masks import is_same_object
+from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene
 
 LEAD = 0.25  # of the mean size of the regions: so far ahead of the next one in place

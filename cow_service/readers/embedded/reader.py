@@ -25,7 +25,8 @@ from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Source, Vector
 from cow_service.settings import Settings
-from cow_service.vision.regions import Region, is_same_object
+from cow_service.vision.masks import is_same_object
+from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene, arrow_of
 
 

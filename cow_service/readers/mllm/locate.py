@@ -17,8 +17,7 @@ from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, Encode
 from cow_service.readers.mllm.identify import MAX_OTHERS
 from cow_service.readers.mllm.replies import Reply, ReplyError
 from cow_service.records import BBox, LocatedObject, ObjectPrior, Point, Vector
-from cow_service.vision.masks import iou
-from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.masks import is_among
 
 CUES = ("arrow", "trail", "text", "orientation", "none")
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
@@ -252,7 +251,7 @@ def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tupl
     warnings: list[str] = []
     for other in others:
         boxes = [mover, *(each.bbox for each in kept)]
-        if any(iou(other.bbox, bbox) >= SAME_OBJECT_IOU for bbox in boxes):
+        if is_among(other.bbox, boxes):
             if other.role == "target":
                 warnings.append(f"The reader's box of '{other.object}' was left out: it is that of another object.")
         elif other.role == "target" or sum(each.role == "obstacle" for each in kept) < MAX_OBSTACLES:

@@ -25,8 +25,7 @@ from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.settings import Settings
-from cow_service.vision.masks import iou
-from cow_service.vision.regions import SAME_OBJECT_IOU
+from cow_service.vision.masks import is_same_object
 from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import PROMPTS
 
@@ -299,7 +298,7 @@ def box_warnings(scene: Scene, bbox: BBox, name: str, clipped: bool) -> tuple[st
     if covers_image(scene.width, scene.height, bbox):
         found.append("The reader's box covers nearly the whole image: it may not be that of one object.")
     colours = set(name_words(name))
-    there = [each for each in scene.regions if each.colour in colours and iou(each.bbox, bbox) < SAME_OBJECT_IOU]
+    there = [each for each in scene.regions if each.colour in colours and not is_same_object(each.bbox, bbox)]
     here = scene.region_of(bbox) if there else None
     if here is not None and colours.isdisjoint((here.colour, *here.colours)):
         x, y = there[0].centre
