@@ -105,9 +105,8 @@ def _read(question: Question) -> Asking | None:
     if listed and asking.form != "which-first":
         return None
     items = question.items
-    said = (
-        {found[at].words[place].at for place in places} | claim | _premise(found[: at + 1], places[0], asking, question)
-    )
+    said = {found[at].words[place].at for place in places} | claim
+    said |= _premise(found[: at + 1], places[0], asking, question)
     phrases = [word.phrase for word in listed]
     said |= {at for at, item in enumerate(items) if listed and (item.phrase in phrases or item.key == "or")}
     said |= {at for at, item in enumerate(items) if item.key == "still" and question.interventions}

@@ -23,9 +23,7 @@ _ACTS = {
 _FORMS: dict[str, AskedForm] = {"either": "which-first"}
 _FORMS.update({form.replace("-", "_"): form for form in get_args(AskedForm)})
 _BY_MOVER: dict[AskedRelation, AskedRelation] = {"covers": "covered", "covered": "covers"}  # "the mug hides it"
-_SPARING = lex.words(
-    "misses missed avoids stays stays_up stays_in stays_on sticks_out stops_short spared safe seen",
-)
+_SPARING = lex.words("misses missed avoids stays stays_up stays_in stays_on sticks_out stops_short spared safe seen")
 _NEGATIONS = _SPARING | {"no", "none", "no_contact"}
 _ANY_PART = frozenset({"any_part", "all_seen", "partly", "wholly", "in_full", "at_some_time"})  # hidden in part or once
 
@@ -120,9 +118,8 @@ class _Clause:
             return None
         if not _SPARING.isdisjoint(self.names):  # to spare all is to hit none; where any is spared, not each is hit
             every = not every and suffer
-        if (
-            suffer != self.done_to or asking.form == "which-first"
-        ):  # else they suffer it, or the subject does it to them
+        # Else they suffer it, or the subject does it to them.
+        if suffer != self.done_to or asking.form == "which-first":
             if relation not in {"touches", "covers"} or (suffer and not self.mover_acted):
                 return None
             relation = _BY_MOVER.get(relation, relation)

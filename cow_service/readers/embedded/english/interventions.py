@@ -16,8 +16,8 @@ _BEFORE = lex.CONDITIONALS | lex.words(". ! ? ; : , and but then also that with"
 _ANYWHERE = lex.words("without with remove taking in")
 _VERBS = lex.VERBS.keys() | lex.BE
 _RELATIONS: dict[str, PlaceRelation] = {
-    "into": "into", "onto": "onto", "between": "between", "in_front_of": "in-front-of", "behind": "behind",
-    "next_to": "next-to", "left_of": "left-of", "right_of": "right-of",
+    "into": "into", "onto": "onto", "between": "between", "front_of_it": "in-front-of", "behind_it": "behind",
+    "next_to": "next-to", "left_of_it": "left-of", "right_of_it": "right-of",
 }  # fmt: skip
 
 

@@ -105,12 +105,8 @@ def singular(noun: str) -> str:
     """A plural noun made singular, by its ending."""
     if noun in TABLES["irregular_plurals"]:
         return TABLES["irregular_plurals"][noun]
-    if (
-        noun in SETS["unchanged_plurals"]
-        or len(noun) < 4
-        or not noun.endswith("s")
-        or noun.endswith(("ss", "us", "is"))
-    ):
+    unchanged = noun in SETS["unchanged_plurals"] or noun.endswith(("ss", "us", "is"))
+    if unchanged or len(noun) < 4 or not noun.endswith("s"):
         return noun
     if noun.endswith(("sses", "xes", "ches", "shes", "toes")):
         return noun[:-2]

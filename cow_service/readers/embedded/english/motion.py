@@ -420,9 +420,8 @@ def read_motion(
 def _in_words(legs: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int]) -> MotionWords:
     first, *rest = legs
     rest = [leg for leg in rest if leg.way(None)[0] is not None or leg.depths]
-    if (first.verb == "come" and any(y > 0 for _, y in first.ways)) or (
-        first.verb in _TIPPED and "over" in first.marks
-    ):
+    comes_down = first.verb == "come" and any(y > 0 for _, y in first.ways)
+    if comes_down or (first.verb in _TIPPED and "over" in first.marks):
         kind = "fall"
     elif first.verb in _KICKED and "airborne" in first.marks:
         kind = "projectile"

@@ -42,12 +42,8 @@ def _with_quantities(found: Sequence[Item]) -> list[Item]:
     def join(at: int) -> tuple[Item, int] | None:
         key, before = found[at].key, key_at(found, at - 1)
         adjective = key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND
-        if (
-            not any(measures[at : at + 8])
-            or adjective
-            or before == "number"
-            or (key in _PARTS and key_at(found, at + 1) == "between")
-        ):
+        place = key in _PARTS and key_at(found, at + 1) == "between"
+        if adjective or place or before == "number" or not any(measures[at : at + 8]):
             return None
         parsed = read_from("quantity", found, at, _QUANTITY_WINDOW)
         if parsed is None:
@@ -309,7 +305,8 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
         if phrase is not None and asked and colour_alone:
             phrase = replace(phrase, noun=None)  # "which mug does it hit first, the blue or the white?"
         # "The red one", "the left one".
-        if phrase is not None and phrase.noun is None and noun and (phrase.colour or _is_one_of_them(item, phrase)):
+        one = words[-1:] == ("one",)
+        if phrase is not None and phrase.noun is None and noun and (phrase.colour or (one and len(phrase.words) > 1)):
             text = [noun if word == "one" else word for word in phrase.text.split()]
             text += [] if "one" in phrase.text.split() else [noun]
             said.append(replace(item, phrase=replace(phrase, text=" ".join(text), noun=noun)))
@@ -317,10 +314,6 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
             said.append(item)
             before |= {_kind_of(phrase)} - {""}
     return said
-
-
-def _is_one_of_them(item: Item, phrase: ObjectPhrase) -> bool:
-    return item.words[-1:] == ("one",) and len(phrase.words) > 1
 
 
 def _kind_of(phrase: ObjectPhrase | None) -> str:
@@ -343,10 +336,9 @@ def with_places(found: Sequence[Item]) -> list[Item]:
             return None
         # "Push the ball behind the mug", "put the ball on the mug": where it gets to, not where it is.
         moved = lex.moves(verb) or (verb is not None and verb.lemma in _PUTS)
-        parsed = (
-            None if moved and after not in {"that", "which", ","} else read_from("place", found, at + 1, _PLACE_WINDOW)
-        )
-        if parsed is None:
+        if moved and after not in {"that", "which", ","}:
+            return None
+        if (parsed := read_from("place", found, at + 1, _PLACE_WINDOW)) is None:
             return None
         tree, end = parsed
         other = next((found[word.at] for word in tree.words), None)

@@ -189,9 +189,8 @@ def _motion(
             if way.direction is not None or way.depth:
                 shared = place
                 break
-    told = motion.read_motion(
-        found[at : shared or end], verb, kind, mover, asked=best is not None and best.asked, arrow=arrow
-    )
+    asked = best is not None and best.asked
+    told = motion.read_motion(found[at : shared or end], verb, kind, mover, asked=asked, arrow=arrow)
     told = motion.with_front(told, found[start:at] if best else found, found)
     elsewhere = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
     speeds = {place: said for place, said in elsewhere if isinstance(said.speed, Quantity)}
