@@ -1,7 +1,6 @@
 """Finds strokes drawn over an image: patches of one flat colour with sharp edges and a narrow part.
 
-A closed rim counts twice: as it is, and together with what it encloses. `arrows.py` and `boxes.py` classify strokes by
-their shape.
+A closed rim counts twice: as it is, and together with what it encloses. `arrows.py` classifies strokes by their shape.
 """
 
 from __future__ import annotations
