@@ -19,6 +19,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
+from llguidance import LLMatcher
 from PIL import Image
 from pydantic import BaseModel, Field
 from pydantic_ai import Agent, ModelRetry
@@ -292,9 +293,9 @@ CUBE = {"label": "cube", "bbox_2d": [50, 2, 90, 40]}
 def test_a_reply_may_leave_out_what_is_optional_and_nothing_else(toy: LocalModel, reply: Any, allowed: bool) -> None:
     coordinates = Coordinates(units="thousandths", box="bbox_2d")
     schema = locate_schema(CoordinateFrame(640, 480, (640, 480), coordinates), True, True, 100)
-    grammars = toy._generator.grammars
-    matcher = grammars.matcher(grammars.grammar(schema))
-    tokens = grammars._tokens.tokenize_str(json.dumps(reply))
+    generator = toy._generator
+    matcher = LLMatcher(generator.grammar_tokens, generator.grammar(schema))
+    tokens = generator.grammar_tokens.tokenize_str(json.dumps(reply))
     assert (matcher.validate_tokens(tokens) == len(tokens)) == allowed
     if allowed:
         assert matcher.consume_tokens(tokens)

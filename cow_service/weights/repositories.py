@@ -133,11 +133,11 @@ def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Find
     folder, known = folder_of(weights_dir, lock.repository), {file.path for file in lock.files}
     # Weights that are not in the record, such as shards of another revision: a loader would read them, too.
     with disk_errors(lock.repository):
-        here = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.safetensors*") if path.is_file())
+        here = {path.relative_to(folder).as_posix() for path in folder.rglob("*.safetensors*") if path.is_file()}
     strangers = [
         path
-        for path in here
-        if path not in known and not path.startswith(".") and any(fnmatchcase(path, glob) for glob in source.files)
+        for path in sorted(here - known)
+        if not path.startswith(".") and any(fnmatchcase(path, glob) for glob in source.files)
     ]
     return (
         *(Finding(file=name, problem="not-pulled") for name in source.files if name not in lock.patterns),
@@ -211,10 +211,9 @@ def write_lock(weights_dir: Path, lock: Lock) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def chosen(lock: Lock, patterns: Iterable[str]) -> tuple[LockedFile, ...]:
+def chosen(lock: Lock, patterns: Sequence[str]) -> tuple[LockedFile, ...]:
     """The recorded files that match one of the glob patterns, in which `*` takes slashes too."""
-    wanted = tuple(patterns)
-    return tuple(file for file in lock.files if any(fnmatchcase(file.path, pattern) for pattern in wanted))
+    return tuple(file for file in lock.files if any(fnmatchcase(file.path, pattern) for pattern in patterns))
 
 
 def examine(lock: Lock, files: Iterable[LockedFile], weights_dir: Path, digests: bool = True) -> tuple[Finding, ...]:
@@ -442,9 +441,6 @@ def _progress_bar(report: Callable[[int], None]) -> type:
         def __enter__(self) -> Bar:
             return self
 
-        def __exit__(self, *error: object) -> None:
-            pass
-
         def update(self, count: float = 1) -> None:
             self.n += int(count)
             report(self.n)
@@ -453,7 +449,7 @@ def _progress_bar(report: Callable[[int], None]) -> type:
             pass
 
         # Having `update_transfer`, it gets one bar per file, and not a second one for bytes on the network.
-        update_transfer = set_transfer_postfix_str = set_postfix_str = refresh = close = _ignore
+        update_transfer = set_transfer_postfix_str = set_postfix_str = refresh = close = __exit__ = _ignore
 
     return Bar
 

@@ -94,28 +94,6 @@ def conversation_of(
     return Conversation(tuple(turns), tuple(images))
 
 
-class Grammars:
-    """Grammars of JSON schemas over one tokenizer, for a model with `vocabulary` logits."""
-
-    def __init__(self, tokenizer: transformers.PreTrainedTokenizerFast, vocabulary: int, ends: Sequence[int]) -> None:
-        self._tokens: LLTokenizer = from_tokenizer(tokenizer, n_vocab=vocabulary, eos_token=list(ends))
-
-    def grammar(self, schema: Mapping[str, Any]) -> str:
-        """The grammar of the JSON texts that a schema allows, without properties that it does not name.
-
-        Raises `UserError` for a schema that is wrong or that says what cannot be held to, such as `uniqueItems`.
-        """
-        grammar = LLMatcher.grammar_from_json_schema(json.dumps(_closed(schema)), overrides=_LAYOUT)
-        is_error, messages = LLMatcher.validate_grammar_with_warnings(grammar, self._tokens)
-        if is_error:
-            raise UserError(f"Replies cannot be held to this JSON schema: {messages[0]}")
-        return grammar
-
-    def matcher(self, grammar: str) -> LLMatcher:
-        """A new reader of a reply, at its start."""
-        return LLMatcher(self._tokens, grammar)
-
-
 def _closed(schema: Any) -> Any:
     """The schema with no other properties than those it names: a model could invent some up to the limit of tokens."""
     if isinstance(schema, list):
@@ -298,16 +276,6 @@ class PendingGeneration:
     request: GenerationRequest
     future: Future[Generation] = field(default_factory=Future[Generation])
 
-    def resolve(self, generation: Generation) -> None:
-        """Ends it with its reply, unless it was canceled."""
-        with suppress(InvalidStateError):
-            self.future.set_result(generation)
-
-    def fail(self, error: BaseException) -> None:
-        """Ends it with an error, unless it was canceled."""
-        with suppress(InvalidStateError):
-            self.future.set_exception(error)
-
 
 class BatchGenerator:
     """A model of images and text with its processor, as transformers has them."""
@@ -329,17 +297,21 @@ class BatchGenerator:
         # Else the checkpoint's advice on sampling would be mixed into every call, after ours.
         self._model.generation_config = self._config()
         self.special_tokens = tuple(self._tokenizer.get_added_vocab())
-        self.grammars = Grammars(self._tokenizer, self._model.get_output_embeddings().weight.shape[0], self._ends)
+        self.device = model.device  # where its inputs go
+        self.is_float32 = model.dtype == torch.float32
+        logits = self._model.get_output_embeddings().weight.shape[0]
+        self.grammar_tokens: LLTokenizer = from_tokenizer(self._tokenizer, n_vocab=logits, eos_token=list(self._ends))
 
-    @property
-    def is_float32(self) -> bool:
-        """Whether it computes in full precision."""
-        return self._model.dtype == torch.float32
+    def grammar(self, schema: Mapping[str, Any]) -> str:
+        """The grammar of the JSON texts that a schema allows, without properties that it does not name.
 
-    @property
-    def device(self) -> torch.device:
-        """Where its inputs go."""
-        return self._model.device
+        Raises `UserError` for a schema that is wrong or that says what cannot be held to, such as `uniqueItems`.
+        """
+        grammar = LLMatcher.grammar_from_json_schema(json.dumps(_closed(schema)), overrides=_LAYOUT)
+        is_error, messages = LLMatcher.validate_grammar_with_warnings(grammar, self.grammar_tokens)
+        if is_error:
+            raise UserError(f"Replies cannot be held to this JSON schema: {messages[0]}")
+        return grammar
 
     def generate(self, batch: Sequence[PendingGeneration]) -> None:
         """Writes all replies at once; each future has its result as soon as that reply is complete.
@@ -386,13 +358,16 @@ class BatchGenerator:
         def resolve(row: BatchRow, finish: Finish) -> None:
             thought = self._decoded(row.thought).removesuffix(_THOUGHT_END).strip()
             output_tokens = len(row.thought) + len(row.tokens)
-            pending.resolve(Generation(self._decoded(row.tokens), thought, finish, input_tokens, output_tokens))
+            with suppress(InvalidStateError):  # it was canceled
+                pending.future.set_result(
+                    Generation(self._decoded(row.tokens), thought, finish, input_tokens, output_tokens)
+                )
 
         return BatchRow(
             request.sampling,
             request.limit,
             self._ends,
-            None if request.grammar is None else self.grammars.matcher(request.grammar),
+            None if request.grammar is None else LLMatcher(self.grammar_tokens, request.grammar),
             on_end=resolve,
             is_canceled=pending.future.done,
             thought_end=self._tokenizer.get_vocab().get(_THOUGHT_END) if thinks else None,

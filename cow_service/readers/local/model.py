@@ -4,7 +4,9 @@ import asyncio
 import gc
 import traceback
 from collections import deque
-from concurrent.futures import Future
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
+from dataclasses import dataclass, field
 from threading import Lock, Thread
 
 import torch
@@ -21,19 +23,17 @@ from cow_service.readers.local.generation import PendingGeneration
 from cow_service.weights.device import cpu_threads, is_out_of_memory
 
 
+@dataclass(eq=False)
 class BatchWorker:
     """The one thread that runs a model. It lives while there are requests, so that it keeps no idle model alive."""
 
-    def __init__(
-        self, generator: generation.BatchGenerator, name: str, max_batch: int, threads: int | None = None
-    ) -> None:
-        self._generator = generator
-        self._name = name
-        self._max_batch = max_batch
-        self._threads = threads  # of the CPU; None for PyTorch's own number
-        self._queue: deque[PendingGeneration] = deque()
-        self._lock = Lock()
-        self._running = False
+    generator: generation.BatchGenerator
+    name: str
+    max_batch: int
+    threads: int | None  # of the CPU; None for PyTorch's own number
+    _queue: deque[PendingGeneration] = field(default_factory=deque[PendingGeneration])
+    _lock: Lock = field(default_factory=Lock)
+    _running: bool = False
 
     def submit(self, request: generation.GenerationRequest) -> Future[generation.Generation]:
         """The reply to come; canceling it takes it out of the queue, or ends it at the next token.
@@ -46,16 +46,16 @@ class BatchWorker:
             if not self._running:
                 self._running = True
                 # No daemon: one that is stopped in the midst of PyTorch's code takes the whole process down with it.
-                Thread(target=self._work, name=f"mllm {self._name}").start()
+                Thread(target=self._work, name=f"mllm {self.name}").start()
         return pending.future
 
     def _work(self) -> None:
-        with cpu_threads(self._threads):
+        with cpu_threads(self.threads):
             while True:
                 # An empty batch ends the thread, which the lock keeps a new request from missing.
                 with self._lock:
                     batch: list[PendingGeneration] = []
-                    while self._queue and len(batch) < self._max_batch:
+                    while self._queue and len(batch) < self.max_batch:
                         pending = self._queue.popleft()
                         if not pending.future.done():
                             batch.append(pending)
@@ -67,35 +67,31 @@ class BatchWorker:
     def _generate(self, batch: list[PendingGeneration]) -> None:
         """Generates a batch. One that fails is split, until the error has found the request that it belongs to."""
         batch = [pending for pending in batch if not pending.future.done()]
-        error = self._try(batch) if batch else None
-        if error is None:
+        if not batch:
             return
-        if len(batch) == 1:
-            batch[0].fail(error)
-            return
-        half = len(batch) // 2
-        self._generate(batch[:half])
-        self._generate(batch[half:])
-
-    def _try(self, batch: list[PendingGeneration]) -> Exception | None:
         try:
-            self._generator.generate(batch)
+            self.generator.generate(batch)
         except Exception as error:  # noqa: BLE001 - whatever it is, it is the callers'; the thread has others to serve
             # The failed frames hold their tensors, and live as long as the traceback does.
             traceback.clear_frames(error.__traceback__)
             failed = error
         else:
-            return None
+            return
+        gc.collect()
+        if self.generator.device.type == "cuda":
+            torch.cuda.empty_cache()
+        if len(batch) > 1:
+            half = len(batch) // 2
+            self._generate(batch[:half])
+            self._generate(batch[half:])
+            return
         if is_out_of_memory(failed):
             failed = MllmUnavailable(
-                f"'{self._name}' ran out of memory on {self._generator.device} while it wrote {len(batch)} "
-                f"repl{'y' if len(batch) == 1 else 'ies'}. Send a smaller image or fewer frames, or set COW_MLLM to a "
-                f"smaller model or COW_DEVICE to a larger device."
+                f"'{self.name}' ran out of memory on {self.generator.device} while it wrote 1 reply. Send a smaller "
+                f"image or fewer frames, or set COW_MLLM to a smaller model or COW_DEVICE to a larger device."
             )
-        gc.collect()
-        if self._generator.device.type == "cuda":
-            torch.cuda.empty_cache()
-        return failed
+        with suppress(InvalidStateError):  # it was canceled
+            batch[0].future.set_exception(failed)
 
 
 PROFILE = ModelProfile(
@@ -223,5 +219,5 @@ class LocalModel(Model[None]):
             conversation=generation.conversation_of(messages, instructions, self._generator.special_tokens),
             sampling=sampling,
             limit=min(limit, self._max_new_tokens),
-            grammar=None if output is None else self._generator.grammars.grammar(output.json_schema),
+            grammar=None if output is None else self._generator.grammar(output.json_schema),
         )

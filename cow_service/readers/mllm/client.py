@@ -61,18 +61,19 @@ class PromptCall(Generic[T]):
     temperature: float | None = None  # by default that of the manifest
 
 
+@dataclass
 class _ReplyParser(Generic[T]):
     """Parses the replies to one call, and remembers what was wrong with the last one."""
 
-    def __init__(self, parse: Callable[[str], T]) -> None:
-        self._parse = parse
-        self.fault, self.reply = "it was empty", ""
+    parse: Callable[[str], T]
+    fault: str = "it was empty"
+    reply: str = ""
 
     def read(self, reply: str) -> T:
         """The value of a reply. Raises `ModelRetry`, which has the model asked again with the reason."""
         self.reply = reply
         try:
-            return self._parse(reply)
+            return self.parse(reply)
         except ReplyError as error:
             self.fault = str(error)
             raise ModelRetry(f"That cannot be used: {error}.") from error

@@ -78,10 +78,8 @@ class CoordinateFrame:
     @property
     def _full(self) -> tuple[float, float]:
         """What the family writes for the right and the lower edge."""
-        units = self.coordinates.units
-        if units == "pixels":
-            return float(self.seen[0]), float(self.seen[1])
-        return (1000.0, 1000.0) if units == "thousandths" else (1.0, 1.0)
+        edges = {"pixels": self.seen, "thousandths": (1000.0, 1000.0), "fractions": (1.0, 1.0)}
+        return edges[self.coordinates.units]
 
     @property
     def units(self) -> str:

@@ -412,8 +412,10 @@ class Scale(Reply):
     @field_validator("metres", mode="before")
     @classmethod
     def _read_metres(cls, written: object) -> float | None:
-        metres = None if replies.is_none(written) else estimates.metres_of(written)
-        if not replies.is_none(written) and (metres is None or not estimates.SIZES[0] <= metres <= estimates.SIZES[1]):
+        if replies.is_none(written):
+            return None
+        metres = estimates.metres_of(written)
+        if metres is None or not estimates.SIZES[0] <= metres <= estimates.SIZES[1]:
             shown = str(written)[:40]
             raise ReplyError(f"`metres` is {shown}; give the length in metres as a number from 0.001 to 1000")
         return metres

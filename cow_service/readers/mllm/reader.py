@@ -203,16 +203,15 @@ class MllmReader:
             named = (*identified.must_be_found, *given.sought, *identified.others)
             others = tuple(dict.fromkeys(each for each in named if name_words(each) != name_words(name)))
         wants_direction = given.motion_wanted and kind in records.DIRECTED_KINDS
-        wants_place = bbox is None or wants_direction
-        wants_scale = given.motion_wanted and kind in records.FALLING_KINDS
-        calls: list[PromptCall[Any]] = []
-        if wants_place:
-            calls.append(locate_call(given.question, image, name, bbox, others, wants_direction, self._reasoning))
-        if wants_scale:
-            calls.append(scale_call(image, name, self._reasoning))
-        results = iter(self._client.complete_all(calls, given))
-        located: Located | CowError | None = next(results) if wants_place else None
-        scaled: Scale | CowError | None = next(results) if wants_scale else None
+        calls: dict[str, PromptCall[Any]] = {}
+        if bbox is None or wants_direction:
+            place = locate_call(given.question, image, name, bbox, others, wants_direction, self._reasoning)
+            calls["place"] = place
+        if given.motion_wanted and kind in records.FALLING_KINDS:
+            calls["scale"] = scale_call(image, name, self._reasoning)
+        results = dict(zip(calls, self._client.complete_all(list(calls.values()), given), strict=True))
+        located: Located | CowError | None = results.get("place")
+        scaled: Scale | CowError | None = results.get("scale")
         if isinstance(located, CowError):
             raise located
         hints: dict[str, Any] = {"kind": kind}
@@ -235,13 +234,9 @@ class MllmReader:
                 f"{self._subject} found nothing in the image or the question that tells which way the "
                 f"{grounding.object} moves. {GIVE_DIRECTION}"
             )
-        reading = replace(
-            reading, distance=hints.distance, duration=hints.duration, until=hints.until, steps=hints.then
-        )
-        if isinstance(hints.speed, base.Quantity):
-            reading = replace(reading, speed=hints.speed)
-        elif hints.speed is not None:
-            reading = replace(reading, speed=hints.speed, speed_deviation=SPEED_DEVIATION)
+        deviation = SPEED_DEVIATION if isinstance(hints.speed, str) else None
+        reading = replace(reading, speed=hints.speed, speed_deviation=deviation, distance=hints.distance)
+        reading = replace(reading, duration=hints.duration, until=hints.until, steps=hints.then)
         cue = hints.cue or "orientation"
         if hints.camera is not None:
             direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
