@@ -27,8 +27,7 @@ class Item(Record):
     source_id: str = Field(description="As the data names it; need not be unique.")
     image: Sha256
     question: tuple[str, ...] = Field(
-        description="The text around the options, one part more than there are options: `question_text` puts an option "
-        "between two parts. The only part of an open question is the question."
+        description="The text around the options, one part more than there are options: see `question_text`."
     )
     options: tuple[AnswerOption, ...] = Field(description="In the data's order.")
     answer: str = Field(description="Letter of the right option, in the data's order.")
@@ -130,20 +129,13 @@ class Observation(Record):
     calls: int = Field(default=0, description="Of the multimodal LLM, those of the imagination included.")
     input_tokens: int = 0
     output_tokens: int = 0
-    seconds: float = Field(
-        default=0.0,
-        description="For simulations and replies, as if each were asked alone; what is found again takes less.",
-    )
+    seconds: float = Field(default=0.0, description="For simulations and replies; what is found again takes less.")
     imagining_seconds: float = Field(default=0.0, description="Of those, for simulations.")
     imaginations: int = Field(default=0, description="Simulations that the reply rests on.")
-    refusal: str | None = Field(
-        default=None, description="Code of the problem for which nothing was imagined where it should have been."
-    )
+    refusal: str | None = Field(default=None, description="Code of the problem for which nothing was imagined.")
     frames: tuple[Sha256, ...] = Field(default=(), description="Pictures shown beside the image, in their order.")
     overlay: Sha256 | None = None
-    probability: float | None = Field(
-        default=None, description="That what is asked happens, by the simulation; null where it tells nothing."
-    )
+    probability: float | None = Field(default=None, description="That it happens, by the simulation, if it tells.")
     happens: bool | None = Field(default=None, description="Whether it does, by the truth; null: not a yes or no.")
     failure: str | None = Field(default=None, description="Why there is no reply; such a question counts nowhere.")
 

@@ -50,9 +50,7 @@ class Gain(Record):
     high: float
     helped: int = Field(description="Pairs of replies, wrong in the baseline and right in the arm.")
     hurt: int = Field(description="The other way round.")
-    discordant: tuple[int, int] = Field(
-        description="Questions right in most repeats of one of both alone: of the arm, of the baseline."
-    )
+    discordant: tuple[int, int] = Field(description="Questions right in most repeats of only the arm, the baseline.")
     p: float = Field(description="Exact McNemar test on these questions, two-sided.")
     p_holm: float | None = Field(default=None, description="The same, adjusted over the tasks that are compared.")
 
@@ -208,13 +206,11 @@ def _standard_error(
 
 def holm(values: Sequence[float]) -> list[float]:
     """p values adjusted for their number (Holm 1979), in the given order."""
-    order = sorted(range(len(values)), key=values.__getitem__)
-    adjusted = [0.0] * len(values)
-    most = 0.0
-    for rank, place in enumerate(order):
-        most = max(most, min(1.0, (len(values) - rank) * values[place]))
-        adjusted[place] = most
-    return adjusted
+    order = np.argsort(values)
+    stepped = np.arange(len(values), 0, -1) * np.asarray(values)[order]
+    adjusted = np.empty(len(values))
+    adjusted[order] = np.minimum(np.maximum.accumulate(stepped), 1.0)
+    return adjusted.tolist()
 
 
 def with_holm(gains: Sequence[Gain]) -> list[Gain]:

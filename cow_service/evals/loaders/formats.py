@@ -68,11 +68,8 @@ def scene_rows(folder: Path) -> Iterator[Row | RowFault]:
 
 def oracle_frames(scene: Path) -> list[bytes]:
     """Pictures of what really happens, in the order of their numbers; empty where there are none."""
-
-    def number(path: Path) -> tuple[int, str]:
-        return int("".join(filter(str.isdigit, path.stem)) or 0), path.name
-
-    return [path.read_bytes() for path in sorted(scene.glob(FUTURE), key=number)]
+    numbered = [(int("".join(filter(str.isdigit, path.stem)) or 0), path) for path in scene.glob(FUTURE)]
+    return [path.read_bytes() for _, path in sorted(numbered)]
 
 
 # What a column means, by its names; those of VLMEvalKit are among them.

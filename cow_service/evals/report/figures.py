@@ -146,8 +146,7 @@ def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
     styles = arm_styles(summaries)
     groups = {"All questions": [(each.name, each.gain) for each in summaries if each.gain is not None]}
     for task in TASKS:
-        own = [(each.name, found.gain) for each in summaries for found in each.gains if found.task == task]
-        groups[task.capitalize()] = own
+        groups[task.capitalize()] = [(each.name, each.gains[task]) for each in summaries if task in each.gains]
     kept = [(heading, group) for heading, group in groups.items() if group]
     if not kept:
         return None
@@ -220,19 +219,18 @@ def draw_rates(summaries: Sequence[ArmSummary]) -> Figure | None:
 
 def _rate_panels(summaries: Sequence[ArmSummary]) -> list[tuple[str, Groups]]:
     """Titles and groups: by task, then each task that has several levels."""
-    cells = [(each.name, cell) for each in summaries for cell in each.cells]
 
     def of(task: str, level: str | None) -> dict[str, Rates]:
-        return {arm: cell.rates for arm, cell in cells if (cell.task, cell.level) == (task, level)}
+        return {each.name: each.cells[task, level] for each in summaries if (task, level) in each.cells}
 
-    tasks = [task for task in TASKS if any(cell.task == task for _, cell in cells)]
+    tasks = [task for task in TASKS if of(task, None)]
     by_task: Groups = {"all": {each.name: each.rates for each in summaries}} if len(tasks) > 1 else {}
     by_task |= {task: of(task, None) for task in tasks}
     several = any(each.rates.tpr.sd is not None for each in summaries)
     whiskers = "mean and SD over repeats" if several else "one repeat, so no SD"
     panels = [(f"Right answers by task (TPR): {whiskers}", by_task)]
     for task in tasks:
-        levels = sorted({cell.level for _, cell in cells if cell.task == task and cell.level})
+        levels = sorted({level for each in summaries for of_task, level in each.cells if of_task == task and level})
         if len(levels) > 1:
             panels.append((f"{task.capitalize()} by level", {level: of(task, level) for level in levels}))
     return panels

@@ -84,7 +84,6 @@ def write_page(
         items=len(core["items"]),
         summaries=summaries,
         against={each.name: arms[each.against].name for each in arms if each.against is not None},
-        gains={(each.name, of.task): of.gain for each in summaries for of in each.gains},
         sections=sections,
         plots=[(title, Markup(inline_svg(path, title))) for title, path in titled],
     )

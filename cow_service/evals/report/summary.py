@@ -18,21 +18,6 @@ from cow_service.records import Record
 BASELINE = "never"
 
 
-class Cell(Record):
-    """The rates of one task, or one level of it."""
-
-    task: Task
-    level: str | None = Field(description="Null: all levels.")
-    rates: Rates
-
-
-class TaskGain(Record):
-    """The gain on one task."""
-
-    task: Task
-    gain: Gain
-
-
 class ArmSummary(Record):
     """What one arm of one run came to."""
 
@@ -41,9 +26,9 @@ class ArmSummary(Record):
     arm: str
     name: str = Field(description="Unique in the report: the arm, and the multimodal LLM where there are several.")
     rates: Rates
-    cells: tuple[Cell, ...]
+    cells: dict[tuple[str, str | None], Rates] = Field(description="By task and level; level null: all levels.")
     gain: Gain | None = Field(default=None, description="Over the arm `never`; null for itself, or without one.")
-    gains: tuple[TaskGain, ...] = Field(default=(), description="The same per task, p values adjusted over them.")
+    gains: dict[str, Gain] = Field(description="The same per task, p values adjusted over them.")
     calibration: Calibration | None = None
     cost: Cost
 
@@ -94,27 +79,22 @@ def baseline_run(runs: Sequence[EvalRun], run: EvalRun) -> EvalRun | None:
     return next((each for each in (run, *same) if each.of_arm(BASELINE)), None)
 
 
-def _cells(observations: Sequence[Observation]) -> tuple[Cell, ...]:
-    """Per task: all of it, then its levels where there are several."""
-    cells: list[Cell] = []
+def _cells(observations: Sequence[Observation]) -> dict[tuple[str, str | None], Rates]:
+    """Per task: all of it, then its levels."""
+    cells: dict[tuple[str, str | None], Rates] = {}
     for task, of_task in _by_task(observations).items():
-        levels = sorted({each.level for each in of_task})
-        for level in (None, *levels):
+        for level in (None, *sorted({each.level for each in of_task})):
             of_level = statistics.rates([each for each in of_task if level in (None, each.level)])
             if of_level is not None:
-                cells.append(Cell(task=task, level=level, rates=of_level))
-    return tuple(cells)
+                cells[task, level] = of_level
+    return cells
 
 
-def _gains(observations: Sequence[Observation], baseline: Sequence[Observation]) -> tuple[TaskGain, ...]:
+def _gains(observations: Sequence[Observation], baseline: Sequence[Observation]) -> dict[str, Gain]:
     there = _by_task(baseline)
-    known: list[tuple[Task, Gain]] = []
-    for task, of_task in _by_task(observations).items():
-        gain = statistics.gain(of_task, there.get(task, []))
-        if gain is not None:
-            known.append((task, gain))
-    adjusted = statistics.with_holm([gain for _, gain in known])
-    return tuple(TaskGain(task=task, gain=gain) for (task, _), gain in zip(known, adjusted, strict=True))
+    found = {task: statistics.gain(seen, there.get(task, [])) for task, seen in _by_task(observations).items()}
+    known = {task: gain for task, gain in found.items() if gain is not None}
+    return dict(zip(known, statistics.with_holm([*known.values()]), strict=True))
 
 
 def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation]]:

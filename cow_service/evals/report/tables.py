@@ -62,14 +62,13 @@ def tables(summaries: Sequence[ArmSummary]) -> tuple[Table, ...]:
 
 def by_level(summaries: Sequence[ArmSummary]) -> Table:
     """As the paper prints it: right and abstained by task and level, with the paper's own figures below."""
-    keys = {(cell.task, cell.level) for each in summaries for cell in each.cells}
+    keys = {key for each in summaries for key in each.cells}
     levels = Counter(task for task, level in keys if level is not None)
     keys = {(task, level) for task, level in keys if level is None or levels[task] > 1}
     columns = sorted(keys, key=lambda key: (TASKS.index(key[0]), key[1] is None, key[1] or ""))
     rows: list[tuple[str, ...]] = []
     for each in summaries:
-        found = {(cell.task, cell.level): cell.rates for cell in each.cells}
-        measured = [found.get(key) for key in columns] + [each.rates]
+        measured = [*(each.cells.get(key) for key in columns), each.rates]
         rows.append((each.name, "TPR", *(NONE if rates is None else _spread(rates.tpr) for rates in measured)))
         rows.append((each.name, "NSR", *(NONE if rates is None else _spread(rates.nsr) for rates in measured)))
     blank = (NONE,) * len(columns)
@@ -112,7 +111,7 @@ def gains(summaries: Sequence[ArmSummary]) -> Table:
         (each.name, task, gain)
         for each in summaries
         if each.gain is not None
-        for task, gain in ((ALL, each.gain), *((of.task, of.gain) for of in each.gains))
+        for task, gain in ((ALL, each.gain), *each.gains.items())
     ]
     rows = [(name, task, *(cell(gain) for cell in columns.values())) for name, task, gain in known]
     if rows:
@@ -122,22 +121,15 @@ def gains(summaries: Sequence[ArmSummary]) -> Table:
     return Table("gains", title, ("arm", "task", *columns), tuple(rows))
 
 
-def in_short(summaries: Sequence[ArmSummary]) -> Table:
-    """The rates of each arm, for a terminal."""
-    return _with_columns(overview(summaries), _IN_SHORT)
-
-
-def gains_in_short(summaries: Sequence[ArmSummary]) -> Table:
-    """The gains over all tasks, and those on each, for a terminal."""
-    whole = gains(summaries)
-    kept = tuple(row for row in whole.rows if row[-1] or row[1] == ALL)  # without those of the paper
-    return _with_columns(replace(whole, rows=kept), _GAINS_IN_SHORT)
-
-
-def _with_columns(whole: Table, header: tuple[str, ...]) -> Table:
-    places = [whole.header.index(name) for name in header]
-    rows = tuple(tuple(row[place] for place in places) for row in whole.rows)
-    return Table(f"{whole.name}-in-short", whole.title, header, rows)
+def in_short(summaries: Sequence[ArmSummary]) -> tuple[Table, ...]:
+    """The rates and gains of each arm, for a terminal: without the figures of the paper, and those that have rows."""
+    rates, whole = overview(summaries), gains(summaries)
+    measured = replace(whole, rows=tuple(row for row in whole.rows if row[-1] or row[1] == ALL))
+    return tuple(
+        Table(f"{table.name}-in-short", table.title, header, rows)
+        for table, header in ((rates, _IN_SHORT), (measured, _GAINS_IN_SHORT))
+        if (rows := tuple(tuple(row[table.header.index(name)] for name in header) for row in table.rows))
+    )
 
 
 def calibration(summaries: Sequence[ArmSummary]) -> Table:

@@ -33,8 +33,7 @@ def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]
         _write(runs, summaries, out)
     except OSError as error:
         raise StorageUnavailable(f"'{out}' cannot be written: {error.strerror or error}.") from error
-    shown = [table for table in (tables.in_short(summaries), tables.gains_in_short(summaries)) if table.rows]
-    return "\n\n".join(map(tables.markdown, shown))
+    return "\n\n".join(map(tables.markdown, tables.in_short(summaries)))
 
 
 def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) -> None:
