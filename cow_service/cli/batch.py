@@ -155,8 +155,7 @@ def print_summary(out: Path) -> int:
                 codes[code] += 1
                 failures.append(f"  {line['id']}: {code}: {line['problem']['detail']}")
     if total.calls:
-        saved = "" if usage == total else f"; without reuse {asked_words(total)}"
-        typer.echo(f"asked of the MLLM: {asked_words(usage)}{saved}")
+        typer.echo(f"asked of the MLLM: {asked_words(usage, total)}")
     without = f" ({without_simulation} without a simulation)" if without_simulation else ""
     typer.echo(f"{count - len(failures)} succeeded{without}, {len(failures)} failed: {results}")
     if not failures:

@@ -180,16 +180,11 @@ def answer_table(answer: Answer) -> Table:
     if sum(answer.votes.values()) > 1:
         table.add_row("votes", escape(display.votes_words(answer)))
     if answer.baseline is not None:
-        table.add_row(
-            "without frames", f"{_verdict(answer.baseline)}, votes {escape(display.votes_words(answer.baseline))}"
-        )
+        votes = escape(display.votes_words(answer.baseline))
+        table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {votes}")
     if answer.gate is not None:
         table.add_row("before looking", escape(display.gate_words(answer.gate)))
-    usage, total = answer.usage, answer.usage_total
-    table.add_row(
-        "tokens",
-        display.asked_words(usage) + ("" if usage == total else f"; without reuse {display.asked_words(total)}"),
-    )
+    table.add_row("tokens", display.asked_words(answer.usage, answer.usage_total))
     table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
     model = answer.reader.model
     table.add_row("reader", escape(answer.reader.name if model is None else f"{answer.reader.name} ({model})"))

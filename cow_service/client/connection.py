@@ -22,7 +22,7 @@ from pydantic import BaseModel
 from cow_service import records
 from cow_service.client import errors, protocol
 from cow_service.client.progress import ProgressLike, reporting
-from cow_service.client.protocol import Event, EventCursor, job_in, job_path, object_in, read
+from cow_service.client.protocol import Event, job_in, job_path, object_in, read
 from cow_service.client.request import MINIMAL, JobRequest, job_request, plain
 
 if TYPE_CHECKING:
@@ -218,25 +218,33 @@ class Connection:
 
     async def events(self, handle: Any, after: int) -> AsyncGenerator[Event]:
         """The events of a job after a number, through broken connections."""
-        cursor = EventCursor(after, self.retries)
+        position, attempts, ended = after, 0, False
         url = f"{self.endpoint.base_url}{job_path(handle.id)}/events"
-        while not cursor.ended:
-            headers = self.endpoint.headers({"Accept": "text/event-stream", **cursor.headers})
+        while not ended:
+            resume = {"Last-Event-ID": str(position)} if position else {}
+            headers = self.endpoint.headers({"Accept": "text/event-stream", **resume})
             timeout = self.endpoint.stream_timeout
             try:
                 async with self.io.stream(url, headers=headers, timeout=timeout) as (response, events):
                     outcome: httpx.Response | httpx.HTTPError = response
+                    ended = response.status_code == protocol.NO_CONTENT
                     if protocol.is_event_stream(response):
                         async for sent in events:
-                            if (event := cursor.take(sent)) is not None:
+                            attempts = 0
+                            if (event := protocol.event_in(sent)) is None:
+                                continue
+                            ended = event.name in protocol.FINAL
+                            if event.number is None or event.number > position:  # else it came before
+                                position = event.number or position
                                 handle.job = event.job or handle.job
                                 yield event
-                            if cursor.ended:
+                            if ended:
                                 break
             except httpx.HTTPError as error:
                 outcome = error
-            if not cursor.ended:
-                await self.io.sleep(cursor.pause_after(outcome))
+            attempts += 1
+            if not ended:
+                await self.io.sleep(protocol.pause_before_reconnect(outcome, attempts, self.retries))
 
     # Batches
 

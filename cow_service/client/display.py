@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 MAX_CONTACTS = 6  # that are named
 
 
-def asked_words(usage: records.Usage) -> str:
-    """What a multimodal LLM was asked."""
-    if not usage.calls:
-        return "none"
-    return f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out"
+def asked_words(usage: records.Usage, total: records.Usage) -> str:
+    """What a multimodal LLM was asked, and what it would have been asked in total without reuse."""
+    if usage != total:
+        return f"{asked_words(usage, usage)}; without reuse {asked_words(total, total)}"
+    return f"{usage.calls} calls, {usage.input_tokens} tokens in, {usage.output_tokens} out" if usage.calls else "none"
 
 
 def readiness_words(backend: records.BackendInfo) -> str:

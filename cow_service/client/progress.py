@@ -36,8 +36,8 @@ def reporting(progress: ProgressLike) -> Generator[Callable[[Job], None] | None]
 def _rich() -> Generator[Callable[[Job], None]]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
 
-    with Progress(TextColumn("{task.description:<10}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"),
-                  TimeElapsedColumn()) as bar:  # fmt: skip
+    stage, percentage = TextColumn("{task.description:<10}"), TextColumn("{task.percentage:>3.0f}%")
+    with Progress(stage, BarColumn(), percentage, TimeElapsedColumn()) as bar:
         task = bar.add_task("queued", total=1.0)
         yield lambda job: bar.update(task, description=describe(job), completed=job.progress)
 

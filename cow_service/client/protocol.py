@@ -141,59 +141,37 @@ class Event:
     job: Job | None
 
 
-class EventCursor:
-    """The position of one reader in the events of a job, and its retries. Does no I/O."""
+def event_in(sent: ServerSentEvent) -> Event | None:
+    """The event that was sent; None for one whose kind this version does not know.
 
-    def __init__(self, after: int, retries: int) -> None:
-        self.position = after
-        self.ended = False
-        self._retries, self._attempts = retries, 0
+    Raises `BadResponse` for one that cannot be read.
+    """
+    if sent.event not in get_args(EventName):
+        return None
+    name = cast("EventName", sent.event)
+    # An event without an id of its own repeats the last one (the HTML standard's rule).
+    number = int(sent.id) if name != "progress" and sent.id.isdecimal() else None
+    try:
+        body = json.loads(sent.data)
+    except ValueError:
+        body = sent.data
+    job = read(Job, {**body, "result": None} if isinstance(body, dict) else body) if body != {} else None
+    return Event(name, number, job)
 
-    @property
-    def headers(self) -> dict[str, str]:
-        """The header that tells the server where to go on."""
-        return {"Last-Event-ID": str(self.position)} if self.position else {}
 
-    def take(self, sent: ServerSentEvent) -> Event | None:
-        """The event that was sent; None for one that came before, or whose kind this version does not know.
+def pause_before_reconnect(outcome: httpx.Response | httpx.HTTPError, attempts: int, retries: int) -> float:
+    """Seconds before a stream of events is opened again that broke, was refused or ended before the job.
 
-        Raises `BadResponse` for one that cannot be read.
-        """
-        self._attempts = 0
-        if sent.event not in get_args(EventName):
-            return None
-        name = cast("EventName", sent.event)
-        # An event without an id of its own repeats the last one (the HTML standard's rule).
-        number = int(sent.id) if name != "progress" and sent.id.isdecimal() else None
-        try:
-            body = json.loads(sent.data)
-        except ValueError:
-            body = sent.data
-        job = read(Job, {**body, "result": None} if isinstance(body, dict) else body) if body != {} else None
-        self.ended = name in FINAL
-        if number is not None and number <= self.position:
-            return None
-        self.position = number or self.position
-        return Event(name, number, job)
-
-    def pause_after(self, outcome: httpx.Response | httpx.HTTPError) -> float:
-        """Seconds before the next connection, after one that broke, was refused or ended before the job.
-
-        Raises the error for which no other is made.
-        """
-        self._attempts += 1
-        if isinstance(outcome, httpx.Response):
-            if outcome.status_code == NO_CONTENT:
-                self.ended = True
-                return 0.0
-            if is_event_stream(outcome):
-                outcome = httpx.RemoteProtocolError("the stream ended before the job", request=outcome.request)
-        pause = pause_before_retry(outcome, self._attempts) if self._attempts <= self._retries else None
-        if pause is not None:
-            return pause
-        if isinstance(outcome, httpx.Response):
-            raise errors.error_of(outcome)
-        raise errors.unreachable(outcome) from outcome
+    Raises the error for which it is not.
+    """
+    if isinstance(outcome, httpx.Response) and is_event_stream(outcome):
+        outcome = httpx.RemoteProtocolError("the stream ended before the job", request=outcome.request)
+    pause = pause_before_retry(outcome, attempts) if attempts <= retries else None
+    if pause is not None:
+        return pause
+    if isinstance(outcome, httpx.Response):
+        raise errors.error_of(outcome)
+    raise errors.unreachable(outcome) from outcome
 
 
 def is_event_stream(response: httpx.Response) -> bool:

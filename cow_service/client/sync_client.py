@@ -57,8 +57,9 @@ class Client:
         http_client: httpx.Client | None = None,
     ) -> None:
         from cow_service.client import sync_results as results  # noqa: PLC0415 - httpx takes 0.3 s to import
+        from cow_service.client.protocol import endpoint_of  # noqa: PLC0415
 
-        self._connection = results.connect(base_url, api_key, timeout, retries, http_client)
+        self._connection = results.connect(endpoint_of(base_url, api_key, timeout), retries, http_client)
         self._run, self._iterate = results.run, results.iterate
 
     @property

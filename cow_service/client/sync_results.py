@@ -26,15 +26,8 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
-def connect(
-    base_url: str | None,
-    api_key: str | None,
-    timeout: float | httpx.Timeout | None,
-    retries: int,
-    http: httpx.Client | None,
-) -> Connection:
+def connect(endpoint: protocol.Endpoint, retries: int, http: httpx.Client | None) -> Connection:
     """The connection of a client."""
-    endpoint = protocol.endpoint_of(base_url, api_key, timeout)
     kinds = {"simulate": Simulation, "answer": Answer}
     return Connection(endpoint, retries, BlockingIO(http), kinds, JobHandle)
 
