@@ -160,7 +160,7 @@ def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngin
         log_config=None,
         access_log=False,
         ws="none",
-        http=Connection,  # h11 whatever is installed: parsers differ on which headers they refuse, and on how long
+        http=HttpConnection,  # h11 whatever is installed: parsers differ on which headers they refuse, and on how long
         timeout_graceful_shutdown=int(settings.shutdown_grace + CLOSE_SECONDS),
     )
     allow_connections()
@@ -172,7 +172,7 @@ MAX_CONNECTIONS = 10_000
 RESERVED_FILES = 256  # of what the system lets this process open: for databases, artifacts and other servers
 
 
-class Connection(H11Protocol):
+class HttpConnection(H11Protocol):
     """uvicorn's HTTP/1.1 connection. It is closed where no request comes in time.
 
     Where there are more than `most`, one that has never sent any is closed for the next, the oldest first.
@@ -191,7 +191,7 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self._start_timer()
         if len(self.connections) > self.most:
-            idle = [each for each in self.connections if isinstance(each, Connection) and each.waits]
+            idle = [each for each in self.connections if isinstance(each, HttpConnection) and each.waits]
             min(idle, key=lambda each: each.priority).close()
 
     def data_received(self, data: bytes) -> None:
@@ -240,4 +240,4 @@ def allow_connections() -> None:
     if soft != resource.RLIM_INFINITY and soft < wanted:
         soft = wanted if hard == resource.RLIM_INFINITY else min(hard, wanted)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        Connection.most = max(soft // 2, min(MAX_CONNECTIONS, soft - RESERVED_FILES))
+        HttpConnection.most = max(soft // 2, min(MAX_CONNECTIONS, soft - RESERVED_FILES))

@@ -48,7 +48,13 @@ from cow_service.errors import (
     WeightsUnavailable,
 )
 from cow_service.readers.local import reader
-from cow_service.readers.local.generation import BatchGenerator, BatchRow, PendingGeneration, Sampling, conversation_of
+from cow_service.readers.local.generation import (
+    BatchGenerator,
+    BatchRow,
+    PendingGeneration,
+    TokenSampling,
+    conversation_of,
+)
 from cow_service.readers.local.model import LocalModel
 from cow_service.readers.local.reader import device_map, load_local
 from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny
@@ -327,7 +333,7 @@ def test_a_checkpoints_own_advice_counts_where_nothing_is_said() -> None:
     model, processor = make_tiny(load_manifests()[NAME].architecture)
     model.generation_config.update(do_sample=True, temperature=0.7, top_p=0.8, top_k=20)
     generator = BatchGenerator(model, processor)
-    assert generator.default_sampling == Sampling(temperature=0.7, top_p=0.8, top_k=20)
+    assert generator.default_sampling == TokenSampling(temperature=0.7, top_p=0.8, top_k=20)
     assert (
         len(
             {
@@ -364,7 +370,7 @@ def test_top_p_and_top_k() -> None:
     def chosen(**rest: Any) -> set[int]:
         found = set()
         for seed in range(60):
-            sampling = Sampling(temperature=1.0, seed=seed, **rest)
+            sampling = TokenSampling(temperature=1.0, seed=seed, **rest)
             row = BatchRow(sampling, 1, [], None, lambda row, finish: None, lambda: False)
             token = row.choose(logits)
             assert token is not None

@@ -12,7 +12,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp
 
 from cow_service import __version__
-from cow_service.api.middleware.access import PROBES, Callers, Gate, KeyRing, Origins, is_loopback
+from cow_service.api.middleware.access import PROBES, Callers, Guard, KeyRing, Origins, is_loopback
 from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
@@ -106,7 +106,7 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
     keys = KeyRing(settings.api_keys)
     limits = {"megabytes": settings.max_body_mb, "seconds": settings.body_timeout}
     app.add_middleware(BodyLimit, **limits, megabytes_at_once=settings.max_bodies_mb)
-    app.add_middleware(Gate, refuse=Callers(keys, settings.rate_limit).refuse)
+    app.add_middleware(Guard, refuse=Callers(keys, settings.rate_limit).refuse)
 
     def surround(stack: ASGIApp) -> ASGIApp:
         if settings.cors_origins:
@@ -118,7 +118,7 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
                 expose_headers=RESPONSE_HEADERS,
             )
         origins = Origins(settings.cors_origins, only_local=not keys and is_loopback(settings.host))
-        stack = Gate(stack, origins.refuse)
+        stack = Guard(stack, origins.refuse)
         return AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"])
 
     app.surround = surround

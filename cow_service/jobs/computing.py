@@ -175,7 +175,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobOutcome:
     """The result of a job, and the time of each stage that was computed for it, s.
 
     `kept` is what is stored of it: without the trajectory where that is stored under `trajectory_key`.
@@ -200,7 +200,7 @@ class Computer:
         """How many jobs of a queue are taken at the same time; 0 where none is."""
         return 0
 
-    def compute(self, work: Work) -> Outcome:
+    def compute(self, work: Work) -> JobOutcome:
         """Computes one job. Raises the `CowError` that it fails with, `Canceled` where it was canceled."""
         raise NotImplementedError
 
@@ -224,7 +224,7 @@ class InProcess(Computer):
         settings = self._parts.service.settings
         return settings.concurrency + settings.mllm_concurrency
 
-    def compute(self, work: Work) -> Outcome:
+    def compute(self, work: Work) -> JobOutcome:
         """As the base class says."""
         try:
             return compute(work, self._parts.service, self._parts.database, self._locks.held)
@@ -245,7 +245,7 @@ class InProcess(Computer):
         return (own,)
 
 
-def compute(work: Work, service: Service, database: Database, hold_key: HoldKey) -> Outcome:
+def compute(work: Work, service: Service, database: Database, hold_key: HoldKey) -> JobOutcome:
     """Computes one job with the backends of a service; stages that are stored already are taken from the database."""
     job, spec, outages = work.job, work.job.spec, Outages(service.settings.outage_budget, work.check)
     step = StoredStep(job.id, job.owner, spec.fresh, database, service.artifacts, work.looked_for, hold_key, outages)
@@ -263,7 +263,7 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     text = result.model_dump_json()
     simulation = result.simulation if isinstance(result, Answer) else result
     if step.trajectory_key is None or simulation is None:
-        return Outcome(text, text, None, computed)
+        return JobOutcome(text, text, None, computed)
     bare = simulation.model_copy(update={"trajectory": None})
     bare = result.model_copy(update={"simulation": bare}) if isinstance(result, Answer) else bare
-    return Outcome(text, bare.model_dump_json(warnings=False), step.trajectory_key, computed)
+    return JobOutcome(text, bare.model_dump_json(warnings=False), step.trajectory_key, computed)

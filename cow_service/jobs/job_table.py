@@ -143,7 +143,7 @@ class OpenCount:
 
 
 @dataclass(frozen=True)
-class Load:
+class QueueLoad:
     """How many jobs are open: all, those of an owner, and those in a queue that no process has taken."""
 
     jobs: int
@@ -157,10 +157,10 @@ class JobTable:
     def __init__(self, database: Database, on_end: OnEnd = lambda connection, job_id, url: None) -> None:
         self._database, self._on_end = database, on_end
 
-    def load(self, owner: str | None, queue: str = "") -> Load:
+    def load(self, owner: str | None, queue: str = "") -> QueueLoad:
         """What a new job of an owner adds to."""
         (row,) = self._database.read(_LOAD, {"owner": owner, "queue": queue})
-        return Load(*row)
+        return QueueLoad(*row)
 
     def insert(
         self, job_id: str, spec: JobSpec, owner: str | None, queue: str, step: int, executor: str | None

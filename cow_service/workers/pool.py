@@ -16,7 +16,7 @@ import psutil
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import DeviceFailed, ShuttingDown, WorkerEnded
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.computing import Computer, KeyLocks, Outcome, Work
+from cow_service.jobs.computing import Computer, JobOutcome, KeyLocks, Work
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.observability.metrics import Metrics
 from cow_service.records import WorkerInfo
@@ -188,7 +188,7 @@ class WorkerPool(Computer):
                 # A worker that takes the place of another one may load for minutes: the server is ready all the same.
                 group.was_loaded |= worker.wait_loaded(0 if group.was_loaded else None)
 
-    def compute(self, work: Work) -> Outcome:
+    def compute(self, work: Work) -> JobOutcome:
         """Gives a job to a worker, in its turn. Raises the `CowError` that it fails with, `Canceled`, `WorkerEnded`.
 
         After a crash, or where its device failed, the job is tried again in another process.
@@ -215,7 +215,7 @@ class WorkerPool(Computer):
                         raise WorkerEnded(f"The process that computed the job {gone}. It is not tried again.") from gone
                     alone = True  # the next crash is this job's own
 
-    def _computed(self, work: Work, group: Group, *, fresh: bool) -> Outcome:
+    def _computed(self, work: Work, group: Group, *, fresh: bool) -> JobOutcome:
         worker, renew = group.take(fresh=fresh), fresh
         try:
             return worker.run(work, self._locks)

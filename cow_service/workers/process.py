@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from cow_service.concurrency import spawn
 from cow_service.errors import Canceled, CowError, JobTimeout, WorkerEnded
-from cow_service.jobs.computing import KeyLocks, Outcome, Work
+from cow_service.jobs.computing import JobOutcome, KeyLocks, Work
 from cow_service.jobs.job_table import TakenJob, error_from_json
 from cow_service.media.images import DecodedImage
 from cow_service.records import GpuMemory
@@ -91,7 +91,7 @@ class Succeeded(NamedTuple):
     """The job is done."""
 
     job_id: str
-    outcome: Outcome
+    outcome: JobOutcome
 
 
 class Failed(NamedTuple):
@@ -173,7 +173,7 @@ class Worker:
             raise self._load_error
         return loaded and self.is_alive
 
-    def run(self, work: Work, locks: KeyLocks) -> Outcome:
+    def run(self, work: Work, locks: KeyLocks) -> JobOutcome:
         """Computes a job. Raises the `CowError` that it fails with, `Canceled`, `JobTimeout`, `WorkerGone`."""
         inbox = self._inboxes[work.job.id] = SimpleQueue()
         try:
@@ -203,7 +203,7 @@ class Worker:
         self._ended.wait()
         self._pipe.close()
 
-    def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], locks: KeyLocks, keys: ExitStack) -> Outcome:
+    def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], locks: KeyLocks, keys: ExitStack) -> JobOutcome:
         """Does what the messages about a job ask for, until its outcome. `keys` gives back those it still holds."""
         until, canceled, begun = time.monotonic() + START_SECONDS + self._job_timeout, False, False
         held: dict[str, ExitStack] = {}

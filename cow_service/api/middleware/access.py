@@ -58,7 +58,7 @@ MAX_CALLERS = 10_000  # remembered; beyond that the one that has been idle longe
 MAX_FAILURES = 30  # per minute from one address, before it has to wait
 
 
-class Gate:
+class Guard:
     """ASGI middleware: answers with the error of `refuse`, where that has one for a request; else passes it on."""
 
     def __init__(self, app: ASGIApp, refuse: Callable[[Scope], CowError | None]) -> None:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, Sprite, StillBody, moving_bodies, still_bodies
-from cow_service.generators.cutout.shadows import Shadow, UnshadedScene, take_shadows
+from cow_service.generators.cutout.shadows import MovingShadow, UnshadedScene, take_shadows
 from cow_service.media.images import fit_within
 from cow_service.vision.inpainting import fill_hole
 from cow_service.vision.masks import CroppedMask, hull, iou, resized_mask, window_of
@@ -68,7 +68,7 @@ class Layers:
     background: Image  # [h, w, 3] without what moves and its shadows
     moving: tuple[MovingBody, ...]
     sprites: tuple[Sprite, ...]  # of the moving bodies
-    shadows: tuple[Shadow, ...]
+    shadows: tuple[MovingShadow, ...]
     still: tuple[StillBody, ...]
     containers: tuple[Container, ...]  # into which bodies are put
     eye: float  # m: the camera's height above the floor, 0 where unknown

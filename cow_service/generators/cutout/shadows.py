@@ -41,7 +41,7 @@ class ShadePatch:
     surface: int | None  # of `Trajectory.bodies`; None for the floor
 
 
-class Shadow(Protocol):
+class MovingShadow(Protocol):
     """A shadow of a moving body."""
 
     def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
@@ -189,7 +189,7 @@ class UnshadedScene:
 
     image: Image  # [h, w, 3]
     noisy: dict[int, Mask]  # by `Path.body`: where a body with a contact shadow has left too little to divide
-    shadows: tuple[Shadow, ...]
+    shadows: tuple[MovingShadow, ...]
 
 
 def take_shadows(
@@ -202,7 +202,7 @@ def take_shadows(
 ) -> UnshadedScene:
     """The scene [h, w, 3] without the shadows of the bodies that move, and these shadows."""
     objects = np.logical_or.reduce([body.mask for body in (*moving, *still)])
-    floor, shadows, noisy = eroded(~objects, 2 * RIM + 1), list[Shadow](), dict[int, Mask]()
+    floor, shadows, noisy = eroded(~objects, 2 * RIM + 1), list[MovingShadow](), dict[int, Mask]()
     for body in moving:
         index, points = body.path.body, np.array(body.path.points)
         if np.abs(points - points[0]).max() <= 1 and np.ptp(body.path.scale) <= 0.01:  # it stays where it is

@@ -74,7 +74,7 @@ class Share:
 
 
 @dataclass(frozen=True)
-class Failed:
+class RankFailed:
     """From a rank: it ends, for the `CowError` of this code."""
 
     code: str
@@ -83,7 +83,7 @@ class Failed:
 
 Port = int  # where the ranks meet, once all have loaded
 ToRank = Load | Port | Share
-FromRank = Literal["loaded"] | Failed
+FromRank = Literal["loaded"] | RankFailed
 
 
 class RankGroup:
@@ -222,7 +222,7 @@ class _Rank:
             try:
                 while True:
                     message: FromRank = self._spawned.pipe.recv()
-                    if isinstance(message, Failed):
+                    if isinstance(message, RankFailed):
                         self.error = kinds().get(message.code, InternalError)(message.detail)
                     else:
                         self.loaded.set()

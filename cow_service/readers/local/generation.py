@@ -110,7 +110,7 @@ def _closed(schema: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Sampling:
+class TokenSampling:
     """How tokens are chosen. Temperature 0 takes the likeliest; without a seed, replies differ from call to call."""
 
     temperature: float = 0.0
@@ -127,7 +127,7 @@ class BatchRow:
     token that ends it, and the grammar holds from there.
     """
 
-    sampling: Sampling
+    sampling: TokenSampling
     limit: int
     ends: Collection[int]
     matcher: LLMatcher | None
@@ -247,7 +247,7 @@ class GenerationRequest:
     """What a reply is wanted for. `limit` is the most tokens that it may have; `grammar`, what it is held to."""
 
     conversation: Conversation
-    sampling: Sampling
+    sampling: TokenSampling
     limit: int
     grammar: str | None = None
 
@@ -289,7 +289,7 @@ class BatchGenerator:
         given = {name: getattr(advice, name) for name in ("temperature", "top_p", "top_k")}
         known: dict[str, Any] = {"temperature": 1.0}
         known |= {name: value for name, value in given.items() if value is not None}
-        self.default_sampling = Sampling(**known) if advice.do_sample else Sampling()
+        self.default_sampling = TokenSampling(**known) if advice.do_sample else TokenSampling()
         ends = advice.eos_token_id
         self._ends = _as_tuple(self._tokenizer.eos_token_id if ends is None else ends)
         padding = self._tokenizer.pad_token_id

@@ -201,7 +201,7 @@ class LocalModel(Model[None]):
         if any(part.part_kind in _UNPREPARED for message in messages for part in message.parts):
             messages = self.prepare_messages(messages, parameters)  # as agents do before they ask
         default = self._generator.default_sampling
-        sampling = generation.Sampling(
+        sampling = generation.TokenSampling(
             temperature=settings.get("temperature", default.temperature),
             top_p=settings.get("top_p", default.top_p),
             top_k=settings.get("top_k", default.top_k),

@@ -142,7 +142,7 @@ class Located:
 
 
 @dataclass(frozen=True)
-class Place:
+class WrittenPlace:
     """Box and point as they were written, what the reply calls them, and the object in which they stand."""
 
     label: str
@@ -212,7 +212,7 @@ def read_located(
     named = list(_named([found for found in around if not replies.is_none(found.box)], others))
     names = [wanted, *(name for name, _, _ in named)]
 
-    def seen(name: str, found: Place) -> SeenObject:
+    def seen(name: str, found: WrittenPlace) -> SeenObject:
         context = estimates.ReadingContext(frame, name, names, warnings)
         return SeenObject.model_validate({**found.fields, "label": found.label, "bbox": found.box}, context=context)
 
@@ -259,7 +259,7 @@ def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tupl
     return tuple(kept), tuple(warnings)
 
 
-def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: str) -> Place | None:
+def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: str) -> WrittenPlace | None:
     """The place that the reply gives for the object; None where it says that it does not see it."""
     places = [place for value in values for place in _places(value, frame)] or list(_places_in_prose(said))
     if not places:
@@ -283,12 +283,12 @@ def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wan
     return None if replies.is_none(place.box) and replies.is_none(place.point) else place
 
 
-def _places(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[Place]:
+def _places(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[WrittenPlace]:
     """Places in a value, each with what it is called: by a field of its own, or by the field in which it stands."""
     if isinstance(value, list):
         parts = replies.listed(value)
         if parts and all(map(replies.is_number, parts)):
-            yield Place(name, parts) if len(parts) == 4 else Place(name, None, parts)
+            yield WrittenPlace(name, parts) if len(parts) == 4 else WrittenPlace(name, None, parts)
         for part in parts:
             if isinstance(part, dict | list):
                 yield from _places(part, frame, name)
@@ -298,31 +298,33 @@ def _places(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[P
     if has_place or coordinates.names_corners(fields):
         label = next((label for key in _LABEL_KEYS if (label := replies.text_of(fields.get(key)))), name)
         box = replies.first_of(fields, *boxes) if has_place else value
-        yield Place(label, box, replies.first_of(fields, *points), fields)
+        yield WrittenPlace(label, box, replies.first_of(fields, *points), fields)
         return
     for key, held in fields.items():
         if isinstance(held, dict | list) and key not in ("others", *_DIRECTION_KEYS):
             yield from _places(held, frame, name if key in _HEADINGS else key.replace("_", " "))
 
 
-def _places_in_prose(said: str) -> Iterator[Place]:
+def _places_in_prose(said: str) -> Iterator[WrittenPlace]:
     """Places between tags, as some families write them in prose; else numbers in brackets, where they are alone."""
     for found in _BOX_TAG.finditer(said):
-        yield Place((found["label"] or "").strip(), found["box"])
+        yield WrittenPlace((found["label"] or "").strip(), found["box"])
     for found in _POINT_TAG.finditer(said):
-        yield Place((found["label"] or "").strip(), None, found["point"])
+        yield WrittenPlace((found["label"] or "").strip(), None, found["point"])
     if "<" in said:
         return
     pairs, four = re.findall(_PAIR, said), _FOUR.fullmatch(said.strip(" ."))
     if four is not None:
-        yield Place("", list(four.groups()))
+        yield WrittenPlace("", list(four.groups()))
     elif len(pairs) == 2 and (corners := _CORNER_PAIRS.search(said)):
-        yield Place("", list(corners.groups()))
+        yield WrittenPlace("", list(corners.groups()))
     elif len(pairs) == 1:
-        yield Place("", None, list(pairs[0]))
+        yield WrittenPlace("", None, list(pairs[0]))
 
 
-def _named(places: Sequence[Place], targets: Sequence[str]) -> Iterator[tuple[str, records.ObjectRole, Place]]:
+def _named(
+    places: Sequence[WrittenPlace], targets: Sequence[str]
+) -> Iterator[tuple[str, records.ObjectRole, WrittenPlace]]:
     """Each place with its name and role: the targets, each once, then all the rest but the floor."""
     left = list(places)
     for target in targets:
