@@ -1,7 +1,5 @@
 """The pipeline: what happens to a request, stage by stage. The only file that names the stages in order."""
 
-from __future__ import annotations
-
 from cow_service.errors import Canceled, CowError, DeviceFailed, InvalidRequest, MllmUnavailable, ReaderUnavailable
 from cow_service.readers.options import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation

@@ -1,7 +1,5 @@
 """The Protocol of readers: what reads an image for a question. Stages know this file, never an implementation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What a reader that asks a multimodal LLM offers beside its readings: chats with that MLLM itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any, Protocol, runtime_checkable

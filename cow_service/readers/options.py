@@ -1,7 +1,5 @@
 """The options that a question offers, and the form in which it wants the reply."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Sequence

@@ -3,8 +3,6 @@
 What a prompt is given is data: it is put in as it stands, and never read as a template.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cache, cached_property

@@ -1,7 +1,5 @@
 """Stage 5: the answer, drawn from the image and the frames of its imagined future."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Stage 1: which object moves and where it is, where the others are that matter, and what is asked of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ backend that does the work. Two runs with the same key come to the same result, 
 multimodal LLM reads: its reading of the image may be taken by other jobs, its answers never are.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Stage 2: how the object moves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The trajectory of worlds that were run: camera, bodies, paths, contacts, placements."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

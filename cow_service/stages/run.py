@@ -1,7 +1,5 @@
 """One request being worked on: its inputs and backends, and how each stage is timed, stored and accounted for."""
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections import abc

@@ -3,8 +3,6 @@
 One rule for every form: `Outcome.sure` decides whether an answer is given, and half the probability is the line.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

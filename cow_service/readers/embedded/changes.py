@@ -1,7 +1,5 @@
 """Finds what a question takes away or puts somewhere. It refuses where that, or where it is put, is not found."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from cow_service.errors import CannotGround

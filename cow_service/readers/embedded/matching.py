@@ -1,7 +1,5 @@
 """Which region of a scene a phrase is about: by its name and by where it says that the thing is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """How a thing moves by the words of a question: its direction in the image, and what they say of speed and distance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TypedDict, TypeVar
 

@@ -5,8 +5,6 @@ be called by several nouns. So each noun has a likelihood, and what counts is ho
 it than under the other nouns.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The reader that needs no weights: rules for the question, classical vision for the image. It refuses, not guesses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

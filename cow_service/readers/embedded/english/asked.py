@@ -4,8 +4,6 @@ The question is taken at its word: one that has a word which no rule reads, wher
 read at all. A wrong yes is worse than "not sure".
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Reads a clause that asks: its tree by the grammar, as the event that is asked about and the things it names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import dropwhile

@@ -1,7 +1,5 @@
 """Finds what a question takes away or puts somewhere before anything moves, and the question without those words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

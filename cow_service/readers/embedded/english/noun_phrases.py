@@ -4,8 +4,6 @@ Nouns have no list. A phrase runs from its determiner up to a word that cannot b
 form, a direction behind the noun. Positions are those of the question's own characters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile

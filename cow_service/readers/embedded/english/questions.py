@@ -3,8 +3,6 @@
 No model and no list of nouns: verbs and function words are closed lists, the noun phrases are what lies between.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

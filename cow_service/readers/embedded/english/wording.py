@@ -1,7 +1,5 @@
 """Puts a question into plain wording: without how to reply, without openings, and without typing errors."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from difflib import SequenceMatcher
