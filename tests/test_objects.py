@@ -17,6 +17,8 @@ from cow_service.records import Grounding, LocatedObject
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.stages.grounding import ground
+from cow_service.stages.motion import read_motion
+from cow_service.stages.trajectory import compute_trajectory
 
 MOVER = (160, 160, 240, 240)
 CUBE = (400, 220, 480, 300)
@@ -165,6 +167,7 @@ def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixe
         ({"relation": "touches", "subject": "lid", "target": "crate"}, "?", ["lid"]),
         ({"relation": "touches", "target": "crate"}, "?", []),
         ({"relation": "touches", "target": "ball"}, "?", []),
+        ({"relation": "touches", "subject": "The Ball", "target": "a crate"}, "?", []),
         (None, "If the ball moves to the right, will it hit the blue mug?", ["blue mug"]),
         (None, "If the ball moves to the right, will it hit the crate?", []),
     ],
@@ -177,3 +180,19 @@ def test_what_is_asked_about_and_was_not_located_is_warned_of(
     result = ground(run_of(pixels, **given, **({} if asked is None else {"asked": asked})))
     told = [each for each in result.warnings if each.startswith("What is asked about, ")]
     assert [each.split("'")[1] for each in told] == missing
+
+
+@pytest.mark.parametrize("target", ["crate", "the crate", "A  Crate"])
+def test_what_is_asked_about_is_found_whatever_its_determiner(pixels: np.ndarray, target: str) -> None:
+    run = run_of(
+        pixels,
+        question="?",
+        grounding={"bbox": MOVER, "object": "ball"},
+        objects=[{"object": "crate", "bbox": CUBE}],
+        asked={"relation": "touches", "target": target},
+        motion={"direction": (1, 0.3)},
+    )
+    grounding = ground(run).value
+    outcome = compute_trajectory(run, grounding, read_motion(run, grounding, run.hints).value).value.outcome
+    assert outcome is not None
+    assert (outcome.object, outcome.sure) == ("crate", True)

@@ -82,14 +82,14 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
             "A generator that cleans cues takes them out; `generator_options.clean_cues: false` keeps them."
         )
     if request.asked is not None or source != "embedded":  # which warns of what it does not find
-        known = {plain(each.object) for each in (mover, *others_of(grounding), *removed_of(grounding))}
+        known = [each.object for each in (mover, *others_of(grounding), *removed_of(grounding))]
         asked = grounding.asked
         named = () if asked is None else (asked.subject, asked.target, *asked.among)
         warnings += [
             f"What is asked about, '{name}', was not found in the image, so the outcome is open: give it in `objects` "
             "under this name."
             for name in named
-            if name is not None and plain(name) not in known
+            if name is not None and not any(same_name(name, each) for each in known)
         ]
     artifacts = (mask.sha256, *(each.mask.sha256 for each in beside if each.mask is not None))
     return StageResult(value=grounding, warnings=tuple(warnings), artifacts=artifacts, hints=reading.hints)

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from cow_service.errors import CannotGround
-from cow_service.narration import place_words
+from cow_service.narration import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit, fit_shadow, prior
@@ -18,7 +18,6 @@ from cow_service.physics.ensemble import Query
 from cow_service.physics.layout import flies
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
-from cow_service.readers.options import plain
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import CameraRequest, SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
@@ -187,14 +186,14 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
 
 def query_of(situation: Situation, bodies: Sequence[SeenBody]) -> Query | None:
     """What is asked of bodies; None where nothing is, or one that is named was not found under that name."""
-    asked, mover = situation.grounding.asked, plain(situation.grounding.object)
+    asked = situation.grounding.asked
     if asked is None:
         return None
 
     def named(words: str) -> tuple[int, ...]:
-        if plain(words) == mover:
+        if same_name(words, situation.grounding.object):
             return (0,)
-        boxes = {each.bbox for each in situation.located if plain(each.object) == plain(words)}
+        boxes = {each.bbox for each in situation.located if same_name(each.object, words)}
         return tuple(index for index, body in enumerate(bodies) if index and body.bbox in boxes)
 
     subjects = (0,) if asked.subject is None else named(asked.subject)
