@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the command line prints its help without records
     from cow_service import records
-    from cow_service.records import Encounter, Intervention, Path, PlacedBefore, PlaceRelation, Trajectory, Vector
+    from cow_service.records import (
+        Encounter,
+        Grounding,
+        Intervention,
+        Path,
+        PlacedBefore,
+        PlaceRelation,
+        Trajectory,
+        Vector,
+    )
+    from cow_service.requests import SimulateRequest
 
 MAX_OBJECT = 200  # characters
 ALONG_AXIS = 0.95  # sine of the angle out of the image plane from which only the depth is worth a word
@@ -123,6 +133,50 @@ def doubts_of(placed: PlacedBefore) -> tuple[str, ...]:
     if placed.visible < HARDLY_SEEN:
         told.append(f"{where} is hardly to be seen in the frames: others hide it there, or it is outside the image.")
     return tuple(told)
+
+
+OFF_CENTRE = 0.25  # of the object's size: a given path that begins further from its centre is remarked on
+
+
+def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Trajectory) -> tuple[str, ...]:
+    """What a caller should know of a trajectory beside what it says, in sentences."""
+    given, found = request.trajectory, list[str]()
+    if not trajectory.encounters_known:
+        found.append(
+            "The surroundings could not be separated into objects, so encounters were not computed: "
+            "an empty list does not mean that nothing is hit."
+        )
+    # Where a given path goes beside the motion, the object or the clip that were given with it.
+    if given is not None and request.stated_motion is not None:
+        found.append(
+            "Both `motion` and `trajectory` were given: the object follows the trajectory, the motion only words it."
+        )
+    x0, y0, x1, y1 = grounding.bbox
+    gap = 0.0 if given is None else math.dist(given.points[0], grounding.point)
+    if request.grounding is not None and gap > OFF_CENTRE * max(x1 - x0, y1 - y0):
+        found.append(
+            f"The given trajectory begins {gap:.0f} px from the object's centre: in the first frame it is drawn there."
+        )
+    # A path that ends where the clip does, or a frame beside it, is of its length.
+    clip = (request.num_frames - 1) / request.fps
+    path = clip if given is None else (len(given.points) - 1) / given.fps
+    if abs(path - clip) * request.fps > 1.5:
+        happens = "its rest is not shown" if path > clip else "from its end on the object stays where it is"
+        found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
+    found += [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
+    found += [
+        f"'{each.object}', put {each.place}, was put there by the way in which that moves, not as the camera sees it."
+        for each in trajectory.placed
+        if each.by_heading
+    ]
+    if trajectory.factual is not None and trajectory.placed:
+        put = {each.body for each in trajectory.placed}
+        found += [
+            f"'{body.object}' makes room for what is put there: it does not begin where the image shows it."
+            for index, (body, seen) in enumerate(zip(trajectory.bodies, trajectory.factual.bodies, strict=False))
+            if index not in put and body.bbox != seen.bbox
+        ]
+    return tuple(found)
 
 
 MAX_NAME = 60  # characters

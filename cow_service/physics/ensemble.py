@@ -25,6 +25,7 @@ MATTERS = 0.2  # correlation with the outcome from which a parameter is named
 MOST_NAMED = 3
 
 KIND_OF: dict[AskedRelation, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
+BY_EVENTS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that what happens in a world decides
 FIRST_MET: tuple[AskedForm, ...] = ("which-first", "where", "what-happens")  # told apart by what is met first
 
 
@@ -36,6 +37,7 @@ class Query:
     target: int | None = None  # None: any
     subject: int = 0  # who does it
     among: tuple[int, ...] = ()  # the things that are meant; empty: any
+    is_decidable: bool = True  # by worlds
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
         shown = likely.result()
     decided: list[Decided | None] = []
     for asked, each in zip(queries, worlds, strict=True):
-        if asked is None or (asked.asked.form == "changes" and len(worlds) == 1):
+        if asked is None or not asked.is_decidable or (asked.asked.form == "changes" and len(worlds) == 1):
             decided.append(None)
         elif asked.asked.form == "changes":
             decided.append(decide_change(asked, each.events, worlds[1].events, rows))

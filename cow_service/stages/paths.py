@@ -57,7 +57,7 @@ def record_trajectory(
     placed = shown.record_placed()
     paths = shown.record_paths() if path is None else (shown.record_free_path(path),)
     until = moving_until(paths, request.fps)
-    contacts = shown.record_contacts(FloorCamera.of(camera, *situation.size))
+    contacts = shown.record_contacts(camera)
     # Points off every body and off the way of all that moves, unless the request gives them.
     anchors = None if given is None else given.anchors
     if anchors is None:
@@ -168,9 +168,9 @@ class _Shown:
             )
         return tuple(found)
 
-    def record_contacts(self, camera: FloorCamera) -> tuple[records.Contact, ...]:
+    def record_contacts(self, estimate: records.CameraEstimate) -> tuple[records.Contact, ...]:
         """Contacts in the order of their times; without those of bodies that stand where they are."""
-        run, shapes = self.worlds.runs[0], self.worlds.shapes[0]
+        run, shapes, camera = self.worlds.runs[0], self.worlds.shapes[0], FloorCamera.of(estimate, *self.world.size)
         found: list[records.Contact] = []
         for meeting in run.meetings:
             a, on_floor = meeting.a, meeting.b is None

@@ -12,13 +12,13 @@ import numpy as np
 from cow_service.errors import CannotGround
 from cow_service.narration import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
-from cow_service.physics.bodies import SeenBody
+from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import CameraFit, fit_shadow, prior
-from cow_service.physics.ensemble import Query
+from cow_service.physics.ensemble import BY_EVENTS, Query
 from cow_service.physics.layout import flies
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
-from cow_service.records import BBox, Grounding, Intervention, LocatedObject, Motion
+from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import CameraRequest, SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
@@ -95,16 +95,15 @@ def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ..
 
 
 def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePath | None]:
-    """The world; what is asked of its bodies, None where one that the question names was not found; and the path that
-    no contact changes, where the mover follows one.
+    """The world, what is asked of its bodies, and the path that no contact changes, where the mover follows one.
 
     Raises `CannotGround` for what cannot be put where the question or the request puts it.
     """
     motion, request = situation.motion, situation.request
     bodies = seen_bodies(situation)
     present = bodies[: 1 + len(situation.obstacles)]
-    query = query_of(situation, bodies)
     carried, before = placement_goals(situation, present)
+    query = query_of(situation, bodies, carried)
     fit = camera_of(
         situation.scene,
         motion,
@@ -134,7 +133,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
             path = ballistic_path(camera, situation.grounding, motion, times)
         to_foot = np.array(bodies[0].foot) - np.array(situation.grounding.point)
         prescribed = PrescribedMotion(path.states[:, :3], path.points + to_foot)
-    target = None if query is None else query.target
+    target = None if query is None or situation.grounding.asked is None else query.target
     world = WorldInput(
         bodies=tuple(replace(body, taper=bottoms.get(index, body.taper)) for index, body in enumerate(present)),
         motion=motion,
@@ -184,11 +183,14 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
     return tuple(bodies)
 
 
-def query_of(situation: Situation, bodies: Sequence[SeenBody]) -> Query | None:
-    """What is asked of bodies; None where nothing is, or one that is named was not found under that name."""
+def query_of(situation: Situation, bodies: Sequence[SeenBody], carried: PlacementGoal | None) -> Query | None:
+    """What is asked of bodies; None where nothing is, or one that is named was not found under that name.
+
+    Where the mover is put somewhere and nothing is asked, whether it gets there: shown is what it does in most worlds.
+    """
     asked = situation.grounding.asked
     if asked is None:
-        return None
+        return None if carried is None else Query(Asked(relation="inside"), carried.targets[0])
 
     def named(words: str) -> tuple[int, ...]:
         if same_name(words, situation.grounding.object):
@@ -203,7 +205,16 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody]) -> Query | None:
         return None
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
     asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
-    return Query(asked, targets[0], subjects[0], known)
+    query = Query(asked, targets[0], subjects[0], known)
+    if carried is not None and asked.relation == "inside":
+        return query
+    # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.
+    subject = bodies[query.subject]
+    in_air = subject.is_flying if query.subject else flies(subject, situation.motion)
+    stands_on_floor = not in_air and supports_of(bodies)[query.subject] is None
+    is_present = situation.is_separated and query.subject <= len(situation.obstacles)
+    is_seen = asked.relation in BY_EVENTS and not (stands_on_floor and asked.relation == "lands")
+    return replace(query, is_decidable=is_present and is_seen)
 
 
 # --- the camera
