@@ -15,8 +15,9 @@ from PIL import Image
 pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")
 
+from cow_service.evals.report.page import TITLES as PLOTS
 from cow_service.evals.report.summary import ArmSummary, Price, summarize
-from cow_service.evals.report.write import PLOTS, write_plots
+from cow_service.evals.report.write import write_plots
 
 NINE = (
     "never",

@@ -171,8 +171,8 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
     """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin."""
     logs = wanted.out / runs.LOGS
     logs.mkdir(exist_ok=True)
-    progress = Progress(info.arms, len(items) * info.repeats)
-    progress.add_earlier(each for each in runs.read_observations(logs) if not (wanted.retry_failed and each.failure))
+    earlier = (each for each in runs.read_observations(logs) if not (wanted.retry_failed and each.failure))
+    progress = Progress(info.arms, len(items) * info.repeats, earlier)
     if not progress.left:
         return
     keys = f"{info.token} {info.rounds}", info.token

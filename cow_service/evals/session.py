@@ -2,7 +2,8 @@
 
 import asyncio
 import time
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -96,90 +97,71 @@ def _server(folder: Path, settings: Mapping[str, Any]) -> Generator[str]:
         yield stack.enter_context(serving(service, pool))
 
 
-@dataclass
-class ArmCount:
-    """How far one arm is."""
-
-    total: int
-    done: int = 0
-    right: int = 0
-    failed: int = 0
-
-    @property
-    def share_right(self) -> str:
-        """Of those with a reply; empty where there are none."""
-        answered = self.done - self.failed
-        return f"{self.right / answered:.1%}" if answered else ""
-
-
 class Progress:
     """Rate, time left and accuracy so far of every arm, on standard error.
 
-    What was done before the process began counts as done, and not for the rate.
+    What an earlier process has asked counts as done, and not for the rate.
     """
 
-    def __init__(self, arms: Iterable[str], questions: int) -> None:
-        self._counts = {arm: ArmCount(questions) for arm in arms}
+    def __init__(self, arms: Iterable[str], questions: int, earlier: Iterable[Observation]) -> None:
+        self._questions = questions  # of each arm
+        self._counts = {arm: Counter[str]() for arm in arms}  # done, of those right and failed
+        for each in earlier:
+            self._count(each.arm, each if each.failure is None else None)
         self._begun = self._told_at = time.monotonic()
-        self._done_here = 0
+        self._left_before = self.left
         self._console = Console(stderr=True)
 
     def add(self, arm: str, seen: Observation | None) -> None:
         """Counts a question that has just been asked; None: it failed."""
-        self._done_here += 1
         self._count(arm, seen)
         if not self._console.is_terminal and time.monotonic() - self._told_at > LINES_EVERY:
             self._told_at = time.monotonic()
             self._print_line()
 
-    def add_earlier(self, observations: Iterable[Observation]) -> None:
-        """Counts what an earlier process has asked."""
-        for each in observations:
-            self._count(each.arm, each if each.failure is None else None)
-
     @property
     def left(self) -> int:
         """Questions that have not been asked."""
-        return sum(count.total - count.done for count in self._counts.values())
+        return sum(self._questions - count["done"] for count in self._counts.values())
 
     @contextmanager
     def shown(self) -> Generator[None]:
         """Shows the progress meanwhile: redrawn in a terminal, else a line now and then."""
-
-        def table() -> Table:
-            found = Table(box=None, pad_edge=False, show_footer=True)
-            done, total = (sum(getattr(count, name) for count in self._counts.values()) for name in ("done", "total"))
-            footers = ("", f"{done} of {total}", *self._pace())
-            for name, footer in zip(("arm", "asked", "right", "failed"), footers, strict=True):
-                found.add_column(name, footer=footer, justify="left" if name == "arm" else "right")
-            for arm, count in self._counts.items():
-                found.add_row(arm, f"{count.done} of {count.total}", count.share_right, str(count.failed or ""))
-            return found
-
         if self._console.is_terminal:
-            with Live(get_renderable=table, console=self._console, refresh_per_second=REDRAWN):
+            with Live(get_renderable=self._table, console=self._console, refresh_per_second=REDRAWN):
                 yield
         else:
             yield
             self._print_line()
 
     def _count(self, arm: str, seen: Observation | None) -> None:
-        if count := self._counts.get(arm):
-            count.done += 1
-            count.failed += seen is None
-            count.right += seen is not None and seen.right
+        if arm in self._counts:
+            self._counts[arm].update(done=1, failed=int(seen is None), right=int(seen is not None and seen.right))
 
-    def _pace(self) -> tuple[str, str]:
-        """Questions per second since the process began, and the time left at this rate."""
-        rate = self._done_here / max(time.monotonic() - self._begun, 1e-9)
+    def _rows(self) -> Iterator[tuple[str, str, str, str]]:
+        """Each arm with what was asked, right and failed; last the rate since the process began, and the time left."""
+        for arm, count in self._counts.items():
+            answered = count["done"] - count["failed"]
+            right = f"{count['right'] / answered:.1%}" if answered else ""
+            yield arm, f"{count['done']} of {self._questions}", right, str(count["failed"] or "")
+        total = self._questions * len(self._counts)
+        rate = (self._left_before - self.left) / max(time.monotonic() - self._begun, 1e-9)
         left = str(timedelta(seconds=round(self.left / rate))) if rate else "?"
-        return f"{rate:.1f}/s", f"{left} left"
+        yield "", f"{total - self.left} of {total}", f"{rate:.1f}/s", f"{left} left"
+
+    def _table(self) -> Table:
+        *arms, footers = self._rows()
+        found = Table(box=None, pad_edge=False, show_footer=True)
+        for name, footer in zip(("arm", "asked", "right", "failed"), footers, strict=True):
+            found.add_column(name, footer=footer, justify="left" if name == "arm" else "right")
+        for row in arms:
+            found.add_row(*row)
+        return found
 
     def _print_line(self) -> None:
-        parts: list[str] = []
-        for arm, count in self._counts.items():
-            right = f" {count.share_right} right" if count.share_right else ""
-            failed = f", {count.failed} failed" if count.failed else ""
-            parts.append(f"{arm} {count.done}/{count.total}{right}{failed}")
-        text = f"{'; '.join(parts)}; {', '.join(self._pace())}"
-        self._console.print(text, soft_wrap=True, highlight=False)
+        *arms, (_, _, *pace) = self._rows()
+        told = [
+            f"{arm} {asked}" + (f", {right} right" if right else "") + (f", {failed} failed" if failed else "")
+            for arm, asked, right, failed in arms
+        ]
+        self._console.print(f"{'; '.join(told)}; {', '.join(pace)}", soft_wrap=True, highlight=False)

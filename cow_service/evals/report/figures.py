@@ -12,6 +12,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from cow_service.evals.items import TASKS
 from cow_service.evals.report.summary import BASELINE, ArmSummary
+from cow_service.evals.report.tables import points
 from cow_service.evals.statistics import Calibration, Cost, Gain, Rates, Spread
 
 # The page replaces these four by the colours of its light or dark style; nothing else may use them.
@@ -103,11 +104,6 @@ def short(name: str, longest: int = LONGEST_NAME) -> str:
         return plain
     start = (longest - 1) // 2
     return f"{plain[:start]}…{plain[start + 1 - longest :]}"
-
-
-def points(share: float) -> str:
-    """A difference of shares, in percentage points, with its sign."""
-    return f"{100 * share:+.1f}".replace("-", "−").replace("+0.0", "0.0").replace("−0.0", "0.0")
 
 
 def _add_legend(figure: Figure, entries: Sequence[tuple[Line2D, str]], **options: Any) -> None:

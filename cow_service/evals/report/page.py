@@ -7,7 +7,6 @@ import base64
 import hashlib
 import json
 import os
-import shutil
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from markupsafe import Markup
 
 from cow_service.evals.items import Item, Observation
 from cow_service.evals.report.summary import BASELINE, ArmSummary, baseline_run
-from cow_service.evals.report.tables import p_text
+from cow_service.evals.report.tables import p_text, points
 from cow_service.evals.runs import PICTURES, EvalRun
 
 PAGE = "index.html"
@@ -47,17 +46,16 @@ def write_page(
     summaries: Sequence[ArmSummary],
     plots: Sequence[Path] = (),
     sections: Sequence[tuple[str, str]] = (),
-    copy_pictures: bool = False,
 ) -> Path:
     """Writes `index.html` into the folder and returns its path.
 
     `plots` are files that `write_plots` wrote; those that are SVG stand in the page. `sections` are headings and plain
-    texts, shown after the summary. The page refers to the pictures where the runs have them; with `copy_pictures` they
-    are copied beside it, so that the folder can be sent as a whole.
+    texts, shown after the summary. The page refers to the pictures where the runs have them.
     """
     folder.mkdir(parents=True, exist_ok=True)
     arms = page_arms(runs, summaries)
-    core, replies = page_data(runs, arms, _PictureLinks(folder, runs, copy_pictures))
+    core, replies = page_data(runs, arms)
+    core["pictures"] = _addresses(folder, runs, core["pictures"])
     style, script = "".join(map(_source, STYLES)), "'use strict';\n" + "".join(map(_source, SCRIPTS))
     # Nothing but this script, this style, and pictures beside the page: whatever a reply says, it does nothing.
     allowed = {
@@ -70,7 +68,7 @@ def write_page(
     }
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template.filters["percent"] = _percent
-    template.filters["points"] = _points
+    template.filters["points"] = points
     template.filters["p"] = p_text
     titled = [(TITLES.get(path.stem, path.stem), path) for path in plots if path.suffix == ".svg"]
     text = template.from_string(_source("template.html")).render(
@@ -99,10 +97,6 @@ def _source(name: str) -> str:
 
 def _percent(share: float | None, digits: int = 1) -> str:
     return "" if share is None else f"{100 * share:.{digits}f}"
-
-
-def _points(share: float) -> str:
-    return f"{100 * share:+.1f}".replace("-", "−")
 
 
 def _digest(text: str) -> str:
@@ -137,38 +131,18 @@ def page_arms(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> tuple
     return tuple(arms)
 
 
-class _PictureLinks:
-    """Addresses of pictures, relative to the page."""
-
-    def __init__(self, folder: Path, runs: Sequence[EvalRun], copied: bool) -> None:
-        self._folder, self._copied = folder, copied
-        self._files: dict[str, Path] = {}
-        for run in runs:
-            own = run.folder / PICTURES
-            for path in sorted(own.iterdir()) if own.is_dir() else ():
-                self._files.setdefault(path.stem, path)
-
-    def address(self, digest: str) -> str | None:
-        """None where the file is not there."""
-        path = self._files.get(digest)
-        if path is None:
-            return None
-        try:
-            if not self._copied:
-                return quote(Path(os.path.relpath(path.resolve(), self._folder.resolve())).as_posix())
-        except ValueError:  # on another drive: there is no relative path
-            pass
-        to = self._folder / PICTURES / path.name
-        if not to.exists():
-            to.parent.mkdir(exist_ok=True)
-            shutil.copyfile(path, to)
-        return quote(f"{PICTURES}/{path.name}")
+def _addresses(folder: Path, runs: Sequence[EvalRun], digests: Sequence[str]) -> list[str | None]:
+    """Where the pictures of these digests are, relative to the page's folder; None for a file that is not there."""
+    known: dict[str, Path] = {}
+    for run in reversed(runs):
+        known |= {path.stem: path for path in (run.folder / PICTURES).glob("*")}
+    found = (known.get(digest) for digest in digests)
+    beside = folder.resolve()
+    return [None if path is None else quote(os.path.relpath(path.resolve(), beside)) for path in found]
 
 
-def page_data(
-    runs: Sequence[EvalRun], arms: Sequence[PageArm], links: _PictureLinks
-) -> tuple[dict[str, Any], list[list[str]]]:
-    """What the page needs at once, and the texts of the replies in blocks of items."""
+def page_data(runs: Sequence[EvalRun], arms: Sequence[PageArm]) -> tuple[dict[str, Any], list[list[str]]]:
+    """What the page needs at once, pictures by their digests, and the texts of the replies in blocks of items."""
     data, pictures, shown, reasons, replies = (dict[Any, int]() for _ in range(5))
 
     def packed_observation(each: Observation) -> list[Any]:
@@ -232,7 +206,7 @@ def page_data(
         "arms": [[each.name, each.against] for each in arms],
         "shown": list(shown),
         "reasons": list(reasons),
-        "pictures": [links.address(each) for each in pictures],
+        "pictures": list(pictures),
         "items": items,
     }
     return core, [list(block) for block in blocks]

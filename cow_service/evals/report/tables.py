@@ -189,6 +189,11 @@ def p_text(value: float | None) -> str:
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
 
 
+def points(share: float) -> str:
+    """A difference of shares, in percentage points, with its sign."""
+    return f"{100 * share:+.1f}".replace("-", "−").replace("+0.0", "0.0").replace("−0.0", "0.0")
+
+
 def _two_digits(mean: float) -> str:
     return "0" if mean == 0 else f"{mean:.{max(0, 2 - max(0, math.floor(math.log10(mean))))}f}"
 

@@ -13,7 +13,6 @@ from cow_service.evals.report.page import write_page
 from cow_service.evals.report.summary import ArmSummary, Price, summarize
 from cow_service.evals.runs import EvalRun
 
-PLOTS = ("gains", "rates", "calibration", "cost")
 SUFFIXES = (".svg", ".png")
 PNG_DPI = 150
 FORMATS = {"md": tables.markdown, "csv": tables.csv_text, "tex": tables.latex}
