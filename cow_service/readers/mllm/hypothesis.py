@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.media.overlay import named_strip
-from cow_service.narration import state_words
+from cow_service.narration import bare_name, state_words
 from cow_service.readers.base import Imagined
 from cow_service.records import MEETINGS, AskedRelation, Doubt, Outcome, Simulation
 
@@ -52,7 +52,7 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
         facts += [_one_line(trajectory.outcome.facts)] if trajectory.outcome.facts else []
         for name, (world, outcome) in outcomes.items():
             if outcome.probability is not None:
-                event = _event(outcome, _one_line(simulation.grounding.object))
+                event = _event(outcome, simulation.grounding.object)
                 told = f"{_share(outcome.probability, world.ensemble)}: {event}."
                 facts.append(f"{name}, {told[0].lower()}{told[1:]}" if name else told)
         if trajectory.outcome.depends_on:
@@ -62,7 +62,7 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
     for each in () if facts else trajectory.encounters:
         covered = "" if each.share is None else f", at most {each.share:.0%} covered"
         sure = "" if each.probability is None else f"; {_share(each.probability, trajectory.ensemble).lower()}"
-        meets = f"{MEETINGS[each.kind]} the {_bare(each.object)}"
+        meets = f"{MEETINGS[each.kind]} the {bare_name(each.object)}"
         encounters.append(f"{meets}, {each.first_frame / trajectory.fps:.2f} s in{covered}{sure}")
     return {
         "sentence": simulation.motion.sentence,
@@ -79,9 +79,9 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
 def _changed(simulation: Simulation) -> str:
     """What is changed before the motion, as in: With the vase removed; empty where nothing is."""
     changes = simulation.grounding.interventions
-    removed = " and ".join(f"the {_bare(each.object.object)}" for each in changes if each.kind == "remove")
+    removed = " and ".join(f"the {bare_name(each.object.object)}" for each in changes if each.kind == "remove")
     put = {each.object for each in simulation.trajectory.placed}
-    placed = [_one_line(state_words(each)) for each in changes if each.kind == "place" and each.object.object in put]
+    placed = [state_words(each) for each in changes if each.kind == "place" and each.object.object in put]
     told = [*([f"{removed} removed"] if removed else []), *placed]
     return f"With {' and '.join(told)}" if told else ""
 
@@ -92,7 +92,7 @@ def _event(outcome: Outcome, mover: str) -> str:
     does, do = EVENTS[asked.relation]
     does_not = does.replace("is ", "is not ", 1) if does.startswith("is ") else f"does not {do}"
     doing = does_not if asked.negated else does
-    subject = f"the {_bare(outcome.subject or mover)}"
+    subject = f"the {bare_name(outcome.subject or mover)}"
     thing = _one_line(outcome.object or asked.target or ("anything" if asked.negated else "something"))
     if asked.form == "changes":
         same = " not" if asked.negated else ""
@@ -117,11 +117,6 @@ def _share(probability: float, worlds: int) -> str:
     if not worlds:
         return f"With a computed probability of {probability:.0%}"
     return f"In {probability:.0%} of {worlds} computed worlds"
-
-
-def _bare(name: str) -> str:
-    """A name on one line, without its article."""
-    return _one_line(name).removeprefix("the ").removeprefix("The ")
 
 
 def _one_line(text: str) -> str:

@@ -141,28 +141,30 @@ class MllmReader:
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
         """
-        warnings: tuple[str, ...] = ()
-        places = {name_words(each.object): each for each in grounding.others}
+        warnings: list[str] = []
+        others_sought = hints is not None  # with the mover
         if hints is None:
             image, identified = self._identify(given)
             located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
-            warnings = () if located is None else located.warnings
-            lost = [each.object for each in hints.also if name_words(each.object) not in places]
-            hints = hints.model_copy(update={"also": tuple(each for each in hints.also if each.object not in lost)})
-            warnings += tuple(f"'{name}' moves, too, and was left out: it has no place. {GIVE_OBJECT}" for name in lost)
+            warnings += () if located is None else located.warnings
+        places = {name_words(each.object): each for each in grounding.others}
         others: list[base.OtherMotionReading] = []
         for hint in hints.also:
             place = places.get(name_words(hint.object))
-            if place is None:
+            if place is not None:
+                others.append(base.OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
+            elif others_sought:
                 raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found. {GIVE_DIRECTION}")
-            others.append(base.OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
+            else:
+                warnings.append(f"'{hint.object}' moves, too, and was left out: it has no place. {GIVE_OBJECT}")
         kind = hints.kind or DEFAULT_KIND
-        reading = MotionReading(kind, None, "text", sentence=hints.sentence, warnings=warnings, others=tuple(others))
+        reading = MotionReading(kind, None, "text", sentence=hints.sentence, others=tuple(others))
         if kind in records.FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
             if hints.scale_error:
-                warning = f"The scale of the scene could not be read ({hints.scale_error}): the default one was taken."
-                reading = replace(reading, warnings=(*warnings, warning))
+                default = "the default one was taken"
+                warnings.append(f"The scale of the scene could not be read ({hints.scale_error}): {default}.")
+        reading = replace(reading, warnings=tuple(warnings))
         return self._directed(given, grounding, reading, hints) if kind in records.DIRECTED_KINDS else reading
 
     def answer(
@@ -229,24 +231,23 @@ class MllmReader:
         self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints
     ) -> MotionReading:
         """The reading with its direction, checked against the drawn arrow where one is the cue."""
-        if hints.ends is None and hints.camera is None:
+        deviation = SPEED_DEVIATION if isinstance(hints.speed, str) else None
+        ends = {"distance": hints.distance, "duration": hints.duration, "until": hints.until, "steps": hints.then}
+        reading = replace(reading, speed=hints.speed, speed_deviation=deviation, cue=hints.cue or "orientation", **ends)
+        if hints.camera is not None:
+            direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
+            return replace(reading, direction=direction, depth=depth, depth_deviation=HEADING_DEVIATION)
+        if hints.ends is None:
             raise CannotReadDirection(
                 f"{self._subject} found nothing in the image or the question that tells which way the "
                 f"{grounding.object} moves. {GIVE_DIRECTION}"
             )
-        deviation = SPEED_DEVIATION if isinstance(hints.speed, str) else None
-        reading = replace(reading, speed=hints.speed, speed_deviation=deviation, distance=hints.distance)
-        reading = replace(reading, duration=hints.duration, until=hints.until, steps=hints.then)
-        cue = hints.cue or "orientation"
-        if hints.camera is not None:
-            direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
-            return replace(reading, direction=direction, depth=depth, depth_deviation=HEADING_DEVIATION, cue=cue)
         if hints.depth_degrees is not None:
             depth = math.sin(math.radians(hints.depth_degrees))
             reading = replace(reading, depth=depth, depth_deviation=HEADING_DEVIATION)
-        (x0, y0), (x1, y1) = hints.ends or ((0.0, 0.0), (1.0, 0.0))
-        reading = replace(reading, direction=(x1 - x0, y1 - y0), cue=cue)
-        if cue != "arrow":
+        (x0, y0), (x1, y1) = hints.ends
+        reading = replace(reading, direction=(x1 - x0, y1 - y0))
+        if reading.cue != "arrow":
             return reading
         with given.cpu():
             return follow_arrow(given.scene, grounding.bbox, replace(reading, along_arrow=hints.along_arrow))

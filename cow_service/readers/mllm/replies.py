@@ -49,8 +49,6 @@ class Reply(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _find_fields(cls, written: object) -> object:
-        if isinstance(written, cls):
-            return written
         fields = fields_of(written)
         return {name: first_of(fields, name, *cls.other_names.get(name, ())) for name in cls.model_fields}
 
@@ -58,12 +56,12 @@ class Reply(BaseModel):
 R = TypeVar("R", bound=Reply)
 
 
-def usable(kind: type[R], most: int = MAX_LISTED) -> BeforeValidator:
+def usable(kind: type[R]) -> BeforeValidator:
     """Reads a list of objects, or one alone. What is none of that kind is left out."""
 
     def read(written: object) -> tuple[R, ...]:
         found: list[R] = []
-        for part in listed(written)[:most]:
+        for part in listed(written)[:MAX_LISTED]:
             with suppress(ValidationError):  # a word instead of an object is its first field
                 found.append(
                     kind.model_validate(part if isinstance(part, dict) else {next(iter(kind.model_fields)): part})
