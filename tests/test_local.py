@@ -373,7 +373,6 @@ def test_top_p_and_top_k() -> None:
             sampling = TokenSampling(temperature=1.0, seed=seed, **rest)
             row = BatchRow(sampling, 1, [], None, lambda row, finish: None, lambda: False)
             token = row.choose(logits)
-            assert token is not None
             found.add(int(token))
         return found
 

@@ -14,22 +14,26 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cow_service.evals.items import LETTERS, REAL, Pictures
-from cow_service.evals.loaders.rows import Collected, FileFault, Row, RowFault, collect
+from cow_service.evals.loaders.rows import Collected, FileFault, Row, RowFault, Unread, collect
 
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
 
 
-def parquet_rows(path: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a file. Raises `FileFault` for a file that is none, or is not whole."""
+Numbered = tuple[str, dict[str, Any]] | RowFault  # where a row stands, and its fields; or why it has none
+
+
+def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
+    """The rows of a file that is shown by this name; last a `FileFault` where it is none, or is not whole."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
     try:
         with pq.ParquetFile(path) as file:
-            for batch in file.iter_batches(batch_size=_AT_ONCE):
-                yield from batch.to_pylist()
+            rows = (row for batch in file.iter_batches(batch_size=_AT_ONCE) for row in batch.to_pylist())
+            for number, row in enumerate(rows):
+                yield f"{name}, row {number}", row
     except (pa.ArrowException, OSError) as error:
-        raise FileFault(f"{path.name}: no whole Parquet file ({str(error).splitlines()[0]}); get it again") from error
+        yield FileFault(f"{name}: no whole Parquet file ({str(error).splitlines()[0]}); get it again")
 
 
 META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
@@ -40,30 +44,31 @@ def scene_folders(folder: Path) -> list[Path]:
     return sorted(path.parent for path in folder.glob(f"*/{META}"))
 
 
-def scene_rows(folder: Path) -> Iterator[Row | RowFault]:
+def scene_rows(folder: Path) -> Iterator[Unread]:
     """A row per scene."""
     for scene in scene_folders(folder):
-        try:
-            meta: Any = json.loads((scene / META).read_bytes())
-        except ValueError as error:
-            yield RowFault(f"{scene.name}/{META}: no whole JSON ({error}); was it written to its end?")
-            continue
-        if not isinstance(meta, dict) or not isinstance(meta.get("question"), str):
-            yield RowFault(f"{scene.name}/{META}: must be an object with `question`, `answer`")
-            continue
-        image = scene / IMAGE
-        yield Row(
-            place=scene.name,
-            id=str(meta.get("id") or scene.name),
-            source_id=str(meta.get("id") or scene.name),
-            image=image.read_bytes() if image.is_file() else None,
-            question=meta["question"],
-            answer=str(meta.get("answer") or ""),
-            task=str(meta.get("task") or ""),
-            level=str(meta["level"]) if meta.get("level") is not None else None,
-            scene=scene.name,
-            oracle=oracle_frames(scene),
-        )
+        yield f"{scene.name}/{META}", partial(_scene_row, scene)
+
+
+def _scene_row(scene: Path) -> Row:
+    try:
+        meta: Any = json.loads((scene / META).read_bytes())
+    except ValueError as error:
+        raise RowFault(f"no whole JSON ({error}); was it written to its end?") from error
+    if not isinstance(meta, dict) or not isinstance(meta.get("question"), str):
+        raise RowFault("must be an object with `question`, `answer`")
+    image = scene / IMAGE
+    return Row(
+        id=str(meta.get("id") or scene.name),
+        source_id=str(meta.get("id") or scene.name),
+        image=image.read_bytes() if image.is_file() else None,
+        question=meta["question"],
+        answer=str(meta.get("answer") or ""),
+        task=str(meta.get("task") or ""),
+        level=str(meta["level"]) if meta.get("level") is not None else None,
+        scene=scene.name,
+        oracle=oracle_frames(scene),
+    )
 
 
 def oracle_frames(scene: Path) -> list[bytes]:
@@ -89,44 +94,36 @@ _URL = ("http://", "https://")
 _NAMES = {name: column for column, names in COLUMNS.items() for name in names}
 _LONGEST_PATH = 1024  # characters; what is longer is base64
 
-Numbered = tuple[str, dict[str, Any]] | RowFault  # where a row stands, and its fields; or why it has none
 
-
-def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Row | RowFault]:
+def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Unread]:
     """The rows of a file of one's own. Columns that mean nothing are faults, unless they are ignored."""
     told: set[str] = set()
-    try:
-        for numbered in READERS[path.suffix.lower()](path):
-            if isinstance(numbered, RowFault):
-                yield numbered
-                continue
-            place, fields = numbered
-            known = (*_NAMES, *IGNORED, *LETTERS)
-            unknown = [] if ignore_columns else [name for name in fields if name not in known]
-            for name in unknown:
-                if name not in told:
-                    close = difflib.get_close_matches(name, _NAMES, 1)
-                    columns = f"known are {', '.join(COLUMNS)}, and A, B, C... for options."
-                    hint = f"did you mean `{close[0]}`?" if close else columns
-                    yield RowFault(f"{place}: unknown column `{name}`: {hint}")
-            told.update(unknown)
-            if unknown:
-                continue
-            values: dict[str, Any] = {
-                _NAMES[name]: value for name, value in fields.items() if name in _NAMES and value not in (None, "")
-            }
-            try:
-                _require(values, REQUIRED)
-                image = _image(values.pop("image"), path.parent)
-                options = _options(values.pop("options", None), fields)
-            except RowFault as fault:
-                yield RowFault(f"{place}: {fault}")
-                continue
-            texts: dict[str, Any] = {name: str(value) for name, value in values.items()}
-            named = texts.pop("id", place.rpartition(" ")[2])
-            yield Row(place=place, id=named, source_id=named, image=image, options=options, **texts)
-    except RowFault as fault:
-        yield fault
+    for numbered in READERS[path.suffix.lower()](path):
+        if isinstance(numbered, RowFault):
+            yield numbered
+            continue
+        place, fields = numbered
+        known = (*_NAMES, *IGNORED, *LETTERS)
+        unknown = [] if ignore_columns else [name for name in fields if name not in known]
+        for name in unknown:
+            if name not in told:
+                close = difflib.get_close_matches(name, _NAMES, 1)
+                columns = f"known are {', '.join(COLUMNS)}, and A, B, C... for options."
+                hint = f"did you mean `{close[0]}`?" if close else columns
+                yield RowFault(f"{place}: unknown column `{name}`: {hint}")
+        told.update(unknown)
+        if not unknown:
+            yield place, partial(_table_row, place, fields, path.parent)
+
+
+def _table_row(place: str, fields: dict[str, Any], folder: Path) -> Row:
+    values = {_NAMES[name]: value for name, value in fields.items() if name in _NAMES and value not in (None, "")}
+    _require(values, REQUIRED)
+    image = _image(values.pop("image"), folder)
+    options = _options(values.pop("options", None), fields)
+    texts: dict[str, Any] = {name: str(value) for name, value in values.items()}
+    named = texts.pop("id", place.rpartition(" ")[2])
+    return Row(id=named, source_id=named, image=image, options=options, **texts)
 
 
 def _require(fields: dict[str, Any], names: Sequence[str]) -> None:
@@ -208,14 +205,14 @@ def _separated(path: Path, delimiter: str) -> Iterator[Numbered]:
                 elif cells:
                     yield place, dict(zip(names, cells, strict=True))
     except (csv.Error, UnicodeDecodeError) as error:
-        raise FileFault(f"{path.name}, row {number + 1}: {error}; was the file written to its end?") from error
+        yield FileFault(f"{path.name}, row {number + 1}: {error}; was the file written to its end?")
 
 
 READERS: dict[str, Callable[[Path], Iterator[Numbered]]] = {
     ".jsonl": _json_lines,
     ".csv": partial(_separated, delimiter=","),
     ".tsv": partial(_separated, delimiter="\t"),
-    ".parquet": lambda path: ((f"{path.name}, row {number}", row) for number, row in enumerate(parquet_rows(path))),
+    ".parquet": lambda path: parquet_rows(path, path.name),
 }
 
 
@@ -257,35 +254,32 @@ def load_causalspatial(folder: Path, subsets: Sequence[str], pictures: Pictures)
     return found
 
 
-def _published_rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, str]) -> Iterator[Row | RowFault]:
+def _published_rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, str]) -> Iterator[Unread]:
     """The rows of all files. What the column `not_sure` says of a row goes into `abstaining`."""
     for subset, shards in subset_shards(folder, subsets).items():
         for shard, path in enumerate(shards):
-            name = path.relative_to(folder).as_posix()
-            try:
-                for number, fields in enumerate(parquet_rows(path)):
-                    row = _published_row(folder, subset, f"{subset}/{shard}/{number}", f"{name}, row {number}", fields)
-                    if isinstance(row, Row) and fields.get("not_sure"):
-                        abstaining[row.id] = str(fields["not_sure"]).strip("() .").upper()[:1]
-                    yield row
-            except FileFault as fault:
-                yield FileFault(f"{subset}/{fault}")
+            rows = parquet_rows(path, path.relative_to(folder).as_posix())
+            for number, numbered in enumerate(rows):
+                if isinstance(numbered, RowFault):
+                    yield numbered
+                    continue
+                place, fields = numbered
+                unique = f"{subset}/{shard}/{number}"
+                if fields.get("not_sure"):
+                    abstaining[unique] = str(fields["not_sure"]).strip("() .").upper()[:1]
+                yield place, partial(_published_row, folder, subset, unique, fields)
 
 
-def _published_row(folder: Path, subset: str, unique: str, place: str, fields: dict[str, Any]) -> Row | RowFault:
+def _published_row(folder: Path, subset: str, unique: str, fields: dict[str, Any]) -> Row:
     """A row. One that lacks what the others have is a fault."""
-    try:
-        _require(fields, ("id", "question", "answer", "image"))
-    except RowFault as fault:
-        return RowFault(f"{place}: {fault}")
+    _require(fields, ("id", "question", "answer", "image"))
     source = str(fields["id"])
     level = _LEVEL.search(source)
     real = subset == "realworld"
     if level is None and not real:
-        return RowFault(f"{place}: the id {source[:60]!r} names no level: it should be like Collision_Level_1_0")
+        raise RowFault(f"the id {source[:60]!r} names no level: it should be like Collision_Level_1_0")
     image: Any = fields["image"]
     return Row(
-        place=place,
         id=unique,
         source_id=source,
         image=image.get("bytes") if isinstance(image, dict) else image if isinstance(image, bytes) else None,

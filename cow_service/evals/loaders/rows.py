@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from pydantic import ValidationError
@@ -31,7 +31,6 @@ class FileFault(RowFault):
 class Row:
     """What a data set says of one question, before it is checked."""
 
-    place: str  # file and row, for people
     id: str
     source_id: str
     image: bytes | None
@@ -44,7 +43,11 @@ class Row:
     oracle: Sequence[bytes] = ()
 
 
-def item_of(row: Row, pictures: Pictures) -> Item:
+# Where a row stands (file and row, for people), and what reads it, which raises `RowFault`; or why it cannot be read.
+Unread = tuple[str, Callable[[], Row]] | RowFault
+
+
+def item_of(place: str, row: Row, pictures: Pictures) -> Item:
     """The item of a row; its pictures are kept. Raises `RowFault`."""
     if not row.question or not row.question.strip():
         raise RowFault("`question` is empty")
@@ -65,7 +68,7 @@ def item_of(row: Row, pictures: Pictures) -> Item:
     try:
         return Item(
             id=row.id,
-            row=row.place,
+            row=place,
             source_id=row.source_id,
             image=image,
             question=parts,
@@ -126,30 +129,28 @@ class Collected:
     notes: list[str] = field(default_factory=list)  # what was found and worked around
 
 
-def collect(rows: Iterable[Row | RowFault], pictures: Pictures, *, repeated_rows: bool = False) -> Collected:
+def collect(rows: Iterable[Unread], pictures: Pictures, *, repeated_rows: bool = False) -> Collected:
     """The items of rows. A row twice is a fault, and so is an id, unless `repeated_rows`: then rows are kept."""
     found = Collected()
     asked: dict[tuple[str, str], Item] = {}
     by_id: dict[str, Item] = {}
     for row in rows:
-        if isinstance(row, FileFault):
-            found.broken.append(str(row))
-            continue
         if isinstance(row, RowFault):
-            found.faults.append(str(row))
+            (found.broken if isinstance(row, FileFault) else found.faults).append(str(row))
             continue
+        place, read = row
         try:
-            item = item_of(row, pictures)
+            item = item_of(place, read(), pictures)
         except RowFault as fault:
-            found.faults.append(f"{row.place}: {fault}")
+            found.faults.append(f"{place}: {fault}")
             continue
         key = item.image, items.question_text(item)
         before = asked.get(key)
         if item.id in by_id:
-            found.faults.append(f"{row.place}: the id {item.id!r} stands in {by_id[item.id].row} too")
+            found.faults.append(f"{place}: the id {item.id!r} stands in {by_id[item.id].row} too")
         elif before is not None and not repeated_rows:
             other = "" if before.answer == item.answer else f" with another answer, ({before.answer})"
-            found.faults.append(f"{row.place}: asks the same as {before.row}{other}")
+            found.faults.append(f"{place}: asks the same as {before.row}{other}")
         else:
             asked.setdefault(key, item)
             by_id[item.id] = item

@@ -19,7 +19,6 @@ import torch
 import transformers
 from llguidance import LLMatcher, LLTokenizer
 from llguidance.hf import from_tokenizer
-from numpy.typing import NDArray
 from PIL import Image
 from pydantic_ai import messages as ai
 from pydantic_ai.exceptions import UserError
@@ -143,22 +142,17 @@ class BatchRow:
         """Whether nothing more is to be written."""
         return self._is_finished or self.is_canceled()
 
-    def allowed(self, vocabulary: int) -> NDArray[np.bool_] | None:
-        """[vocabulary]: the tokens with which the reply can go on. None for all."""
-        if self.matcher is None:
-            return None
-        if self.thought_end is not None:
-            thinking = np.ones(vocabulary, dtype=np.bool_)
-            thinking[list(self.ends)] = False  # the reply is still to come
-            return thinking
-        # llguidance's own function for tensors needs a C++ compiler at run time.
-        bits = np.frombuffer(self.matcher.compute_bitmask(), np.uint8)
-        return np.unpackbits(bits, count=vocabulary, bitorder="little").astype(np.bool_)
-
-    def choose(self, logits: Tensor) -> Tensor | None:
-        """A token id, [], from the allowed logits, [vocabulary]; None where the likeliest will do."""
+    def choose(self, logits: Tensor) -> Tensor:
+        """The id, [], of a token with which the reply can go on, from logits, [vocabulary]."""
+        if self.matcher is not None and self.thought_end is not None:
+            logits = logits.index_fill(0, torch.tensor(list(self.ends), device=logits.device), -torch.inf)  # too early
+        elif self.matcher is not None:
+            # llguidance's own function for tensors needs a C++ compiler at run time.
+            bits = np.frombuffer(self.matcher.compute_bitmask(), np.uint8)
+            allowed = torch.from_numpy(np.unpackbits(bits, count=len(logits), bitorder="little")).to(logits.device)
+            logits = logits.masked_fill(allowed == 0, -torch.inf)
         if self.sampling.temperature == 0:
-            return None
+            return logits.argmax()
         logits = logits / self.sampling.temperature
         if self.sampling.top_k > 0:
             least = logits.topk(min(self.sampling.top_k, len(logits))).values[-1]
@@ -212,21 +206,13 @@ class RowSampler(transformers.LogitsProcessor):
 
     def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:
         """`scores` is [rows, vocabulary]; what is returned is 0 at each row's token and minus infinity elsewhere."""
-        allowed = np.ones(tuple(scores.shape), dtype=np.bool_)
-        for i, row in enumerate(self._rows):
-            if not row.done() and (tokens_allowed := row.allowed(scores.shape[1])) is not None:
-                allowed[i] = tokens_allowed
-        scores = scores.masked_fill(~torch.from_numpy(allowed).to(scores.device), -torch.inf)
-        chosen = scores.argmax(-1)
-        for i, row in enumerate(self._rows):
-            if not row.done() and (token := row.choose(scores[i])) is not None:
-                chosen[i] = token
-        tokens: list[int] = chosen.tolist()
-        for i, row in enumerate(self._rows):
-            if row.done():
-                tokens[i] = self._padding
-            else:
-                row.take(tokens[i])
+        tokens: list[int] = []
+        for row, logits in zip(self._rows, scores, strict=True):
+            token = self._padding
+            if not row.done():
+                token = int(row.choose(logits))
+                row.take(token)
+            tokens.append(token)
         only = torch.tensor(tokens, device=scores.device)[:, None]
         return torch.full_like(scores, -torch.inf).scatter_(1, only, 0.0)
 

@@ -3,7 +3,6 @@
 import asyncio
 import gc
 import traceback
-from collections import deque
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -31,7 +30,7 @@ class BatchWorker:
     name: str
     max_batch: int
     threads: int | None  # of the CPU; None for PyTorch's own number
-    _queue: deque[PendingGeneration] = field(default_factory=deque[PendingGeneration])
+    _queue: list[PendingGeneration] = field(default_factory=list[PendingGeneration])
     _lock: Lock = field(default_factory=Lock)
     _running: bool = False
 
@@ -54,11 +53,8 @@ class BatchWorker:
             while True:
                 # An empty batch ends the thread, which the lock keeps a new request from missing.
                 with self._lock:
-                    batch: list[PendingGeneration] = []
-                    while self._queue and len(batch) < self.max_batch:
-                        pending = self._queue.popleft()
-                        if not pending.future.done():
-                            batch.append(pending)
+                    waiting = [pending for pending in self._queue if not pending.future.done()]
+                    batch, self._queue = waiting[: self.max_batch], waiting[self.max_batch :]
                     self._running = bool(batch)
                 if not batch:
                     return
