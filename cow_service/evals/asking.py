@@ -11,12 +11,13 @@ import re
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import permutations
 from typing import Any, Literal
 
 from inspect_ai import model as inspect_model
 
-from cow_service.client import AsyncAnswer, AsyncClient
+from cow_service.client import AsyncClient
 from cow_service.client.errors import error_from
 from cow_service.errors import MllmUnavailable
 from cow_service.evals.imagination import NO_USAGE, REFUSALS, Arm, Evidence, Imagination, asked_once, evidence_of
@@ -285,10 +286,7 @@ class AnswerAsker:
     async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Evidence]:
         options: Any = {**self.options, **({"seed": trial} if trial else {})}
         image = self.pictures.path(case.item.image)
-
-        async def ask(key: str) -> AsyncAnswer:
-            return await self.client.answer(image, case.question, idempotency_key=key, imagine=imagine, **options)
-
+        ask = partial(self.client.answer, image, case.question, imagine=imagine, **options)
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
         answer = await asked_once(ask, *parts)
         found = Evidence()

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, TypeVar
 
 from cow_service.client import AsyncClient, AsyncSimulation
@@ -94,15 +95,15 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
     return arms
 
 
-async def asked_once(ask: Callable[[str], Awaitable[Result]], *parts: str) -> Result:
-    """What `ask` returns under the key of these parts.
+async def asked_once(ask: Callable[..., Awaitable[Result]], *parts: str) -> Result:
+    """What `ask` returns for an `idempotency_key` of these parts.
 
     A job that an interrupt has canceled stays so under its key: then there is another key. Raises what `ask` raises.
     """
     for attempt in range(MAX_INTERRUPTS):
         key = hashlib.sha256("\n".join((*parts, str(attempt))).encode()).hexdigest()
         try:
-            return await ask(key)
+            return await ask(idempotency_key=key)
         except Canceled:
             continue
     raise Canceled(f"The same job was canceled {MAX_INTERRUPTS} times.")
@@ -180,10 +181,7 @@ class Imagination:
     async def _simulate(self, item: Item, trial: int, changes: Mapping[str, Any]) -> AsyncSimulation:
         options: Any = {**self._options, **({"seed": trial} if trial else {}), **changes}
         image, question = self._pictures.path(item.image), question_text(item)
-
-        async def ask(key: str) -> AsyncSimulation:
-            return await self._client.simulate(image, question, idempotency_key=key, video=False, **options)
-
+        ask = partial(self._client.simulate, image, question, video=False, **options)
         return await asked_once(ask, self._key, item.id, item.image, str(sorted(options.items())))
 
 

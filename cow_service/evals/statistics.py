@@ -133,7 +133,8 @@ def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples:
         by_item[one.item].append((one.right, other.right))
     table = np.array([sums[scene] for scene in sorted(sums)])
     low, high = bootstrap_interval(table, resamples)
-    majority = [(_most(a for a, _ in values), _most(b for _, b in values)) for values in by_item.values()]
+    # Whether most replies to a question are right, in the arm and in the baseline.
+    majority = [[statistics.fmean(side) > 0.5 for side in zip(*values, strict=True)] for values in by_item.values()]
     won = sum(a and not b for a, b in majority)
     lost = sum(b and not a for a, b in majority)
     return Gain(
@@ -147,11 +148,6 @@ def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples:
         discordant=(won, lost),
         p=float(binomtest(won, won + lost).pvalue) if won + lost else 1.0,
     )
-
-
-def _most(values: Iterable[bool]) -> bool:
-    """Whether more than half are true."""
-    return statistics.fmean(values) > 0.5
 
 
 def bootstrap_interval(table: NDArray[np.float64], resamples: int = RESAMPLES) -> tuple[float, float]:
@@ -211,12 +207,6 @@ def holm(values: Sequence[float]) -> list[float]:
     adjusted = np.empty(len(values))
     adjusted[order] = np.minimum(np.maximum.accumulate(stepped), 1.0)
     return adjusted.tolist()
-
-
-def with_holm(gains: Sequence[Gain]) -> list[Gain]:
-    """The same with adjusted p values."""
-    adjusted = holm([each.p for each in gains])
-    return [each.model_copy(update={"p_holm": p}) for each, p in zip(gains, adjusted, strict=True)]
 
 
 def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibration | None:

@@ -52,10 +52,6 @@ class CallLog:
     usage: records.Usage = field(default_factory=records.Usage)
     prompts: dict[str, int] = field(default_factory=dict[str, int])  # version by name
 
-    def add(self, usage: records.Usage) -> None:
-        """Counts a call."""
-        self.usage += usage
-
 
 @dataclass(frozen=True)
 class ReaderInput:

@@ -106,19 +106,12 @@ def short(name: str, longest: int = LONGEST_NAME) -> str:
     return f"{plain[:start]}…{plain[start + 1 - longest :]}"
 
 
-def _add_legend(figure: Figure, entries: Sequence[tuple[Line2D, str]], **options: Any) -> None:
-    drawn = figure.legend([line for line, _ in entries], list(map(str, range(len(entries)))), **options)
-    # Set afterwards: matplotlib leaves out an entry whose name starts with an underscore.
-    for text, (_, name) in zip(drawn.get_texts(), entries, strict=True):
-        text.set_text(name)
-
-
 def _add_arm_legend(figure: Figure, styles: Mapping[str, ArmStyle], width: float) -> None:
     """Above the panels, in as many columns as fit a figure of this width in inches."""
-    entries = [(Line2D([], [], **style.marked()), short(name)) for name, style in styles.items()]
-    fitting = int(width * LEGEND_WIDTH / 10 / (max(len(name) for _, name in entries) + 6))
-    columns = min(max(1, fitting), len(entries))
-    _add_legend(figure, entries, loc="outside upper left", ncols=columns, columnspacing=1.4, handletextpad=0.3)
+    lines, names = [Line2D([], [], **style.marked()) for style in styles.values()], list(map(short, styles))
+    fitting = int(width * LEGEND_WIDTH / 10 / (max(map(len, names)) + 6))
+    columns = min(max(1, fitting), len(names))
+    figure.legend(lines, names, loc="outside upper left", ncols=columns, columnspacing=1.4, handletextpad=0.3)
 
 
 def _draw_right_answers(axes: Axes, x: float, tpr: Spread, style: ArmStyle, size: float, **whisker: Any) -> None:
@@ -276,7 +269,7 @@ def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
     figure = Figure(figsize=(SQUARE + 0.6, SQUARE + 0.5 + 0.42 * len(curves)), layout="constrained")
     axes = figure.add_subplot()
     (diagonal,) = axes.plot([0, 100], [0, 100], color=DIM, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
-    entries = [(diagonal, "as told (perfect calibration)")]
+    lines, names = [diagonal], ["as told (perfect calibration)"]
     counted = len(curves) <= COUNTED  # the counts of the bins stand beside the markers
     for place, (arms, found) in enumerate(curves):
         base = sum(each.count * each.happened for each in found.bins) / found.count
@@ -298,14 +291,14 @@ def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
             label = axes.annotate(f"{each.count}", (x, y), (offset, -offset), textcoords="offset points", fontsize=7.5)
             label.set(va="top" if side > 0 else "bottom", ha="left" if side > 0 else "right")
         edge: dict[str, Any] = {"markersize": 7, "markeredgecolor": INK, "markeredgewidth": 0.7}
-        line = Line2D([], [], color=colour, linestyle=stroke, marker=marker, **edge)
-        entries.append((line, f"{short(', '.join(arms), 70)}\n{scores}; n = {found.count}"))
+        lines.append(Line2D([], [], color=colour, linestyle=stroke, marker=marker, **edge))
+        names.append(f"{short(', '.join(arms), 70)}\n{scores}; n = {found.count}")
     axes.set(xlim=(-6, 108), ylim=(-10, 106), aspect="equal")
     axes.grid()
     axes.set_xlabel("Probability told by the simulation (%)")
     axes.set_ylabel("Happened (% of cases)")
     axes.set_title("Told probability against what happened\n(bins of 10 points; marker area: number of questions)")
-    _add_legend(figure, entries, loc="outside lower left", fontsize=8, handlelength=3)
+    figure.legend(lines, names, loc="outside lower left", fontsize=8, handlelength=3)
     return figure
 
 

@@ -94,7 +94,8 @@ def _gains(observations: Sequence[Observation], baseline: Sequence[Observation])
     there = _by_task(baseline)
     found = {task: statistics.gain(seen, there.get(task, [])) for task, seen in _by_task(observations).items()}
     known = {task: gain for task, gain in found.items() if gain is not None}
-    return dict(zip(known, statistics.with_holm([*known.values()]), strict=True))
+    adjusted = statistics.holm([gain.p for gain in known.values()])
+    return {task: known[task].model_copy(update={"p_holm": p}) for task, p in zip(known, adjusted, strict=True)}
 
 
 def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation]]:

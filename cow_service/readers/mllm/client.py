@@ -193,7 +193,8 @@ class MllmClient:
         except (errors.AgentRunError, errors.UserError, TimeoutError) as error:
             return self._error(call, parser, model, error)
         finally:  # in the one thread of the event loop, so that calls at the same time do not lose each other's usage
-            given.calls.add(Usage(calls=model.calls, input_tokens=used.input_tokens, output_tokens=used.output_tokens))
+            tokens = {"input_tokens": used.input_tokens, "output_tokens": used.output_tokens}
+            given.calls.usage += Usage(calls=model.calls, **tokens)
             given.calls.prompts |= {prompt.name: prompt.version, SYSTEM_PROMPT: self._instructions.version}
 
     def _supported(self, settings: ModelSettings) -> ModelSettings:

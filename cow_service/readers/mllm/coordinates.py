@@ -104,9 +104,8 @@ class CoordinateFrame:
     @property
     def numbers(self) -> Schema:
         """The JSON schema of one coordinate."""
-        units = self.coordinates.units
-        highest = max(self.seen) if units == "pixels" else int(self._full[0])
-        return number(0, highest, "number" if units == "fractions" else "integer")
+        kind = "number" if self.coordinates.units == "fractions" else "integer"
+        return number(0, int(max(self._full)), kind)
 
     def point(self, written: object) -> Point:
         """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""

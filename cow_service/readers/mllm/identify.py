@@ -87,6 +87,7 @@ def _way(written: object) -> tuple[records.Vector, float] | None:
 
 
 Name = Annotated[str, Field(min_length=1), BeforeValidator(replies.name_of)]
+_RELATION = BeforeValidator(lambda said: RELATION_WORDS.get(replies.text_of(said).lower().replace("_", "-")))
 _WAY = BeforeValidator(_way), WithJsonSchema(replies.one_of(*WAYS))
 
 
@@ -96,13 +97,8 @@ class Change(Reply):
     other_names: ClassVar = {"object": ("name", "label"), "targets": ("target",)}
     kind: Annotated[records.InterventionKind, _known(records.InterventionKind, _CHANGES)]
     object: Name
-    relation: records.PlaceRelation | None = None
+    relation: Annotated[records.PlaceRelation | None, _RELATION] = None
     targets: Annotated[tuple[str, ...], *_names(2)] = ()
-
-    @field_validator("relation", mode="before")
-    @classmethod
-    def _read_relation(cls, written: Any) -> records.PlaceRelation | None:
-        return RELATION_WORDS.get(replies.text_of(written).lower().replace("_", "-"))
 
     @model_validator(mode="after")
     def _check_place(self) -> Self:

@@ -51,6 +51,7 @@ _POINT_TAG = re.compile(
 # Two pairs are corners where nothing but these stands between; in a sentence they may be two objects.
 _CORNER_PAIRS = re.compile(rf"{_PAIR}\s*(?:,|-|–|→|to|and|through)?\s*{_PAIR}")
 _FOUR = re.compile(r"[(\[]?\s*" + r"\s*,\s*".join([f"({NUMBER})"] * 4) + r"\s*[)\]]?")
+_CAMERA = BeforeValidator(lambda said: estimates.CAMERA.get(replies.text_of(said).lower().strip(" .")))
 _COORDINATES = WithJsonSchema({replies.COORDINATES: 4})  # nullable
 Ends = tuple[Point, Point]  # of a line, px of the upright image
 
@@ -96,7 +97,7 @@ class Line(Reply):
     other_names: ClassVar = {"direction": _DIRECTION_KEYS[1:]}
     cue: Annotated[records.Cue | None, WithJsonSchema(replies.one_of(*CUES))]
     along_arrow: Annotated[bool | None, BeforeValidator(replies.truth_of)]
-    camera: estimates.CameraSense | None
+    camera: Annotated[estimates.CameraSense | None, _CAMERA]
     direction: Annotated[Ends | None, _COORDINATES]
     depth_degrees: estimates.DepthDegrees = None  # out of the image plane, positive away from the camera
     speed: estimates.KnownSpeed = None
@@ -106,11 +107,6 @@ class Line(Reply):
     def _read_cue(cls, written: object) -> records.Cue | None:
         said = replies.text_of(written).lower()
         return next((cue for word, cue in _CUE_WORDS.items() if word in said), None)
-
-    @field_validator("camera", mode="before")
-    @classmethod
-    def _read_camera(cls, written: object) -> estimates.CameraSense | None:
-        return estimates.CAMERA.get(replies.text_of(written).lower().strip(" ."))
 
     @field_validator("direction", mode="before")
     @classmethod
