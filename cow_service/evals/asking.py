@@ -9,7 +9,7 @@ import hashlib
 import random
 import re
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import permutations
@@ -148,10 +148,6 @@ class CaseReplies:
     evidence: tuple[Evidence, ...] = ()
     before: int = 0  # replies from the image alone that decided whether to imagine
     messages: tuple[Any, ...] = field(default=(), compare=False)  # as they were sent last, for the log
-
-
-# A way of asking. Raises the `CowError` for which there is no reply.
-Asker = Callable[[Case], Awaitable[CaseReplies]]
 
 
 def observation_of(case: Case, asked: CaseReplies) -> Observation:

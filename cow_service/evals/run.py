@@ -98,9 +98,10 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
         if shared is None:
             raise RuntimeError("The solver runs in tasks of `causalspatial` alone.")
         client, imagination = shared.clients()
-        asker: asking.Asker = asking.PromptAsker(get_model(), imagination, shared.pictures, shared.reply_key)
         if ask == "answer":
             asker = asking.AnswerAsker(client, shared.pictures, shared.options, shared.key)
+        else:
+            asker = asking.PromptAsker(get_model(), imagination, shared.pictures, shared.reply_key)
         try:
             asked = await asker(case)
         except Exception:

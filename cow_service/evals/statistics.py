@@ -58,8 +58,6 @@ class Gain(Record):
 class Bin(Record):
     """Told probabilities between two bounds, and how often what they tell of happened."""
 
-    low: float
-    high: float
     count: int
     told: float = Field(description="Mean of the probabilities.")
     happened: float = Field(description="Share that happened.")
@@ -225,7 +223,7 @@ def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibrat
     for place in np.unique(places).tolist():
         rows = table[places == place]
         mean, happened = map(float, rows.mean(axis=0))
-        found.append(Bin(low=place / bins, high=(place + 1) / bins, count=len(rows), told=mean, happened=happened))
+        found.append(Bin(count=len(rows), told=mean, happened=happened))
     return Calibration(
         count=len(table),
         brier=float(np.mean((table[:, 0] - table[:, 1]) ** 2)),

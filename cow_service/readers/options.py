@@ -60,6 +60,10 @@ _NOT_SURE = re.compile(
     re.IGNORECASE,
 )
 
+MARKS = "*_`\"'“” \t."  # around an answer
+_LETTER = re.compile(
+    r"(?:option\s+|choice\s+)?[(\[]?(?P<letter>[A-Za-z])[)\]]?\s*[.:)\-]?\s*(?P<text>.*)", re.DOTALL | re.IGNORECASE
+)
 _TEMPLATE = re.compile(r"\{[^{}]*\}", re.DOTALL)
 _KEY = re.compile(r"[\"'\u2018\u201c]([\w -]{1,40})[\"'\u2019\u201d]\s*:")
 _REASONS = re.compile(r"reason|rationale|explanation|explain|thought|thinking|analysis|justification", re.IGNORECASE)
@@ -130,6 +134,18 @@ def option_saying(options: Sequence[AnswerOption], text: str) -> AnswerOption | 
     """The only option whose text is this, but for case, spaces and punctuation."""
     said = [option for option in options if plain(option.text) == plain(text) != ""]
     return said[0] if len(said) == 1 else None
+
+
+def option_named(options: Sequence[AnswerOption], said: str) -> AnswerOption | None:
+    """The option that a short text names: by its letter, by its own words, or by both."""
+    text = said.strip(MARKS)
+    if letter := _LETTER.fullmatch(text):
+        # Behind the letter stands nothing, or that option's own text.
+        lettered = next((option for option in options if option.letter == letter["letter"].upper()), None)
+        rest = letter["text"].strip(MARKS + ")")
+        if lettered and (not rest or rest == lettered.text or plain(rest) == plain(lettered.text) != ""):
+            return lettered
+    return option_saying(options, text)
 
 
 def plain(text: str) -> str:

@@ -10,12 +10,10 @@ from pydantic import ValidationError
 from cow_service.errors import CowError
 from cow_service.evals import items
 from cow_service.evals.items import Item, Pictures, Task
-from cow_service.readers.options import not_sure_option, option_saying
+from cow_service.readers.options import not_sure_option, option_named
 from cow_service.records import AnswerOption
 
 MAX_SHOWN = 20  # faults in an error
-_LETTER = re.compile(r"^\s*[(\[]?\s*([A-Za-z])\s*[)\].:]?\s*$")
-_LETTER_AND_TEXT = re.compile(r"^\s*(?:[(\[]\s*([A-Za-z])\s*[)\]]|([A-Z])\s*[.:)])\s*(\S.*)$", re.DOTALL)
 _TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **{task: task for task in items.TASKS}}
 
 
@@ -95,18 +93,12 @@ def task_of(name: str | None) -> Task:
 
 def _answer(given: str | None, options: Sequence[AnswerOption]) -> str:
     """The letter of the right option: given as a letter, as its text, or both."""
-    if given is None or not str(given).strip():
+    if not given or not given.strip():
         raise RowFault("`answer` is empty")
-    text = str(given)
-    by_letter = {option.letter: option for option in options}
-    letter = _LETTER.match(text)
-    if letter and letter[1].upper() in by_letter:
-        return letter[1].upper()
-    both = _LETTER_AND_TEXT.match(text)
-    said = option_saying(options, both[3] if both else text)
-    if said is None or (both and (both[1] or both[2]).upper() != said.letter):
+    said = option_named(options, given)
+    if said is None:
         shown = ", ".join(f"({option.letter}) {option.text}" for option in options)
-        raise RowFault(f"`answer` is none of the options: {text[:60]!r}; they are {shown[:200]}")
+        raise RowFault(f"`answer` is none of the options: {given[:60]!r}; they are {shown[:200]}")
     return said.letter
 
 

@@ -22,7 +22,6 @@ class ArmSummary(Record):
     """What one arm of one run came to."""
 
     run: int = Field(description="Place of the run in the report, from 0.")
-    mllm: str
     arm: str
     name: str = Field(description="Unique in the report: the arm, and the multimodal LLM where there are several.")
     rates: Rates
@@ -42,7 +41,6 @@ class Price(Record):
 
 def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None) -> tuple[ArmSummary, ...]:
     """Of every arm that has replies, in the order of the runs and of their arms."""
-    several = len({run.info.mllm for run in runs}) > 1 or len(runs) > 1
     found: list[ArmSummary] = []
     for place, run in enumerate(runs):
         for arm in run.info.arms:
@@ -50,7 +48,7 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
             of_all = statistics.rates(observations)
             if of_all is None:
                 continue
-            name = f"{run.info.mllm}, {arm}" if several else arm
+            name = f"{run.info.mllm}, {arm}" if len(runs) > 1 else arm
             known = {each.name for each in found}
             compared = None if arm == BASELINE else baseline_run(runs, run)
             baseline = [] if compared is None else compared.of_arm(BASELINE)
@@ -59,7 +57,6 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
             found.append(
                 ArmSummary(
                     run=place,
-                    mllm=run.info.mllm,
                     arm=arm,
                     name=f"{name} ({place + 1})" if name in known else name,
                     rates=of_all,

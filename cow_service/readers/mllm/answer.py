@@ -10,7 +10,7 @@ from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.hypothesis import hypothesis
 from cow_service.readers.mllm.replies import ReplyError
-from cow_service.readers.options import not_sure_option, option_saying, plain, question_without, says_not_sure
+from cow_service.readers.options import MARKS, not_sure_option, option_named, plain, question_without, says_not_sure
 from cow_service.records import AnswerOption
 
 MAX_ANSWER = 400  # characters of an open answer
@@ -19,7 +19,6 @@ UNSURE_WORDS = 6  # an open answer that says "not sure" in more words says somet
 VOTING_TEMPERATURE = 0.7  # without chance every vote would be the same
 _KEYS = ("answer", "final_answer", "choice", "option", "letter")
 _REASONING_KEYS = ("reasoning", "reason", "explanation", "rationale", "thought", "thoughts")
-MARKS = "*_`\"'“” \t."
 _ANSWER_IS = re.compile(r"\b(?:final\s+)?answer\b[\s*_\"'`]*(?:is|:|=)[\s*_\"'`]*(?P<said>[^\n]*)", re.IGNORECASE)
 _TAGGED = re.compile(r"<answer>(?P<said>.*?)(?:</answer>|$)", re.IGNORECASE | re.DOTALL)
 _BOXED = re.compile(r"\\boxed\{(?:\\\w+\{)*(?P<said>[^{}]*)\}")
@@ -30,9 +29,6 @@ _CHOSEN = re.compile(
     re.MULTILINE,
 )
 _SPECIAL = re.compile(r"<\|\w+\|>")
-_LETTER = re.compile(
-    r"(?:option\s+|choice\s+)?[(\[]?(?P<letter>[A-Za-z])[)\]]?\s*[.:)\-]?\s*(?P<text>.*)", re.DOTALL | re.IGNORECASE
-)
 
 
 def answer_calls(
@@ -138,16 +134,10 @@ def _reading_of(option: AnswerOption, reasoning: str) -> AnswerReading:
 
 
 def _option(said: str, options: Sequence[AnswerOption]) -> AnswerOption | None:
-    """The option that a short text means: by its letter, by its own words, or because neither is sure."""
-    text = said.strip(MARKS)
-    if letter := _LETTER.fullmatch(text):
-        # Behind the letter stands nothing, or that option's own text.
-        lettered = next((option for option in options if option.letter == letter["letter"].upper()), None)
-        rest = letter["text"].strip(MARKS + ")")
-        if lettered and (not rest or rest == lettered.text or plain(rest) == plain(lettered.text) != ""):
-            return lettered
-    if found := option_saying(options, text):
+    """The option that a short text means: it names it, begins with its words, or neither is sure."""
+    if found := option_named(options, said):
         return found
+    text = said.strip(MARKS)
     begun = [o for o in options if re.match(rf"{re.escape(o.text)}\s*[,.;:!]\s", text, re.IGNORECASE)]
     if len(begun) == 1 and not says_not_sure(text):
         return begun[0]
