@@ -130,9 +130,9 @@ def measure(engine: JobEngine, counts: list[int]) -> list[dict[str, Any]]:
             {
                 "jobs": made,
                 "page_ms": timed(lambda: engine.page(None, JobFilters())),
-                "failed_ms": timed(lambda: engine.page(None, JobFilters(status=("failed",)))),
-                "succeeded_ms": timed(lambda: engine.page(None, JobFilters(status=("succeeded",)))),
-                "running_ms": timed(lambda: engine.page(None, JobFilters(status=("running",)))),
+                "failed_ms": timed(lambda: engine.page(None, JobFilters(status=["failed"]))),
+                "succeeded_ms": timed(lambda: engine.page(None, JobFilters(status=["succeeded"]))),
+                "running_ms": timed(lambda: engine.page(None, JobFilters(status=["running"]))),
                 "answers_ms": timed(lambda: engine.page(None, JobFilters(kind="answer"))),
                 "one_ms": timed(lambda: engine.find(good, None)),
             }
