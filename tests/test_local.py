@@ -55,7 +55,7 @@ from cow_service.readers.local.generation import (
     TokenSampling,
     conversation_of,
 )
-from cow_service.readers.local.model import LocalModel
+from cow_service.readers.local.model import LocalModel, LocalOptions
 from cow_service.readers.local.reader import device_map, load_local
 from cow_service.readers.local.tiny import NAME, SPECIAL, TEMPLATE, THOUGHT, make_tiny
 from cow_service.readers.mllm.coordinates import CoordinateFrame
@@ -150,7 +150,7 @@ def batches(model: LocalModel, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def another(model: LocalModel, **rest: Any) -> LocalModel:
     """The same weights behind a queue of its own."""
-    return LocalModel(NAME, model._generator, **({"max_new_tokens": 4096, "threads": 1} | rest))
+    return LocalModel(NAME, model._generator, LocalOptions(**({"max_new_tokens": 4096, "threads": 1} | rest)))
 
 
 # What is said.
@@ -326,7 +326,7 @@ def test_a_seed_gives_the_same_reply_in_any_company(toy: LocalModel) -> None:
 def test_only_full_precision_promises_the_same_reply(toy: LocalModel) -> None:
     assert toy.deterministic
     model, processor = make_tiny(load_manifests()[NAME].architecture)
-    assert not LocalModel("half", BatchGenerator(model.to(torch.bfloat16), processor)).deterministic
+    assert not LocalModel("half", BatchGenerator(model.to(torch.bfloat16), processor), LocalOptions()).deterministic
 
 
 def test_a_checkpoints_own_advice_counts_where_nothing_is_said() -> None:
@@ -338,12 +338,14 @@ def test_a_checkpoints_own_advice_counts_where_nothing_is_said() -> None:
         len(
             {
                 text(found)
-                for found in now(*[ask(LocalModel("advised", generator), "?", max_tokens=9) for _ in range(4)])
+                for found in now(
+                    *[ask(LocalModel("advised", generator, LocalOptions()), "?", max_tokens=9) for _ in range(4)]
+                )
             }
         )
         > 1
     )
-    calm = LocalModel("calm", generator, settings=ModelSettings(temperature=0, max_tokens=9))
+    calm = LocalModel("calm", generator, LocalOptions(), ModelSettings(temperature=0, max_tokens=9))
     assert len({text(found) for found in now(*[ask(calm, "?") for _ in range(4)])}) == 1
 
 
@@ -351,7 +353,7 @@ def test_a_model_that_thinks_first() -> None:
     """The thought is free and kept apart; the reply after it is held to the schema."""
     model, processor = make_tiny(load_manifests()[NAME].architecture)
     processor.chat_template = TEMPLATE.removesuffix("{% endif %}") + THOUGHT[0] + "\n{% endif %}"
-    thinker = LocalModel("thinker", BatchGenerator(model, processor), threads=1, max_new_tokens=4000)
+    thinker = LocalModel("thinker", BatchGenerator(model, processor), LocalOptions(threads=1, max_new_tokens=4000))
     asked = [ask(thinker, "?", schema=BOX, temperature=9.0, seed=seed) for seed in (1, 9)]
     for found in now(*asked):
         thought, reply = found.parts

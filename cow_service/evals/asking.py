@@ -311,21 +311,15 @@ def message(digests: Iterable[str], text: str, pictures: Pictures) -> inspect_mo
     return inspect_model.ChatMessageUser(content=[*content, inspect_model.ContentText(text=text)])
 
 
-def conversation(
-    case: Case, asked: CaseReplies, overlay: str | None, pictures: Pictures
-) -> list[inspect_model.ChatMessage]:
+def conversation(case: Case, asked: CaseReplies, pictures: Pictures) -> list[inspect_model.ChatMessage]:
     """What a viewer shows: what was asked last, every reply, and in the first repeat the overlay.
 
     What `/answer` sends by itself is not known here: in its place stand the image, the frames and the question.
     """
     frames = [digest for found in asked.evidence for digest in found.frames]
-    sent: tuple[inspect_model.ChatMessage, ...] = asked.messages or (
-        message((case.item.image, *frames), case.question, pictures),
-    )
-    shown: list[inspect_model.ChatMessage] = [
-        *sent,
-        *(inspect_model.ChatMessageAssistant(content=reply.text) for reply in asked.replies),
-    ]
+    shown = list(asked.messages) or [message((case.item.image, *frames), case.question, pictures)]
+    shown += [inspect_model.ChatMessageAssistant(content=reply.text) for reply in asked.replies]
+    overlay = asked.evidence[0].overlay if asked.evidence else None
     if overlay is not None and case.repeat == 1:
         shown.append(message((overlay,), OVERLAY, pictures))
     return shown

@@ -110,7 +110,7 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
         seen = asking.observation_of(case, asked)
         shared.count(arm, seen)
         state.store.set(runs.OBSERVATION, seen.model_dump(mode="json"))
-        state.messages = asking.conversation(case, asked, seen.overlay, shared.pictures)
+        state.messages = asking.conversation(case, asked, shared.pictures)
         state.output = ModelOutput.from_content(str(state.model), asked.replies[-1].text)
         state.completed = True
         return state

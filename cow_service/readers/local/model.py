@@ -7,8 +7,10 @@ from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import Lock, Thread
+from typing import Literal
 
 import torch
+from pydantic import Field
 from pydantic_ai.exceptions import UserError
 from pydantic_ai.messages import ModelMessage, ModelResponse, TextPart, ThinkingPart
 from pydantic_ai.models import Model, ModelRequestParameters
@@ -19,7 +21,23 @@ from pydantic_ai.usage import RequestUsage
 from cow_service.errors import MllmUnavailable
 from cow_service.readers.local import generation
 from cow_service.readers.local.generation import PendingGeneration
+from cow_service.records import Record
 from cow_service.weights.device import cpu_threads, is_out_of_memory
+
+
+class LocalOptions(Record):
+    """How an MLLM runs in this process: the section `local` of its manifest."""
+
+    dtype: Literal["float32", "bfloat16", "float16", "auto"] = Field(
+        default="auto", description="Of the weights; auto takes them as they are saved."
+    )
+    device_map: str = Field(
+        default="auto", description="Over which GPUs accelerate spreads it, where COW_DEVICE is auto and there are any."
+    )
+    attn_implementation: str = "sdpa"
+    max_batch: int = Field(default=4, ge=1, le=256, description="Replies that are written together.")
+    max_new_tokens: int = Field(default=2048, ge=1, description="The most tokens of a reply, whatever a request says.")
+    threads: int | None = Field(default=None, ge=1, description="Of the CPU; null for PyTorch's own number.")
 
 
 @dataclass(eq=False)
@@ -28,8 +46,7 @@ class BatchWorker:
 
     generator: generation.BatchGenerator
     name: str
-    max_batch: int
-    threads: int | None  # of the CPU; None for PyTorch's own number
+    options: LocalOptions
     _queue: list[PendingGeneration] = field(default_factory=list[PendingGeneration])
     _lock: Lock = field(default_factory=Lock)
     _running: bool = False
@@ -49,12 +66,12 @@ class BatchWorker:
         return pending.future
 
     def _work(self) -> None:
-        with cpu_threads(self.threads):
+        with cpu_threads(self.options.threads):
             while True:
                 # An empty batch ends the thread, which the lock keeps a new request from missing.
                 with self._lock:
                     waiting = [pending for pending in self._queue if not pending.future.done()]
-                    batch, self._queue = waiting[: self.max_batch], waiting[self.max_batch :]
+                    batch, self._queue = waiting[: self.options.max_batch], waiting[self.options.max_batch :]
                     self._running = bool(batch)
                 if not batch:
                     return
@@ -123,21 +140,15 @@ class LocalModel(Model[None]):
         self,
         name: str,
         generator: generation.BatchGenerator,
-        *,
-        max_batch: int = 4,
-        max_new_tokens: int = 1024,
-        threads: int | None = None,
+        options: LocalOptions,
         settings: ModelSettings | None = None,
     ) -> None:
-        """`max_new_tokens` is a reply's limit whatever the request says; `settings`, what counts where it says nothing.
-
-        `threads` are those of the CPU; null for PyTorch's own number.
-        """
+        """`settings` are what counts where a request says nothing."""
         super().__init__(profile=PROFILE, settings=settings)
         self._name = name
         self._generator = generator
-        self._worker = BatchWorker(generator, name, max_batch, threads)
-        self._max_new_tokens = max_new_tokens
+        self._worker = BatchWorker(generator, name, options)
+        self._max_new_tokens = options.max_new_tokens
 
     @property
     def model_name(self) -> str:

@@ -9,43 +9,27 @@ import traceback
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import transformers
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from pydantic_ai.settings import ModelSettings
 from transformers.models.auto.processing_auto import PROCESSOR_MAPPING
 
 from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
 from cow_service.readers.local.generation import BatchGenerator
-from cow_service.readers.local.model import LocalModel
+from cow_service.readers.local.model import LocalModel, LocalOptions
 from cow_service.readers.local.tiny import make_tiny, still
 from cow_service.readers.mllm.client import MllmClient
 from cow_service.readers.mllm.models import ConfiguredModel, mllm_manifests, resolve_model
 from cow_service.readers.mllm.reader import MllmReader
-from cow_service.records import Record
 from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed
 from cow_service.weights.manifests import Manifest, load_families
 from cow_service.weights.repositories import verify, weights_identity
 
 MAX_LISTED = 4  # weights in an error
-
-
-class LocalOptions(Record):
-    """How an MLLM runs in this process: the section `local` of its manifest."""
-
-    dtype: Literal["float32", "bfloat16", "float16", "auto"] = Field(
-        default="auto", description="Of the weights; auto takes them as they are saved."
-    )
-    device_map: str = Field(
-        default="auto", description="Over which GPUs accelerate spreads it, where COW_DEVICE is auto and there are any."
-    )
-    attn_implementation: str = "sdpa"
-    max_batch: int = Field(default=4, ge=1, le=256, description="Replies that are written together.")
-    max_new_tokens: int = Field(default=2048, ge=1, description="The most tokens of a reply.")
-    threads: int | None = Field(default=None, ge=1, description="Of the CPU; null for PyTorch's own number.")
 
 
 def create(settings: Settings) -> MllmReader:
@@ -94,14 +78,7 @@ def load_local(settings: Settings) -> LocalModel:
             model, processor = _from_folder(folder, manifest, options, places)
         generator = BatchGenerator(model, processor)
     defaults: Any = {name: value for name, value in manifest.defaults.items() if name in ModelSettings.__annotations__}
-    return LocalModel(
-        manifest.name,
-        generator,
-        max_batch=options.max_batch,
-        max_new_tokens=options.max_new_tokens,
-        threads=options.threads,
-        settings=ModelSettings(**defaults),
-    )
+    return LocalModel(manifest.name, generator, options, ModelSettings(**defaults))
 
 
 def device_map(device: str, spread: str) -> str | dict[str, str]:
