@@ -150,7 +150,9 @@ def batches(model: LocalModel, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def another(model: LocalModel, **rest: Any) -> LocalModel:
     """The same weights behind a queue of its own."""
-    return LocalModel(NAME, model._generator, LocalOptions(**({"max_new_tokens": 4096, "threads": 1} | rest)))
+    return LocalModel(
+        NAME, model._generator, LocalOptions.model_validate({"max_new_tokens": 4096, "threads": 1} | rest)
+    )
 
 
 # What is said.

@@ -304,10 +304,9 @@ class AnswerAsker:
 
 def message(digests: Iterable[str], text: str, pictures: Pictures) -> inspect_model.ChatMessageUser:
     """Pictures, then a text."""
-    content: list[inspect_model.Content] = []
-    for data in map(pictures.read, digests):
-        url = f"data:{media_type_of(data)};base64,{base64.b64encode(data).decode()}"
-        content.append(inspect_model.ContentImage(image=url))
+    shown = map(pictures.read, digests)
+    urls = (f"data:{media_type_of(data)};base64,{base64.b64encode(data).decode()}" for data in shown)
+    content = (inspect_model.ContentImage(image=url) for url in urls)
     return inspect_model.ChatMessageUser(content=[*content, inspect_model.ContentText(text=text)])
 
 

@@ -218,10 +218,8 @@ def _check_server(url: str, wanted: plan.Plan) -> None:
     except CowError as error:
         error.detail = f"The server at {url} cannot be asked. {error.detail}"
         raise
-    for option, name, known in (
-        ("reader", wanted.reader, models.readers),
-        ("generator", wanted.generator, models.generators),
-    ):
+    named = {"reader": (wanted.reader, models.readers), "generator": (wanted.generator, models.generators)}
+    for option, (name, known) in named.items():
         backend = next((each for each in known if each.name == name), None)
         if name is not None and backend is None:
             raise InvalidRequest(f"--{option} {name}: the server has only {', '.join(each.name for each in known)}.")

@@ -122,12 +122,10 @@ def configure(settings: Settings) -> ConfiguredModel:
     except (ReaderUnavailable, UserError, ValueError, ImportError) as error:
         reason = str(error).splitlines()[0]
         raise ReaderUnavailable(f"COW_MLLM={settings.mllm!r} cannot be used: {reason}") from error
-    client: Any = getattr(model, "client", None)
-    # Azure's addresses and headers are its own.
-    if not isinstance(client, AsyncOpenAI) or isinstance(client, AsyncAzureOpenAI):
-        return ConfiguredModel(model, name, manifest, family)
-    key = client.api_key if client.api_key != NO_KEY else None
-    upstream = Upstream(str(client.base_url).rstrip("/"), name, key or None)
+    client, upstream = getattr(model, "client", None), None
+    if isinstance(client, AsyncOpenAI) and not isinstance(client, AsyncAzureOpenAI):  # whose addresses are its own
+        key = None if client.api_key in ("", NO_KEY) else client.api_key
+        upstream = Upstream(str(client.base_url).rstrip("/"), name, key)
     return ConfiguredModel(model, name, manifest, family, upstream=upstream)
 
 

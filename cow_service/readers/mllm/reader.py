@@ -49,15 +49,11 @@ class MllmReader:
         self._subject = f"The multimodal LLM '{self._model.name}'"
         self._reasoning = int(self._model.manifest.defaults.get("max_reasoning", DEFAULT_REASONING_LENGTH))
         self.info = records.ReaderInfo(name=name, model=self._model.name)
-        self._family_warnings: tuple[str, ...] = ()
-        if self._model.manifest.name == UNKNOWN:
-            family = self._model.family.name
-            taken = f"by its name it was taken for one of the family '{family}'"
-            if family == UNKNOWN:
-                taken = (
-                    "coordinates were asked for as fractions, and a model that is used to others may have given those"
-                )
-            self._family_warnings = (f"No manifest describes '{self._model.name}': {taken}.",)
+        taken = f"by its name it was taken for one of the family '{self._model.family.name}'"
+        if self._model.family.name == UNKNOWN:
+            taken = "coordinates were asked for as fractions, and a model that is used to others may have given those"
+        warning = f"No manifest describes '{self._model.name}': {taken}."
+        self._family_warnings = (warning,) if self._model.manifest.name == UNKNOWN else ()
 
     @cached_property
     def fingerprint(self) -> str:
