@@ -152,7 +152,6 @@ class CaseReplies:
 
 def observation_of(case: Case, asked: CaseReplies) -> Observation:
     """The observation of a case. Of several replies the most frequent answer counts, of equals the first given."""
-    item = case.item
     deciding = asked.replies[asked.before :] or asked.replies
     chosen = leading([case.read(reply.text) for reply in deciding])
     first_shown = asked.evidence[0] if asked.evidence else Evidence()
@@ -174,7 +173,7 @@ def observation_of(case: Case, asked: CaseReplies) -> Observation:
         frames=tuple(digest for each in asked.evidence for digest in each.frames),
         overlay=first_shown.overlay,
         probability=first_shown.probability,
-        happens=happens(item),
+        happens=happens(case.item),
     )
 
 

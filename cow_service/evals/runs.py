@@ -68,7 +68,6 @@ def read_run(folder: Path) -> EvalRun:
         items = {item.id: item for item in map(Item.model_validate_json, lines)}
     except (ValidationError, OSError) as error:
         raise _unreadable(folder, ITEMS, error) from error
-
     return EvalRun(folder, info, items, tuple(read_observations(folder / LOGS)))
 
 

@@ -49,7 +49,6 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
             if of_all is None:
                 continue
             name = f"{run.info.mllm}, {arm}" if len(runs) > 1 else arm
-            known = {each.name for each in found}
             compared = None if arm == BASELINE else baseline_run(runs, run)
             baseline = [] if compared is None else compared.of_arm(BASELINE)
             price = (prices or {}).get(run.info.mllm)
@@ -58,7 +57,7 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
                 ArmSummary(
                     run=place,
                     arm=arm,
-                    name=f"{name} ({place + 1})" if name in known else name,
+                    name=f"{name} ({place + 1})" if any(each.name == name for each in found) else name,
                     rates=of_all,
                     cells=_cells(observations),
                     gain=statistics.gain(observations, baseline),

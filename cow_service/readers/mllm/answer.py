@@ -57,9 +57,8 @@ def answer_calls(
 
 def answer_schema(options: Sequence[AnswerOption], reasoning_length: int) -> replies.Schema:
     """JSON schema of the reply."""
-    answer = replies.nullable(replies.words(MAX_ANSWER))
-    if options:
-        answer = replies.one_of(*(option.letter for option in options))
+    letters = [option.letter for option in options]
+    answer = replies.one_of(*letters) if letters else replies.nullable(replies.words(MAX_ANSWER))
     schema = replies.schema_of(reasoning_length=reasoning_length)
     return schema | {"properties": schema["properties"] | {"answer": answer}, "required": ["reasoning", "answer"]}
 

@@ -83,12 +83,9 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
     mode = "text" if output is None else "native"
     parameters = ModelRequestParameters(function_tools=tools, output_mode=mode, output_object=output)
 
-    warnings: tuple[str, ...] = ()
-    if left_out:
-        names = ", ".join(f"`{name}`" for name in left_out)
-        warnings = (
-            f"Not sent: {names}. This MLLM is not asked over OpenAI's protocol, and its own has no such field.",
-        )
+    names = ", ".join(f"`{name}`" for name in left_out)
+    warning = f"Not sent: {names}. This MLLM is not asked over OpenAI's protocol, and its own has no such field."
+    warnings = (warning,) if left_out else ()
     return PreparedChat(list(_messages(body)), cast("ModelSettings", settings), parameters, warnings)
 
 

@@ -78,8 +78,7 @@ class CoordinateFrame:
     @property
     def _full(self) -> tuple[float, float]:
         """What the family writes for the right and the lower edge."""
-        edges = {"pixels": self.seen, "thousandths": (1000.0, 1000.0), "fractions": (1.0, 1.0)}
-        return edges[self.coordinates.units]
+        return {"pixels": self.seen, "thousandths": (1000.0, 1000.0), "fractions": (1.0, 1.0)}[self.coordinates.units]
 
     @property
     def units(self) -> str:
