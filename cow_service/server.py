@@ -39,6 +39,7 @@ class Server(uvicorn.Server):
     def __init__(self, config: uvicorn.Config, engine: JobEngine) -> None:
         super().__init__(config)
         self._engine = engine
+        self.is_ending = threading.Event()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listens, and logs how to begin."""
@@ -58,7 +59,9 @@ class Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Accepts no more jobs, then closes connections, then lets the app end."""
-        self._engine.drain()
+        self.is_ending.set()
+        if self._engine.is_running:
+            self._engine.drain()
         await super().shutdown(sockets)
 
 
@@ -79,7 +82,10 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
                 service.metrics.serve(host, port)
             except OSError as error:
                 raise SettingsError(f"Bad settings: COW_METRICS_PORT={port}: {error.strerror or error}.") from error
-        pool.check()
+        pool.load(ended)
+        engine.wait_for_database(ended)
+        if ended.is_set():
+            return
         engine.start()
         log.info("this worker takes jobs: %s", ", ".join(service.settings.queues) or "of all queues")
         ended.wait()
@@ -96,18 +102,34 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
     Raises the `CowError` for which the default request cannot be served.
     """
     server, engine, readiness = _server(service, pool)
+    failures: list[CowError] = []
 
     def failed() -> None:
         server.should_exit = True
 
+    def start_later() -> None:
+        engine.wait_for_database(server.is_ending)
+        try:
+            if not server.is_ending.is_set():
+                engine.start()
+        except CowError as error:
+            failures.append(error)
+            failed()
+
     readiness.start(failed)
     try:
         readiness.wait(LOAD_WAIT_SECONDS)
-        engine.start()
+        starting = threading.Thread(target=start_later, name="cow-starting", daemon=True)
+        if engine.database.is_away():
+            starting.start()  # probes are answered while it waits, and all other requests with 503
+        else:
+            engine.start()
         server.run()
         readiness.wait(0)
     finally:
         readiness.end()
+    if failures:
+        raise failures[0]
 
 
 @contextmanager
@@ -149,12 +171,12 @@ def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngin
     if settings.role == "api":
         engine, readiness = JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
     elif pool is not None:
-        engine, readiness = JobEngine(service, pool), Readiness(service, pool.check)
+        engine, readiness = JobEngine(service, pool), Readiness(service, pool.load, fault=pool.fault)
     else:
         warm = partial(warm_up, settings) if settings.warmup else lambda: None
         engine, readiness = JobEngine(service), Readiness(service, warm_up=warm)
     config = uvicorn.Config(
-        create_app(engine, readiness),
+        create_app(engine, readiness, starting=False),
         host=settings.host,
         port=settings.port,
         log_config=None,

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from platformdirs import user_data_path
 from pydantic import Field, SecretStr, ValidationError, ValidationInfo, field_validator
+from pydantic_core import to_json
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from pydantic_settings import SettingsError as UnreadableSetting
 
@@ -107,6 +108,9 @@ class Settings(BaseSettings):
     machine's."""
     worker_jobs: int = Field(default=1000, ge=1)
     """Jobs after which a worker process is replaced by a new one."""
+    load_timeout: float = Field(default=600, gt=0, le=86_400)
+    """Seconds that a worker process may take to start and to load its backends; beyond that it is ended, and started
+    again."""
     warmup: bool = True
     """Compute something small before /readyz says ready, and compile a video model for clips of any size when it is
     loaded; else the first requests take several times as long."""
@@ -203,6 +207,11 @@ class Settings(BaseSettings):
     def weights_dir(self) -> Path:
         """Folder for weights."""
         return self.models_dir or self.data_dir / "models"
+
+    def dump_secrets(self) -> str:
+        """All settings as JSON, secrets too, for a process of this server: `Settings.model_validate_json` reads it."""
+        values = {name: value.get_secret_value() if isinstance(value, SecretStr) else value for name, value in self}
+        return to_json(values).decode()
 
     def has(self, name: str) -> bool:
         """Whether a setting, by its name in the environment (COW_...), is set."""

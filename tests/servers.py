@@ -90,8 +90,8 @@ class Served:
     def __exit__(self, *_: object) -> None:
         self.kill()
 
-    def start(self) -> None:
-        """Starts a server, and waits until it is ready."""
+    def start(self, probe: str | None = None) -> None:
+        """Starts a server, and waits until a probe of it succeeds, by default that it is ready."""
         said = self._log_file.stat().st_size if self._log_file.exists() else 0
         with self._log_file.open("ab") as log:
             self.process = subprocess.Popen(self._command, env=self._environment, stdout=log, stderr=log)
@@ -105,8 +105,8 @@ class Served:
         self.http.close()  # to a server that ended by itself
         self.http = httpx.Client(base_url=eventually(address), timeout=TIME_LIMIT)
         # One that only takes requests is ready once a worker is.
-        probe = "/livez" if self._environment.get("COW_ROLE") == "api" else "/readyz"
-        eventually(lambda: self.http.get(probe).status_code == 200)
+        ready = "/livez" if self._environment.get("COW_ROLE") == "api" else "/readyz"
+        eventually(lambda: self.http.get(probe or ready).status_code == 200)
 
     def log(self) -> str:
         return self._log_file.read_text(errors="replace")

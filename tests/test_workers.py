@@ -28,7 +28,7 @@ def poison(how: str, seed: int = 0) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    limits = {"COW_WORKER_MEMORY_MB": "1000", "COW_JOB_TIMEOUT": "15"}
+    limits = {"COW_WORKER_MEMORY_MB": "1000", "COW_JOB_TIMEOUT": "25"}
     with Served(tmp_path_factory.mktemp("workers"), COW_WORKERS="true", **limits) as one:
         yield one
 

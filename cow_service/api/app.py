@@ -9,10 +9,10 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from starlette.middleware.cors import CORSMiddleware
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Scope
 
 from cow_service import __version__
-from cow_service.api.middleware.access import PROBES, Callers, Guard, KeyRing, Origins, is_loopback
+from cow_service.api.middleware.access import PAGE_FILES, PAGES, PROBES, Callers, Guard, KeyRing, Origins, is_loopback
 from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
@@ -21,8 +21,8 @@ from cow_service.api.problems import documented, install_problem_handlers
 from cow_service.api.routes import artifacts, health, jobs, page, simulate
 from cow_service.api.routes.artifacts import MAX_CONCURRENT_DOWNLOADS
 from cow_service.api.submission import Submitter
-from cow_service.errors import OriginNotAllowed, RateLimited, Unauthorized
-from cow_service.jobs.engine import JobEngine
+from cow_service.errors import NotReady, OriginNotAllowed, RateLimited, Unauthorized
+from cow_service.jobs.engine import NOT_STARTED, JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.observability import tracing
 from cow_service.observability.metrics import Metrics
@@ -49,10 +49,13 @@ RESPONSE_HEADERS = ("X-Request-Id", "Location", "Retry-After", "traceparent")
 log = logging.getLogger("cow_service")
 
 
-def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing: bool = True) -> FastAPI:
+def create_app(
+    engine: JobEngine, readiness: Readiness | None = None, *, starting: bool = True, closing: bool = True
+) -> FastAPI:
     """The application of an engine, which it starts if it is not running yet.
 
-    When the app ends, it closes engine and service, unless `closing` is false because others use them.
+    Without `starting` others start it, and until then all requests but those of probes and pages are refused. When the
+    app ends, it closes engine and service, unless `closing` is false because others use them.
     """
     service = engine.service
     submitter = Submitter(engine)
@@ -60,12 +63,13 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
-        if not engine.is_running:
+        if starting and not engine.is_running:
             await to_thread.run_sync(engine.start)
         yield
         await completer.close()
         if closing:
-            await to_thread.run_sync(engine.close)
+            if engine.is_running:
+                await to_thread.run_sync(engine.close)
             await to_thread.run_sync(service.close)
             await to_thread.run_sync(tracing.stop)
 
@@ -84,11 +88,19 @@ def create_app(engine: JobEngine, readiness: Readiness | None = None, *, closing
     # Else a few GIFs would take the threads of all operations.
     app.state.downloads = CapacityLimiter(MAX_CONCURRENT_DOWNLOADS)
     install_problem_handlers(app)
+    if not starting:
+        app.add_middleware(Guard, refuse=lambda scope: refuse_until_started(scope, engine))
     install_layers(app, service.settings, service.metrics)
     for module in (simulate, chats, jobs, artifacts, health, page):
         app.include_router(module.router)
     app.openapi = lambda: contract(app)
     return app
+
+
+def refuse_until_started(scope: Scope, engine: JobEngine) -> NotReady | None:
+    """Why a request is refused while the engine waits for its database, if it is."""
+    is_open = scope["path"] in PROBES | PAGES or scope["path"].startswith(PAGE_FILES)
+    return None if engine.is_running or is_open else NotReady(NOT_STARTED)
 
 
 class LayeredApp(FastAPI):

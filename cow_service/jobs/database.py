@@ -24,7 +24,7 @@ import sqlalchemy as sa
 from pydantic_core import from_json
 from sqlalchemy import event
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.exc import DisconnectionError, SQLAlchemyError
+from sqlalchemy.exc import DisconnectionError, OperationalError, SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
@@ -204,6 +204,16 @@ class Database:
     def check(self) -> None:
         """Runs a query that always succeeds where the database can be used."""
         self.read(sa.text("SELECT 1"))
+
+    def is_away(self) -> bool:
+        """Whether PostgreSQL cannot be reached, or lets nobody in: it may be starting. A file is never away."""
+        if self.file is not None:
+            return False
+        try:
+            with self.engine.connect():
+                return False
+        except OperationalError:
+            return True
 
     def read(self, query: sa.Executable, values: dict[str, Any] | None = None) -> Sequence[Any]:
         """The rows of a single query, with the values of its parameters."""

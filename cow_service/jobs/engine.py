@@ -6,6 +6,7 @@ database may take it. Each attempt to compute it is a workflow of DBOS. One proc
 process.
 """
 
+import logging
 import threading
 import uuid
 from collections.abc import Iterable
@@ -14,7 +15,15 @@ from http import HTTPStatus
 
 from dbos import DBOS
 
-from cow_service.errors import ArtifactNotFound, CowError, IdempotencyKeyReused, JobNotFound, QueueFull, ShuttingDown
+from cow_service.errors import (
+    ArtifactNotFound,
+    CowError,
+    IdempotencyKeyReused,
+    JobNotFound,
+    NotReady,
+    QueueFull,
+    ShuttingDown,
+)
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, EngineParts, InProcess
 from cow_service.jobs.database import Database, database_errors
@@ -30,7 +39,11 @@ from cow_service.media.images import DecodedImage
 from cow_service.records import TERMINAL, AcceptedRequest, JobPage, ProcessRole
 from cow_service.service import Service
 
+FIRST_WAIT, LONGEST_WAIT = 1.0, 5.0  # seconds between two tries to reach the database
+NOT_STARTED = "The server waits for its job database. Ask again in a while."
 HANDOVER_SECONDS = 3.0  # for interrupted jobs to end, after the grace period
+
+log = logging.getLogger("cow_service")
 
 
 class JobEngine:
@@ -71,6 +84,15 @@ class JobEngine:
         """Runs the jobs of another service from now on, on the same database. Only tests do this."""
         self._parts.service = service
         self.webhooks.use(service.settings, service.metrics)
+
+    def wait_for_database(self, stop: threading.Event) -> None:
+        """Waits until the database can be reached, or until `stop` is set, and logs that it waits."""
+        pause = FIRST_WAIT
+        while self.database.is_away():
+            log.warning("the job database cannot be reached: see COW_DATABASE_URL. Tried again in %g s.", pause)
+            if stop.wait(pause):
+                return
+            pause = min(2 * pause, LONGEST_WAIT)
 
     def start(self) -> None:
         """Opens the database and recovers the jobs that were interrupted. Raises `StorageUnavailable`."""
@@ -130,6 +152,8 @@ class JobEngine:
         if self._stopping:
             raise ShuttingDown("The server is stopping. Ask another one, or this one again in a while.")
         self.database.check()
+        if not self.is_running:
+            raise NotReady(NOT_STARTED)
         self.processes.overview.check_served()
 
     def check_capacity(self, owner: str | None, queue: str = "") -> int:

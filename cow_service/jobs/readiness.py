@@ -29,12 +29,16 @@ class Readiness:
     """Waits once until the default backends are loaded, in a thread of its own."""
 
     def __init__(
-        self, service: Service, load: Callable[[], None] | None = None, warm_up: Callable[[], None] = lambda: None
+        self,
+        service: Service,
+        load: Callable[[], None] | None = None,
+        warm_up: Callable[[], None] = lambda: None,
+        fault: Callable[[], str | None] = lambda: None,
     ) -> None:
         """`load` returns once they are loaded, and raises the `CowError` for which they cannot be. `warm_up` is called
-        once, then."""
+        once, then. `fault` says what holds up the jobs, and passes by itself."""
         self._service = service
-        self._load_backends = load or service.check
+        self._load_backends, self._fault = load or service.check, fault
         self._warm_up = warm_up
         self._warming = threading.Lock()  # held while it warms up, and for ever once the process ends
         self._done = threading.Event()
@@ -58,8 +62,11 @@ class Readiness:
 
     def check(self) -> None:
         """Raises `NotReady` while loading, `StorageUnavailable`, `ReaderUnavailable`, `GeneratorUnavailable`."""
+        fault = self._fault()
         if self._started and not self._done.is_set():
-            raise NotReady("The default reader and generator are being loaded. Ask again in a while.")
+            raise NotReady(fault or "The default reader and generator are being loaded. Ask again in a while.")
+        if fault is not None:
+            raise NotReady(fault)
         self._service.artifacts.check()
         self._load_backends()
         free = shutil.disk_usage(self._service.settings.data_dir).free

@@ -21,16 +21,17 @@ from cow_service.concurrency import leave_decisions_to_the_parent
 from cow_service.errors import Canceled, CowError, unforeseen
 from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import error_as_json
+from cow_service.jobs.job_table import TakenJob, error_as_json
 from cow_service.jobs.readiness import warm_up
+from cow_service.media.images import DecodedImage
 from cow_service.observability import logging as context
 from cow_service.observability import tracing
 from cow_service.observability.metrics import gpu_memory
 from cow_service.requests import Stage
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.workers import process
-from cow_service.workers.process import FromWorker, ToWorker
+from cow_service.workers import messages
+from cow_service.workers.messages import FromWorker
 
 HEARTBEAT_SECONDS = 1.0
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for a key checks whether it was canceled
@@ -42,32 +43,33 @@ log = logging.getLogger("cow_service")
 class _Job:
     """One job at work here."""
 
-    def __init__(self, start: process.Start, send: Callable[[FromWorker], None]) -> None:
-        self.job, self._image, self._send = start.job, start.image, send
+    def __init__(self, job: TakenJob, image: DecodedImage | None, send: Callable[[FromWorker], None]) -> None:
+        self.job, self._image, self._send = job, image, send
         self.canceled, self.key_held = threading.Event(), threading.Event()
         self._told: tuple[Stage | None, float] = (None, 0.0)
 
-    def compute(self, service: Service, database: Database) -> process.Succeeded | process.Failed:
+    def compute(self, service: Service, database: Database) -> messages.Succeeded | messages.Failed:
         """Its end, to be sent."""
         job_id, spec = self.job.id, self.job.spec
+        self._send(messages.Progressed(job_id, None, 0.0))  # from here on the job may be what ends the process
         work = Work(
             job=self.job,
             image=self._image,
             progress=self._progress,
             check=self._check,
-            looked_for=lambda stage, found: self._send(process.LookedFor(job_id, stage, found)),
+            looked_for=lambda stage, found: self._send(messages.LookedFor(job_id, stage, found)),
         )
         try:
             with (
                 context.bound(request=spec.request_id, job=job_id),
                 tracing.span("compute", parent=spec.traceparent, job_id=job_id),
             ):
-                return process.Succeeded(job_id, compute(work, service, database, self._hold_key))
+                return messages.Succeeded(job_id, compute(work, service, database, self._hold_key))
         except CowError as error:
-            return process.Failed(job_id, error_as_json(error))
+            return messages.Failed(job_id, error_as_json(error))
         except Exception:
             log.exception("job %s failed", job_id)
-            return process.Failed(job_id, error_as_json(unforeseen()))
+            return messages.Failed(job_id, error_as_json(unforeseen()))
 
     def _check(self) -> None:
         if self.canceled.is_set():
@@ -77,24 +79,24 @@ class _Job:
         self._check()
         if stage != self._told[0] or done >= min(1.0, self._told[1] + MIN_PROGRESS):
             self._told = stage, done
-            self._send(process.Progressed(self.job.id, stage, done))
+            self._send(messages.Progressed(self.job.id, stage, done))
 
     @contextmanager
     def _hold_key(self, key: str, check_canceled: Callable[[], None]) -> Generator[None]:
         self.key_held.clear()
-        self._send(process.HoldKey(self.job.id, key))
+        self._send(messages.HoldKey(self.job.id, key))
         try:
             while not self.key_held.wait(CANCEL_POLL_SECONDS):
                 check_canceled()
             yield
         finally:
-            self._send(process.ReleaseKey(self.job.id, key))
+            self._send(messages.ReleaseKey(self.job.id, key))
 
 
 class WorkerProcess:
     """Computes the jobs that come over a pipe, each in a thread."""
 
-    def __init__(self, pipe: Connection[FromWorker, ToWorker], settings: Settings) -> None:
+    def __init__(self, pipe: Connection, settings: Settings) -> None:
         self._pipe = pipe
         self._sending = threading.Lock()
         self._service = Service(settings)
@@ -107,27 +109,28 @@ class WorkerProcess:
         threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
         threading.Thread(target=self._load, name="load", daemon=True).start()
         while True:
-            match self._pipe.recv():
-                case process.Start() as start:
-                    self._jobs[start.job.id] = _Job(start, self._send)
-                    self._threads.submit(self._work, start.job.id)
-                case process.Cancel(job_id) if job_id in self._jobs:
+            match messages.receive_by_worker(self._pipe):
+                case messages.Start(job=job, image=sent):
+                    image = None if sent is None else messages.receive_image(self._pipe, sent)
+                    self._jobs[job.id] = _Job(job, image, self._send)
+                    self._threads.submit(self._work, job.id)
+                case messages.Cancel(job_id) if job_id in self._jobs:
                     self._jobs[job_id].canceled.set()
-                case process.KeyHeld(job_id) if job_id in self._jobs:
+                case messages.KeyHeld(job_id) if job_id in self._jobs:
                     self._jobs[job_id].key_held.set()
-                case None:
+                case messages.End():
                     return
                 case _:
                     pass  # about a job that has just ended
 
     def _send(self, message: FromWorker) -> None:
         with self._sending:
-            self._pipe.send(message)
+            messages.send(self._pipe, message)
 
     def _beat(self) -> None:
         this = psutil.Process()
         while True:
-            self._send(process.Heartbeat(this.memory_info().rss, gpu_memory()))
+            self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory()))
             time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:
@@ -141,7 +144,7 @@ class WorkerProcess:
         except Exception:
             log.exception("the default backends could not be loaded")
             failure = error_as_json(unforeseen())
-        self._send(process.Loaded(failure))
+        self._send(messages.Loaded(failure))
 
     def _work(self, job_id: str) -> None:
         end = self._jobs[job_id].compute(self._service, self._database)
@@ -152,13 +155,14 @@ class WorkerProcess:
 def main(descriptor: int) -> None:
     """Works on the pipe of a file descriptor until it ends."""
     leave_decisions_to_the_parent()
-    pipe: Connection[FromWorker, ToWorker] = Connection(descriptor)
+    pipe = Connection(descriptor)
     try:
-        first = pipe.recv()
-        assert isinstance(first, Settings)
-        context.set_up(first)
+        first = messages.receive_by_worker(pipe)
+        assert isinstance(first, messages.Begin)
+        settings = Settings.model_validate_json(first.settings)
+        context.set_up(settings)
         tracing.start()
-        WorkerProcess(pipe, first).run()
+        WorkerProcess(pipe, settings).run()
     except (EOFError, OSError):
         pass
     tracing.stop()

@@ -8,6 +8,7 @@ import logging
 import math
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from itertools import count
 
@@ -23,11 +24,13 @@ from cow_service.records import WorkerInfo
 from cow_service.settings import Settings
 from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
-from cow_service.workers.process import Worker, WorkerGone
+from cow_service.workers.process import EndReason, Worker, WorkerGone
 
 MAX_CRASHES = 3  # of workers that had nothing but the job, or of their device
 HEARTBEAT_TIMEOUT_SECONDS = 15.0  # after which a worker that says nothing is ended
 WATCH_SECONDS = 0.5  # between two looks at each worker
+FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS = 1.0, 60.0  # after a worker that could not start; doubled each time
+POLL_SECONDS = 0.1  # how often a job that waits for such a pause checks whether it was canceled
 SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
 RENEW_SHARE = 0.75  # of that, from which on a worker without a job is replaced
 
@@ -55,26 +58,48 @@ class Group:
         self.places = PrioritySemaphore(self.size * self.jobs_each)
         self.workers: list[Worker] = []
         self.was_loaded = False  # whether a worker has loaded the default backends
+        self.fault: str | None = None  # why the last worker that was started could not load them
         self.alone = threading.Lock()  # held by a job that is computed for itself, as its last worker crashed
         self._settings, self._metrics = settings.model_copy(update=share), metrics
         self._lock = threading.Lock()
         self._taken: dict[Worker, int] = {}
         self._closed = False
+        self._failed_starts, self._next_start = 0, 0.0  # in a row; the time before which none is started
 
     def start(self) -> None:
         """Starts the first worker."""
         with self._lock:
             self._start()
 
-    def take(self, *, fresh: bool = False) -> Worker:
-        """The worker with the fewest jobs, or a new one where all have some and there may be more."""
+    def recover(self) -> None:
+        """Starts a worker, after a pause, in the place of one that could not start."""
         with self._lock:
-            free = [one for one in self.workers if one.is_alive and self._taken[one] < self.jobs_each]
-            best = min(free, key=lambda one: self._taken[one], default=None)
-            if fresh or best is None or (self._taken[best] and len(self.workers) < self.size):
-                best = self._start()
-            self._taken[best] += 1
-            return best
+            if self.fault is None or self._closed:
+                return
+            self._remove_dead()
+            if any(worker.is_loaded and worker.is_alive for worker in self.workers):
+                self._failed_starts, self.fault = 0, None
+            elif not self.workers and time.monotonic() >= self._next_start:
+                self._start()
+
+    def take(self, check: Callable[[], None], *, fresh: bool = False) -> Worker:
+        """The worker with the fewest jobs, or a new one where all have some and there may be more.
+
+        Where workers cannot start, it waits for the next try; what `check` raises ends the wait.
+        """
+        while True:
+            with self._lock:
+                self._remove_dead()
+                free = [one for one in self.workers if one.is_alive and self._taken[one] < self.jobs_each]
+                best = min(free, key=lambda one: self._taken[one], default=None)
+                wants_new = fresh or best is None or (self._taken[best] and len(self.workers) < self.size)
+                if wants_new and time.monotonic() >= self._next_start:
+                    best = self._start()
+                if best is not None:
+                    self._taken[best] += 1
+                    return best
+            check()
+            time.sleep(POLL_SECONDS)
 
     def give_back(self, worker: Worker, *, renew: bool) -> None:
         """The job of a worker is over. One that is to be renewed gets no more jobs, and ends without any."""
@@ -104,16 +129,33 @@ class Group:
     def _start(self) -> Worker:
         if self._closed:
             raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
-        for dead in [one for one in self.workers if not one.is_alive and not self._taken[one]]:  # ended without a job
-            self.workers.remove(dead)
-            del self._taken[dead]
-            dead.close()
         names = {one.name for one in self._taken}
         name = next(name for number in count(1) if (name := f"{self.name}-{number}") not in names)
-        worker = Worker(name, self._settings, lambda reason: self._metrics.worker_ends.labels(reason).inc())
+        worker = Worker(name, self._settings, self._note_end)
         self.workers.append(worker)
         self._taken[worker] = 0
         return worker
+
+    def _remove_dead(self) -> None:
+        """Lets go of workers that ended without a job."""
+        for dead in [one for one in self.workers if not one.is_alive and not self._taken[one]]:
+            self.workers.remove(dead)
+            del self._taken[dead]
+            dead.close()
+
+    def _note_end(self, worker: Worker, reason: EndReason) -> None:
+        """Counts the end of a worker; after one that could not start, the next is started later and later."""
+        self._metrics.worker_ends.labels(reason).inc()
+        if worker.is_loaded or reason in ("renewed", "stopped"):
+            return
+        pause = min(FIRST_PAUSE_SECONDS * 2**self._failed_starts, LONGEST_PAUSE_SECONDS)
+        self._failed_starts, self._next_start = self._failed_starts + 1, time.monotonic() + pause
+        often = "" if self._failed_starts == 1 else f" {self._failed_starts} were started in vain."
+        self.fault = (
+            f"The worker process {worker.name} {worker.end_reason} before it had loaded its backends.{often} Another "
+            f"one is started {pause:g} s later; the log says more."
+        )
+        log.warning("%s", self.fault)
 
 
 class WorkerPool(Computer):
@@ -135,9 +177,8 @@ class WorkerPool(Computer):
             return
         self._watching = threading.Thread(target=self._watch, name="cow-workers", daemon=True)
         self._watching.start()
-        default = queue_of(self._settings.reader, self._settings.generator, self._settings)
-        for name in self._settings.queues or {LIGHT, default}:
-            self._group(name).start()
+        for group in self._default_groups():
+            group.start()
 
     def close(self) -> None:
         """Ends all workers."""
@@ -181,12 +222,21 @@ class WorkerPool(Computer):
             for one in group.alive()
         )
 
-    def check(self) -> None:
-        """Waits until the default backends were loaded once. Raises the `CowError` for which they cannot be."""
-        for group in self.groups:
-            for worker in tuple(group.workers)[:1]:
-                # A worker that takes the place of another one may load for minutes: the server is ready all the same.
-                group.was_loaded |= worker.wait_loaded(0 if group.was_loaded else None)
+    def load(self, stop: threading.Event | None = None) -> None:
+        """Waits until the default backends were loaded once, or until `stop` is set or the pool is closed.
+
+        Raises the `CowError` for which they cannot be loaded. A process that ends before is no such error: another one
+        is started in its place.
+        """
+        for group in self._default_groups():
+            while not (group.was_loaded or self._closed.is_set() or (stop is not None and stop.is_set())):
+                group.was_loaded = any(worker.wait_loaded(POLL_SECONDS) for worker in tuple(group.workers))
+                if not group.was_loaded:
+                    self._closed.wait(POLL_SECONDS)
+
+    def fault(self) -> str | None:
+        """Why jobs wait, where workers cannot start."""
+        return next((group.fault for group in self.groups if group.fault is not None), None)
 
     def compute(self, work: Work) -> JobOutcome:
         """Gives a job to a worker, in its turn. Raises the `CowError` that it fails with, `Canceled`, `WorkerEnded`.
@@ -209,6 +259,8 @@ class WorkerPool(Computer):
                     if crashes >= MAX_CRASHES:
                         raise
                 except WorkerGone as gone:
+                    if gone.never_began:  # no fault of the job, which waits for a worker that can start
+                        continue
                     crashes += alone
                     log.warning("the worker of job %s %s", work.job.id, gone)
                     if crashes >= MAX_CRASHES or (alone and gone.is_final):
@@ -216,7 +268,7 @@ class WorkerPool(Computer):
                     alone = True  # the next crash is this job's own
 
     def _computed(self, work: Work, group: Group, *, fresh: bool) -> JobOutcome:
-        worker, renew = group.take(fresh=fresh), fresh
+        worker, renew = group.take(work.check, fresh=fresh), fresh
         try:
             return worker.run(work, self._locks)
         except DeviceFailed:
@@ -227,6 +279,10 @@ class WorkerPool(Computer):
             renew |= worker.memory_bytes > RENEW_SHARE * self._memory_limit
             group.give_back(worker, renew=renew)
 
+    def _default_groups(self) -> list[Group]:
+        default = queue_of(self._settings.reader, self._settings.generator, self._settings)
+        return [self._group(name) for name in self._settings.queues or (LIGHT, *({default} - {LIGHT}))]
+
     def _group(self, name: str) -> Group:
         with self._guard:
             if name not in self._groups:
@@ -234,16 +290,23 @@ class WorkerPool(Computer):
             return self._groups[name]
 
     def _watch(self) -> None:
-        """Ends workers that are frozen or too large."""
+        """Ends workers that are frozen or too large, and starts others for those that could not start."""
         looked = time.monotonic()
         while not self._closed.wait(WATCH_SECONDS):
             slept = time.monotonic() - looked > HEARTBEAT_TIMEOUT_SECONDS / 2  # this process was frozen itself
             looked = time.monotonic()
-            for worker in [one for group in self.groups for one in tuple(group.workers) if one.is_alive]:
-                if slept:
-                    worker.heard = looked
-                elif looked - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:
-                    worker.kill("frozen", f"was ended, as it said nothing for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
-                elif worker.memory_bytes > self._memory_limit:
-                    reason = f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB"
-                    worker.kill("memory", reason, is_final=True)
+            for group in self.groups:
+                for worker in [one for one in tuple(group.workers) if one.is_alive]:
+                    if slept:
+                        worker.heard = looked
+                    self._judge(worker, looked)
+                group.recover()
+
+    def _judge(self, worker: Worker, now: float) -> None:
+        if not worker.is_loaded and now - worker.started > self._settings.load_timeout:
+            limit = f"{self._settings.load_timeout:g} s, which COW_LOAD_TIMEOUT allows"
+            worker.kill("load", f"was ended, as it had not started within {limit},")
+        elif worker.is_loaded and now - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:
+            worker.kill("frozen", f"was ended, as it said nothing for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
+        elif worker.memory_bytes > self._memory_limit:
+            worker.kill("memory", f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB", is_final=True)

@@ -1,0 +1,187 @@
+"""What a server and its worker processes say to each other: JSON, so that neither runs what the other one sends.
+
+A worker decodes images and runs models, and may be taken over by one of them. All that the server takes from it is
+data: of a limited size, and checked.
+"""
+
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, TypeAdapter
+from pydantic_core import to_json
+
+from cow_service.jobs.computing import JobOutcome
+from cow_service.jobs.job_table import TakenJob
+from cow_service.media.images import DecodedImage
+from cow_service.records import GpuMemory, ImageInfo
+from cow_service.requests import Stage
+
+MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
+
+
+# To the worker.
+
+
+@dataclass(frozen=True)
+class SentImage:
+    """The image of a job; its pixels are the next message, as they lie in memory."""
+
+    info: ImageInfo
+    media_type: str
+
+
+@dataclass(frozen=True)
+class Begin:
+    """The first message: the settings of the worker, of which those of concurrency are its own share, as JSON."""
+
+    settings: str
+    kind: Literal["begin"] = "begin"
+
+
+@dataclass(frozen=True)
+class Start:
+    """Compute a job."""
+
+    job: TakenJob
+    image: SentImage | None  # else it is read from the artifacts
+    kind: Literal["start"] = "start"
+
+
+@dataclass(frozen=True)
+class Cancel:
+    """Nobody wants the result any more."""
+
+    job_id: str
+    kind: Literal["cancel"] = "cancel"
+
+
+@dataclass(frozen=True)
+class KeyHeld:
+    """The job holds the lock of the key that it asked for."""
+
+    job_id: str
+    kind: Literal["key-held"] = "key-held"
+
+
+@dataclass(frozen=True)
+class End:
+    """The last message: the worker has no jobs, and ends."""
+
+    kind: Literal["end"] = "end"
+
+
+# From the worker.
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """The default backends are loaded, or the error, as JSON, for which they are not."""
+
+    error: dict[str, Any] | None
+    kind: Literal["loaded"] = "loaded"
+
+
+@dataclass(frozen=True)
+class Heartbeat:
+    """The process is alive. `memory_bytes` is its resident set."""
+
+    memory_bytes: int
+    gpus: tuple[GpuMemory, ...]
+    kind: Literal["heartbeat"] = "heartbeat"
+
+
+@dataclass(frozen=True)
+class Progressed:
+    """A job has come so far in a stage, 0 to 1. Without a stage: it has begun."""
+
+    job_id: str
+    stage: Stage | None
+    done: float
+    kind: Literal["progressed"] = "progressed"
+
+
+@dataclass(frozen=True)
+class LookedFor:
+    """A stage was looked for among stored results."""
+
+    job_id: str
+    stage: Stage
+    found: bool
+    kind: Literal["looked-for"] = "looked-for"
+
+
+@dataclass(frozen=True)
+class HoldKey:
+    """A job wants the lock of a key: what one job computes, another one waits for, whatever worker it has."""
+
+    job_id: str
+    key: str
+    kind: Literal["hold-key"] = "hold-key"
+
+
+@dataclass(frozen=True)
+class ReleaseKey:
+    """The job gives the lock of a key back."""
+
+    job_id: str
+    key: str
+    kind: Literal["release-key"] = "release-key"
+
+
+@dataclass(frozen=True)
+class Succeeded:
+    """The job is done."""
+
+    job_id: str
+    outcome: JobOutcome
+    kind: Literal["succeeded"] = "succeeded"
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The job failed with an error, as JSON; `Canceled` where it was canceled."""
+
+    job_id: str
+    error: dict[str, Any]
+    kind: Literal["failed"] = "failed"
+
+
+ToWorker = Begin | Start | Cancel | KeyHeld | End
+OfJob = Progressed | LookedFor | HoldKey | ReleaseKey | Succeeded | Failed
+FromWorker = Loaded | Heartbeat | OfJob
+
+_TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(Annotated[ToWorker, Field(discriminator="kind")])
+_FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])
+
+
+def send(connection: Connection, message: ToWorker | FromWorker) -> None:
+    """Sends a message. Only one thread may do so at a time. Raises `OSError` where the other process has ended."""
+    connection.send_bytes(to_json(message))
+
+
+def send_image(connection: Connection, image: DecodedImage) -> None:
+    """Sends the pixels of the job's image, right behind its `Start`."""
+    connection.send_bytes(image.pixels.data.cast("B"))
+
+
+def receive_image(connection: Connection, sent: SentImage) -> DecodedImage:
+    """The image whose pixels are the next message."""
+    shape = sent.info.height, sent.info.width, 3
+    pixels = np.frombuffer(connection.recv_bytes(), np.uint8).reshape(shape)
+    return DecodedImage(pixels, sent.info, sent.media_type)
+
+
+def receive_by_worker(connection: Connection) -> ToWorker:
+    """Waits for the next message to a worker. Raises `OSError` or `EOFError` where the server has ended."""
+    return _TO_WORKER.validate_json(connection.recv_bytes())
+
+
+def receive_from_worker(connection: Connection) -> FromWorker:
+    """Waits for the next message of a worker.
+
+    Raises `OSError` or `EOFError` where it has ended, and for a message that is too long; `ValidationError` for what is
+    no message.
+    """
+    return _FROM_WORKER.validate_json(connection.recv_bytes(MAX_MESSAGE_BYTES))

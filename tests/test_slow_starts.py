@@ -1,0 +1,81 @@
+"""Worker processes that start slowly, or not at all, and a server that starts while its database is away."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from conftest import SLOWNESS
+from postgres import postgres
+from servers import BODY, Served, eventually, problem
+from test_workers import workers_of
+
+from cow_service.workers.pool import HEARTBEAT_TIMEOUT_SECONDS
+
+pytestmark = pytest.mark.slow
+
+# Runs at the start of every Python process of the server, before its imports.
+AT_START = """
+import os, pathlib, sys, time
+if "cow_service.workers" in sys.orig_argv:
+    left = pathlib.Path(os.environ["BAD_STARTS"])
+    number = int(left.read_text())
+    left.write_text(str(max(0, number - 1)))
+    if number and os.environ["BAD_START"] == "dies":
+        os.kill(os.getpid(), 9)
+    time.sleep(float(os.environ["BAD_START"]) if number else 0)
+"""
+
+
+def bad_starts(folder: Path, number: int, bad: str, **settings: str) -> Served:
+    """A server of which so many worker processes start badly: each "dies", or takes so many seconds more."""
+    (folder / "site").mkdir()
+    (folder / "site" / "sitecustomize.py").write_text(AT_START)
+    (folder / "number").write_text(str(number))
+    own = {"PYTHONPATH": str(folder / "site"), "BAD_STARTS": str(folder / "number"), "BAD_START": bad}
+    return Served(folder, COW_WORKERS="true", **own, **settings)
+
+
+def test_a_worker_that_starts_slowly_is_waited_for(tmp_path: Path) -> None:
+    with bad_starts(tmp_path, 1, f"{1.2 * HEARTBEAT_TIMEOUT_SECONDS}") as served:
+        assert served.http.post("/simulate", json=BODY).status_code == 200
+        assert "was ended" not in served.log()
+
+
+def test_a_worker_that_does_not_load_in_time_is_replaced(tmp_path: Path) -> None:
+    limit = str(8 * SLOWNESS)
+    with bad_starts(tmp_path, 1, "1000", COW_LOAD_TIMEOUT=limit) as served:  # which waits until the server is ready
+        assert "COW_LOAD_TIMEOUT" in served.log()
+        assert served.http.post("/simulate", json=BODY).status_code == 200
+
+
+def test_no_job_fails_because_a_worker_cannot_start(tmp_path: Path) -> None:
+    with bad_starts(tmp_path, 2, "dies") as served:  # the server stays up, and is ready after the third start
+        assert served.log().count("before it had loaded its backends") == 2
+        (tmp_path / "number").write_text("3")
+        for one in workers_of(served):
+            one.kill()
+        job = served.submit(BODY)
+        refused = eventually(lambda: None if (answer := served.http.get("/readyz")).is_success else answer)
+        assert "signal 9" in problem(refused, 503, "not-ready")["detail"]
+        assert served.job(job["id"])["status"] in ("queued", "running")
+        assert served.ended(job["id"])["status"] == "succeeded"
+        eventually(lambda: served.http.get("/readyz").is_success)
+
+
+def test_a_server_that_starts_while_its_database_is_away_waits_and_says_so(tmp_path: Path) -> None:
+    with postgres() as database:
+        database.kill()
+        served = Served(tmp_path, COW_DATABASE_URL=database.url)
+        with ExitStack() as stack:
+            stack.callback(served.kill)
+            served.start("/livez")
+            problem(served.http.get("/readyz"), 503, "storage-unavailable")
+            refused = served.http.post("/simulate", json=BODY)
+            problem(refused, 503, "not-ready")
+            assert refused.headers["Retry-After"]
+            assert "the job database cannot be reached" in served.log()
+            database.start()
+            eventually(lambda: served.http.get("/readyz").is_success)
+            assert served.http.post("/simulate", json=BODY).is_success
