@@ -95,6 +95,8 @@ class Group:
                 wants_new = fresh or best is None or (self._taken[best] and len(self.workers) < self.size)
                 if wants_new and time.monotonic() >= self._next_start:
                     best = self._start()
+                elif fresh:
+                    best = None  # the job may end the process that it is given to
                 if best is not None:
                     self._taken[best] += 1
                     return best
