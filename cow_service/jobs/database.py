@@ -15,7 +15,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -284,6 +284,10 @@ class Database:
 
         address = sa.make_url(self.url).set(drivername="postgresql").render_as_string(hide_password=False)
         return psycopg.connect(address, autocommit=True, connect_timeout=CONNECT_SECONDS)
+
+    def limited(self, session: psycopg.Connection[Any]) -> AbstractContextManager[None]:
+        """Limits the time that the block takes with a session, from `watch` on."""
+        return self.stalled.limited(session) if self.stalled else nullcontext()
 
     def flush(self) -> None:
         """Returns once everything that was committed is on the disk, and so outlives a loss of power."""

@@ -142,8 +142,8 @@ class JobEngine:
         self.processes.stop()
         self._computer.close()
         set_runner(None)
+        self._lease.release()  # before the database's: a session that has no answer is ended by what that stops
         self.database.close()
-        self._lease.release()
         self.is_running = False
 
     def check(self) -> None:

@@ -166,8 +166,7 @@ class SessionLease(BackgroundThread):
 
     def _ask(self, session: psycopg.Connection[Any], statement: LiteralString, *values: object) -> object:
         """The value that a statement returns. Raises `psycopg.Error`, also where no answer comes."""
-        assert self._database.stalled is not None, "leases of sessions are PostgreSQL's"
-        with self._database.stalled.limited(session):
+        with self._database.limited(session):
             row = session.execute(statement, values).fetchone()
         return None if row is None else row[0]
 

@@ -78,7 +78,8 @@ class PostgresNotifications(Notifications):
         while not self._stop.is_set():
             try:
                 with self._parts.database.session() as session:
-                    session.execute(f"LISTEN {CHANNEL}")
+                    with self._parts.database.limited(session):
+                        session.execute(f"LISTEN {CHANNEL}")
                     while not self._stop.is_set():
                         for message in session.notifies(timeout=LISTEN_SECONDS):
                             with suppress(ValueError, TypeError):  # of another version

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cow_service.physics.camera import FOCAL_WIDTHS, FloorCamera
 from cow_service.records import BBox, Vector
-from cow_service.vision.masks import bbox_of, lab_of, resized_mask, scaled, without_holes
+from cow_service.vision.masks import bbox_of, eroded, lab_of, resized_mask, scaled, without_holes
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 PAINT, DARK, OTHER = 1, 2, 3  # labels of pixels, 0 beside it: the body's colour, tyres, and glass and lamps
@@ -204,7 +204,7 @@ def _seen(image: Image, mask: Mask, bbox: BBox) -> _Seen | None:
 def _labels(lab: Floats32, own: Mask, near: BBox) -> Labels:
     """Labels [h, w] of a window whose pixels have these Lab colours, of what a mask and a box are about."""
     lightness, chroma = lab[..., 0], np.hypot(lab[..., 1], lab[..., 2])
-    inner = _eroded(own) if _eroded(own).any() else own
+    inner = eroded(own) if eroded(own).any() else own
     paint, colour = float(np.median(lightness[inner])), np.median(lab[..., 1:][inner], axis=0)
     floor = float(np.median(lightness[~own])) if not own.all() else 100.0
     dark = (lightness < min(TYRE_SHARE * floor, TYRE_LIGHTNESS)) & (chroma < TYRE_CHROMA) & (paint > BLACK)
@@ -226,11 +226,7 @@ def _labels(lab: Floats32, own: Mask, near: BBox) -> Labels:
     down = (rows - top) / max(1.0, bottom - 1 - top)
     other &= (down <= LOW_PART) | (lightness > paint)
     labels = np.where(filled, np.uint8(PAINT), np.uint8(0))
-    labels[_eroded(filled) & other | filled & ~whole] = OTHER
+    labels[eroded(filled) & other | filled & ~whole] = OTHER
     labels[filled & dark & (down > HIGH_PART)] = DARK
     labels[filled & dark & (down <= HIGH_PART)] = OTHER
     return labels
-
-
-def _eroded(mask: Mask) -> Mask:
-    return cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
