@@ -5,7 +5,15 @@ BIN := $(VENV)/bin
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
 
-.PHONY: demo serve test test-fast soak lint unasync openapi bench clean
+.PHONY: demo serve test test-fast soak chaos lint unasync openapi lock sbom bench clean
+
+# Tools that the project is not built with, apart from what they look at.
+TOOLS ?= .tools
+# The images' Python and every machine; torch as the tests hold it, and none without the extras of video models.
+LOCK = $(TOOLS)/bin/uv pip compile --quiet --python-version 3.13 --universal --generate-hashes --no-annotate \
+	--custom-compile-command "make lock" --constraint tests/constraints.txt $(UPGRADE)
+CPU_EXTRAS := --extra providers --extra otel --extra mcp --extra objects
+CUDA_EXTRAS := $(CPU_EXTRAS) --extra wan --extra fp8 --extra local
 
 demo: $(VENV)/.base ## run the main job on an example
 	$(BIN)/cow demo --out demo
@@ -19,10 +27,13 @@ test: $(VENV)/.test ## every test but those marked soak_only; of long tables eve
 test-fast: $(VENV)/.test ## of `make test` those not marked slow
 	$(PYTEST) -m "not slow"
 
-soak: $(VENV)/.test ## every test with every case; crash, fuzz and state tests ten times as long; public harnesses
+soak: $(VENV)/.test ## every test with every case; chaos, fuzz and state tests ten times as long; public harnesses
 	$(PYTEST) tests/test_inspect.py tests/test_docs.py
 	COW_TEST_SCALE=10 $(PYTEST)
 	$(MAKE) -C cow-scenes test
+
+chaos: $(VENV)/.test ## strike servers, databases, networks and disks at random; COW_CHAOS_SEED=N repeats a schedule
+	COW_TEST_SCALE=10 $(BIN)/python -m pytest tests/test_chaos.py --numprocesses 2 -rA
 
 lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/ruff check .
@@ -36,6 +47,16 @@ unasync: $(VENV)/.test ## write the classes of the blocking client from the asyn
 openapi: $(VENV)/.base ## write openapi.yaml from the app
 	$(BIN)/cow openapi > openapi.yaml
 
+lock: $(TOOLS)/.made ## write versions and hashes of what the images install; UPGRADE=--upgrade takes newer ones
+	echo "hatchling>=1.27" | $(LOCK) - --output-file docker/locks/build.txt
+	$(LOCK) pyproject.toml $(CPU_EXTRAS) --output-file docker/locks/cpu.txt
+	$(LOCK) pyproject.toml $(CUDA_EXTRAS) --output-file docker/locks/cuda.txt
+
+sbom: $(TOOLS)/.made ## write what the images install as CycloneDX, into dist
+	mkdir -p dist
+	for image in cpu cuda; do $(TOOLS)/bin/cyclonedx-py requirements docker/locks/$$image.txt --pyproject pyproject.toml \
+		--output-reproducible --output-file dist/cow-$$image.cdx.json; done
+
 bench: $(VENV)/.base ## the figures of the README
 	$(BIN)/python benchmarks/scenes.py examples
 	$(BIN)/python benchmarks/answers.py examples
@@ -45,7 +66,7 @@ bench: $(VENV)/.base ## the figures of the README
 	$(BIN)/python benchmarks/chat.py
 
 clean: ## remove what the other targets made
-	rm -rf $(VENV) demo dist build
+	rm -rf $(VENV) $(TOOLS) demo dist build
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -58,3 +79,8 @@ $(VENV)/.base: pyproject.toml | $(BIN)/python
 $(VENV)/.test: pyproject.toml tests/constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test]" --constraint tests/constraints.txt
 	touch $(VENV)/.base $@
+
+$(TOOLS)/.made: Makefile
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip install --quiet uv==0.13.9 cyclonedx-bom==7.5.0
+	touch $@

@@ -57,7 +57,7 @@ class Instant(BaseHTTPRequestHandler):
 def request_of(service: Service, folder: Path, **body: Any) -> AnswerRequest:
     """The image and question of a scene."""
     meta = json.loads((folder / "meta.json").read_text())
-    image, _ = service.keep_image((folder / "image.jpg").read_bytes())
+    image = service.keep_image((folder / "image.jpg").read_bytes())
     return AnswerRequest.model_validate(
         {"image": {"artifact": image.sha256}, "question": meta["question"], "video": False} | body
     )

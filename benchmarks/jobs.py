@@ -25,7 +25,7 @@ import sqlalchemy as sa
 
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobFilters, JobSpec
-from cow_service.media.images import DecodedImage, encode_png
+from cow_service.media.images import encode_png
 from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.stages.run import now
@@ -42,10 +42,10 @@ TABLES = {
 GIVEN: dict[str, Any] = {"grounding": {"bbox": [10, 20, 30, 40]}, "num_frames": 9, "video": False}
 
 
-def run_job(engine: JobEngine, image: DecodedImage, motion: dict[str, Any]) -> str:
+def run_job(engine: JobEngine, image: str, motion: dict[str, Any]) -> str:
     """One job to its end; its id."""
     asked = {
-        "image": {"artifact": image.info.sha256},
+        "image": {"artifact": image},
         "question": "If it moves, what happens?",
         "motion": motion,
         **GIVEN,
@@ -55,7 +55,7 @@ def run_job(engine: JobEngine, image: DecodedImage, motion: dict[str, Any]) -> s
 
     async def ended() -> None:
         with engine.active.waiting(job_id) as waiter:
-            await asyncio.to_thread(engine.submit, job_id, spec, None, None, image)
+            await asyncio.to_thread(engine.submit, job_id, spec, None, None, lambda: None)
             await waiter.ended.wait()
 
     asyncio.run(ended())
@@ -114,7 +114,7 @@ def measure(engine: JobEngine, counts: list[int]) -> list[dict[str, Any]]:
     """A row for each number of jobs."""
     pixels = np.full((64, 96, 3), 200, np.uint8)
     pixels[20:40, 10:30] = (200, 30, 30)
-    _, image = engine.service.keep_image(encode_png(pixels))
+    image = engine.service.keep_image(encode_png(pixels)).sha256
     good = run_job(engine, image, {"direction": [1, 0]})
     bad = run_job(engine, image, {})  # the question tells no direction
     rows: list[dict[str, Any]] = []

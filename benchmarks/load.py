@@ -20,12 +20,21 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from crash import Ground
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+
+from servers import Served
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "ball-and-mug"
 QUESTION = "If the yellow ball moves to the left, will it hit the blue mug?"
 SOAKERS = 4
+
+
+def server(folder: str, database: str | None, **settings: str) -> Served:
+    """A server with an empty data folder, as users start it."""
+    usual = {"COW_WORKERS": "true", "COW_WARMUP": "true", "COW_QUEUE_LIMIT": "100000"}
+    return Served(Path(folder), **usual | settings | ({"COW_DATABASE_URL": database} if database else {}))
 
 
 def body(seed: int, **rest: Any) -> dict[str, Any]:
@@ -42,19 +51,19 @@ def body(seed: int, **rest: Any) -> dict[str, Any]:
     }
 
 
-def resident(ground: Ground) -> float:
+def resident(served: Served) -> float:
     """MB of the server's memory that are in use."""
-    assert ground.process is not None
-    status = Path(f"/proc/{ground.process.pid}/status").read_text()
+    assert served.process is not None
+    status = Path(f"/proc/{served.process.pid}/status").read_text()
     return round(int(status.split("VmRSS:")[1].split()[0]) / 1024, 1)
 
 
-def callers(ground: Ground, many: int) -> dict[str, Any]:
+def callers(served: Served, many: int) -> dict[str, Any]:
     """All at once: how they were answered, and how long the last one waited."""
     started = time.perf_counter()
 
     def ask(seed: int) -> int:
-        return httpx.post(f"{ground.address}/simulate", json=body(seed), timeout=600).status_code
+        return httpx.post(f"{served.http.base_url}/simulate", json=body(seed), timeout=600).status_code
 
     with ThreadPoolExecutor(many) as pool:
         statuses = list(pool.map(ask, range(many)))
@@ -62,32 +71,26 @@ def callers(ground: Ground, many: int) -> dict[str, Any]:
     return {"callers": many, "statuses": told, "all_answered_s": round(time.perf_counter() - started, 1)}
 
 
-def full_queue(folder: Path, database: str | None) -> dict[str, Any]:
+def full_queue(folder: str, database: str | None) -> dict[str, Any]:
     """Milliseconds until a request of 1 MB is refused because the queue is full, while the server works."""
-    ground = Ground(folder, database, queue_limit=4)
-    try:
-        ground.start()
+    with server(folder, database, COW_QUEUE_LIMIT="4") as served:
         for seed in range(4):
             slow = body(seed, generator="slow", generator_options={"seconds": 60})
-            httpx.post(f"{ground.address}/simulate", json=slow, headers={"Prefer": "respond-async"}, timeout=60)
+            served.submit(slow)
         times: list[float] = []
         sent = json.dumps(body(9, question=QUESTION + " " * 3000)).encode() + b" " * 1_000_000
-        with httpx.Client(base_url=ground.address) as client:
-            for _ in range(40):
-                started = time.perf_counter()
-                answer = client.post("/simulate", content=sent, headers={"content-type": "application/json"})
-                times.append(1000 * (time.perf_counter() - started))
-                assert answer.json()["type"].endswith("queue-full"), answer.text
-    finally:
-        ground.kill()
-        ground.close()
+        for _ in range(40):
+            started = time.perf_counter()
+            answer = served.http.post("/simulate", content=sent, headers={"content-type": "application/json"})
+            times.append(1000 * (time.perf_counter() - started))
+            assert answer.json()["type"].endswith("queue-full"), answer.text
     return {"p50_ms": round(statistics.median(times), 1), "max_ms": round(max(times), 1)}
 
 
-def soak(ground: Ground, requests: int) -> dict[str, Any]:
+def soak(served: Served, requests: int) -> dict[str, Any]:
     """The server's memory along the way."""
     curve: list[float] = []
-    with ThreadPoolExecutor(SOAKERS) as pool, httpx.Client(base_url=ground.address, timeout=600) as client:
+    with ThreadPoolExecutor(SOAKERS) as pool, httpx.Client(base_url=served.http.base_url, timeout=600) as client:
 
         def ask(seed: int) -> int:
             return client.post("/simulate", json=body(seed, num_frames=9)).status_code
@@ -95,7 +98,7 @@ def soak(ground: Ground, requests: int) -> dict[str, Any]:
         statuses: list[int] = []
         for start in range(0, requests, 100):
             statuses += list(pool.map(ask, range(1_000_000 + start, 1_000_000 + start + 100)))
-            curve.append(resident(ground))
+            curve.append(resident(served))
     told = {str(status): statuses.count(status) for status in sorted(set(statuses))}
     return {"requests": requests, "statuses": told, "resident_mb_every_100": curve}
 
@@ -109,17 +112,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     told: dict[str, Any] = {"database": "postgresql" if given.database else "sqlite"}
-    with tempfile.TemporaryDirectory(prefix="cow-load-") as made:
-        ground = Ground(Path(made), given.database)
-        try:
-            ground.start()
-            told["callers"] = callers(ground, given.callers)
-            print(json.dumps(told["callers"]), file=sys.stderr)
-            told["soak"] = soak(ground, given.requests)
-        finally:
-            ground.close()
-    with tempfile.TemporaryDirectory(prefix="cow-load-") as made:
-        told["queue_full"] = full_queue(Path(made), given.database)
+    with tempfile.TemporaryDirectory(prefix="cow-load-") as folder, server(folder, given.database) as served:
+        told["callers"] = callers(served, given.callers)
+        print(json.dumps(told["callers"]), file=sys.stderr)
+        told["soak"] = soak(served, given.requests)
+    with tempfile.TemporaryDirectory(prefix="cow-load-") as folder:
+        told["queue_full"] = full_queue(folder, given.database)
     print(json.dumps(told))
     if given.json:
         given.json.write_text(json.dumps(told, indent=1) + "\n")

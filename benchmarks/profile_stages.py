@@ -28,6 +28,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cow_service.pipeline import simulate
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -101,10 +102,11 @@ def profiled(image: bytes, question: str, request: dict[str, Any], runs: int, to
 
         def once() -> dict[str, float]:
             started = time.perf_counter()
-            artifact, decoded = service.keep_image(image)
-            kept = time.perf_counter()
+            artifact = service.keep_image(image)
             asked = {"image": {"artifact": artifact.sha256}, "question": question, **request}
-            found = service.simulate(SimulateRequest.model_validate(asked), image=decoded)
+            run = service.prepare(SimulateRequest.model_validate(asked))
+            kept = time.perf_counter()
+            found = simulate(run)
             ended = time.perf_counter()
             return {"whole": ended - started, "image": kept - started, **found.timings}
 

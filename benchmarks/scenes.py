@@ -64,7 +64,7 @@ class Row:
 def measure(service: Service, folder: Path) -> Row:
     """Runs one scene by image and question alone, as a caller would, and holds the result against the truth."""
     meta = json.loads((folder / "meta.json").read_text())
-    image, _ = service.keep_image((folder / "image.jpg").read_bytes())
+    image = service.keep_image((folder / "image.jpg").read_bytes())
     body: dict[str, Any] = {
         "image": {"artifact": image.sha256},
         "question": meta["question"],

@@ -178,10 +178,10 @@ def probability(throw: Throw, size: int) -> tuple[float, bool]:
         source="embedded",
     )
     fit: CameraFit = fit_shadow(prior(), box, throw.shadow, (WIDTH, HEIGHT)) or prior()
-    world = WorldInput(bodies, motion, fit, (WIDTH, HEIGHT), FRAMES, FPS, asked=1)
+    world = WorldInput(bodies, motion, fit, (WIDTH, HEIGHT), FRAMES, FPS)
     shown, rows = likeliest(), ensemble(size)
-    single = find_world_events(run_world(world, shown), bodies, FPS, shown, (WIDTH, HEIGHT)).of[0]
-    found = find_world_events(run_world(world, rows, 2), bodies, FPS, rows, (WIDTH, HEIGHT)).of[0]
+    single = find_world_events(run_world(world, shown), bodies, shown, (WIDTH, HEIGHT)).of[0]
+    found = find_world_events(run_world(world, rows, 2), bodies, rows, (WIDTH, HEIGHT)).of[0]
     return float(np.isfinite(found.times["touches"][:, 1]).mean()), bool(np.isfinite(single.times["touches"][0, 1]))
 
 

@@ -9,7 +9,7 @@ import statistics
 import time
 from dataclasses import dataclass, field
 
-from cow_service.generators.wan.capabilities import MINIMUM_VERSIONS, Capabilities
+from cow_service.generators.wan.capabilities import MINIMUM_VERSIONS, Capabilities, is_installed
 
 SHARE_OF_PEAK = 0.4  # of matrix products, in a pass
 FILL_BYTES_PER_SECOND = 4e9  # random weights
@@ -43,9 +43,12 @@ class Budget:
         self._errors.append(seconds / reckoned)
 
 
-def missing_packages(machine: Capabilities) -> list[str]:
+WANTED = {"accelerate": "0.17.0", "flash-attn": "2.6.3", "kernels": "0.12.3", **MINIMUM_VERSIONS}
+
+
+def missing_packages() -> list[str]:
     """What a bare machine lacks, as arguments of `pip download` elsewhere."""
-    return [f"{name}>={least}" for name, least in MINIMUM_VERSIONS.items() if name not in machine.packages]
+    return [f"{name}>={least}" for name, least in WANTED.items() if not is_installed(name, least)]
 
 
 # Where `--plan` is asked for without the GPU that it is for.

@@ -147,7 +147,7 @@ def totals(case: Case, results: list[Result]) -> list[dict[str, Any]]:
         return []
     parts: dict[str, float] = clip["parts_s"]
     rest = sum(seconds for name, seconds in parts.items() if name not in {"denoising", "VAE encode", "decode"})
-    passes = sum(2 if sampling.guides(step) else 1 for step in range(sampling.steps))
+    passes = sampling.steps * (2 if sampling.is_guided else 1)
     return [
         {
             "name": name,

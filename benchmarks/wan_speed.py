@@ -54,7 +54,7 @@ from wan_table import PARTS, table
 from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.acceleration import FIRST_LAYERS
 from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
-from cow_service.generators.wan.capabilities import ATTENTION_BACKENDS, detect_capabilities, refusals
+from cow_service.generators.wan.capabilities import backends_for_auto, detect_capabilities, refusals
 from cow_service.generators.wan.pipeline import image_token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
 from cow_service.generators.wan.tracks import nearest_lengths
@@ -193,8 +193,7 @@ def survey(case: Case, names: Iterable[str], file: Path | None, budget: Budget |
     found["attention"] = [attention_figures(one, case) for one in timed]
     keep([])
     if budget is not None:
-        best = fastest(one for one in timed if ATTENTION_BACKENDS[one.name].in_auto)
-        measure_rows(case, peak, best, budget, keep)
+        measure_rows(case, peak, fastest(timed), budget, keep)
         return found
     results: list[Result] = []
     for name in names:
@@ -205,10 +204,9 @@ def survey(case: Case, names: Iterable[str], file: Path | None, budget: Budget |
 
 def time_attention(case: Case) -> tuple[TimedBackend, ...]:
     """Each attention backend that this machine has, by itself, at the shape of the clip."""
-    machine = detect_capabilities(case.device)
-    names = [name for name in ATTENTION_BACKENDS if not refusals(Acceleration(attention=name), machine)]
-    if case.device.type == "cuda":  # a matrix of tokens x tokens would not fit
-        names.remove("_native_math")
+    names = backends_for_auto(Acceleration(), detect_capabilities(case.device))
+    if case.device.type == "cpu":  # on a GPU, its matrix of tokens x tokens would not fit
+        names += ("_native_math",)
     dtype = torch.bfloat16 if case.device.type == "cuda" else torch.float32
     return time_backends(names, _attention_shape(case), dtype, case.device)
 
@@ -245,7 +243,7 @@ def plan(case: Case, budget: Budget | None) -> str:
             continue
         total += 0 if left_out else seconds
         lines.append(f"{row.name}: {seconds:.0f} s (reckoned)" + (", not within the budget" * left_out))
-    if is_here and (missing := missing_packages(machine)):
+    if is_here and (missing := missing_packages()):
         lines.append(f"Not installed here: {', '.join(missing)}.")
     return "\n".join([f"{machine.name}: in all {total:.0f} s (reckoned).", *lines])
 

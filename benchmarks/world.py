@@ -62,7 +62,7 @@ def measure(service: Service, folder: Path) -> Row | None:
     """Runs one scene as a caller would."""
     meta = json.loads((folder / "meta.json").read_text())
     form = meta.get("form") or meta["motion"]
-    image, _ = service.keep_image((folder / "image.jpg").read_bytes())
+    image = service.keep_image((folder / "image.jpg").read_bytes())
     body: dict[str, Any] = {"image": {"artifact": image.sha256}, "question": meta["question"]}
     try:
         answer = service.answer(AnswerRequest.model_validate(body))

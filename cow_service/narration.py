@@ -163,6 +163,10 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
     if abs(path - clip) * request.fps > 1.5:
         happens = "its rest is not shown" if path > clip else "from its end on the object stays where it is"
         found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
+    found += [
+        f"Something may stand at ({(left + right) / 2:.0f}, {bottom:.0f}) that is too faint to tell: no world has it."
+        for left, _, right, bottom in trajectory.faint
+    ]
     found += [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
     found += [
         f"'{each.object}', put {each.place}, was put there by the way in which that moves, not as the camera sees it."
@@ -228,10 +232,7 @@ def facts_of_both(changes: Sequence[Intervention], mover: str, changed: Trajecto
 
 def named(name: str, article: str) -> str:
     """A name behind an article, without its own."""
-    words = name.split()
-    if len(words) > 1 and words[0].lower() in {"the", "a", "an"}:
-        words = words[1:]
-    short = " ".join(words).rstrip(".?!;:") or "object"
+    short = bare_name(name).rstrip(".?!;:") or "object"
     if len(short) > MAX_NAME:
         short = short[:MAX_NAME].rstrip() + "\u2026"
     return f"{article} {short}"
@@ -387,25 +388,28 @@ class _Facts:
 
     def _time(self, encounter: Encounter) -> float:
         """Seconds until an encounter begins."""
-        pair = {encounter.subject, encounter.body}
-        met = (each.time for each in self._trajectory.contacts if each.b is not None and {each.a, each.b} == pair)
-        frame = encounter.first_frame / self._trajectory.fps
-        return next(met, frame) if encounter.kind == "touches" else frame
+        return encounter.first_frame / self._trajectory.fps if encounter.time is None else encounter.time
+
+    def _after_clip(self, time: float) -> str:
+        """That something happens when the clip has ended, where it does."""
+        trajectory = self._trajectory
+        return " (after the clip ends)" if time * trajectory.fps > trajectory.num_frames - 1 else ""
 
     def _meeting(self, encounter: Encounter) -> str:
         """What a body does with another one, and when."""
-        name, time = named(encounter.object, "the"), f"{self._time(encounter):.1f} s"
+        name, at = named(encounter.object, "the"), self._time(encounter)
+        time, later = f"{at:.1f} s", self._after_clip(at)
         share = "" if encounter.share is None else f"{round(100 * encounter.share)}%"
         if encounter.kind == "occludes":
-            return f"passes in front of {name}{f' (hiding {share} of it)' if share else ''} from {time} on"
+            return f"passes in front of {name}{f' (hiding {share} of it)' if share else ''} from {time} on{later}"
         if encounter.kind == "occluded-by":
-            return f"passes behind {name}{f' (which hides {share} of it)' if share else ''} from {time} on"
+            return f"passes behind {name}{f' (which hides {share} of it)' if share else ''} from {time} on{later}"
         path, effect = self._paths.get(encounter.body or 0) if encounter.body else None, ""
         if path is not None and path.tipped_at is not None:
             effect = "and tips over "
         elif path is not None and _distance_moved(path) >= MOVED:
             effect = "and pushes "
-        return f"meets {effect}{name} after {time}"
+        return f"meets {effect}{name} after {time}{later}"
 
     def _missed(self, body: int, met: Sequence[Encounter]) -> list[str]:
         """That what is asked about does not happen, or that nothing is touched."""
@@ -452,7 +456,7 @@ class _Facts:
         found = [(time, name) for time, name in found if self._is_meant(name)]
         if found:
             time, name = min(found, key=lambda each: each[0])
-            return f"{named(name, 'the')} {does} after {time:.1f} s"
+            return f"{named(name, 'the')} {does} after {time:.1f} s{self._after_clip(time)}"
         if outcome.asked.among:
             return ""
         return f"{named(outcome.object, 'the')} {does_not}" if outcome.object else f"nothing {does}"

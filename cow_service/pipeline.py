@@ -37,7 +37,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
         **dict(clip),
         reader=run.reader_info("grounding", "motion"),
         **run.accounts(*SIMULATION_STAGES),
-        warnings=run.warnings("grounding", "motion", "trajectory"),
+        warnings=run.warnings(*SIMULATION_STAGES),
     )
 
 
@@ -59,6 +59,8 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     else:
         verdicts = run.stage("answering", answer_question, run.grounding, simulation, first)
         warnings = run.warnings("answering")
+    if simulation is not None:  # whoever reads only the answer must see what it rests on
+        warnings = tuple(dict.fromkeys((*simulation.warnings, *warnings)))
     if failure is not None:
         why = f"{failure.code}: {failure.detail}"
         warnings = (f"Nothing was imagined, the answer is from the image alone. {why}", *warnings)

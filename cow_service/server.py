@@ -183,6 +183,7 @@ def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngin
         access_log=False,
         ws="none",
         http=HttpConnection,  # h11 whatever is installed: parsers differ on which headers they refuse, and on how long
+        backlog=MAX_ACCEPTED,
         timeout_graceful_shutdown=int(settings.shutdown_grace + CLOSE_SECONDS),
     )
     allow_connections()
@@ -191,7 +192,8 @@ def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngin
 
 REQUEST_SECONDS = 20.0  # for a request's line and headers, from the connection or the first byte behind a response
 MAX_CONNECTIONS = 10_000
-RESERVED_FILES = 256  # of what the system lets this process open: for databases, artifacts and other servers
+MAX_ACCEPTED = 64  # at a time, before one more than `most` is noticed, closed and gone: some turns of the event loop
+RESERVED_FILES = 384  # of what the system lets this process open: for databases, artifacts, other servers, and those
 
 
 class HttpConnection(H11Protocol):
@@ -213,7 +215,8 @@ class HttpConnection(H11Protocol):
         super().connection_made(transport)
         self._start_timer()
         if len(self.connections) > self.most:
-            idle = [each for each in self.connections if isinstance(each, HttpConnection) and each.waits]
+            alive = [each for each in self.connections if not each.transport.is_closing()]
+            idle = [each for each in alive if isinstance(each, HttpConnection) and each.waits]
             min(idle, key=lambda each: each.priority).close()
 
     def data_received(self, data: bytes) -> None:

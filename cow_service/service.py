@@ -1,7 +1,9 @@
 """The composition root: settings in, a service that simulates out. Nothing else chooses a backend."""
 
+import hashlib
 import re
 import uuid
+from collections.abc import Iterable
 from functools import partial
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -13,7 +15,7 @@ from cow_service import errors
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, DiskArtifacts, RetryPolicy, media_type_of, try_once
-from cow_service.media.images import DecodedImage, decode, decode_data_url
+from cow_service.media.images import check, decode, decode_data_url
 from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
 from cow_service.pipeline import answer, simulate
@@ -32,6 +34,8 @@ OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's 
 WORD_READER = "embedded"  # it needs no weights: it reads the words of requests whose images another reader looks at
 Request = TypeVar("Request", bound=SimulateRequest)
 Place = TypeVar("Place", bound=PlaceRequest)
+File = tuple[bytes, str]
+"""Bytes to be kept, and their media type."""
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
 
 
@@ -65,43 +69,38 @@ class Service:
                 loadable = [name for name, each in load_manifests().items() if OWN_PARTS & each.sources.keys()]
                 raise SettingsError(f"Bad settings: COW_CHECKPOINTS for {name!r}: only for {', '.join(loadable)}.")
 
-    def keep_image(self, data: bytes) -> tuple[Artifact, DecodedImage]:
-        """Decodes an image (PNG, JPEG or WebP) and keeps its bytes as sent. Raises the errors of `images.decode`."""
-        image = decode(data, max_megapixels=self.settings.max_image_megapixels)
-        return self.artifacts.put(data, image.media_type), image
+    def keep_image(self, data: bytes) -> Artifact:
+        """Keeps an image (PNG, JPEG or WebP) as sent, not decoded. Raises the errors of `images.check`."""
+        return self.artifacts.put(data, self.check_image(data))
 
-    def simulate(
-        self,
-        request: SimulateRequest,
-        progress: runs.Progress = runs.ignore_progress,
-        image: DecodedImage | None = None,
-    ) -> Simulation:
+    def check_image(self, data: bytes) -> str:
+        """The media type of an image that may be decoded, as its header shows. Raises the errors of `images.check`."""
+        return check(data, max_megapixels=self.settings.max_image_megapixels)
+
+    def simulate(self, request: SimulateRequest, progress: runs.Progress = runs.ignore_progress) -> Simulation:
         """One simulation, start to end. Raises any `CowError` of its stages. Arguments as for `prepare`."""
-        return simulate(self.prepare(request, progress, image))
+        return simulate(self.prepare(request, progress))
 
-    def answer(
-        self, request: AnswerRequest, progress: runs.Progress = runs.ignore_progress, image: DecodedImage | None = None
-    ) -> Answer:
+    def answer(self, request: AnswerRequest, progress: runs.Progress = runs.ignore_progress) -> Answer:
         """One answer, start to end. Raises any `CowError` that leaves no answer. Arguments as for `prepare`."""
-        return answer(self.prepare(request, progress, image))
+        return answer(self.prepare(request, progress))
 
     def prepare(
         self,
         request: Request,
         progress: runs.Progress = runs.ignore_progress,
-        image: DecodedImage | None = None,
         step: runs.Step = runs.compute_directly,
         retry_policy: RetryPolicy = try_once,
         run_id: str | None = None,
         created_at: str | None = None,
         turn: int = 0,
     ) -> runs.Run[Request]:
-        """A run of the request, with its backends and its image, decoded here unless `image` is given.
+        """A run of the request, with its backends and its image, which is decoded here.
 
         Runs compute by `turn`, then first in, first out by `created_at` (RFC 3339, by default now).
 
-        Raises `InvalidRequest` for names of backends that nobody has, the errors of `image_of`, and whatever `progress`
-        raises.
+        Raises `InvalidRequest` for names of backends that nobody has, the errors of `digested` and of `images.decode`,
+        and whatever `progress` raises.
         """
         reader, generator = self._names_of(request)
         backends = runs.Backends(
@@ -113,26 +112,64 @@ class Service:
             cpu=self.cpu,
             device=partial(self._device, generator),
         )
-        request = self.keep_masks(request)
+        request, files = self.digested(request)
+        self.keep(files)
         created_at = created_at or runs.now()
-        # Also with an image at hand: a run begins in its turn, and its job counts as queued until then.
+        # A run begins in its turn, and its job counts as queued until then.
         with self.cpu.held(runs.priority_of(turn, created_at), partial(progress, None, 0.0)):
-            image = image or self.image_of(request.image)[1]
+            image = decode(self.fetch(request.image), max_megapixels=self.settings.max_image_megapixels)
         return runs.Run(
             request, image, backends, progress, step, retry_policy, run_id or str(uuid.uuid4()), created_at, turn
         )
 
-    def keep_masks(self, request: Request) -> Request:
-        """The request with its masks as artifacts: those that are data URLs are kept, and not decoded before they are
-        needed. Raises `InvalidRequest` and `ImageTypeUnsupported`."""
+    def digested(self, request: Request, image: bytes | None = None) -> tuple[Request, list[File]]:
+        """The request with its image and masks by their digests, and what is to be kept for it: nothing is yet.
+
+        `image`: the bytes of its image, where they came apart from it. Raises `InvalidRequest`, the errors of `fetch`
+        and of `images.check`. Masks are not decoded before they are needed.
+        """
+        files: list[File] = []
         changed: dict[str, Any] = {}
-        if request.grounding is not None and isinstance(request.grounding.mask, str):
-            changed["grounding"] = self._with_mask_kept(request.grounding, "/grounding/mask")
-        if any(isinstance(given.mask, str) for given in request.objects):
+
+        def digest(data: bytes, media_type: str) -> ImageArtifact:
+            files.append((data, media_type))
+            return ImageArtifact(artifact=hashlib.sha256(data).hexdigest())
+
+        def with_digest(place: Place, pointer: str) -> Place:
+            if not isinstance(place.mask, str):
+                return place
+            data = decode_data_url(place.mask, pointer)
+            if media_type_of(data) != "image/png":
+                detail = "is no PNG"
+                raise errors.InvalidRequest(
+                    f"`{errors.field_of(pointer)}` {detail}.", errors=(errors.FieldError(pointer, detail),)
+                )
+            return place.model_copy(update={"mask": digest(data, "image/png")})
+
+        if image is None and not isinstance(request.image, ImageArtifact):
+            image = self.fetch(request.image)
+        if image is not None:
+            changed["image"] = digest(image, self.check_image(image))
+        if request.grounding is not None:
+            changed["grounding"] = with_digest(request.grounding, "/grounding/mask")
+        if request.objects:
             changed["objects"] = tuple(
-                self._with_mask_kept(given, f"/objects/{index}/mask") for index, given in enumerate(request.objects)
+                with_digest(given, f"/objects/{index}/mask") for index, given in enumerate(request.objects)
             )
-        return request.model_copy(update=changed) if changed else request
+        return request.model_copy(update=changed), files
+
+    def keep(self, files: Iterable[File]) -> None:
+        """Keeps what `digested` found. Raises `StorageUnavailable`."""
+        for data, media_type in files:
+            self.artifacts.put(data, media_type)
+
+    def fetch(self, ref: ImageRef) -> bytes:
+        """The bytes of an image. Raises `InvalidRequest`, `ImageUrlNotAllowed`, `ImageUrlUnreachable`,
+        `ArtifactNotFound`."""
+        if isinstance(ref, ImageArtifact):
+            return self.artifacts.read(ref.artifact)
+        url = ref.url if isinstance(ref, ImageUrl) else ref
+        return self._image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
         """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
@@ -201,33 +238,6 @@ class Service:
     def _generator(self, name: str) -> Generator:
         _check_modules(name, errors.GeneratorUnavailable)
         return self.generators.get(name)
-
-    def image_of(self, ref: ImageRef) -> tuple[str, DecodedImage]:
-        """The image that a request means: its SHA-256 as kept here, and its pixels.
-
-        Raises `ArtifactNotFound`, `ImageUrlNotAllowed`, and what `keep_image` raises.
-        """
-        if isinstance(ref, ImageUrl) or is_url(ref):
-            url = ref.url if isinstance(ref, ImageUrl) else str(ref)
-            artifact, image = self.keep_image(self._image_urls.fetch(url))
-            return artifact.sha256, image
-        if isinstance(ref, ImageArtifact):
-            data = self.artifacts.read(ref.artifact)
-            return ref.artifact, decode(data, max_megapixels=self.settings.max_image_megapixels)
-        artifact, image = self.keep_image(decode_data_url(ref))
-        return artifact.sha256, image
-
-    def _with_mask_kept(self, place: Place, pointer: str) -> Place:
-        if not isinstance(place.mask, str):
-            return place
-        data = decode_data_url(place.mask, pointer)
-        if media_type_of(data) != "image/png":
-            detail = "is no PNG"
-            raise errors.InvalidRequest(
-                f"`{errors.field_of(pointer)}` {detail}.", errors=(errors.FieldError(pointer, detail),)
-            )
-        kept = ImageArtifact(artifact=self.artifacts.put(data, "image/png").sha256)
-        return place.model_copy(update={"mask": kept})
 
     def _names_of(self, request: SimulateRequest) -> tuple[str, str]:
         """Its reader and its generator. Raises `InvalidRequest` for a name that nobody has."""

@@ -2,6 +2,7 @@
 
 import base64
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -124,8 +125,15 @@ class Settings(BaseSettings):
     )
     """Who may call, as JSON: name to the hash of its key, as `cow keys new NAME` prints them; by default whoever
     reaches the server."""
+    admin_keys: tuple[str, ...] = ()
+    """Names of COW_API_KEYS whose holders administer the server, as JSON: GET /workers tells only them hosts, process
+    ids and ids of jobs; everybody where there are no keys."""
     rate_limit: int | None = Field(default=None, ge=1, le=1_000_000)
     """Requests a minute with one key, or from one address where there are no keys."""
+    rate_limit_mb: float | None = Field(default=None, gt=0, le=1_000_000)
+    """Request bodies, and images fetched by URL, in MB a minute, likewise; refused requests count, too."""
+    rate_limit_cpu: float | None = Field(default=None, gt=0, le=60_000)
+    """Seconds of CPU that reading these may take in a minute, likewise; refused requests count, too."""
     cors_origins: tuple[Annotated[str, Field(pattern=ORIGIN)], ...] = ()
     """Origins of web pages that may use the server, as JSON, such as https://app.example.org; * for all of them where
     keys are set."""
@@ -171,13 +179,13 @@ class Settings(BaseSettings):
             raise ValueError("two names have the same key")
         return hashes
 
-    @field_validator("key_weights")
+    @field_validator("key_weights", "admin_keys")
     @classmethod
-    def _of_keys(cls, weights: dict[str, float], info: ValidationInfo) -> dict[str, float]:
-        unknown = weights.keys() - info.data.get("api_keys", {}).keys()
+    def _of_keys(cls, names: Collection[str], info: ValidationInfo) -> Collection[str]:
+        unknown = set(names) - info.data.get("api_keys", {}).keys()
         if unknown:
             raise ValueError(f"{min(unknown)[:64]!r} is no name of COW_API_KEYS: `cow keys new` makes one")
-        return weights
+        return names
 
     @field_validator("cors_origins")
     @classmethod
@@ -196,6 +204,10 @@ class Settings(BaseSettings):
             if begin != "whsec" or size not in SECRET_BYTES or len(each) > MAX_SECRETS:
                 raise ValueError("not whsec_ and base64 of 24 to 64 bytes")
         return secret
+
+    def is_admin(self, owner: str | None) -> bool:
+        """Whether the owner of a key administers the server; None: there are no keys."""
+        return owner is None or owner in self.admin_keys
 
     @property
     def own_queue_limit(self) -> int:

@@ -9,14 +9,19 @@
 #
 # prints a key, and the COW_API_KEYS to give with `-e`. A folder in place of the volume must belong to 10001:10001.
 
-# Every package has a wheel for glibc, so that neither stage needs a compiler. An exact tag, to be raised on purpose.
+# An exact tag, to be raised on purpose. Whoever owns the registry can move a tag, and no digest: where that matters,
+# look it up and build with --build-arg PYTHON_IMAGE=python:3.13.14-slim-trixie@sha256:...
 ARG PYTHON_IMAGE=python:3.13.14-slim-trixie
 
 FROM ${PYTHON_IMAGE} AS build
 WORKDIR /src
-# pip installs into the environment from outside, and stays out of it: an image that runs is not to be changed.
-ENV PIP_PYTHON=/opt/cow/bin/python
+COPY docker/locks/build.txt docker/locks/cpu.txt docker/locks/
+# What is not in a lock, by version and SHA-256, is not installed (`make lock`). Wheels only: that takes no compiler, and
+# runs no code of a package that is installed. pip stays out of the environment: an image that runs is not to be changed.
 RUN python -m venv --without-pip /opt/cow
+RUN --mount=type=cache,target=/root/.cache/pip \
+    pip --python /opt/cow/bin/python install --only-binary :all: --require-hashes --requirement docker/locks/cpu.txt \
+    && pip install --only-binary :all: --require-hashes --requirement docker/locks/build.txt
 COPY pyproject.toml README.md LICENSE ./
 COPY models models
 COPY prompts prompts
@@ -25,8 +30,8 @@ COPY examples/falling-ball/image.jpg examples/falling-ball/
 COPY examples/bottle-passes-cylinder/image.jpg examples/bottle-passes-cylinder/
 COPY examples/thrown-ball/image.jpg examples/thrown-ball/
 COPY cow_service cow_service
-RUN --mount=type=cache,target=/root/.cache/pip \
-    pip install "/src[providers,otel,mcp,objects]"
+RUN pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /wheels /src \
+    && pip --python /opt/cow/bin/python install --no-cache-dir --no-deps --no-index /wheels/*.whl
 
 FROM ${PYTHON_IMAGE}
 ARG PYTHON_IMAGE

@@ -17,18 +17,19 @@
 
 # Not one of nvidia/cuda: PyTorch from PyPI brings CUDA's libraries, cuDNN and ptxas in the versions that it was built
 # with, and the host brings the driver; a CUDA of the base would be a second one that nobody uses.
+# An exact tag, to be raised on purpose. Whoever owns the registry can move a tag, and no digest: where that matters,
+# look it up and build with --build-arg PYTHON_IMAGE=python:3.13.14-slim-trixie@sha256:...
 ARG PYTHON_IMAGE=python:3.13.14-slim-trixie
 
 FROM ${PYTHON_IMAGE} AS build
-# PyTorch's version decides which driver is enough.
-ARG TORCH_VERSION=2.13.0
 WORKDIR /src
-# pip installs into the environment from outside, and stays out of it: an image that runs is not to be changed.
-ENV PIP_PYTHON=/opt/cow/bin/python
+COPY docker/locks/build.txt docker/locks/cuda.txt docker/locks/
+# What is not in a lock, by version and SHA-256, is not installed (`make lock`). Wheels only: that takes no compiler, and
+# runs no code of a package that is installed. pip stays out of the environment: an image that runs is not to be changed.
 RUN python -m venv --without-pip /opt/cow
-# Gigabytes that do not change with COW's code: a layer of their own.
 RUN --mount=type=cache,target=/root/.cache/pip \
-    pip install "torch==${TORCH_VERSION}"
+    pip --python /opt/cow/bin/python install --only-binary :all: --require-hashes --requirement docker/locks/cuda.txt \
+    && pip install --only-binary :all: --require-hashes --requirement docker/locks/build.txt
 COPY pyproject.toml README.md LICENSE ./
 COPY models models
 COPY prompts prompts
@@ -37,8 +38,8 @@ COPY examples/falling-ball/image.jpg examples/falling-ball/
 COPY examples/bottle-passes-cylinder/image.jpg examples/bottle-passes-cylinder/
 COPY examples/thrown-ball/image.jpg examples/thrown-ball/
 COPY cow_service cow_service
-RUN --mount=type=cache,target=/root/.cache/pip \
-    pip install "torch==${TORCH_VERSION}" "/src[wan,fp8,local,providers,otel,mcp,objects]"
+RUN pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /wheels /src \
+    && pip --python /opt/cow/bin/python install --no-cache-dir --no-deps --no-index /wheels/*.whl
 
 FROM ${PYTHON_IMAGE}
 ARG PYTHON_IMAGE

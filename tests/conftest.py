@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # other tests do not need a browser
     from browser import Windows
     from playwright.sync_api import Browser
 
-# How much the crash, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
+# How much the chaos, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
 SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
 # On a machine that has other work to do, everything takes longer: time limits grow with its load when the tests begin.
 SLOWNESS = min(max(os.getloadavg()[0] / (os.cpu_count() or 1), 1.0), 6.0)
@@ -47,7 +47,7 @@ settings.load_profile("cow")
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 SHARED_SCENES = ROOT.parent / "shared" / "scenes"
-FIRST = ("test_docs.py", "test_crash.py")  # the longest files: begun last, they would keep one process alone at work
+FIRST = ("test_docs.py", "test_chaos.py")  # the longest files: begun last, they would keep one process alone at work
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_report_header(config: pytest.Config) -> str:
     cases = "every twelfth case of long tables, no soak_only tests" if is_thinned_out(config) else "all cases"
-    return f"cow: {cases}; crash, fuzz and state tests x{SCALE}; time limits x{SLOWNESS:.1f}"
+    return f"cow: {cases}; chaos, fuzz and state tests x{SCALE}; time limits x{SLOWNESS:.1f}"
 
 
 @pytest.hookimpl(tryfirst=True)

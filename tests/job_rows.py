@@ -6,8 +6,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from cow_service.jobs.database import JOBS, OPEN, Database
+from cow_service.jobs.database import OPEN, Database
 from cow_service.jobs.job_table import JobSpec, JobTable, TakenJob
+from cow_service.jobs.schema import JOBS
 from cow_service.stages.run import now
 
 STEP = 100

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
 import pytest
+from servers import send
 
 REQUIRED = "COW_TEST_POSTGRES"  # set where a missing PostgreSQL is a fault and not a reason to skip
 
@@ -34,17 +36,25 @@ class PostgresServer:
         self._run("createdb", "-h", "127.0.0.1", "-p", str(self.port), "-U", "cow", "cow")
 
     def start(self) -> None:
-        options = f"-p {self.port} -h 127.0.0.1 -k {self._folder}"
+        # What nobody waits for is written late: a crash shows what should have been waited for.
+        options = f"-p {self.port} -h 127.0.0.1 -k {self._folder} -c wal_writer_delay=10s"
         self._run("pg_ctl", "-D", self._data, "-l", str(self._folder / "log"), "-w", "-o", options, "start")
 
     def kill(self) -> None:
         """Ends every process of the server at once. What it had not handed to the system is gone."""
-        pid = int((self._folder / "data" / "postmaster.pid").read_text().split()[0])
-        postmaster = psutil.Process(pid)
-        processes = [postmaster, *postmaster.children(recursive=True)]
-        for process in processes:
-            process.kill()
+        pid = (self._folder / "data" / "postmaster.pid").read_text().split()[0]
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text()  # psutil would look through all of /proc
+        processes: list[psutil.Process] = []
+        for one in [pid, *children.split()]:
+            with suppress(psutil.NoSuchProcess):
+                processes.append(psutil.Process(int(one)))
+        send(processes, signal.SIGKILL)
         psutil.wait_procs(processes)
+
+    def run_script(self, file: Path, **variables: str) -> None:
+        """Has psql run a file as the owner of the database."""
+        command = [str(self._programs / "psql"), "--set", "ON_ERROR_STOP=1", "--file", str(file), self.url]
+        subprocess.run(command, check=True, env=os.environ | variables, stdout=subprocess.DEVNULL, timeout=60)
 
     def stop(self) -> None:
         command = [*self._as_user, str(self._programs / "pg_ctl"), "-D", self._data, "-m", "immediate", "stop"]

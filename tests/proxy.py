@@ -13,23 +13,26 @@ class Proxy:
 
     def __init__(self, port: int) -> None:
         self._target = port
-        self._passing = threading.Event()
-        self._passing.set()
+        self._requests, self._replies = threading.Event(), threading.Event()  # whether their bytes are passed on
+        self.restore()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self._sockets: list[socket.socket] = []
         self._threads = [threading.Thread(target=self._accept)]
 
-    def hold(self) -> None:
-        """Passes no byte on from now on, and says nothing: neither side learns of it."""
-        self._passing.clear()
+    def hold(self, *, requests: bool = True) -> None:
+        """Passes no byte on from now on, or none of the replies, and says nothing: neither side learns of it."""
+        self._replies.clear()
+        if requests:
+            self._requests.clear()
 
     def restore(self) -> None:
         """Passes bytes on again. What was held before arrives now."""
-        self._passing.set()
+        self._requests.set()
+        self._replies.set()
 
     def cut(self) -> None:
-        """Ends all connections."""
+        """Ends all connections. What is held is lost."""
         for one in self._sockets:
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
@@ -52,20 +55,22 @@ class Proxy:
         with suppress(OSError):
             while True:
                 caller, _ = self._listener.accept()
-                self._sockets.append(caller)
-                with suppress(ConnectionRefusedError):
+                try:
                     server = socket.create_connection(("127.0.0.1", self._target))
-                    self._sockets.append(server)
-                    for pair in ((caller, server), (server, caller)):
-                        self._threads.append(threading.Thread(target=self._pass, args=pair))
-                        self._threads[-1].start()
+                except ConnectionRefusedError:
+                    caller.close()
+                    continue
+                self._sockets += [caller, server]
+                for way in ((caller, server, self._requests), (server, caller, self._replies)):
+                    self._threads.append(threading.Thread(target=self._pass, args=way))
+                    self._threads[-1].start()
 
-    def _pass(self, source: socket.socket, target: socket.socket) -> None:
+    def _pass(self, source: socket.socket, target: socket.socket, passing: threading.Event) -> None:
         with suppress(OSError):
             while data := source.recv(65536):
-                self._passing.wait()
+                passing.wait()
                 target.sendall(data)
-        self._passing.wait()
+        passing.wait()
         for one in (source, target):
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)

@@ -10,7 +10,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,30 +58,68 @@ def slow(seconds: float, seed: int = 0, **others: Any) -> dict[str, Any]:
     return {**BODY, **options, "num_frames": 80, "seed": seed, **others}
 
 
-class Served:
-    """A data folder, and the server on it that lives just now. Ends it with the `with` block."""
+class Program:
+    """A `cow` process of a data folder, and those that it has started. It can be killed, and started again."""
 
-    def __init__(self, folder: Path, code: str | None = None, log: str = "log", **settings: str) -> None:
+    def __init__(self, folder: Path, command: list[str], log: str, **settings: str) -> None:
         self.data = folder / "data"
         self.journal = folder / "journal"
         self.journal.touch()
         self._log_file = folder / log
         own = {
             "COW_DATA_DIR": str(self.data),
-            "COW_PORT": "0",
-            "COW_HOST": "127.0.0.1",
             "PYTHONPATH": str(SLOW_GENERATOR),
             "SLOW_JOURNAL": str(self.journal),
-            # Where who computes does not matter: processes that are started for each server take most of a test's time.
-            "COW_WORKERS": "false",
             "COW_WARMUP": "false",
         }
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
         self._environment |= own | settings
-        self._command = (
-            [sys.executable, "-m", "cow_service.cli.main", "serve"] if code is None else [sys.executable, "-c", code]
-        )
+        self._command = [sys.executable, *command]
         self.process: subprocess.Popen[bytes] | None = None
+
+    def launch(self) -> int:
+        """Starts the process, and does not wait for it; returns how long its log was before, in bytes."""
+        said = self._log_file.stat().st_size if self._log_file.exists() else 0
+        if self.process is not None:
+            self.process.wait()
+        with self._log_file.open("ab") as log:
+            self.process = subprocess.Popen(self._command, env=self._environment, stdout=log, stderr=log)
+        return said
+
+    def processes(self) -> list[psutil.Process]:
+        """Its children, and itself last; none where it is gone."""
+        if self.process is None or self.process.poll() is not None:  # its number may be another process's by now
+            return []
+        try:
+            own = psutil.Process(self.process.pid)
+            return [*own.children(recursive=True), own]
+        except psutil.NoSuchProcess:
+            return []
+
+    def end(self) -> None:
+        """Ends the process and all that it has started, also what is frozen."""
+        processes = self.processes()
+        send(processes, signal.SIGKILL)
+        if self.process is not None:
+            self.process.wait()
+        psutil.wait_procs(processes)
+
+    def log(self) -> str:
+        return self._log_file.read_text(errors="replace")
+
+
+class Served(Program):
+    """A data folder, and the server on it that lives just now. Ends it with the `with` block."""
+
+    def __init__(self, folder: Path, code: str | None = None, log: str = "log", **settings: str) -> None:
+        own = {
+            "COW_PORT": "0",
+            "COW_HOST": "127.0.0.1",
+            # Where who computes does not matter: processes that are started for each server take most of a test's time.
+            "COW_WORKERS": "false",
+        }
+        command = ["-m", "cow_service.cli.main", "serve"] if code is None else ["-c", code]
+        super().__init__(folder, command, log, **own | settings)
         self.http = httpx.Client()
 
     def __enter__(self) -> Served:
@@ -92,9 +131,7 @@ class Served:
 
     def start(self, probe: str | None = None) -> None:
         """Starts a server, and waits until a probe of it succeeds, by default that it is ready."""
-        said = self._log_file.stat().st_size if self._log_file.exists() else 0
-        with self._log_file.open("ab") as log:
-            self.process = subprocess.Popen(self._command, env=self._environment, stdout=log, stderr=log)
+        said = self.launch()
 
         def address() -> str | None:
             assert self.process is not None
@@ -107,9 +144,6 @@ class Served:
         # One that only takes requests is ready once a worker is.
         ready = "/livez" if self._environment.get("COW_ROLE") == "api" else "/readyz"
         eventually(lambda: self.http.get(probe or ready).status_code == 200)
-
-    def log(self) -> str:
-        return self._log_file.read_text(errors="replace")
 
     def kill(self) -> None:
         """Ends it as a loss of power would."""
@@ -167,49 +201,34 @@ class Served:
         return [int(line) for line in self.journal.read_text().split()]
 
 
-class Worker:
+class Worker(Program):
     """A worker on the data folder and database of a server. Ends with the `with` block."""
 
     def __init__(self, folder: Path, log: str, **settings: str) -> None:
-        own = {"COW_DATA_DIR": str(folder / "data"), "PYTHONPATH": str(SLOW_GENERATOR)}
-        own["SLOW_JOURNAL"] = str(folder / "journal")
-        self._environment = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
-        self._environment |= own | settings
-        self._log_file = folder / log
-        self._process: subprocess.Popen[bytes] | None = None
+        super().__init__(folder, ["-m", "cow_service.cli.main", "worker"], log, **settings)
 
     def __enter__(self) -> Worker:
         self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for one in self.processes():
-            one.kill()
-        if self._process is not None:
-            self._process.wait()
+        self.end()
 
     def start(self) -> None:
         """Starts it, and waits until it takes jobs."""
-        said = self._log_file.stat().st_size if self._log_file.exists() else 0
-        if self._process is not None:
-            self._process.wait()
-        command = [sys.executable, "-m", "cow_service.cli.main", "worker"]
-        with self._log_file.open("ab") as log:
-            self._process = subprocess.Popen(command, env=self._environment, stdout=log, stderr=log)
-        eventually(lambda: "takes jobs" in self._log_file.read_text()[said:])
-
-    def processes(self) -> list[psutil.Process]:
-        """It and its children, itself last; none where it is gone."""
-        assert self._process is not None
-        try:
-            own = psutil.Process(self._process.pid)
-            return [*own.children(recursive=True), own]
-        except psutil.NoSuchProcess:
-            return []
+        said = self.launch()
+        eventually(lambda: "takes jobs" in self.log()[said:])
 
     def cpu_seconds(self) -> float:
         """That it and its children have computed."""
         return sum(sum(one.cpu_times()[:2]) for one in self.processes())
+
+
+def send(processes: Iterable[psutil.Process], number: int) -> None:
+    """Sends a signal to those that are still there."""
+    for one in processes:
+        with suppress(psutil.NoSuchProcess):
+            one.send_signal(number)
 
 
 def eventually(look: Callable[[], Value | None], within: float = TIME_LIMIT) -> Value:

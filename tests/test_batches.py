@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import aclosing
+from contextlib import aclosing, closing
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from cow_service.cli.main import app
 from cow_service.client import AsyncClient, Client, errors
 from cow_service.client.batches import OutageTimer, Question, questions
 from cow_service.client.journal import Journal
-from cow_service.client.progress import BatchProgress, duration, rate_words
+from cow_service.client.progress import BatchProgress
 
 COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
@@ -151,7 +151,7 @@ def a_question(own: str = "q", question: str = "?") -> Question:
 
 
 def test_a_half_written_line_is_cut_off_and_asked_again_under_the_same_key(tmp_path: Path) -> None:
-    with Journal(tmp_path, "answer") as journal:
+    with closing(Journal(tmp_path, "answer")) as journal:
         journal.append(a_question("first"), line())
         key = journal.key(a_question("second"), b"body")
         journal.append(a_question("second"), line())
@@ -159,7 +159,7 @@ def test_a_half_written_line_is_cut_off_and_asked_again_under_the_same_key(tmp_p
     whole = results.read_bytes()
     for cut in range(whole.index(b"\n") + 1, len(whole)):
         results.write_bytes(whole[:cut])
-        with Journal(tmp_path, "answer") as journal:
+        with closing(Journal(tmp_path, "answer")) as journal:
             assert journal.has(a_question("first"))
             assert not journal.has(a_question("second"))
             assert journal.key(a_question("second"), b"body") == key
@@ -168,14 +168,14 @@ def test_a_half_written_line_is_cut_off_and_asked_again_under_the_same_key(tmp_p
 
 
 def test_keys_differ_by_batch_question_and_body(tmp_path: Path) -> None:
-    with Journal(tmp_path / "a", "answer") as a, Journal(tmp_path / "b", "answer") as b:
+    with closing(Journal(tmp_path / "a", "answer")) as a, closing(Journal(tmp_path / "b", "answer")) as b:
         keys = {a.key(a_question(), b"x"), b.key(a_question(), b"x"), a.key(a_question("r"), b"x")}
         assert len(keys | {a.key(a_question(), b"y"), a.key(a_question(), b"x", fresh=True)}) == 5
 
 
 def test_what_goes_with_a_question_may_be_numpys(tmp_path: Path) -> None:
     (question,) = questions([{"image": "a.png", "question": "?", "meta": {"truth": np.int64(3)}}])
-    with Journal(tmp_path, "answer") as journal:
+    with closing(Journal(tmp_path, "answer")) as journal:
         journal.append(question, line())
     assert lines_of(tmp_path)[0]["meta"] == {"truth": 3}
 
@@ -195,18 +195,18 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_failure_is_asked_again_under_another_key_and_only_when_told(tmp_path: Path) -> None:
-    with Journal(tmp_path, "answer") as journal:
+    with closing(Journal(tmp_path, "answer")) as journal:
         keys = [journal.key(a_question("bad"), b"")]
         journal.append(a_question("good"), line())
         journal.append(a_question("bad"), line("failed"))
-    with Journal(tmp_path, "answer") as journal:
+    with closing(Journal(tmp_path, "answer")) as journal:
         assert journal.has(a_question("bad"))
     for _ in range(2):
-        with Journal(tmp_path, "answer", retry_failed=True) as journal:
+        with closing(Journal(tmp_path, "answer", retry_failed=True)) as journal:
             assert not journal.has(a_question("bad"))
             assert journal.has(a_question("good"))
             keys.append(journal.key(a_question("bad"), b""))
-        with Journal(tmp_path, "answer") as journal:  # killed before it had an outcome: no other key
+        with closing(Journal(tmp_path, "answer")) as journal:  # killed before it had an outcome: no other key
             assert journal.key(a_question("bad"), b"") == keys[-1]
             journal.append(a_question("bad"), line("failed"))
     assert len(set(keys)) == 3
@@ -221,7 +221,7 @@ def test_a_full_disk_leaves_whole_lines(tmp_path: Path, monkeypatch: pytest.Monk
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(descriptor, data[: room.pop()])
 
-    with Journal(tmp_path, "answer") as journal:
+    with closing(Journal(tmp_path, "answer")) as journal:
         journal.append(a_question("first"), line())
         monkeypatch.setattr("cow_service.client.journal.os.write", little)
         with pytest.raises(OSError, match="No space"):
@@ -233,7 +233,7 @@ def test_a_full_disk_leaves_whole_lines(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_folder_is_for_one_batch_at_a_time_and_of_one_kind(tmp_path: Path) -> None:
-    with Journal(tmp_path, "answer") as journal:
+    with closing(Journal(tmp_path, "answer")) as journal:
         journal.append(a_question(), line())
         with pytest.raises(errors.InvalidRequest, match="in use"):
             Journal(tmp_path, "answer")
@@ -451,9 +451,7 @@ def test_progress_in_words() -> None:
     for _ in range(20):
         progress.count(True)
     progress.count(False)
-    assert str(progress) == "71/100 done, 1 failed, 2.1/s, 14 s left"
-    assert [duration(s) for s in (59.4, 61, 3600, 7300)] == ["59 s", "1:01 min", "1:00 h", "2:01 h"]
-    assert [rate_words(r) for r in (2.04, 0.5)] == ["2.0/s", "30.0/min"]
+    assert str(progress) == "71/100 done, 1 failed, 126/min, 0:00:14 left"
 
 
 # The command
@@ -481,7 +479,6 @@ def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> N
         assert result.returncode == 3
         assert "image-unreadable 1" in result.stderr
         assert "gone: image-unreadable: " in result.stderr
-        assert "1 of 7 images is not there: no.png" in result.stderr
     assert len(lines_of(out)) == 7
     (tmp_path / "no.png").write_bytes(IMAGE)
     result = run(path, "-o", out, "--url", server.address, "--retry-failed")
@@ -497,7 +494,6 @@ def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> N
         ("\n[]", (), "line 2: it must be an object, got list"),
         ('{"image": "a.png", "question": "?", "votes": 99}', (), "line 1: /votes: "),
         ('{"question": "?"}\n\n{"image": "a.png"}', (), "line 3: `question` is missing"),
-        ('{"image": "a.png", "question": "?"}', (), "none of the 1 images is there"),
         ('{"image": "a.png", "question": "?", "vote": 1}', (), "/vote: Extra inputs"),
         ('{"image": "a.png", "question": "?"}', ("--request", '{"num_frames": 1}'), "/num_frames"),
         ('{"image": "a.png", "question": "?"}', ("--request", "[]"), "--request must be an object"),

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from conftest import SCALE
-from floors import TrueCamera
+from floors import TrueCamera, outline
 
-from cow_service.physics.camera import MEASUREMENT_SIGMA, fit_shadow, prior
-from cow_service.records import BBox
+from cow_service.physics.bodies import SeenBody
+from cow_service.physics.camera import MEASUREMENT_SIGMA, Standing, fit_shadow, narrowed, prior
+from cow_service.physics.draws import ensemble
+from cow_service.physics.layout import Cameras
+from cow_service.physics.world import WorldInput, run_world
+from cow_service.records import BBox, MetresPerPixel, Motion
+from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
 
 SIZE = (640, 400)
@@ -121,3 +127,60 @@ def test_what_can_be_no_shadow_of_the_ball_gives_nothing(change: str) -> None:
         "a streak": ((x, y), (xx, 30 * yy, xy)),
     }[change]
     assert fit_shadow(prior(), box, Shadow(shadow.bbox, centre, spread, 0.3), SIZE) is None
+
+
+def standing(camera: TrueCamera, shape: str, right: float, ahead: float) -> Standing:
+    """What a cylinder or a cube of 0.3 m on the floor shows of a camera, its outline included."""
+    places = outline("cylinder" if shape == "cylinder" else "box", (right, ahead), 0.15, 0.3, yaw=0.3)
+    hull = cv2.convexHull(camera.seen(places).astype(np.float32)).round().astype(np.int32)
+    mask = np.zeros(SIZE[::-1], np.uint8)
+    cv2.fillConvexPoly(mask, hull, 1)
+    body = SeenBody(shape, camera.box(places), CroppedMask.of(mask > 0), "cylinder")
+    return Standing(body.bbox, body.rim if shape == "cylinder" else None, is_cube=shape == "cube")
+
+
+class TestNarrowed:
+    def test_nothing_is_assumed_of_a_camera_but_what_pictures_have(self) -> None:
+        cameras, _ = Cameras.drawn(prior(), SIZE, ensemble(200))
+        pitch = np.degrees(np.arcsin(-cameras.axes[:, 1, 2]))
+        widths = cameras.focal / SIZE[0]
+        assert (pitch.min(), pitch.max()) == pytest.approx((0, 55), abs=1.5)
+        assert (widths.min(), widths.max()) == pytest.approx((0.6, 2.2), rel=0.05)
+
+    @pytest.mark.parametrize("pitch", [12, 28, 45])
+    @pytest.mark.parametrize("shape", ["cylinder", "cube"])
+    def test_what_stands_on_the_floor_tells_how_far_the_camera_looks_down(self, pitch: float, shape: str) -> None:
+        distance = 2.6
+        camera = TrueCamera(pitch, 0.0, 700, distance * math.sin(math.radians(pitch)) + 0.15)
+        ahead = distance * math.cos(math.radians(pitch))
+        start = prior()
+        fit = narrowed(start, [standing(camera, shape, -0.4, ahead), standing(camera, shape, 0.5, ahead + 0.2)], SIZE)
+        deviation = math.degrees(math.sqrt(fit.covariance[0, 0]))
+        assert abs(math.degrees(fit.mean[0]) - pitch) < max(6, 2 * deviation)
+        assert deviation < (8 if shape == "cylinder" else 14) < math.degrees(math.sqrt(start.covariance[0, 0]))
+
+    def test_feet_lie_below_the_horizon(self) -> None:
+        fit = narrowed(prior(), [Standing((300, 60, 340, 90))], SIZE)
+        assert math.degrees(fit.mean[0]) > 30, "so high in the image they are on a floor that is seen from above"
+
+    def test_what_no_ellipse_is_tells_nothing(self) -> None:
+        spiky = np.zeros(SIZE[::-1], bool)
+        spiky[200:260, 300:340] = True
+        spiky[170:200, 318:322] = True
+        assert SeenBody("candle", (300, 170, 340, 260), CroppedMask.of(spiky), "cylinder").rim is None
+
+    def test_how_deep_an_unknown_thing_is_is_not_known(self) -> None:
+        block = np.zeros(SIZE[::-1], bool)
+        block[200:260, 300:340] = True
+        mover = SeenBody("ball", (100, 220, 140, 260), CroppedMask.of(block), "sphere")
+        motion = Motion(
+            kind="linear", direction=(1, 0), cue="request", speed=100, sentence="", source="request",
+            metres_per_pixel=MetresPerPixel(value=0.005, source="default"),
+        )  # fmt: skip
+        for known, least, most in ((True, 1.0, 1.0), (False, 0.33, 1.9)):
+            thing = SeenBody("it", (300, 200, 340, 260), CroppedMask.of(block), "cylinder", is_form_known=known)
+            world = WorldInput((mover, thing), motion, prior(), SIZE, 17, 16.0)
+            shapes = [bodies[1] for bodies in run_world(world, ensemble(50)).shapes]
+            shares = [shape.half_depth / shape.half_width for shape in shapes]
+            assert min(shares) <= least
+            assert max(shares) >= most

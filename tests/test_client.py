@@ -42,7 +42,6 @@ from cow_service import records
 from cow_service.client import AsyncClient, Client, CowError, Event, Simulation, errors
 from cow_service.client.display import simulation_html
 from cow_service.client.options import AnswerOptions, SimulateOptions
-from cow_service.client.progress import reporting
 from cow_service.client.request import image_input
 from cow_service.records import Job
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, ObjectRequest, SimulateRequest
@@ -332,10 +331,10 @@ def test_pictures_are_downloaded_once_and_when_asked_for(connect: Connect, addre
     simulation = client.simulate(PHOTO, ASKED, num_frames=9)
     assert seen == ["POST /simulate"]
     frames = simulation.pil_frames()
-    assert [(frame.mode, frame.size) for frame in frames] == [("RGB", (512, 295))] * 3
+    assert [(frame.mode, frame.size) for frame in frames] == [("RGB", (512, 295))] * 4
     assert seen[1:] == [f"GET /artifacts/{frame.sha256}" for frame in simulation.frames]
     array = simulation.numpy_frames()
-    assert (array.shape, str(array.dtype)) == ((3, 295, 512, 3), "uint8")
+    assert (array.shape, str(array.dtype)) == ((4, 295, 512, 3), "uint8")
     assert np.array_equal(array[1], np.asarray(frames[1]))
     assert simulation.pil_overlay().size == (simulation.image.width, simulation.image.height)
     assert simulation.video_bytes()[4:8] == b"ftyp"
@@ -343,9 +342,9 @@ def test_pictures_are_downloaded_once_and_when_asked_for(connect: Connect, addre
     simulation.load()
     simulation.pil_frames()
     simulation.video_bytes()
-    assert len(seen) == before == 1 + 3 + 1 + 1
+    assert len(seen) == before == 1 + 4 + 1 + 1
     client.simulate(simulation.image, ASKED, num_frames=9).load()
-    assert len(seen) == before + 1 + 3 + 1 + 1
+    assert len(seen) == before + 1 + 4 + 1 + 1
 
 
 def test_a_simulation_without_video_says_so(client: Any) -> None:
@@ -367,8 +366,7 @@ def test_what_is_saved_is_the_result(client: Any, tmp_path: Path) -> None:
     assert again.model_dump() == answer.simulation.model_dump()
     with pytest.raises(ValueError, match="artifact"):
         again.pil_frames()
-    assert again._repr_html_().count("not downloaded") == 5
-    assert again._repr_png_() is None
+    assert again._repr_html_().count("not downloaded") == 6
 
 
 def test_the_scene_as_it_is_is_saved_beside_what_becomes_of_it(client: Any, tmp_path: Path) -> None:
@@ -389,14 +387,16 @@ def test_results_can_be_copied_compared_and_sent_to_other_processes(address: str
         for copy in (deepcopy(simulation), simulation.model_copy(deep=True), pickle.loads(pickle.dumps(simulation))):
             assert copy == simulation
             assert copy.pil_frames()[0].size == simulation.pil_frames()[0].size
-    assert pickle.loads(pickle.dumps(simulation))._repr_png_() == simulation._repr_png_()
+    assert pickle.loads(pickle.dumps(simulation))._repr_html_() == simulation._repr_html_()
 
 
 def test_reprs_are_short(client: Any) -> None:
     handle = client.submit(IMAGE, QUESTION, **SMALL)
     simulation = handle.wait()
     assert re.fullmatch(rf"<(Async)?JobHandle {handle.id}: simulate, succeeded>", repr(handle))
-    assert re.fullmatch(rf"<(Async)?Simulation {handle.id}: object meets nothing; 1 frames>", repr(simulation))
+    assert re.fullmatch(
+        rf"<(Async)?Simulation {handle.id}: object touches blue object at [^;]+; 1 frames>", repr(simulation)
+    )
     long = Simulation.model_validate({**SIMULATION, "grounding": {**SIMULATION["grounding"], "object": "a b\n" * 500}})
     assert len(repr(long)) < 200
     assert "\n" not in repr(long)
@@ -407,8 +407,8 @@ def test_reprs_are_short(client: Any) -> None:
 def test_notebooks_show_pictures_and_need_no_network(client: Any) -> None:
     answer = client.answer(PHOTO, ASKED, baseline=True, votes=3, video=True).load()
     page = answer._repr_html_()
-    assert "B: No" in page
-    assert (page.count("data:image/png;base64,"), page.count("data:image/jpeg;base64,")) == (3, 1)
+    assert "B (No)" in page
+    assert (page.count("data:image/png;base64,"), page.count("data:image/jpeg;base64,")) == (4, 1)
     coded = re.findall(r'<video controls loop muted playsinline [^>]*src="data:video/mp4;base64,([^"]+)"', page)
     assert [base64.b64decode(one) for one in coded] == [answer.simulation.video_bytes()]
     assert "band: where 80% of 50 worlds have it" in page
@@ -416,10 +416,6 @@ def test_notebooks_show_pictures_and_need_no_network(client: Any) -> None:
         r'(?:src|href)="(?!data:(?:image/png|image/jpeg|video/mp4);base64)|url\(|<script|@import|/artifacts/', page
     )
     assert "band" not in client.simulate(IMAGE, QUESTION, ensemble=0, **SMALL)._repr_html_()
-    assert answer._repr_png_().startswith(b"\x89PNG")
-    with Image.open(io.BytesIO(answer._repr_png_())) as strip:
-        assert strip.height == 240
-        assert strip.width > 4 * 240
 
 
 def test_a_video_that_is_too_large_for_a_notebook_is_named(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -437,19 +433,13 @@ def test_models_are_a_table(client: Any) -> None:
     assert len(lines) == len(models.readers) + len(models.generators)
     assert "generator  cutout (default)    yes" in lines
     assert "generator  ati                 needs its weights; cow models pull ati" in lines
-    page = models._repr_html_()
-    assert page.count("<tr>") == 1 + len(lines)
-    for said in ("<code>cow models pull ati</code>", "bytedance-research/ATI", "Apache-2.0", "needs COW_MLLM"):
-        assert said in page
 
 
-def test_names_in_the_table_of_models_are_no_markup() -> None:
+def test_names_in_the_table_of_models_stay_on_their_line() -> None:
     evil = "<img src=x onerror=alert(1)>\n"
     backend = {"name": evil, "default": True, "ready": False, "summary": evil, "licence": evil, "weights": evil}
     backend |= {"missing": [evil], "install": evil, "pull": evil}
     models = cow_service.client.Models.model_validate({"readers": [backend], "generators": [], "mllms": [evil]})
-    assert "<img" not in models._repr_html_()
-    assert models._repr_html_().count(html.escape(evil).strip()) == 8
     assert len(str(models).splitlines()) == 1
 
 
@@ -505,7 +495,6 @@ def test_a_notebook_shows_what_is_left_when_the_server_has_gone(
             lambda sha256: seen.append(sha256) or (_ for _ in ()).throw(CowError("gone")),
         )
         page = simulation._repr_html_()
-        assert simulation._repr_png_() is None
     assert page.count("not downloaded") == 2
     assert len(seen) == 1  # a server that is gone is not asked for every picture
 
@@ -646,22 +635,13 @@ def test_progress_is_told_to_a_function(client: Any) -> None:
     assert len({job.progress for job in heard}) > 2
 
 
-@pytest.mark.parametrize("bar", [True, "rich", "tqdm"])
-def test_progress_is_shown(address: str, capsys: pytest.CaptureFixture[str], bar: Any) -> None:
+def test_progress_is_shown(address: str, capsys: pytest.CaptureFixture[str]) -> None:
     with Client(address) as client:
-        client.simulate(IMAGE, QUESTION, progress=bar, **SMALL)
-        client.submit(IMAGE, QUESTION, **SMALL).wait(progress=bar)
+        client.simulate(IMAGE, QUESTION, progress=True, **SMALL)
+        client.submit(IMAGE, QUESTION, **SMALL).wait(progress=True)
     shown = capsys.readouterr()
     assert "100%" in shown.out + shown.err
     assert "succeeded" in shown.out + shown.err
-
-
-@pytest.mark.parametrize("bar", ["rich", "tqdm"])
-def test_bars_bear_every_share(bar: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    with reporting(bar) as report:
-        assert report is not None
-        for share in [0, *(n / 7 for n in range(8)), 0.1, 0.7, 1.0]:
-            report(Job.model_validate({**JOB, "progress": share}))
 
 
 def test_progress_in_many_threads(address: str) -> None:
@@ -742,7 +722,7 @@ def test_keys_are_sent(tmp_path: Path) -> None:
     with Served(tmp_path, COW_API_KEYS=json.dumps({"alice": hashed})) as served:
         address = str(served.http.base_url)
         with Client(address, api_key=key) as client:
-            assert client.simulate(IMAGE, QUESTION, **SMALL).load()._repr_png_()
+            assert client.simulate(IMAGE, QUESTION, **SMALL).load()._repr_html_()
         with Client(address, api_key="cow_wrong", retries=0) as client, pytest.raises(errors.Unauthorized):
             client.models()
 
@@ -774,7 +754,7 @@ from cow_service.records import Job
 from cow_service.requests import FramesRequest
 
 client = Client(timeout=5, retries=2)
-simulation = client.simulate("a.png", "What happens?", frames={"policy": "events"}, motion={"direction": [1, 0]})
+simulation = client.simulate("a.png", "What happens?", frames={"count": 5}, motion={"direction": [1, 0]})
 assert_type(simulation, Simulation)
 assert_type(simulation.pil_frames(), list[Image.Image])
 assert_type(simulation.video_bytes(), bytes)
@@ -783,7 +763,7 @@ assert_type(answer, Answer)
 assert_type(answer.simulation, Simulation | None)
 handle = client.submit("a.png", "What?", kind="answer", votes=3)
 assert_type(handle, JobHandle[Answer])
-assert_type(handle.wait(timeout=3, progress="rich"), Answer)
+assert_type(handle.wait(timeout=3, progress=True), Answer)
 assert_type(client.submit("a.png", "What?").wait(), Simulation)
 assert_type(client.job("x").wait(), Simulation | Answer)
 assert_type(client.models(), Models)
@@ -877,4 +857,4 @@ def test_the_sdk_needs_three_packages(wheel: Path, tmp_path: Path, address: str)
     assert ran.stdout.splitlines()[0].startswith("No <Answer")
     assert "image-unreadable" in ran.stdout
     assert "PIL" in ran.stdout
-    assert (tmp_path / "out" / "frame_001.png").exists()
+    assert len([*(tmp_path / "out").glob("frame_*.png")]) == 4

@@ -89,21 +89,21 @@ RIGHT, DOWN = {"direction": (1.0, 0.0)}, {"direction": (0.0, 1.0)}
         ({"duration": 0.7}, 50, [0.7]),
         ({"distance": 50, "duration": 0.2}, 100, [0.2]),
         ({"distance": 50, "steps": [DOWN]}, 100, [0.5, math.inf]),
-        ({"steps": [DOWN]}, 100, [2.0, math.inf]),
-        ({"steps": [DOWN | {"distance": 100}, RIGHT]}, 100, [1.5, 1.0, math.inf]),
+        ({"steps": [DOWN]}, 100, [2.5, math.inf]),
+        ({"steps": [DOWN | {"distance": 100}, RIGHT]}, 100, [2.0, 1.0, math.inf]),
         ({"until": "contact"}, 100, [math.inf]),
     ],
 )
 def test_how_long_legs_are(fields: dict[str, Any], speed: float, seconds: list[float]) -> None:
     given_ = motion(**fields)
-    course = course_of(given_, [np.zeros(3)] * (1 + len(given_.steps)), speed, clip=4.0)
+    course = course_of(given_, [np.zeros(3)] * (1 + len(given_.steps)), speed)
     assert course is not None
     assert [leg.duration for leg in course.legs] == pytest.approx(seconds)
     assert course.halts == (fields.get("until") == "contact")
 
 
 def test_what_just_goes_on_has_no_course() -> None:
-    assert course_of(motion(), [np.zeros(3)], 100, 4.0) is None
+    assert course_of(motion(), [np.zeros(3)], 100) is None
 
 
 IMAGE = drawn.block(drawn.ball(drawn.floor(), (150, 250), 25, (200, 40, 40)), (400, 190, 460, 280), (40, 40, 200))
@@ -190,6 +190,6 @@ def test_the_sentence_tells_the_whole_motion() -> None:
     others = [{"object": "blue block", "direction": (-1, 0)}]
     told = read(None, direction=(1, 0), distance=60, steps=steps, others=others).value.sentence
     assert told == (
-        "The ball moves straight to the right at a constant speed, then down, then to the left, and then stops. "
+        "The ball sets off to the right, then down, then to the left, and then stops. "
         "At the same time the Blue block moves to the left. The camera stays still."
     )

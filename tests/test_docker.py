@@ -22,6 +22,8 @@ import pytest
 import typer
 import yaml
 from conftest import ROOT, Server
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service import __version__
@@ -34,6 +36,7 @@ from cow_service.weights.manifests import EXAMPLES, load_manifests
 DOCKER = ROOT / "docker"
 IMAGES = {"cow:cpu": DOCKER / "cpu.Dockerfile", "cow:cuda": DOCKER / "cuda.Dockerfile"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MAKEFILE = (ROOT / "Makefile").read_text()
 COMPOSE = (DOCKER / "compose.yaml").read_text()
 PINNED = re.compile(r"^[a-z0-9./-]+:v?\d+\.\d+(\.\d+)?(-[a-z0-9.]+)*$")
 TWO_NUMBERS = ("postgres",)  # whose releases have no third one
@@ -185,16 +188,67 @@ def test_the_wheel_can_be_built_from_what_is_copied(dockerfile: Path, tmp_path: 
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
-def test_extras_are_those_of_the_project(dockerfile: Path) -> None:
-    text = " ".join(text for _, word, text in instructions(dockerfile) if word == "RUN")
-    (extras,) = re.findall(r'pip install [^&]*"/src\[([^]]*)\]"', text)
-    assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
-    assert {"providers", "otel"} <= set(extras.split(","))
+def locked(file: str) -> dict[str, str]:
+    """Versions by name. Each has hashes, and nothing says where it comes from."""
+    lines = (DOCKER / "locks" / file).read_text().replace("\\\n", " ").splitlines()
+    found: dict[str, str] = {}
+    for line in [line for line in lines if not line.startswith("#")]:
+        parsed = re.fullmatch(r"([a-z0-9-]+)==(\S+)(?: ; [^:]+?)?((?: +--hash=sha256:[0-9a-f]{64})+)", line)
+        assert parsed is not None, line
+        assert parsed[1] not in found
+        found[parsed[1]] = parsed[2]
+    return found
 
 
-def test_torch_is_the_version_that_the_tests_hold() -> None:
-    (version,) = (text for _, word, text in instructions(IMAGES["cow:cuda"]) if text.startswith("TORCH_VERSION="))
-    assert f"torch=={version.split('=')[1]}" in (ROOT / "tests" / "constraints.txt").read_text().split()
+def unmet(needed: list[str], file: str) -> list[str]:
+    """Those of some requirements that a lock does not meet, in the images' environment."""
+    versions, failed = locked(file), list[str]()
+    for one in map(Requirement, needed):
+        if one.marker is None or one.marker.evaluate({"python_version": "3.13", "python_full_version": "3.13.14"}):
+            version = versions.get(canonicalize_name(one.name))
+            if version is None or not one.specifier.contains(version):
+                failed.append(f"{one}, and the lock has {version}")
+    return failed
+
+
+@pytest.mark.parametrize(("file", "extras"), [("cpu.txt", "CPU_EXTRAS"), ("cuda.txt", "CUDA_EXTRAS")])
+def test_a_lock_satisfies_the_project(file: str, extras: str) -> None:
+    (cpu,) = re.findall("CPU_EXTRAS := (.*)", MAKEFILE)
+    (options,) = re.findall(f"{extras} := (.*)", MAKEFILE.replace("$(CPU_EXTRAS)", cpu))
+    named = re.findall(r"--extra (\S+)", options)
+    assert {"providers", "otel"} <= set(named)
+    needed = [*PROJECT["dependencies"], *(one for name in named for one in PROJECT["optional-dependencies"][name])]
+    assert unmet(needed, file) == [], "run `make lock`"
+    held = (ROOT / "tests" / "constraints.txt").read_text().splitlines()
+    there = locked(file)
+    constraints = [one for one in held if canonicalize_name(re.split("=", one)[0]) in there]
+    assert constraints, "versions that the tests hold still"
+    assert unmet(constraints, file) == []
+
+
+def test_only_the_gpu_image_has_torch() -> None:
+    assert {"torch", "transformers", "diffusers"}.isdisjoint(locked("cpu.txt"))
+    assert {"torch", "transformers", "diffusers"} <= locked("cuda.txt").keys()
+
+
+def test_the_lock_of_the_build_satisfies_it() -> None:
+    system = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]
+    assert unmet(system["requires"], "build.txt") == []
+
+
+def test_nothing_is_installed_but_what_is_locked(dockerfile: Path) -> None:
+    steps = [text for _, word, text in instructions(dockerfile) if word == "RUN" and re.search(r"\bpip\b", text)]
+    commands = [one.strip() for step in steps for one in re.split("&&|cache/pip ", step) if "pip " in one]
+    files: list[str] = []
+    for command in commands:
+        words = shlex.split(command)
+        if "--requirement" in words:
+            assert {"--require-hashes", "--only-binary"} <= set(words), command
+            files.append(words[words.index("--requirement") + 1])
+        elif "venv" not in words:
+            assert "--no-deps" in words, command
+            assert {"--no-index", "--no-build-isolation"} & set(words), command
+    assert files == [f"docker/locks/{dockerfile.stem}.txt", "docker/locks/build.txt"]
 
 
 def test_postgresql_needs_no_library_of_the_image() -> None:
@@ -421,6 +475,25 @@ class Deploy(Part):
     resources: Resources
 
 
+class Config(Part):
+    source: str
+    target: str = Field(pattern=r"^/docker-entrypoint-initdb\.d/[a-z]+\.sql$")
+
+
+class ConfigFile(Part):
+    file: str
+
+
+class LogOptions(Part):
+    max_size: str = Field(alias="max-size", pattern=SIZE)
+    max_file: str = Field(alias="max-file", pattern=r"^[1-9]$")  # Docker takes strings only
+
+
+class Logging(Part):
+    driver: Literal["json-file"]
+    options: LogOptions
+
+
 class Service(Part):
     image: str
     build: Build | None = None
@@ -433,7 +506,9 @@ class Service(Part):
     environment: dict[str, str] = {}
     env_file: list[EnvFile] = []
     volumes: list[Annotated[str, Field(pattern=r"^[a-z]+:/[a-z/.]+$")]] = []
+    configs: list[Config] = []
     networks: list[str]
+    logging: Logging
     depends_on: dict[str, Needs] = {}
     healthcheck: Health | None = None
     stop_grace_period: str = Field(pattern=DURATION)
@@ -454,6 +529,7 @@ class File(Part):
     services: dict[str, Service]
     networks: dict[str, Network | None]
     volumes: dict[str, None]
+    configs: dict[str, ConfigFile]
 
 
 def compose() -> File:
@@ -467,7 +543,8 @@ SERVERS = ("cow", "cow-mllm", "api")  # that take requests
 
 
 def interpolated(environment: dict[str, str]) -> dict[str, str]:
-    return {name: re.sub(r"\$\{[^}]*\}", "secret", value) for name, value in environment.items()}
+    """What a container is given, without what is kept from it."""
+    return {name: re.sub(r"\$\{[^}]*\}", "secret", value) for name, value in environment.items() if value}
 
 
 def test_without_a_profile_it_is_the_service_and_what_it_needs() -> None:
@@ -500,6 +577,8 @@ def test_names_are_declared_and_used() -> None:
     file = compose()
     volumes = {volume.split(":")[0] for service in file.services.values() for volume in service.volumes}
     assert volumes == set(file.volumes)
+    assert {config.source for service in file.services.values() for config in service.configs} == set(file.configs)
+    assert all((DOCKER / config.file).is_file() for config in file.configs.values())
     assert {name for service in file.services.values() for name in service.networks} == set(file.networks)
     for name in OURS:
         (declared,) = texts(IMAGES[file.services[name].image], "VOLUME")
@@ -532,7 +611,7 @@ def test_secrets_are_asked_for() -> None:
     assert all(re.match(r"^[A-Z_]+:\?.", variable) for variable in variables), "a message, and no value, where it lacks"
     for service in compose().services.values():
         for name, value in service.environment.items():
-            assert not re.search("PASSWORD|SECRET|TOKEN|_KEY", name) or value.startswith("${"), name
+            assert not re.search("PASSWORD|SECRET|TOKEN|_KEY", name) or not value or value.startswith("${"), name
     example = (DOCKER / "example.env").read_text()
     for name in {variable.split(":")[0] for variable in variables}:
         assert re.search(rf"^{name}=$", example, re.MULTILINE), "to be filled in"
@@ -553,8 +632,13 @@ def test_the_service_is_set_up_and_may_do_little(name: str, monkeypatch: pytest.
     database = settings.database_url
     assert database is not None
     there = compose().services["postgres"].environment
-    assert database.get_secret_value() == f"postgresql://{there['POSTGRES_USER']}@postgres:5432/{there['POSTGRES_DB']}"
-    assert service.environment["PGPASSWORD"] == there["POSTGRES_PASSWORD"]
+    role, password = there["POSTGRES_USER"], there["POSTGRES_PASSWORD"]
+    if name != "migration":
+        assert service.environment["COW_POSTGRES_PASSWORD"] == "", "it stands in the .env that all are given"
+        role, password = "cow_serving", there["COW_SERVING_PASSWORD"]
+        assert f"CREATE ROLE {role} LOGIN" in (DOCKER / "postgres" / "roles.sql").read_text()
+    assert database.get_secret_value() == f"postgresql://{role}@postgres:5432/{there['POSTGRES_DB']}"
+    assert service.environment["PGPASSWORD"] == password
     assert seconds(service.stop_grace_period) > longest_stop(settings)
     assert service.read_only
     assert service.init

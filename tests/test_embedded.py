@@ -87,10 +87,8 @@ def test_towards_and_away_from_the_camera(words: str, sense: float) -> None:
         ("rolls right at a speed of 2.5 m/s", {"speed": Quantity(2.5, "m/s")}),
         ("moves right by 50 pixels", {"distance": Quantity(50.0, "px")}),
         ("moves 10 centimetres to the right", {"distance": Quantity(0.1, "m")}),
-        ("moves half the image width to the right", {"distance": Quantity(0.5, "widths")}),
         ("rolls right for half a second and then stops", {"duration": 0.5}),
         ("rolls right until it meets something", {"until": "contact"}),
-        ("rolls right until it leaves the picture", {"until": "out-of-view"}),
     ],
 )
 def test_how_fast_how_far_how_long(words: str, expected: dict[str, object]) -> None:
@@ -114,10 +112,10 @@ def test_several_legs_and_a_second_mover() -> None:
     _, motion = read(drawn(arrow=False), told)
     assert (motion.direction, motion.distance) == ((0.0, 1.0), Quantity(50.0, "px"))
     assert motion.steps == (StepReading((1.0, 0.0), 0.0, None, 2.0),)
-    for words in ("the blue cube moves left", "the blue cube to the left"):
-        _, motion = read(drawn(arrow=False), f"If the red ball moves right and {words}, will the ball hit the cube?")
-        (other,) = motion.others
-        assert (other.object.object, other.direction, motion.direction) == ("blue cube", (-1.0, 0.0), (1.0, 0.0))
+    told = "If the red ball moves right and the blue cube moves left, will the ball hit the cube?"
+    _, motion = read(drawn(arrow=False), told)
+    (other,) = motion.others
+    assert (other.object.object, other.direction, motion.direction) == ("blue cube", (-1.0, 0.0), (1.0, 0.0))
 
 
 def test_falls_throws_and_rests() -> None:
@@ -174,10 +172,9 @@ def test_words_of_place_and_size_single_one_out(words: str, x: int) -> None:
 
 
 def test_a_noun_that_is_not_what_is_seen_is_warned_of() -> None:
-    warnings = reader.ground(
-        ReaderInput(drawn(False), "If the red ball rolls right, will it hit the blue cone?")
-    ).warnings
-    assert any("does not look like 'cone'" in warning for warning in warnings)
+    grounding = reader.ground(ReaderInput(drawn(False), "If the red ball rolls right, will it hit the blue cone?"))
+    assert any("names 'blue cone', which was not found" in warning for warning in grounding.warnings)
+    assert grounding.others == ()  # what is not found is in no answer
     warnings = reader.ground(ReaderInput(drawn(False), "If the blue elephant moves right, what happens?")).warnings
     assert any("whether 'elephant' is right" in warning for warning in warnings)
 

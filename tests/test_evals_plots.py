@@ -81,15 +81,6 @@ def test_the_figures_stand_in_the_text(nine: tuple[ArmSummary, ...], tmp_path: P
     assert "Money per question" in said["cost"]
 
 
-def test_no_two_plots_share_an_id_that_is_referred_to(nine: tuple[ArmSummary, ...], tmp_path: Path) -> None:
-    write_plots(tmp_path, nine)
-    seen: list[set[str]] = []
-    for name in PLOTS:
-        found = ElementTree.parse(tmp_path / f"{name}.svg").iter()
-        seen.append({each.attrib["id"] for each in found if "id" in each.attrib and each.tag.endswith("clipPath")})
-    assert sum(map(len, seen)) == len(set().union(*seen))
-
-
 def test_one_arm_has_no_gains_and_no_calibration(tmp_path: Path) -> None:
     (tmp_path / "gains.svg").write_text("of an earlier report")
     paths = write_plots(tmp_path, summarize([run(tmp_path, 6, ("never",), 1, ("collision",))]))

@@ -12,7 +12,7 @@ from asked_runs import HOSTILE, run
 from conftest import ROOT
 
 from cow_service.evals.report.summary import ArmSummary, read_prices, summarize
-from cow_service.evals.report.tables import Table, csv_text, latex, markdown, pairs, tables
+from cow_service.evals.report.tables import Table, csv_text, latex, markdown, replies, tables
 from cow_service.evals.report.write import write_report
 from cow_service.evals.runs import EvalRun
 
@@ -50,16 +50,13 @@ def test_the_figures_of_a_table_are_those_of_the_replies(asked: EvalRun, summari
     assert rows["GPT-5 (paper)", "TPR"]["all"] == "54.17"
 
 
-def test_every_question_and_repeat_has_a_row_of_its_own(asked: EvalRun, summaries: tuple[ArmSummary, ...]) -> None:
-    rows = list(csv.DictReader(io.StringIO(csv_text(pairs([asked], summaries)))))
-    assert len(rows) == 24 * 3
-    for row in rows[:20]:
-        for arm in asked.info.arms:
-            (seen,) = (
-                each for each in asked.of_arm(arm) if (each.item, str(each.repeat)) == (row["item"], row["repeat"])
-            )
-            expected = ("", "") if seen.failure else (seen.read or "", str(int(seen.right)))
-            assert (row[f"{arm}: chosen"], row[f"{arm}: right"]) == expected
+def test_every_reply_has_a_row_of_its_own(asked: EvalRun) -> None:
+    rows = list(csv.DictReader(io.StringIO(csv_text(replies([asked])))))
+    replied = [each for each in asked.observations if each.failure is None]
+    assert len(rows) == len(replied) > 24
+    for row, each in zip(rows, replied, strict=True):
+        assert (row["item"], row["arm"], row["repeat"]) == (each.item, each.arm, str(each.repeat))
+        assert (row["chosen"], row["right"]) == (each.read or "", str(int(each.right)))
 
 
 def test_text_that_means_something_to_a_format_is_text_in_it() -> None:

@@ -436,8 +436,3 @@ def test_fit_within(size, max_side, expected):
 def test_fit_within_averages_and_takes_grey():
     checks = np.indices((64, 64)).sum(axis=0).astype(np.uint8) % 2 * np.uint8(200)
     assert np.abs(fit_within(checks, 16).astype(int) - 100).max() <= 1
-
-
-def test_fit_within_nothing_is_refused():
-    with pytest.raises(ValueError, match="max_side is 0"):
-        fit_within(np.zeros((8, 8, 3), np.uint8), 0)

@@ -66,17 +66,16 @@ def test_whose_collision_is_asked_about() -> None:
 @pytest.mark.parametrize(
     ("said", "expected"),
     [
-        ("the last of which is the one nearest to the pink cube", (True, "pink cube", None)),
-        ("the first of which is the one closest to the pink cube", (False, "pink cube", None)),
-        ("the last of which is the leftmost", (True, None, (-1.0, 0.0))),
-        ("the latest of them is on the right", (True, None, (1.0, 0.0))),
+        ("the last of which is the one nearest to the pink cube", ("pink cube", None)),
+        ("the last of which is the leftmost", (None, (-1.0, 0.0))),
+        ("the latest of which is on the right", (None, (1.0, 0.0))),
     ],
 )
 def test_which_end_of_a_trail_is_the_present(said: str, expected: tuple[Any, ...]) -> None:
     question = parse(f"If the orange ball flies on along the trail of positions that is shown, {said}, will it land?")
     trail = question.motion.trail
     assert trail is not None
-    assert (trail.last, trail.near and trail.near.text, trail.side) == expected
+    assert (trail.near and trail.near.text, trail.side) == expected
     assert question.mover is not None
     assert (question.mover.text, question.motion.kind) == ("orange ball", "projectile")
 

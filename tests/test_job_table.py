@@ -19,8 +19,9 @@ from pydantic import SecretStr
 
 from cow_service.errors import InternalError, InvalidRequest
 from cow_service.jobs import webhooks, workflows
-from cow_service.jobs.database import JOBS, Database
+from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import MAX_STARTS, JobFilters, JobTable
+from cow_service.jobs.schema import JOBS
 from cow_service.jobs.workflows import Dispatcher
 from cow_service.settings import Settings
 
@@ -104,15 +105,26 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
     assert (found.job.status, found.job.position) == ("queued", 0)
     (new,) = table.take("light", "me", 1, None)
     assert not table.begin(old)
-    assert not table.succeed(old, '{"by":"old"}', None)
+    assert not table.succeed(old, '{"by":"old"}', None, ())
     table.release("job", old.run)
     assert table.begin(new)
-    assert table.succeed(new, '{"by":"new"}', None)
-    assert table.succeed(new, '{"by":"new"}', None), "a repeated try whose first commit was not heard of"
+    assert table.succeed(new, '{"by":"new"}', None, ())
+    assert table.succeed(new, '{"by":"new"}', None, ()), "a repeated try whose first commit was not heard of"
     assert not table.fail(new, InternalError("late"))
     assert not table.cancel("job")
     assert table.recover(["me", "frozen"]) == []
     assert ids(table.page(None, JobFilters(status=("succeeded",)), {}).jobs) == ["job"]
+
+
+def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_without_it(database: Database) -> None:
+    table = JobTable(database)
+    job = add_job(database, "job", executor="me")
+    assert job is not None
+    database.store_result("key", "job", "grounding", "{}", ["a" * 64])
+    assert not table.succeed(job, "{}", None, ("grounding", "generation"))
+    assert table.taken_by("me") == {"job": job.run}
+    database.store_result("another key", "job", "generation", "{}", ["b" * 64])
+    assert table.succeed(job, "{}", None, ("grounding", "generation"))
 
 
 def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(database: Database) -> None:
@@ -123,7 +135,7 @@ def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(datab
     table.delete(["job"])
     new = add_job(database, "job", executor="me")
     assert new is not None
-    assert not table.succeed(old, "{}", None)
+    assert not table.succeed(old, "{}", None, ())
     assert table.taken_by("me") == {"job": new.run}
 
 

@@ -52,7 +52,7 @@ def remote(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 def answers(service: Service) -> list[Answer]:
     """Answers for several seeds, until one imagined: random words may name nothing, or a place without area."""
     scene = example("ball-and-mug")
-    image, _ = service.keep_image(scene.image)
+    image = service.keep_image(scene.image)
     body = {"image": {"artifact": image.sha256}, "question": scene.meta["question"], "video": False, "num_frames": 9}
     found: list[Answer] = []
     for seed in range(1, 12):
@@ -84,14 +84,14 @@ def test_from_grounding_to_answer(place: str, request: pytest.FixtureRequest) ->
         assert simulation is not None
         assert simulation.grounding.source == simulation.motion.source == "mllm"
         assert simulation.reader.prompts.keys() >= {"identify", "locate"}
-        assert len(simulation.frames) == 3
+        assert len(simulation.frames) == 4
         assert answer.reader.prompts.keys() >= {"identify", "locate", "answer-with-frames"}
     assert {answer.reader.name for answer in told} == {"local" if place == "local" else "mllm"}
 
 
 def test_the_same_seed_gives_the_same_answer(local: Service) -> None:
     scene = example("ball-and-mug")
-    image, _ = local.keep_image(scene.image)
+    image = local.keep_image(scene.image)
     body = {"image": {"artifact": image.sha256}, "question": scene.meta["question"], "imagine": "never", "seed": 3}
     first, second = (local.answer(AnswerRequest.model_validate(body)) for _ in range(2))
     assert (first.answer, first.reasoning) == (second.answer, second.reasoning)
@@ -102,7 +102,7 @@ def test_a_wrong_path_on_the_server_is_a_typed_error(remote: Service) -> None:
     address = str(remote.settings.mllm_base_url)
     assert httpx.post(address + "/nothing", json={}).status_code == 404
     settings = Settings(data_dir=remote.settings.data_dir, mllm="tiny-qwen3-vl", mllm_base_url=address + "/wrong")
-    image, _ = remote.keep_image(example("ball-and-mug").image)
+    image = remote.keep_image(example("ball-and-mug").image)
     request = AnswerRequest.model_validate({"image": {"artifact": image.sha256}, "question": "Will it move?"})
     with Service(settings) as service, pytest.raises(CowError) as told:
         service.answer(request)

@@ -9,15 +9,19 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from postgres import postgres_server
+from conftest import ROOT
+from postgres import postgres
 from servers import BODY, Served
 
-ROLE = """
-CREATE ROLE cow_app LOGIN;
-GRANT USAGE ON SCHEMA public, dbos TO cow_app;
-GRANT SELECT, INSERT, UPDATE, DELETE ON ALL TABLES IN SCHEMA public, dbos TO cow_app;
-GRANT USAGE ON ALL SEQUENCES IN SCHEMA public, dbos TO cow_app;
-"""
+ROLES = ROOT / "docker" / "postgres" / "roles.sql"
+REFUSED = (
+    "CREATE TABLE mine (id int)",
+    "ALTER TABLE cow_jobs ADD COLUMN mine int",
+    "DROP TABLE cow_jobs",
+    "TRUNCATE cow_jobs",
+    "CREATE ROLE mine",
+    "COPY cow_jobs TO PROGRAM 'true'",
+)
 
 
 def cow(*words: str, **settings: str) -> subprocess.CompletedProcess[str]:
@@ -27,18 +31,29 @@ def cow(*words: str, **settings: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_a_server_runs_on_tables_that_it_may_not_create(tmp_path: Path) -> None:
-    with postgres_server() as url:
+@pytest.mark.parametrize("roles_first", [True, False], ids=["roles before tables", "tables before roles"])
+def test_a_server_runs_on_tables_that_it_may_not_create(tmp_path: Path, roles_first: bool) -> None:
+    with postgres() as server:
+        url = server.url
+        if roles_first:
+            server.run_script(ROLES, COW_SERVING_PASSWORD="it's secret")
         told = cow("migrate", COW_DATABASE_URL=url, COW_DATA_DIR=str(tmp_path))
         assert (told.returncode, told.stdout) == (0, "The job database is up to date.\n"), told.stderr
         assert cow("migrate", COW_DATABASE_URL=url, COW_DATA_DIR=str(tmp_path)).returncode == 0, (
             "again it changes nothing"
         )
+        if not roles_first:
+            server.run_script(ROLES, COW_SERVING_PASSWORD="it's secret")
         with psycopg.connect(url) as connection:
-            connection.execute(ROLE)
-        weak = {"COW_DATABASE_URL": url.replace("cow@", "cow_app@"), "COW_MIGRATE": "false"}
-        with Served(tmp_path, **weak) as one:
+            connection.execute("CREATE TABLE of_a_later_version (id int)")
+        weak = url.replace("cow@", "cow_serving@")
+        with Served(tmp_path, COW_DATABASE_URL=weak, COW_MIGRATE="false") as one:
             assert one.ended(one.submit(BODY)["id"])["status"] == "succeeded"
+        with psycopg.connect(weak, autocommit=True) as connection:
+            connection.execute("INSERT INTO of_a_later_version VALUES (1)")
+            for statement in REFUSED:
+                with pytest.raises(psycopg.errors.InsufficientPrivilege):
+                    connection.execute(statement)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from cow_service.errors import CannotGround, InvalidRequest
 from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
 from cow_service.records import Grounding, LocatedObject
-from cow_service.requests import SimulateRequest
+from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
@@ -150,13 +150,15 @@ def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixe
     data = base64.b64encode(png_bytes(np.repeat(circle((430, 260), 25)[..., None], 3, axis=2))).decode()
     objects = [{"object": "disc", "mask": f"data:image/png;base64,{data}"}]
     asked = SimulateRequest.model_validate({"image": "data:,", "question": "?", "objects": objects})
-    kept_request = service.keep_masks(asked)
+    asked = asked.model_copy(update={"image": ImageArtifact(artifact="0" * 64)})
+    kept_request, files = service.digested(asked)
+    service.keep(files)
     assert service.artifacts.read(kept_request.objects[0].mask.artifact)  # pyright: ignore[reportAttributeAccessIssue]
-    assert service.keep_masks(kept_request) is kept_request
+    assert service.digested(kept_request) == (kept_request, [])
     for mask, told in (("data:image/png;base64,AAAA", "no PNG"), ("data:,x", "data URL with base64")):
         wrong = asked.objects[0].model_copy(update={"mask": mask})
         with pytest.raises(InvalidRequest, match=told) as caught:
-            service.keep_masks(asked.model_copy(update={"objects": (wrong,)}))
+            service.digested(asked.model_copy(update={"objects": (wrong,)}))
         assert caught.value.errors[0].pointer == "/objects/0/mask"
 
 

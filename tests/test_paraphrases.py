@@ -10,7 +10,6 @@ from cow_service.readers.embedded.english.questions import parse
 MOVES = "If the red ball rolls to the left, "
 SAME = """
 is there a moment when it blocks our view of the vase? | will it hide the vase?
-can we see all of the vase? | will the vase stay fully visible?
 can we still see the vase? | will the vase stay visible?
 will it at some point be standing in front of the vase? | will it pass in front of the vase?
 is there anything left for it to crash into? | will it hit anything?

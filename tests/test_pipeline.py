@@ -31,7 +31,7 @@ QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 
 
 def run(service: Service, image: bytes = DRAWN, question: str = QUESTION, progress=None, **body) -> Simulation:
-    artifact, _ = service.keep_image(image)
+    artifact = service.keep_image(image)
     request = SimulateRequest.model_validate({"image": {"artifact": artifact.sha256}, "question": question, **body})
     return service.simulate(request, progress) if progress else service.simulate(request)
 
@@ -75,14 +75,17 @@ def test_everything_that_a_simulation_promises(service: Service) -> None:
     heard: list[tuple[str, float]] = []
     simulation = run(service, progress=lambda stage, done: heard.append((stage, done)))
     assert [(e.object, e.kind) for e in simulation.trajectory.encounters] == [("blue cube", "touches")]
-    assert [frame.index for frame in simulation.frames] == [1, 3, 5]
-    assert simulation.frames[1].time == pytest.approx(3 / 16)
+    shown = [frame.index for frame in simulation.frames]
+    hit = simulation.trajectory.encounters[0].first_frame
+    assert len(shown) == 4
+    assert shown[0] < hit < shown[-1], "what led to the hit and what came of it are shown, too"
+    assert simulation.frames[shown.index(hit)].time == pytest.approx(hit / 16)
     assert set(simulation.timings) == {"grounding", "motion", "trajectory", "generation"}
     assert simulation.reader.name == "embedded"
     assert simulation.reader.stages == ("grounding", "motion")
     assert simulation.generator.options == {"clean_cues": True}
     assert simulation.warnings == ()
-    assert simulation.motion.sentence.startswith("The red ball moves")
+    assert simulation.motion.sentence.startswith("The red ball sets off")
     assert "to the right" in simulation.motion.sentence
     for frame in simulation.frames:
         assert picture(service, frame.sha256).shape == (frame.height, frame.width, 3) == (320, 512, 3)
@@ -169,7 +172,7 @@ def test_many_objects_stay_affordable(service: Service) -> None:
     place = {"grounding": {"bbox": [30, 30, 90, 90]}, "motion": {"direction": [1, 0]}}
     simulation = run(service, png_bytes(image), "?", **place, video=False)
     assert len(Scene(image).regions) == MAX_REGIONS
-    assert len(simulation.frames) == 3
+    assert len(simulation.frames) == 4
 
 
 def test_the_same_request_gives_the_same_bytes(service: Service) -> None:
@@ -197,7 +200,7 @@ def test_small_and_long_images(service: Service, size: tuple[int, int]) -> None:
     place = {"grounding": {"bbox": [2, 2, 6, 6]}, "motion": {"direction": [1, 1]}}
     simulation = run(service, png_bytes(image), "?", **place, num_frames=5)
     assert simulation.image.width == size[0]
-    assert len(simulation.frames) == 3
+    assert len(simulation.frames) == 4
     assert max(picture(service, simulation.overlay.sha256).shape) == min(1280, max(size))
 
 

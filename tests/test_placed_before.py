@@ -208,7 +208,7 @@ class TestFrames:
         image = ball(bowl(floor(), (420, 240), 70, 50, BLUE), (330, 130), 20, GREEN)
         image = ball(image, (105, 280), 25, RED)
         frames = {"indices": [0, 48], "max_side": None}
-        fast = RIGHT | {"speed": 900}
+        fast = RIGHT | {"speed": 1000}
         wanted = run(put("egg", "into", "bowl"), image=image, objects=objects, video=False, frames=frames, motion=fast)
         told, clip = clip_of(wanted)
         assert told.placed[0].result == "inside"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import platform
 import re
 import signal
 import socket
@@ -21,7 +23,8 @@ import yaml
 from conftest import ROOT
 from engines import running_engine
 from postgres import postgres_server
-from servers import Served, Worker, eventually, problem, slow
+from pydantic import ValidationError
+from servers import ASYNC, Served, Worker, eventually, problem, slow
 
 from cow_service.api.middleware.access import hash_of
 from cow_service.jobs.job_table import VERSION
@@ -142,9 +145,46 @@ def test_a_worker_that_crashes_is_counted(served: Served) -> None:
     eventually(lambda: 'cow_worker_ends_total{reason="crashed"} 1.0' in served.http.get("/metrics").text)
 
 
+def test_only_administrators_are_told_where_processes_are(tmp_path: Path) -> None:
+    keys = json.dumps({name: hash_of(f"cow_{name}") for name in ("alice", "root")})
+    with Served(tmp_path, COW_API_KEYS=keys, COW_ADMIN_KEYS='["root"]') as one:
+        job = one.http.post("/simulate", json=slow(20), headers=ASYNC | {"Authorization": "Bearer cow_alice"}).json()
+
+        def told(name: str) -> dict[str, Any] | None:
+            answer = one.http.get("/workers", headers={"Authorization": f"Bearer cow_{name}"}).json()
+            return (
+                answer["processes"][0]
+                if [1 for worker in answer["processes"][0]["workers"] if worker["jobs"]]
+                else None
+            )
+
+        def places(process: dict[str, Any]) -> list[Any]:
+            (worker,) = process["workers"]
+            return [process["host"], process["pid"], worker["pid"], worker["jobs"][0]["id"]]
+
+        pid = one.process.pid if one.process else 0
+        assert places(eventually(lambda: told("root"))) == [platform.node(), pid, pid, job["id"]]
+        shown = eventually(lambda: told("alice"))
+        assert places(shown) == [None] * 4
+        assert shown["workers"][0]["jobs"][0]["kind"] == "simulate"
+        tops = {
+            name: cow(one, "top", "--once", "--url", str(one.http.base_url), COW_API_KEY=f"cow_{name}").stdout
+            for name in ("root", "alice")
+        }
+        assert f"server on {platform.node()}  pid {pid}, COW" in tops["root"]
+        assert re.search(r"^server  COW ", tops["alice"], re.MULTILINE)
+        assert platform.node() not in tops["alice"]
+        assert str(pid) not in tops["alice"].split()
+
+
+def test_an_administrator_has_a_key() -> None:
+    with pytest.raises(ValidationError, match="'bob' is no name of COW_API_KEYS"):
+        Settings(api_keys={"alice": hash_of("cow_alice")}, admin_keys=("bob",))
+
+
 def test_processes_are_shown_while_they_tell_of_themselves() -> None:
     database = running_engine().database
-    table, keys = ProcessTable(database), {"alice": hash_of("cow_alice")}
+    table = ProcessTable(database)
     job = WorkerJob(id="secret", kind="answer", progress=0, seconds=1)
     worker = WorkerInfo(name="light-1", queue="light", pid=2, memory_mb=1, jobs_done=0, jobs=(job,))
     info = {"role": "worker", "host": "box", "pid": 1, "version": "9", "workflow_version": "9", "seen_at": "now"}
@@ -155,7 +195,6 @@ def test_processes_are_shown_while_they_tell_of_themselves() -> None:
         return [job.id for one in found if one.host == "box" for worker in one.workers for job in worker.jobs]
 
     assert shown(Settings()) == ["secret"]
-    assert shown(Settings(api_keys=keys)) == [None], "an id is for the owner of the job"
     with database.transaction() as connection:
         connection.execute(sa.text("UPDATE cow_executors SET seen = seen - 11 WHERE executor = 'other'"))
     assert shown(Settings()) == []

@@ -35,8 +35,8 @@ def test_every_shipped_prompt_loads(name: str) -> None:
 
 def test_fields() -> None:
     prompt = load_prompt("motion-sentence")
-    assert prompt.version == 3
-    assert prompt.inputs == ("object", "kind", "words", "sentence", "further", "stops", "also")
+    assert prompt.version == 4
+    assert prompt.inputs == ("object", "kind", "law", "words", "sentence", "further", "stops", "also")
 
 
 SAMPLES: dict[str, object] = {
@@ -210,22 +210,27 @@ def test_direction_words_with_depth(direction: Vector | None, depth: float, word
 @pytest.mark.parametrize(
     ("kind", "direction", "words"),
     [
-        ("linear", (1.0, 0.0), "moves straight to the right at a constant speed"),
-        ("linear", None, "moves in a straight line at a constant speed"),
+        ("linear", (1.0, 0.0), "sets off to the right"),
+        ("linear", None, "sets off in a straight line"),
         ("projectile", (0.0, -1.0), "is thrown up and flies on a curved path, pulled down by gravity"),
         ("fall", None, "falls straight down, faster and faster, pulled down by gravity"),
         ("static", None, "stays where it is and does not move"),
     ],
 )
 def test_motion_sentence(kind: MotionKind, direction: Vector | None, words: str) -> None:
-    sentence = motion_sentence("the orange\n ball", kind, direction, 0.0)
+    sentence = motion_sentence("the orange\n ball", kind, "contact", direction, 0.0)
     assert sentence == f"The orange ball {words}. The camera stays still."
+
+
+def test_only_what_nothing_stops_moves_at_a_constant_speed() -> None:
+    sentence = motion_sentence("ball", "linear", "ballistic", (1.0, 0.0), 0.0)
+    assert sentence == "The ball moves straight to the right at a constant speed. The camera stays still."
 
 
 @settings(deadline=None)
 @given(st.text(), st.sampled_from(["linear", "projectile", "fall", "static"]))
 def test_motion_sentence_is_one_line_of_bounded_length(name: str, kind: MotionKind) -> None:
-    sentence = motion_sentence(name, kind, (1.0, 0.0), 0.0)
+    sentence = motion_sentence(name, kind, "contact", (1.0, 0.0), 0.0)
     assert len(sentence.splitlines()) == 1
     assert len(sentence) < 350
     assert sentence.endswith("The camera stays still.")

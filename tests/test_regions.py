@@ -128,6 +128,61 @@ def test_a_shadow_is_no_object() -> None:
     assert find_regions(darker) == ()
 
 
+def clouds(rgb: tuple[int, int, int], size: int, seed: int = 0) -> Image:
+    """A floor whose light varies by more than half over patches as large as things: stone, carpet or grass."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.random((400 // size + 2, 640 // size + 2), np.float32)
+    light = cv2.resize(coarse, (640, 400), interpolation=cv2.INTER_CUBIC)[..., None]
+    return np.clip(np.array(rgb) * (0.55 + 0.9 * light) + rng.normal(0, 3, (400, 640, 3)), 0, 255).astype(np.uint8)
+
+
+def below_a_wall(image: Image, rgb: tuple[int, int, int]) -> Image:
+    image[:120] = rgb
+    return image
+
+
+FLOORS = {
+    "blue stone": lambda: below_a_wall(clouds((70, 70, 120), 40), (165, 175, 185)),
+    "dark carpet": lambda: clouds((60, 62, 66), 25),
+    "brown wood": lambda: below_a_wall(clouds((185, 170, 150), 30), (120, 118, 110)),
+    "grass": lambda: clouds((50, 95, 60), 12),
+}
+
+
+@pytest.mark.parametrize("name", sorted(FLOORS))
+def test_the_texture_of_a_floor_is_no_object_and_hides_none(name: str) -> None:
+    image = ball(FLOORS[name](), (200, 260), 38, RGB["orange"])
+    image = block(image, (420, 190, 500, 270), RGB["purple"])
+    image = ball(image, (330, 200), 30, RGB["white"])
+    regions = find_regions(jpeg(image))
+    assert sorted(region.colour for region in regions) == ["orange", "purple", "white"]
+    for box in ((162, 222, 238, 298), (420, 190, 500, 270), (300, 170, 360, 230)):
+        assert max(iou(region.bbox, box) for region in regions) > 0.8
+
+
+@pytest.mark.parametrize("light", [0.3, 0.4, 0.6])
+@pytest.mark.parametrize("ground", [(200, 200, 205), (90, 120, 170)], ids=["grey", "blue"])
+def test_a_dark_shadow_with_a_hard_edge_is_no_object_and_no_part_of_one(
+    ground: tuple[int, int, int], light: float
+) -> None:
+    shade = np.full((400, 640, 3), ground, np.float32)
+    for centre, axes in (((235, 300), (55, 22)), ((440, 310), (50, 20)), ((520, 120), (48, 18))):
+        dark = cv2.ellipse(np.zeros((400, 640), np.uint8), centre, axes, 0, 0, 360, 1, -1)[..., None] > 0
+        shade = np.where(dark, shade * light, shade)
+    image = np.clip(shade + np.random.default_rng(0).normal(0, 2, shade.shape), 0, 255).astype(np.uint8)
+    image = block(ball(image, (200, 270), 40, RGB["red"]), (380, 230, 450, 310), RGB["green"])
+    regions = find_regions(jpeg(image))
+    assert sorted(region.colour for region in regions) == ["green", "red"]
+    assert max(iou(region.bbox, (160, 230, 240, 310)) for region in regions) > 0.85
+    assert max(iou(region.bbox, (380, 230, 450, 310)) for region in regions) > 0.85
+
+
+def test_the_lit_top_of_something_black_belongs_to_it() -> None:
+    image = block(floor(), (250, 180, 350, 280), RGB["black"])
+    image[180:205, 250:350] = 78
+    assert [iou(region.bbox, (250, 180, 350, 280)) > 0.9 for region in find_regions(jpeg(image))] == [True]
+
+
 def test_a_cluttered_image_gives_nothing() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
     assert find_regions(cv2.resize(noise, (640, 480), interpolation=cv2.INTER_NEAREST)) == ()
@@ -221,3 +276,27 @@ def test_the_mouth_and_the_body_of_a_white_vase_are_one_unless_the_floor_is_seen
     (whole,) = find_regions(jpeg(white_vase(134), 90))
     assert iou(whole.bbox, (260, 140, 340, 273)) > 0.9
     assert len(find_regions(jpeg(white_vase(None), 90))) == 2
+
+
+CSS = {
+    "silver": (192, 192, 192), "gray": (128, 128, 128), "white": (255, 255, 255), "black": (0, 0, 0),
+    "maroon": (128, 0, 0), "red": (255, 0, 0), "purple": (128, 0, 128), "fuchsia": (255, 0, 255),
+    "green": (0, 128, 0), "lime": (0, 255, 0), "olive": (128, 128, 0), "yellow": (255, 255, 0),
+    "navy": (0, 0, 128), "blue": (0, 0, 255), "teal": (0, 128, 128), "aqua": (0, 255, 255),
+    "pink": (255, 192, 203), "brown": (165, 42, 42), "orange": (255, 165, 0), "turquoise": (64, 224, 208),
+}  # fmt: skip
+SAID = {  # what people also call them
+    "silver": "grey", "gray": "grey", "maroon": "red", "fuchsia": "pink", "lime": "green", "olive": "green",
+    "navy": "blue", "teal": "cyan", "aqua": "cyan", "turquoise": "cyan",
+}  # fmt: skip
+
+
+# On a light floor silver and grey, darker and of its hue, cannot be told from a shadow.
+@pytest.mark.parametrize(
+    ("name", "ground"),
+    [(name, ground) for name in sorted(CSS) for ground in (70, 225) if ground < 200 or name not in ("silver", "gray")],
+)
+def test_a_plain_colour_is_found_and_named_on_a_dark_and_on_a_light_floor(name: str, ground: int) -> None:
+    found = find_regions(jpeg(block(floor(grey=ground), (260, 160, 340, 240), CSS[name])))
+    assert [SAID.get(name, name) in region.colours for region in found] == [True]
+    assert iou(found[0].bbox, (260, 160, 340, 240)) > 0.9

@@ -60,7 +60,7 @@ def simulated(**given: Any) -> tuple[Grounding, Trajectory]:
 
 class TestWorlds:
     def test_without_it_the_mover_gets_to_what_is_behind_it(self) -> None:
-        grounding, told = simulated()
+        grounding, told = simulated(camera={"pitch": 28, "focal": 640})
         assert [each.object.object for each in grounding.interventions] == ["Green  block"]
         assert [other.object for other in grounding.others] == ["cube"]
         factual = told.factual
@@ -92,7 +92,7 @@ class TestWorlds:
         assert fallen.runs[0].positions[1, 0, 1] == pytest.approx(kept.runs[0].positions[1, 0, 1])
         assert fallen.runs[0].positions[1, -1, 1] < fallen.runs[0].positions[1, 0, 1] - 0.3
         assert kept.runs[0].positions[1, -1, 1] == pytest.approx(kept.runs[0].positions[1, 0, 1], abs=0.01)
-        events = find_world_events(fallen, bodies, 16.0, likeliest(), camera.size)
+        events = find_world_events(fallen, bodies, likeliest(), camera.size)
         assert np.isfinite(events.moved[0, 1])
 
     @pytest.mark.parametrize(("negated", "likely"), [(False, 1.0), (True, 0.0)])
@@ -244,6 +244,6 @@ def test_a_world_of_an_ensemble_records_turns_only_where_they_are_wanted() -> No
     rows = ensemble(4)
     for wanted in (True, False):
         worlds = run_world(replace(world, turns_wanted=wanted), rows, 2)
-        tipped = find_world_events(worlds, world.bodies, 16.0, rows, camera.size).tipped
+        tipped = find_world_events(worlds, world.bodies, rows, camera.size).tipped
         assert np.isfinite(tipped[:, 1]).all() == wanted
         assert not np.isfinite(tipped[:, 0]).any()

@@ -237,6 +237,27 @@ def test_without_keys_each_address_has_its_own_limit(tmp_path: Path) -> None:
     assert ask(app, ("GET", "/nowhere"), client="2001:db8::2")[0].status_code == 429
 
 
+@pytest.mark.parametrize(
+    ("setting", "per_minute", "unit"),
+    [("rate_limit_mb", 1.0, "1 MB of bodies"), ("rate_limit_cpu", 1e-6, "1e-06 CPU seconds for reading bodies")],
+)
+def test_what_refused_requests_use_counts(tmp_path: Path, setting: str, per_minute: float, unit: str) -> None:
+    app = app_of(tmp_path, api_keys=KEYS, **{setting: per_minute})
+    unfinished = {"content": b"{" + b" " * 1_500_000}
+
+    async def run() -> tuple[list[httpx.Response], httpx.Response]:
+        transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow:8000") as http:
+            alice, bob = ({**bearer(key), "Content-Type": "application/json"} for key in (ALICE, BOB))
+            asked = [await http.post("/v1/chat/completions", headers=alice, **unfinished) for _ in range(2)]
+            return asked, await http.post("/v1/chat/completions", headers=bob, **unfinished)
+
+    (first, refused), of_bob = asyncio.run(run())
+    assert [code(first), code(refused), code(of_bob)] == ["malformed-body", "rate-limited", "malformed-body"]
+    assert f"takes {unit} a minute" in refused.json()["detail"]
+    assert int(refused.headers["retry-after"]) >= 1
+
+
 def test_wrong_keys_are_counted_and_right_ones_pass(tmp_path: Path) -> None:
     app = app_of(tmp_path, api_keys=KEYS, rate_limit=1000)
     responses = ask(app, *[("GET", "/models", bearer(f"cow_{i}")) for i in range(32)])

@@ -13,7 +13,7 @@ from runs import run_of
 
 from cow_service.errors import InvalidRequest
 from cow_service.readers.base import MotionReading
-from cow_service.records import Contact, Encounter, Grounding, Motion, Path, Trajectory
+from cow_service.records import Asked, Contact, Encounter, Grounding, Motion, Outcome, Path, Trajectory
 from cow_service.requests import AnswerRequest, FramesRequest, SimulateRequest, TrajectoryRequest
 from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
@@ -178,12 +178,15 @@ def plain(frames: int, encounters: tuple[int, ...] = (), seen: int | None = None
 
 
 def test_frame_policies() -> None:
-    assert choose_frames(FramesRequest(), plain(81)) == (1, 3, 5)
-    assert choose_frames(FramesRequest(policy="uniform"), plain(81)) == (0, 40, 80)
+    assert choose_frames(FramesRequest(policy="initial", count=3), plain(81)) == (1, 3, 5)
+    assert choose_frames(FramesRequest(policy="uniform", count=3), plain(81)) == (0, 40, 80)
     assert choose_frames(FramesRequest(policy="uniform", count=1), plain(81)) == (80,)
-    assert choose_frames(FramesRequest(policy="events"), plain(81, (12, 30, 50))) == (12, 30, 50)
-    assert 12 in choose_frames(FramesRequest(policy="events"), plain(81, (12,), seen=40))
-    assert max(choose_frames(FramesRequest(policy="events"), plain(81, seen=40))) == 39
+    # By default: before, at and after what matters, and the end.
+    assert choose_frames(FramesRequest(), plain(81, (30,))) == (15, 30, 55, 80)
+    assert choose_frames(FramesRequest(), plain(81, (12, 30, 50))) == (6, 12, 30, 80)
+    assert choose_frames(FramesRequest(count=1), plain(81, (12,))) == (12,)
+    assert choose_frames(FramesRequest(), plain(81, (12,), seen=40)) == (6, 12, 25, 39)
+    assert max(choose_frames(FramesRequest(), plain(81, seen=40))) == 39
     assert choose_frames(FramesRequest(indices=(7, 3, 3)), plain(81)) == (3, 7)
 
 
@@ -192,10 +195,18 @@ def test_event_frames_show_contacts_that_no_other_frame_shows() -> None:
         return Contact(a=0, b=b, time=time, point=(0, 0), impulse=1)
 
     contacts = (at(0.0, None), at(0.5, None), at(1.0, 1), at(1.05, 2))
-    events = FramesRequest(policy="events")
-    assert choose_frames(events, plain(81, (40,), contacts=contacts)) == (8, 16, 40)  # 1.05 s shows what 1 s does
-    assert choose_frames(events, plain(81, (16,), contacts=contacts))[:2] == (8, 16)
+    events = FramesRequest(count=5)
+    assert choose_frames(events, plain(81, (40,), contacts=contacts)) == (8, 16, 20, 40, 80)  # 1.05 s is as 1 s
     assert max(choose_frames(events, plain(81, contacts=contacts, moving_until=2.0))) == 32
+
+
+def test_event_frames_show_what_is_asked_about_first() -> None:
+    met = tuple(
+        Encounter(object=name, bbox=(0, 0, 1, 1), first_frame=i, kind="touches") for name, i in (("a", 20), ("b", 60))
+    )
+    asked = Outcome(asked=Asked(relation="touches", target="b"), object="b", probability=1.0, sure=True, robust=True)
+    trajectory = plain(81).model_copy(update={"encounters": met, "outcome": asked})
+    assert choose_frames(FramesRequest(count=3), trajectory) == (30, 60, 80)
 
 
 @given(
@@ -238,7 +249,7 @@ def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, eve
         ({"motion": {"direction": [0, 0]}}, "must have a length"),
         ({"motion": {"kind": "projectile"}}, "needs a `direction`"),
         ({"trajectory": {"points": [[1, 1]]}}, "at least 2"),
-        ({"trajectory": {"points": [[1, 1], [1e9, 0]]}}, "1,000,000 px"),
+        ({"trajectory": {"points": [[1, 1], [1e9, 0]]}}, "less than or equal to 1000000"),
         ({"motion": {"kind": "fall", "direction": [1, 0]}}, "takes no `direction`"),
         ({"question": "   "}, "empty"),
         ({"num_frames": 1}, "greater than or equal to 2"),
@@ -264,7 +275,8 @@ def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> N
     x0, y0, x1, y1 = grounded(scene, **POINT).bbox
     radius, gravity = (x1 - x0 + y1 - y0) / 4, thrown.gravity[1]
     assert thrown.speed**2 / (gravity * radius) == pytest.approx(1.8**2 / (9.81 * 0.15))
-    assert (thrown.law, thrown.speed_deviation, thrown.depth_deviation) == ("contact", 0.28, 0)
+    assert (thrown.law, thrown.speed_deviation, thrown.depth_deviation) == ("contact", 0.28, 15)
+    assert moved(scene, direction=(1, 0), kind="projectile", depth=0.0).depth_deviation == 0, "its depth is given"
     ballistic = moved(scene, direction=(1, 0), kind="projectile", law="ballistic")
     assert (ballistic.law, ballistic.speed) == ("ballistic", pytest.approx(0.26 * 640))
     given = moved(scene, direction=(1, 0), kind="projectile", speed=50, depth_deviation=4)
@@ -299,10 +311,10 @@ def test_a_reader_is_asked_where_the_request_is_silent(scene: Scene) -> None:
         def read_motion(self, given, grounding, hints):
             assert given.question == "Where to?"
             assert hints is None
-            return MotionReading("linear", (0.0, -2.0), "text", warnings=("careful",))
+            return MotionReading("linear", (-2.0, 0.0), "text", warnings=("careful",))
 
     result = read_motion(run(scene, reader=OneReader, question="Where to?"), grounded(scene, **POINT), None)
-    assert result.value.direction == (0, -1)
+    assert result.value.direction == (-1, 0)
     assert result.value.source == "embedded"
     assert result.warnings == ("careful",)
 

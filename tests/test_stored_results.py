@@ -13,7 +13,8 @@ from fastapi.testclient import TestClient
 from job_rows import add_job
 from servers import data_url
 
-from cow_service.jobs.database import JOBS, RESULTS, TRAJECTORIES, Database, unpacked
+from cow_service.jobs.database import Database, unpacked
+from cow_service.jobs.schema import JOBS, RESULTS, TRAJECTORIES
 from cow_service.records import Simulation
 from cow_service.service import Service
 from cow_service.settings import Settings

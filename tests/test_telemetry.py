@@ -311,6 +311,26 @@ def test_json_is_one_object_a_line(written: SimpleNamespace) -> None:
     assert set(second) == {"time", "level", "logger", "message", "exception"}
 
 
+@pytest.mark.parametrize("log_format", ["text", "json"])
+def test_a_line_has_an_end_whatever_was_sent(written: SimpleNamespace, log_format: str) -> None:
+    written.set_up(log_format=log_format)
+    sent = "first " + "x" * 1_000_000 + " last"
+    try:
+        raise ValueError(sent)
+    except ValueError:
+        with context.bound(request="r1"):
+            logging.getLogger("cow_service").exception("failed", extra={"sent": sent})
+            logging.getLogger("cow_service").warning("%s", sent)
+    traced, told = (text for text in re.split(r"\n(?={|\d{4}-)", written.err.getvalue()))
+    assert max(map(len, written.err.getvalue().splitlines())) < 3 * logs.MAX_TEXT
+    assert "failed" in traced
+    assert "first" in told
+    assert "r1" in told
+    for text in (traced, told):
+        assert "characters]" in text
+        assert "last" in text
+
+
 def test_the_job_engine_speaks_through_our_handler(written: SimpleNamespace) -> None:
     written.set_up()
     written.set_up()  # once more changes nothing

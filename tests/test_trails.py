@@ -61,7 +61,6 @@ def test_a_multiple_exposure_leaves_the_end_to_the_words() -> None:
     for end in (
         TrailEnd(near=(460, 230, 530, 300)),
         TrailEnd(side=(1.0, 0.0)),
-        TrailEnd(side=(-1.0, 0.0), is_oldest=True),
     ):
         assert math.dist(found.ending(end).present.centre, PLACES[-1]) < 1.5
     assert math.dist(found.ending(TrailEnd(side=(-1.0, 0.0))).present.centre, PLACES[0]) < 1.5

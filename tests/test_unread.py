@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 from drawn import ball, block, floor, jpeg
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from cow_service.errors import CannotGround, CannotReadDirection
@@ -15,7 +13,7 @@ from cow_service.readers.embedded.answers import answer_from
 from cow_service.readers.embedded.english.asked import read_asked, unread
 from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.records import Asked, Grounding
+from cow_service.records import Grounding
 from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
@@ -52,7 +50,15 @@ First shift the ball left by 90 px, in the air, and only then release it. Will i
 Nobody throws the cube. If the ball rolls left, does it hit the mug? | cube
 If the ball rolls left by twice the width of the mug, does it hit the cube? | by twice width of mug
 If the ball rolls right, does it still hit the mug at the end? | still hit mug at end
-True or false? The mug is on the table. If the ball rolls left, it hits the mug. | mug
+True or false? The mug is on the table. If the ball rolls left, it hits the mug. | true or false
+If the ball and the mug move to the left, do they meet? | mug move
+If the ball moves right and the blue cube to the left, will the ball hit the cube? | blue cube
+If the ball rolls left, once the ball has bumped into the cup, will the cup tip the cube? | bumped into cup
+If the ball is kicked into the air along the arrow, where will it land? | into air
+If the ball rolls left by half the image width, does it hit the mug? | by half image width
+If the ball rolls left until it leaves the picture, does it hit the mug? | until it leaves picture
+The ball flies on along its trail, the first of which is the leftmost. Does it hit the mug? | first of which is leftmost
+The ball rolls left, then it goes for 2 seconds. Does it hit the mug? | for 2 seconds
 """
 BESIDE = """
 The floor is icy. If the ball rolls right, does it hit the mug? | floor is icy
@@ -63,7 +69,6 @@ If the ball rolls right, does it hit the mug?
 There is a red ball and a blue mug. If the ball rolls right, does it hit the mug?
 Please tell me: would the ball, rolling freely along the arrow on the floor, hit the mug?
 Remove the vase and then roll the ball gently to the right by 20 px. Does it still hit the mug?
-Is the ball able to reach the mug by rolling left?
 Excuse me, could you please tell me whether the ball is going to hit the mug if we give it a little push left?
 OK so what I'd like to know is whether the ball, rolling left, gets past the mug without touching it.
 The ball rolls left and strikes the bowl, right? Would the bowl be shoved into the cone by this?
@@ -108,6 +113,9 @@ WORDS = sorted({word for text, _ in rows(TURNING + BESIDE + PLAIN) for word in t
 
 
 @settings(deadline=None, max_examples=50)
+@example(
+    "If the ball rolls left this arrow indicate line, will it hit the mug?"
+)  # a half of "indicate line" is no adverbial
 @given(st.one_of(st.text(max_size=80), st.lists(st.sampled_from(WORDS), max_size=30).map(" ".join)))
 def test_never_raises(text: str) -> None:
     question = parse(text)
@@ -138,12 +146,10 @@ def test_a_thing_is_singled_out_by_where_it_is(said: str, left: int | None) -> N
         assert EmbeddedReader().ground(given).bbox[0] == pytest.approx(left, abs=4)
 
 
-def test_the_other_one_and_the_latter() -> None:
-    question = parse("There is a red ball and a blue cube. If the latter slides left, does it hit the former?")
-    assert question.mover is not None
-    assert (question.mover.text, [each.text for each in question.others]) == ("blue cube", ["red ball"])
-    asked: Any = read_asked(parse("If the red ball rolls right, does it hit the other one?"))
-    assert asked.target == "other ball"
+def test_the_latter_is_not_guessed() -> None:
+    question = "There is a red ball and a blue cube. If the latter slides left, does it hit the former?"
+    with pytest.raises(CannotGround):
+        EmbeddedReader().ground(ReaderInput(scene(), question))
 
 
 @pytest.mark.parametrize("way", ["up and down", "left to the right", "left and stays still"])
@@ -173,17 +179,17 @@ def test_the_things_of_a_kind_are_found_or_refused() -> None:
         EmbeddedReader().ground(ReaderInput(scene(), "If the blue cube slides left, does it hit all three balls?"))
 
 
-def test_typing_errors_are_read_and_said() -> None:
-    question = parse("If the gren ball mvoes to the rigth, will it touhc the trunk?")
-    assert question.errors == (("mvoes", "moves"), ("rigth", "right"), ("touhc", "touch"))
-    assert (question.motion.verb, read_asked(question)) == ("move", Asked(relation="touches", target="trunk"))
-    given = ReaderInput(scene(), "If the red ball rools left, is the cube hit?")
-    assert "Read 'rools' as 'rolls'." in EmbeddedReader().ground(given).warnings
+@pytest.mark.parametrize(
+    "question", ["If the ball mvoes left, will it hit it?", "If the ball rolls to the rigth, is it hit?"]
+)
+def test_misspelt_words_are_not_guessed(question: str) -> None:
+    told = parse(question).motion
+    assert not told.verb or told.direction is None
+    assert unread(parse(question)).turning
 
 
 @given(st.text("bcdfghjklmnpqrstvwxz", min_size=6, max_size=12))
 def test_no_sense_is_made_of_what_has_none(word: str) -> None:
     question = parse(f"If the red ball {word} left, does it hit the mug?")
-    assert question.errors == ()
     assert question.mover is not None
     assert word in question.mover.text or word in unread(question).turning  # a noun nobody knows, or named as unread

@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from cow_service.generators.wan import attention
 from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
 from cow_service.generators.wan.capabilities import (
-    ATTENTION_BACKENDS,
-    MINIMUM_VERSIONS,
+    EXACT_BACKENDS,
     Capabilities,
     backends_for_auto,
     refusals,
@@ -115,14 +114,16 @@ def test_the_next_start_chooses_the_same(tmp_path: Path, monkeypatch: pytest.Mon
 
     assert [chosen("native", "_native_math") for _ in range(3)] == ["native"] * 3
     assert len(timed) == 1
-    assert chosen("native", "_native_math", "flash") == "_native_math"
+    assert chosen("native", "_native_math", "_native_flash") == "_native_math"
     assert chosen("native", "_native_math") == "native"
     monkeypatch.setattr(attention, "_fetched", lambda name: "offline" if name == "native" else None)
-    chosen("native", "_native_math")
-    assert len(timed) == 3, "what cannot be fetched any more is chosen anew"
+    chosen("native", "_native_math", "_native_flash")
+    assert timed[2:] == [("_native_math", "_native_flash")], (
+        "where one cannot be fetched, it is chosen among the others"
+    )
     monkeypatch.setattr(attention, "_fetched", lambda name: None)
     kept.write_text("{damaged")
-    chosen("native", "_native_math", "flash")
+    chosen("native", "_native_math", "_native_flash")
     assert len(timed) == 4
     assert sorted(each.name for each in kept.parent.iterdir()) == ["attention.json"]
 
@@ -172,7 +173,7 @@ def test_kernels_of_the_hub_are_fetched_beforehand(monkeypatch: pytest.MonkeyPat
     assert fetched["flash_hub"] == "OSError: no build of it for this version of torch"
     assert "sage_hub" not in fetched, "no profile names it"
     assert "kernels-community/flash-attn3" in asked
-    only = Acceleration(attention="sage_hub"), Acceleration(attention="native")
+    only = Acceleration(attention="sage_hub"), Acceleration(attention="native"), Acceleration(attention="flash")
     assert set(attention.fetch_kernels(only, CPU)) == {"sage_hub"}
 
 
@@ -183,13 +184,14 @@ def test_the_shape_is_that_of_the_transformer() -> None:
 def test_only_what_is_exact_and_there_is_tried() -> None:
     auto = Acceleration(attention="auto")
     natives = ("native", "_native_flash", "_native_cudnn", "_native_efficient")
-    assert backends_for_auto(auto, gpu(8, 0)) == natives
-    assert backends_for_auto(auto, gpu(7, 5)) == ("native", "_native_efficient")
-    everything = backends_for_auto(auto, gpu(9, 0, *MINIMUM_VERSIONS))
+    assert backends_for_auto(auto, gpu(8, 0)) == (*natives, "flash", "flash_hub", "xformers")
+    assert backends_for_auto(auto, gpu(7, 5)) == ("native", "_native_efficient", "xformers")
+    everything = backends_for_auto(auto, gpu(9, 0))
     assert {"_flash_3", "_flash_3_hub", "flash_4_hub", "xformers"} <= set(everything)
+    assert not {"_flash_3", "_flash_3_hub"} & set(backends_for_auto(auto, gpu(10, 0)))
     assert not [name for name in everything if "sage" in name or name == "_native_math"]
-    shared = backends_for_auto(Acceleration(attention="auto", context_parallel=2), gpu(9, 0, *MINIMUM_VERSIONS))
-    assert all(ATTENTION_BACKENDS[name].context_parallel for name in shared)
+    shared = backends_for_auto(Acceleration(attention="auto", context_parallel=2), gpu(9, 0))
+    assert all(EXACT_BACKENDS[name].context_parallel for name in shared)
 
 
 def test_auto_needs_a_gpu() -> None:

@@ -10,11 +10,11 @@ import torch
 from golden import figures, image_embeds, original_folder, tensors
 
 from cow_service.generators.wan.checkpoints import load_transformer
-from cow_service.generators.wan.conditioning import ati_condition, wan_move_condition, wan_move_latent
+from cow_service.generators.wan.conditioning import ati_condition, wan_move, wan_move_latent
 from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, make_schedule
 from cow_service.generators.wan.profiles import Sampling
 from cow_service.generators.wan.tiny import make_tiny
-from cow_service.generators.wan.tracks import to_ati_tensor
+from cow_service.generators.wan.tracks import Tracks, to_ati_tensor
 from cow_service.weights.manifests import load_manifests
 
 CPU = torch.device("cpu")
@@ -39,8 +39,11 @@ def test_wan_move_latent() -> None:
     found = wan_move_latent(golden["latent_in"], golden["tracks"], golden["visibility"])
     assert torch.equal(found, golden["latent_out"])
     mask = torch.rand(4, *golden["latent_in"].shape[1:])
-    whole = wan_move_condition(torch.cat([mask, golden["latent_in"]]), golden["tracks"], golden["visibility"])
-    assert torch.equal(whole, torch.cat([mask, golden["latent_out"]]))
+    plain = torch.cat([mask, golden["latent_in"]])
+    tracks = Tracks(golden["tracks"].numpy(), golden["visibility"].numpy())
+    guided, unconditional = wan_move(plain, tracks, 8 * plain.shape[3], 8 * plain.shape[2])
+    assert torch.equal(guided, torch.cat([mask, golden["latent_out"]]))
+    assert torch.equal(unconditional, plain)
 
 
 def test_the_condition_of_the_sampling() -> None:
@@ -107,20 +110,16 @@ def test_steps_whose_times_round_to_the_same(solver: str, steps: int, shift: flo
     assert torch.isfinite(sample).all()
 
 
-def test_guidance_over_a_window_takes_fewer_passes(pipeline: WanTrackPipeline) -> None:
+def test_without_guidance_each_step_takes_one_pass(pipeline: WanTrackPipeline) -> None:
     golden = tensors("tiny_denoise")
-    whole = Sampling(steps=4, shift=5.0, guidance_scale=5.0)
-    part = whole.model_copy(update={"guidance_window": (0.0, 0.5)})
-    none = whole.model_copy(update={"guidance_scale": 1.0})
-    guided = [sum(sampling.guides(step) for step in range(sampling.steps)) for sampling in (whole, part, none)]
-    assert guided == [4, 2, 0]
+    unguided = Sampling(steps=4, shift=5.0, guidance_scale=1.0)
     passes: list[int] = []
     hook = pipeline.transformer.register_forward_hook(lambda *_: passes.append(1))
     try:
-        found = pipeline.denoise(golden["noise"][None], guide(), part, lambda done, steps: None)
+        found = pipeline.denoise(golden["noise"][None], guide(), unguided, lambda done, steps: None)
     finally:
         hook.remove()
-    assert len(passes) == 6
+    assert len(passes) == 4
     assert relative(found[0], golden["latents_s4_shift5.0_g5.0"]) > 1e-4
 
 

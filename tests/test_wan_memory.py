@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan import memory
 from cow_service.generators.wan.loading import assemble
-from cow_service.generators.wan.memory import check_memory, need_of
+from cow_service.generators.wan.memory import check_machine, need_of
 from cow_service.generators.wan.profiles import profile_of
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.weights.manifests import load_manifests
@@ -27,6 +27,10 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("toy")
     make_tiny(TOY).save_pretrained(folder)
     return folder
+
+
+def here(checkpoint: Path) -> dict[str, Path]:
+    return {"transformer": checkpoint, "base": checkpoint}
 
 
 @pytest.mark.parametrize(
@@ -49,32 +53,30 @@ def test_it_is_what_the_loaded_parts_take(checkpoint: Path) -> None:
     parts = assemble(make_tiny(TOY).transformer.to(torch.bfloat16), checkpoint, torch.bfloat16, torch.float32)
     models = [part for part in parts.components.values() if isinstance(part, torch.nn.Module)]
     taken = sum(weight.numel() * weight.element_size() for model in models for weight in model.parameters())
-    found = memory._read_headers(checkpoint, checkpoint)
-    assert found is not None
-    assert need_of(profile_of(ATI, "exact"), found[0], 2).device == pytest.approx(taken, rel=0.03)
+    parameters, _ = memory._read_headers(here(checkpoint))
+    assert need_of(profile_of(ATI, "exact"), parameters, 2).device == pytest.approx(taken, rel=0.03)
 
 
 def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is no GPU here: its size, and what it can do, are fakes."""
     monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)
     monkeypatch.setattr(memory, "refusals", lambda wanted, machine: ())
-    found = memory._read_headers(checkpoint, checkpoint)
-    assert found is not None
-    need = {name: need_of(profile_of(ATI, name), found[0], ATI.architecture["num_layers"]) for name in ATI.profiles}
+    parameters, _ = memory._read_headers(here(checkpoint))
+    need = {name: need_of(profile_of(ATI, name), parameters, ATI.architecture["num_layers"]) for name in ATI.profiles}
     monkeypatch.setattr(memory, "_room", lambda device: need["fast"].device)
     monkeypatch.setattr(memory, "_host", lambda: need["small"].host)
-    check_memory(ATI, "fast", checkpoint, checkpoint, GPU)
-    with pytest.raises(GeneratorUnavailable, match=r"'exact' take .* of the GPU's memory.*fit: fast, .*small"):
-        check_memory(ATI, "exact", checkpoint, checkpoint, GPU)
+    check_machine(ATI, "fast", here(checkpoint), GPU)
+    with pytest.raises(GeneratorUnavailable, match=r"'exact': .* of the GPU's memory.*can run: fast, .*small"):
+        check_machine(ATI, "exact", here(checkpoint), GPU)
     monkeypatch.setattr(memory, "_host", lambda: need["small"].host - 1)
-    with pytest.raises(GeneratorUnavailable, match=r"of this machine's memory.*fit: fast, .*turbo"):
-        check_memory(ATI, "small", checkpoint, checkpoint, GPU)
+    with pytest.raises(GeneratorUnavailable, match=r"of this machine's memory.*can run: fast, .*turbo"):
+        check_machine(ATI, "small", here(checkpoint), GPU)
     monkeypatch.setattr(memory, "_room", lambda device: min(each.device for each in need.values()) - 1)
-    with pytest.raises(GeneratorUnavailable, match="None of its profiles fits"):
-        check_memory(ATI, "turbo", checkpoint, checkpoint, GPU)
+    with pytest.raises(GeneratorUnavailable, match="can run none of its profiles"):
+        check_machine(ATI, "turbo", here(checkpoint), GPU)
     monkeypatch.setattr(memory, "_host", lambda: need["portable"].device - 1)
     with pytest.raises(GeneratorUnavailable, match="of this machine's memory"):
-        check_memory(ATI, "portable", checkpoint, checkpoint, torch.device("cpu"))
+        check_machine(ATI, "portable", here(checkpoint), torch.device("cpu"))
 
 
 def test_float8_is_kept_only_where_there_is_some(
@@ -84,20 +86,25 @@ def test_float8_is_kept_only_where_there_is_some(
     monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)
     monkeypatch.setattr(memory, "refusals", lambda wanted, machine: ())
     monkeypatch.setattr(memory, "_room", lambda device: 10**12)
-    with pytest.raises(GeneratorUnavailable, match=r"'small-float8' keeps the float8 .* has none.*COW_CHECKPOINTS"):
-        check_memory(ATI, "small-float8", checkpoint, checkpoint, GPU)
+    with pytest.raises(GeneratorUnavailable, match=r"'small-float8': .*keeps the float8 .* has some.*COW_CHECKPOINTS"):
+        check_machine(ATI, "small-float8", here(checkpoint), GPU)
     monkeypatch.setattr(memory, "_room", lambda device: 20_000)
     with pytest.raises(GeneratorUnavailable) as caught:
-        check_memory(ATI, "exact", checkpoint, checkpoint, GPU)
+        check_machine(ATI, "exact", here(checkpoint), GPU)
     assert "small-float8" not in caught.value.detail
     weights = load_file(next((checkpoint / "transformer").glob("*.safetensors")))
     save_file({name: each.to(torch.float8_e4m3fn) for name, each in weights.items()}, tmp_path / "one.safetensors")
     monkeypatch.setattr(memory, "_room", lambda device: 10**12)
-    check_memory(ATI, "small-float8", tmp_path / "one.safetensors", checkpoint, GPU)
+    check_machine(ATI, "small-float8", {"transformer": tmp_path / "one.safetensors", "base": checkpoint}, GPU)
 
 
-def test_what_cannot_be_read_is_left_to_loading(checkpoint: Path, tmp_path: Path) -> None:
-    check_memory(ATI, "exact", tmp_path, checkpoint, GPU)
+def test_what_cannot_be_read_is_left_to_loading(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)
+    monkeypatch.setattr(memory, "refusals", lambda wanted, machine: ())
+    check_machine(ATI, "exact", {}, GPU)
+    check_machine(ATI, "exact", {"transformer": tmp_path, "base": checkpoint}, GPU)
     (tmp_path / "text_encoder").mkdir()
     (tmp_path / "text_encoder" / "model.safetensors").write_bytes(b"damaged")
-    check_memory(ATI, "exact", checkpoint, tmp_path, GPU)
+    check_machine(ATI, "exact", {"transformer": checkpoint, "base": tmp_path}, GPU)

@@ -48,7 +48,7 @@ def simulation() -> Simulation:
 
 def test_a_tool_tells_contacts_probabilities_and_the_outcome(simulation: Simulation) -> None:
     text = simulation_text(simulation, "")
-    for part in ("92% of the worlds", FACTS, "it depends on speed and heading", "red ball and blue mug at 1.12 s"):
+    for part in ("92% of the worlds", FACTS, "it depends on speed and heading", "red ball and blue mug at 1.1 s"):
         assert part in text
 
 

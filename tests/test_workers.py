@@ -1,21 +1,21 @@
-"""API servers and workers on one job database: a crash, a frozen worker, a flood of memory, and who computes what."""
+"""API servers and workers on one job database: jobs that harm their process, and who computes what."""
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import psutil
 import pytest
-from conftest import SCALE
-from postgres import postgres_server
-from servers import ASYNC, BODY, Served, Worker, eventually, problem, slow
+from postgres import PostgresServer, postgres
+from servers import ASYNC, BODY, TIME_LIMIT, Served, Worker, eventually, problem, slow
 
+from cow_service.errors import Canceled
 from cow_service.jobs.queues import check_queues
+from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings, SettingsError
+from cow_service.workers.pool import Group
 
 pytestmark = pytest.mark.slow
 
@@ -85,24 +85,6 @@ def test_a_job_that_cannot_be_stopped_is_canceled_all_the_same(served: Served) -
     )
 
 
-@pytest.mark.skipif(SCALE == 1, reason="frozen processes are waited for in `make soak`")
-def test_a_frozen_worker_is_replaced(served: Served) -> None:
-    job = served.submit(slow(4, seed=107))
-    served.rendering(job["id"])
-    frozen = workers_of(served)
-    for one in frozen:
-        one.suspend()
-    assert served.ended(job["id"])["status"] == "succeeded"
-    assert not {one.pid for one in frozen} & {one.pid for one in workers_of(served)}
-
-
-def test_a_worker_that_ends_without_a_job_is_replaced(served: Served) -> None:
-    for one in workers_of(served):
-        one.kill()
-    assert served.http.post("/simulate", json=slow(0.1, seed=108)).status_code == 200
-    assert served.http.get("/readyz").status_code == 200
-
-
 def test_a_queued_job_says_how_long_it_will_wait(served: Served) -> None:
     jobs = [served.submit(slow(0.5, seed=110 + place)) for place in range(8)]
     last = served.job(jobs[-1]["id"])
@@ -114,15 +96,17 @@ def test_a_queued_job_says_how_long_it_will_wait(served: Served) -> None:
 
 
 @pytest.fixture(scope="module")
-def postgres() -> Iterator[str]:
-    with postgres_server() as url:
-        yield url
+def database() -> Iterator[PostgresServer]:
+    with postgres() as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
-def fleet(postgres: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Served, Worker, Worker]]:
+def fleet(
+    database: PostgresServer, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Served, Worker, Worker]]:
     """A server that computes nothing, and two workers, on one PostgreSQL."""
-    folder, own = tmp_path_factory.mktemp("fleet"), {"COW_DATABASE_URL": postgres}
+    folder, own = tmp_path_factory.mktemp("fleet"), {"COW_DATABASE_URL": database.url, "COW_SHUTDOWN_GRACE": "1"}
     with (
         Served(folder, COW_ROLE="api", **own) as api,
         Worker(folder, log="first", **own) as first,
@@ -152,23 +136,6 @@ def test_progress_and_cancellation_reach_the_other_process(fleet: tuple[Served, 
     assert api.http.post("/simulate", json=slow(0.1, seed=211)).status_code == 200
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL] if SCALE == 1 else [signal.SIGKILL, signal.SIGSTOP])
-def test_a_worker_that_is_gone_or_frozen_loses_its_jobs(fleet: tuple[Served, Worker, Worker], number: int) -> None:
-    api, first, second = fleet
-    jobs = [api.submit(slow(3, seed=220 + 10 * number + place))["id"] for place in range(3)]
-    for job in jobs:
-        eventually(lambda job=job: api.job(job)["status"] != "queued")
-    victim = first if number == signal.SIGKILL else second
-    for one in victim.processes():
-        os.kill(one.pid, number)
-    assert {api.ended(job)["status"] for job in jobs} == {"succeeded"}
-    if number == signal.SIGKILL:
-        first.start()
-    else:
-        for one in victim.processes():
-            os.kill(one.pid, signal.SIGCONT)
-
-
 def test_an_api_server_takes_jobs_for_models_that_it_does_not_have(fleet: tuple[Served, Worker, Worker]) -> None:
     api, *_ = fleet
     wrong = {**BODY, "generator": "ati", "num_frames": 81, "generator_options": {"steps": "many"}}
@@ -176,6 +143,27 @@ def test_an_api_server_takes_jobs_for_models_that_it_does_not_have(fleet: tuple[
     job = api.submit(wrong | {"generator_options": {"steps": 4}})
     assert api.job(job["id"])["status"] in ("queued", "running", "failed")
     api.http.delete(f"/jobs/{job['id']}")
+
+
+def test_workers_that_are_stopped_end_while_the_database_is_away(
+    fleet: tuple[Served, Worker, Worker], database: PostgresServer
+) -> None:
+    api, *workers = fleet
+    for seed in (230, 231):
+        api.rendering(api.submit(slow(60, seed=seed))["id"])
+    database.kill()
+    for worker in workers:
+        assert worker.process is not None
+        worker.process.terminate()
+    assert [worker.process and worker.process.wait(TIME_LIMIT) for worker in workers] == [0, 0]
+
+
+def test_a_job_whose_worker_ends_with_the_server_does_not_fail() -> None:
+    """It would need another one, and has none before the next start."""
+    group = Group("light", Settings(), Metrics())
+    group.close()
+    with pytest.raises(Canceled):
+        group.take(lambda: None)
 
 
 @pytest.mark.parametrize("name", ["lihgt", "cutout"])

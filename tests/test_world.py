@@ -52,7 +52,7 @@ def happened(bodies, motion: Motion, draws=None, every: int = 1, doubt: float = 
     world = WorldInput(tuple(bodies), motion, known(CAMERA, doubt), CAMERA.size, FRAMES, FPS)
     rows = likeliest() if draws is None else draws
     worlds = run_world(world, rows, every)
-    return worlds, find_world_events(worlds, bodies, FPS, rows, CAMERA.size).of[0]
+    return worlds, find_world_events(worlds, bodies, rows, CAMERA.size).of[0]
 
 
 def kinds(events: Events, body: int = 1) -> set[str]:
@@ -70,7 +70,7 @@ class TestRolling:
         assert events.times["touches"][0, 1] == pytest.approx((1.4 - 0.24) / SPEED, abs=0.1)
         assert 1 in worlds.runs[0].moved
         bodies = [ball(-1.2, 3.0), post(0.2, 3.0)]
-        found = find_world_events(worlds, bodies, FPS, likeliest(), CAMERA.size)
+        found = find_world_events(worlds, bodies, likeliest(), CAMERA.size)
         (met,) = (each for each in encounters(found, None, bodies, FPS, FRAMES) if each.kind == "touches")
         assert met.first_frame == math.ceil(events.times["touches"][0, 1] * FPS)
 
@@ -122,7 +122,7 @@ class TestFalling:
                 CAMERA.size, FRAMES, FPS,
             )  # fmt: skip
             worlds = run_world(world, likeliest())
-            events = find_world_events(worlds, world.bodies, FPS, likeliest(), CAMERA.size).of[0]
+            events = find_world_events(worlds, world.bodies, likeliest(), CAMERA.size).of[0]
             assert ("touches" in kinds(events)) == hit
             if hit:
                 assert events.times["touches"][0, 1] == pytest.approx(math.sqrt(2 * 0.6 / 9.81), abs=0.1)

@@ -52,7 +52,7 @@ def verdicts(service: Service, path: Path = SEEN, part: slice = slice(None)) -> 
 
 def verdict(service: Service, item: dict[str, Any]) -> Verdict:
     expect, question = item["expect"], item["question"]
-    image, _ = service.keep_image((ROOT / item["picture"]).read_bytes())
+    image = service.keep_image((ROOT / item["picture"]).read_bytes())
     body = {"image": {"artifact": image.sha256}, "question": question, "options": item["options"], "ensemble": 20}
     expected = f"refuse: {expect['refuse']}" if expect["refuse"] else str(expect["answer"] or expect["asked"])
     try:

@@ -118,7 +118,7 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
     keys = KeyRing(settings.api_keys)
     limits = {"megabytes": settings.max_body_mb, "seconds": settings.body_timeout}
     app.add_middleware(BodyLimit, **limits, megabytes_at_once=settings.max_bodies_mb)
-    app.add_middleware(Guard, refuse=Callers(keys, settings.rate_limit).refuse)
+    app.add_middleware(Guard, refuse=Callers(keys, settings).refuse)
 
     def surround(stack: ASGIApp) -> ASGIApp:
         if settings.cors_origins:

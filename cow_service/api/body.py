@@ -4,6 +4,7 @@ JSON is read as RFC 8259 has it, more strictly than parsers do by default: what 
 refused.
 """
 
+import hashlib
 import json
 import re
 from collections import Counter
@@ -19,14 +20,13 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from cow_service.api.problems import invalid
 from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody, pointer_part, shortened
-from cow_service.media.images import DecodedImage
 from cow_service.requests import SimulateRequest
-from cow_service.service import Service
 
 FORM_FIELDS = ("image", "question", "request")
 SHOWN_CHARACTERS = 80  # of what the caller sent
 MAX_VALUES = 2_000_000  # of a JSON text: the longest tracks that a request may hold, twice; each takes up to 100 bytes
 MAX_KEYS = 1000  # of one JSON object
+MAX_OBJECTS = 100_000  # of a JSON text; each is checked in Python
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _NAMES = {list: "an array", str: "a string", int: "a number", float: "a number", bool: "a boolean", type(None): "null"}
 
@@ -123,21 +123,20 @@ async def receive(request: Request) -> RawBody:
         await form.close()
 
 
-def parse(raw: RawBody, model: type[Body], service: Service) -> tuple[Body, DecodedImage | None]:
-    """The validated request, and the image of a form, stored and decoded. CPU work: not for the event loop."""
+def parse(raw: RawBody, model: type[Body]) -> Body:
+    """The validated request; the image of a form by the SHA-256 that it will be kept by. CPU work: not for the event
+    loop."""
     try:
         if raw.json is not None:
-            return model.model_validate(read_object(raw.json, "The body")), None
+            return model.model_validate(read_object(raw.json, "The body"))
         given = read_object(raw.request, "The form field `request`")
         twice = [name for name in ("image", "question") if name in given and getattr(raw, name) is not None]
         _check_unique(twice, "stands in the form and in its field `request`; give it once")
         if raw.question is not None:
             given["question"] = raw.question
-        image = None
         if raw.image is not None:
-            artifact, image = service.keep_image(raw.image)
-            given["image"] = {"artifact": artifact.sha256}
-        return model.model_validate(given), image
+            given["image"] = {"artifact": hashlib.sha256(raw.image).hexdigest()}
+        return model.model_validate(given)
     except ValidationError as error:
         raise invalid(error) from error
 
@@ -172,8 +171,9 @@ def read_object(text: bytes | str, what: str) -> dict[str, Any]:
         ) from error
     if "\0" in unicode:
         raise MalformedBody(f"{what} holds NUL bytes, as UTF-16 does: encode the JSON as UTF-8.")
-    if (commas := unicode.count(",")) > MAX_VALUES:
-        raise MalformedBody(f"{what} holds {commas} commas: no request needs more than {MAX_VALUES} values.")
+    for sign, most in ((",", MAX_VALUES), ("{", MAX_OBJECTS)):
+        if (count := unicode.count(sign)) > most:
+            raise MalformedBody(f"{what} holds {count} times the sign {sign} and no request needs more than {most}.")
     try:
         value = json.loads(unicode, object_pairs_hook=_unique, parse_constant=_reject_constant)
     except json.JSONDecodeError as error:

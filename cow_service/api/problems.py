@@ -34,9 +34,10 @@ def invalid(
     error: ValidationError | RequestValidationError, placed: Callable[[str], str] = lambda pointer: pointer
 ) -> errors.InvalidRequest:
     """A pydantic error as ours, with a JSON Pointer per field; `placed` says where that stands in the request."""
-    if any(item["type"] in ("json_invalid", "model_type") and not item["loc"] for item in error.errors()):
-        return errors.MalformedBody(f"The body is no JSON object: {error.errors()[0]['msg']}.")
-    fields = field_errors(error.errors(), placed)
+    found = error.errors()
+    if any(item["type"] in ("json_invalid", "model_type") and not item["loc"] for item in found):
+        return errors.MalformedBody(f"The body is no JSON object: {found[0]['msg']}.")
+    fields = field_errors(found, placed)
     summary = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in fields[:5])
     return errors.InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=fields)
 

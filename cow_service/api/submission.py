@@ -4,6 +4,7 @@ import asyncio
 import json
 import re
 import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,12 +17,12 @@ from fastapi import Depends, Request, Response
 from starlette.datastructures import Headers
 
 from cow_service.api.body import Body, parse, receive
+from cow_service.api.middleware.access import charge
 from cow_service.api.middleware.body_limit import release_body
 from cow_service.errors import Canceled, CowError, FieldError, InvalidRequest, JobNotFound, StorageUnavailable
 from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobSpec, JobState
-from cow_service.media.images import DecodedImage
 from cow_service.observability import logging as context
 from cow_service.records import TERMINAL, JobKind
 from cow_service.requests import ImageArtifact, SimulateRequest
@@ -29,7 +30,7 @@ from cow_service.service import is_url
 from cow_service.stages.run import now
 
 POLL_SECONDS = 3.0  # another process may have run the job
-MAX_CONCURRENT_BODIES = 4  # decoded at the same time
+MAX_CONCURRENT_BODIES = 4  # read at the same time
 MAX_CONCURRENT_FETCHES = 64  # of images given by URL
 RETRY_AFTER = {"Retry-After": "1"}
 REPLAYED = "Idempotent-Replayed"  # as Stripe names it
@@ -79,12 +80,16 @@ class Preferences:
 
 @dataclass
 class Submission:
-    """Who submits which job, and how they want to be answered. `replayed` is known once it was submitted."""
+    """Who submits which job, and how they want to be answered. `replayed` is known once it was submitted.
+
+    `image` is that of the request as its bytes were received, until it is kept.
+    """
 
     kind: JobKind
     owner: str | None
     prefer: Preferences
     job_id: str
+    image: bytes | None = None
     replayed: bool = False  # the job was there before, under the same Idempotency-Key
 
     @property
@@ -98,13 +103,67 @@ class Submission:
         return self.prefer != Preferences(fresh=self.prefer.fresh, minimal=self.prefer.minimal)
 
 
+class FairThreads:
+    """Does work of owners in a few threads. A thread that is free takes that of the owner whose work is in the fewest,
+    then what came first. One is left for others: no owner with a key has more than three quarters of them.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._limiter = CapacityLimiter(threads)  # never waited for
+        self._free, self._most = threads, threads - threads // 4
+        self._working = Counter[str | None]()
+        self._waiting: list[tuple[str | None, asyncio.Event]] = []
+
+    async def run(self, owner: str | None, work: Callable[[], Made]) -> Made:
+        """What the work returns or raises. The caller is charged for its CPU time."""
+        used = 0.0
+
+        def timed() -> Made:
+            nonlocal used
+            began = time.thread_time()
+            try:
+                return work()
+            finally:
+                used = time.thread_time() - began
+
+        mine = owner, asyncio.Event()
+        self._waiting.append(mine)
+        self._admit()
+        try:
+            await mine[1].wait()
+            return await to_thread.run_sync(timed, limiter=self._limiter)
+        finally:
+            charge.get()("CPU seconds for reading bodies", used)
+            if mine[1].is_set():
+                self._free += 1
+                self._working[owner] -= 1
+            else:
+                self._waiting.remove(mine)
+            self._admit()
+
+    def _admit(self) -> None:
+        while self._free:
+            may = [one for one in self._waiting if one[0] is None or self._working[one[0]] < self._most]
+            if not may:
+                return
+            owner, admitted = first = min(may, key=lambda one: self._working[one[0]])
+            self._waiting.remove(first)
+            self._free -= 1
+            self._working[owner] += 1
+            admitted.set()
+
+
 class Submitter:
-    """Makes jobs of requests, and responses of their outcomes. Bodies are decoded in threads."""
+    """Makes jobs of requests, and responses of their outcomes.
+
+    Bodies are read in threads. Their images are decoded where jobs are computed: a decoder that crashes, or takes long,
+    costs a worker process.
+    """
 
     def __init__(self, engine: JobEngine) -> None:
         self.engine = engine
-        self._limiter = CapacityLimiter(MAX_CONCURRENT_BODIES)
-        self._fetches = CapacityLimiter(MAX_CONCURRENT_FETCHES)
+        self._bodies = FairThreads(MAX_CONCURRENT_BODIES)
+        self._fetches = FairThreads(MAX_CONCURRENT_FETCHES)
 
     async def run(self, request: Request, kind: JobKind, model: type[Body]) -> Response:
         """The job's result, or the job itself where the caller does not want to wait so long.
@@ -112,10 +171,14 @@ class Submitter:
         Raises what is wrong with the request, and what the job fails with.
         """
         submission = self.submission(request, kind)
-        checked = await self.in_thread(partial(parse, await receive(request), model, self.engine.service))
-        release_body(request)
+        raw = await receive(request)
+        submission.image = raw.image
+        body = await self.in_thread(submission.owner, partial(parse, raw, model))
+        del raw
+        if submission.image is None:
+            release_body(request)
         try:
-            result = await self.result(request, submission, *checked)
+            result = await self.result(request, submission, body)
         except CowError as error:
             error.headers |= submission.headers
             raise
@@ -133,31 +196,32 @@ class Submitter:
             self.engine.check_capacity(owner)  # before the body is read: a refusal comes at once
         return Submission(kind, owner, prefer, new_job_id(owner, prefer.key))
 
-    async def in_thread(self, work: Callable[[], Made]) -> Made:
-        """Decodes a body in a thread, a few at the same time."""
-        return await to_thread.run_sync(work, limiter=self._limiter)
+    async def in_thread(self, owner: str | None, work: Callable[[], Made]) -> Made:
+        """Reads a body of an owner in a thread, a few at the same time."""
+        return await self._bodies.run(owner, work)
 
-    async def submit(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> str | None:
+    async def submit(self, submission: Submission, body: SimulateRequest) -> str | None:
         """Makes a job of a request; returns its creation time, or None for one that exists.
 
-        `image` is that of the request, where it is kept and decoded. One that is given by a URL is fetched apart from
-        all other work: a server that is slow to send it holds up nobody else.
+        An image that is given by a URL is fetched apart from all other work: a server that is slow to send it holds up
+        nobody else.
         """
-        if image is None and is_url(body.image):
-            await self.in_thread(partial(self._precheck, submission, body, image))
-            fetch = partial(self.engine.service.image_of, body.image)
-            sha256, image = await to_thread.run_sync(fetch, limiter=self._fetches)
-            body = body.model_copy(update={"image": ImageArtifact(artifact=sha256)})
-        created_at = await self.in_thread(partial(self._submit, submission, body, image))
+        if is_url(body.image):
+            await self.in_thread(submission.owner, partial(self._precheck, submission, body))
+            fetch = partial(self.engine.service.fetch, body.image)
+            submission.image = await self._fetches.run(submission.owner, fetch)
+            charge.get()("MB of bodies", len(submission.image) / 1e6)
+        created_at = await self.in_thread(submission.owner, partial(self._submit, submission, body))
         submission.replayed = created_at is None
         return created_at
 
-    async def result(
-        self, request: Request, submission: Submission, body: SimulateRequest, image: DecodedImage | None = None
-    ) -> str | None:
+    async def result(self, request: Request, submission: Submission, body: SimulateRequest) -> str | None:
         """What the request comes to, as JSON; None where the caller wants the job instead."""
+        received = submission.image is not None
         with self.engine.active.waiting(submission.job_id) as waiter:
-            created_at = await self.submit(submission, body, image)
+            created_at = await self.submit(submission, body)
+            if received:
+                release_body(request)
             if submission.prefer.respond_async and not submission.prefer.wait:
                 return None
             outcome = self.outcome(submission, waiter, created_at, submission.prefer.wait)
@@ -220,10 +284,10 @@ class Submitter:
         if created_at is not None and not submission.may_return:
             await to_thread.run_sync(self.engine.cancel, submission.job_id, submission.owner)
 
-    def _precheck(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> tuple[str, str]:
+    def _precheck(self, submission: Submission, body: SimulateRequest) -> tuple[str, str]:
         """Raises what is wrong with a request before its image is looked at; returns its reader and generator."""
-        if isinstance(body.image, ImageArtifact):
-            self.engine.may_read(body.image.artifact, submission.owner if image is None else None)
+        if isinstance(body.image, ImageArtifact) and submission.image is None:
+            self.engine.may_read(body.image.artifact, submission.owner)
         for mask in body.masks:
             if isinstance(mask, ImageArtifact):
                 self.engine.may_read(mask.artifact, submission.owner)
@@ -232,14 +296,14 @@ class Submitter:
             self.engine.webhooks.check(body.webhook)
         return backends
 
-    def _submit(self, submission: Submission, body: SimulateRequest, image: DecodedImage | None) -> str | None:
+    def _submit(self, submission: Submission, body: SimulateRequest) -> str | None:
         service = self.engine.service
-        reader, generator = self._precheck(submission, body, image)
-        sha256 = None
-        if image is None:
-            sha256, image = service.image_of(body.image)
-        kept = ImageArtifact(artifact=sha256 or image.info.sha256)
-        asks = service.keep_masks(body).model_copy(update={"image": kept, "webhook": None, "priority": "normal"})
+        reader, generator = self._precheck(submission, body)
+        if isinstance(body.image, ImageArtifact) and submission.image is None:
+            service.check_image(service.fetch(body.image))
+        asks, files = service.digested(body, submission.image)
+        submission.image = None
+        asks = asks.model_copy(update={"webhook": None, "priority": "normal"})
         spec = JobSpec(
             kind=submission.kind,
             request=asks.model_dump(mode="json", exclude_defaults=True),
@@ -252,7 +316,8 @@ class Submitter:
             request_id=context.request_id.get(),
             traceparent=context.traceparent(),
         )
-        is_new = self.engine.submit(submission.job_id, spec, submission.owner, submission.prefer.key, image)
+        keep = partial(service.keep, files)
+        is_new = self.engine.submit(submission.job_id, spec, submission.owner, submission.prefer.key, keep)
         return spec.created_at if is_new else None
 
     def _result(self, submission: Submission, created_at: str | None) -> str | None:

@@ -83,7 +83,7 @@ def batch(
 
 
 def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]:
-    """The questions of a file; images are looked for beside it. Prints which of them are missing.
+    """The questions of a file; images are looked for beside it.
 
     Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything.
     """
@@ -115,21 +115,7 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
         raise InvalidRequest("\n".join(faults[:MAX_FAULTS_SHOWN]) + more)
     if not items:
         raise InvalidRequest(f"{path.name} holds no questions: give one JSON object a line.")
-    asked = list(questions(items, defaults, path.parent))
-    # The questions of files that are missing will fail; where all are, nothing is asked.
-    files = [question.image for question in asked if isinstance(question.image, Path)]
-    missing = [file for file in files if not file.is_file()]
-    if files and len(missing) == len(files):
-        raise InvalidRequest(
-            f"{path.name}: none of the {len(files)} images is there, such as '{files[0]}': a path starts at the folder "
-            "of the file that names it."
-        )
-    if missing:
-        verb = "is" if len(missing) == 1 else "are"
-        names = ", ".join(file.name for file in missing[:MAX_FAILURES_SHOWN])
-        warning = f"{len(missing)} of {len(files)} images {verb} not there: {names}"
-        typer.echo(printable(warning + (", ..." if len(missing) > MAX_FAILURES_SHOWN else "")), err=True)
-    return asked
+    return list(questions(items, defaults, path.parent))
 
 
 def print_summary(out: Path) -> int:

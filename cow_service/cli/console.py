@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
 from cow_service import __version__, records
-from cow_service.cli.options import HINTS, FolderNotWritable, read_file
+from cow_service.cli.options import HINTS, read_file, writable
 from cow_service.client import display
 from cow_service.errors import CowError, InvalidRequest
 from cow_service.jobs.processes import describe_unserved, remedy, unserved_jobs
@@ -48,7 +48,7 @@ def run_request(
     if out is not None:
         with writable(out):  # before the work, so that its results are not lost
             out.mkdir(parents=True, exist_ok=True)
-    artifact, decoded = service.keep_image(read_file(image))
+    artifact = service.keep_image(read_file(image))
     model = AnswerRequest if kind == "answer" else SimulateRequest
     try:
         request = model.model_validate({"image": {"artifact": artifact.sha256}, **body})
@@ -59,23 +59,20 @@ def run_request(
     result: Simulation | Answer
     with stages_shown(console) as show:
         if isinstance(request, AnswerRequest):
-            result = service.answer(request, show, decoded)
+            result = service.answer(request, show)
         else:
-            result = service.simulate(request, show, decoded)
+            result = service.simulate(request, show)
     written = [] if out is None else save(service, result, out, formats)
     if as_json:
         print(result.model_dump_json(indent=2))
     simulation = result.simulation if isinstance(result, Answer) else result
-    warnings: list[str] = []
     if simulation is not None:
         print_stages(console, simulation)
-        warnings += simulation.warnings
     if isinstance(result, Answer):
         console.print(answer_table(result))
         if result.reasoning:
             console.print(f"[dim]reasoning[/]: {escape(result.reasoning)}")
-        warnings += result.warnings
-    for warning in warnings:
+    for warning in result.warnings:
         console.print(f"[yellow]warning[/]: {escape(warning)}")
     problem = result.simulation_problem if isinstance(result, Answer) else None
     if problem is not None and problem.code in HINTS:
@@ -143,16 +140,6 @@ def save(service: Service, result: Simulation | Answer, out: Path, formats: Sequ
             for name, make in made.items():
                 (out / name).write_bytes(make(frames, fps))
     return [*artifacts, *documents, *made]
-
-
-@contextmanager
-def writable(out: Path) -> Generator[None]:
-    """Translates `OSError` to `FolderNotWritable`, which names the folder."""
-    try:
-        yield
-    except OSError as error:
-        detail = f"'{out}' cannot be written: {error.strerror}. Choose another folder with --out."
-        raise FolderNotWritable(detail) from error
 
 
 def print_models(models: records.Models, *, as_json: bool) -> None:
@@ -224,7 +211,7 @@ class Report(BaseModel):
     platform: str
     packages: dict[str, str | None]
     data_folder: str
-    free_disk_gb: float | None
+    free_disk_gb: float
     problem: str | None
     backends: list[records.BackendInfo]
     unserved: list[Unserved]  # jobs that wait, and that no process takes
@@ -277,8 +264,8 @@ def print_report(report: Report, *, as_json: bool) -> None:
         return
     console = Console()
     console.print(f"cow {report.cow}, Python {report.python}, {report.platform}", highlight=False)
-    free = "" if report.free_disk_gb is None else f" ({report.free_disk_gb:.1f} GB free)"
-    console.print(f"data folder: {report.data_folder}{free}", highlight=False, soft_wrap=True)
+    folder = f"data folder: {report.data_folder} ({report.free_disk_gb:.1f} GB free)"
+    console.print(folder, highlight=False, soft_wrap=True)
     table = Table("backend", "ready", "missing", "get it with", box=None, pad_edge=False)
     for backend in report.backends:
         ready = {True: "[green]yes[/]", False: "[yellow]no[/]", None: "unknown"}[backend.ready]
@@ -287,10 +274,7 @@ def print_report(report: Report, *, as_json: bool) -> None:
         )
     console.print(table)
     installed = ", ".join(f"{name} {found}" for name, found in report.packages.items() if found)
-    absent = ", ".join(name for name, found in report.packages.items() if not found)
     console.print(f"installed: {installed}", highlight=False)
-    if absent:
-        console.print(f"not installed (needed by no backend that is ready): {absent}", highlight=False)
     if report.problem:
         console.print(f"[red]{report.problem}[/]", highlight=False)
     else:

@@ -76,7 +76,7 @@ def demo(
 
     question = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
     with open_service() as service, as_file(EXAMPLES["ball-and-mug"].file("image")) as image:
-        run_request(service, "simulate", image, {"question": question, "frames": {"policy": "events"}}, out)
+        run_request(service, "simulate", image, {"question": question}, out)
     if open_it:
         typer.launch(str(out / "video.mp4"))
 

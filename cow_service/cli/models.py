@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cow_service.cli.options import EXISTING, AsJson, Texts, argument, option
+from cow_service.cli.options import EXISTING, AsJson, Texts, argument, option, writable
 from cow_service.errors import InvalidRequest
 
 if TYPE_CHECKING:
@@ -167,45 +167,23 @@ def _downloads(manifest: Manifest, weights_dir: Path, revisions: dict[str, str])
 
 @contextmanager
 def _shown(console: Console, size: int) -> Generator[ProgressCallback]:
-    """Bars for the files and for all bytes; where there is no terminal, a line for each file."""
+    """A line for each file, and in a terminal a bar for all bytes."""
     from rich.filesize import decimal  # noqa: PLC0415
-    from rich.progress import (  # noqa: PLC0415
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TaskID,
-        TextColumn,
-        TimeRemainingColumn,
-        TransferSpeedColumn,
-    )
+    from rich.progress import DownloadColumn, Progress, TransferSpeedColumn  # noqa: PLC0415
 
-    def tell(step: DownloadProgress) -> None:
-        if step.state == "downloading" and step.done == 0:
-            console.print(f"{step.repository}: {step.file}, {decimal(step.size)}")
-
-    if not console.is_terminal:
-        yield tell
-        return
-    text = TextColumn("{task.description}", markup=False)
-    columns = text, BarColumn(bar_width=24), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console) as bars:
-        overall = bars.add_task("all files", total=size)
-        tasks: dict[tuple[str, str], TaskID] = {}
+    columns = *Progress.get_default_columns(), DownloadColumn(), TransferSpeedColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        overall = bar.add_task("all files", total=size)
         done: dict[tuple[str, str], int] = {}
 
         def show(step: DownloadProgress) -> None:
-            key = step.repository, step.file
-            if key not in tasks:
-                tasks[key] = bars.add_task(step.file, total=step.size)
-            done[key] = step.done
-            suffix = "" if step.state == "downloading" else f" ({step.state})"
-            bars.update(tasks[key], completed=step.done, description=step.file + suffix, visible=step.state != "done")
-            bars.update(overall, completed=sum(done.values()))
+            if step.state == "downloading" and step.done == 0:
+                console.print(f"{step.repository}: {step.file}, {decimal(step.size)}")
+            done[step.repository, step.file] = step.done
+            bar.update(overall, completed=sum(done.values()))
 
         yield show
 
-
-Result = TypeVar("Result")
 
 tracks = typer.Typer(
     rich_markup_mode=None, no_args_is_help=True, help="Write and read the track files of ATI and Wan-Move."
@@ -232,7 +210,8 @@ def export_tracks(
     if not record.trajectory.path.states:
         raise InvalidRequest(f"{simulation.name} is a minimal result, without tracks: get it without `return=minimal`.")
     tracks = tracks_of(record.trajectory, record.image.width, record.image.height)
-    written = _written(out, lambda: write_tracks(tracks, out))
+    with writable(out):
+        written = write_tracks(tracks, out)
     still = len(record.trajectory.anchors)
     moving = tracks.points.shape[1] - still
     names = " and ".join(str(path) for path in written)
@@ -286,7 +265,8 @@ def import_tracks(
     if out is None:
         typer.echo(trajectory.model_dump_json())
         return
-    _written(out, lambda: out.write_text(trajectory.model_dump_json(), encoding="utf-8"))
+    with writable(out):
+        out.write_text(trajectory.model_dump_json(), encoding="utf-8")
     typer.echo(f"{int(moves.sum())} moving and {int((~moves).sum())} static tracks: {out}")
 
 
@@ -295,10 +275,3 @@ def _invalid(fault: str, error: ValidationError, whole: str) -> InvalidRequest:
     first = error.errors()[0]
     place = ".".join(map(str, first["loc"])) or whole
     return InvalidRequest(f"{fault}: {place}: {first['msg']}.")
-
-
-def _written(out: Path, write: Callable[[], Result]) -> Result:
-    try:
-        return write()
-    except OSError as error:
-        raise InvalidRequest(f"'{out}' cannot be written: {error.strerror}. Choose another file with --out.") from error

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from functools import wraps
 from inspect import Parameter, signature
@@ -60,13 +60,6 @@ class Commands(TyperGroup):
             for field in (field for field in error.errors if field.detail not in error.detail):
                 typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
             raise typer.Exit(1) from error
-        except typer.BadParameter as error:
-            from pydantic import ValidationError  # noqa: PLC0415 - its import would slow down --help
-
-            if isinstance(error.__cause__, ValidationError):  # without what typer puts before it ("Value error, ")
-                raised = error.__cause__.errors()[0].get("ctx", {}).get("error")
-                error.message = str(raised) if isinstance(raised, ValueError) else error.message
-            raise
         except Exception as error:
             from cow_service.settings import SettingsError  # noqa: PLC0415 - its import would slow down --help
 
@@ -106,7 +99,7 @@ Until = Literal["contact"]
 
 
 class Format(StrEnum):
-    """What a clip can be made into, beside the mp4."""
+    """What a clip can be made into, beside the mp4. Typer takes no list of a `Literal`."""
 
     GIF = "gif"
     WEBP = "webp"
@@ -180,7 +173,7 @@ def request_body(
     fps: Annotated[float, option("Frames per second.")] = 16,
     seed: Annotated[int | None, option("For what draws random numbers.", shown="0, and none for an MLLM")] = None,
     frames: Annotated[Policy, option("Which frames to keep as pictures.")] = "events",
-    count: Annotated[int, option("How many of them.")] = 3,
+    count: Annotated[int, option("How many of them.")] = 4,
     max_side: Annotated[int, option("Their longest side, px; 0 for the clip's own size.")] = 512,
 ) -> dict[str, Any]:
     """The fields of the request that both commands have. Raises `InvalidRequest` naming the option that is wrong."""
@@ -246,6 +239,16 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise FileUnreadable(f"'{path}' cannot be read: {error.strerror}. Choose another file.") from error
+
+
+@contextmanager
+def writable(out: Path) -> Generator[None]:
+    """Translates `OSError` to `FolderNotWritable`, which names the folder."""
+    try:
+        yield
+    except OSError as error:
+        detail = f"'{out}' cannot be written: {error.strerror}. Choose another place with --out."
+        raise FolderNotWritable(detail) from error
 
 
 def object_in(text: str | bytes, name: str) -> dict[str, Any]:

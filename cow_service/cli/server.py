@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import gc
 import json
 import logging
@@ -66,9 +65,12 @@ def worker(
 
         pool = WorkerPool(service.settings, service.metrics)
         pool.start()
+        from cow_service.observability import tracing  # noqa: PLC0415
         from cow_service.server import run_worker  # noqa: PLC0415
 
     run_worker(service, pool)
+    tracing.stop()
+    os._exit(0)  # while the database is away, DBOS retries in threads for which Python would wait
 
 
 def migrate() -> None:
@@ -219,20 +221,10 @@ def check_port(settings: Settings) -> None:
     if port == 0:
         return
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except socket.gaierror as error:
-        raise SettingsError(f"Bad settings: COW_HOST={host}: {error.strerror}.") from error
-    for family, kind, protocol, _, address in found:
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(address)
-            except OSError as error:
-                reason = f"{error.strerror}. See --host and --port."
-                if error.errno == errno.EADDRINUSE:
-                    reason = (
-                        f"another program listens there, at {host}. Choose another with --port; 0 takes a free one."
-                    )
-                elif error.errno == errno.EACCES:
-                    reason = "only the system's administrator may listen there. Choose a --port above 1023."
-                raise SettingsError(f"Bad settings: COW_PORT={port}: {reason}") from error
+        for family, _, _, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            socket.create_server(address[:2], family=family).close()
+    except OSError as error:
+        raise SettingsError(
+            f"Bad settings: COW_HOST={host}, COW_PORT={port}: {error.strerror}. Choose others with --host and --port; "
+            "port 0 takes a free one."
+        ) from error

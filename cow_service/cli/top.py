@@ -72,8 +72,10 @@ def picture(found: Workers, url: str) -> RenderableType:
     parts += [Text(), queues, Text()]
     for process in found.processes:
         takes = ", ".join(map(printable, process.queues)) or "nothing"
-        head = Text(f"{ROLES[process.role]} on {printable(process.host)}", style="bold")
-        head.append(f"  pid {process.pid}, COW {printable(process.version)}, takes {takes}", style="not bold dim")
+        place = "" if process.host is None else f" on {printable(process.host)}"
+        pid = "" if process.pid is None else f"pid {process.pid}, "
+        head = Text(f"{ROLES[process.role]}{place}", style="bold")
+        head.append(f"  {pid}COW {printable(process.version)}, takes {takes}", style="not bold dim")
         parts += [head, _workers(process.workers)] if process.workers else [head]
     return Group(*parts)
 
@@ -90,7 +92,8 @@ def _workers(workers: Iterable[WorkerInfo]) -> Table:
     table.add_column("progress", width=BAR_WIDTH + 5, no_wrap=True)
     table.add_column("time", justify="right", no_wrap=True)
     for worker in workers:
-        left = Text(f"  {printable(worker.name)}"), str(worker.pid), f"{worker.memory_mb:.0f} MB", str(worker.jobs_done)
+        pid = "-" if worker.pid is None else str(worker.pid)
+        left = Text(f"  {printable(worker.name)}"), pid, f"{worker.memory_mb:.0f} MB", str(worker.jobs_done)
         rows: list[tuple[Text, Text, RenderableType, str]] = []
         for job in worker.jobs:
             named = f"{job.kind} {printable(job.id)[:ID_LENGTH]}" if job.id else job.kind

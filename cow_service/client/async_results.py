@@ -6,6 +6,7 @@ Change `async_results.py`: `make unasync` writes `sync_results.py` from it.
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
@@ -15,7 +16,7 @@ from pydantic import PrivateAttr
 from cow_service.client import protocol
 from cow_service.client.async_io import AsyncIO, iterate, picture_bytes, run
 from cow_service.client.connection import Connection, Files
-from cow_service.client.display import AnswerView, SimulationView, picture_of, stacked
+from cow_service.client.display import AnswerView, SimulationView, answer_html, picture_of, simulation_html, stacked
 from cow_service.client.progress import ProgressLike, reporting
 from cow_service.client.protocol import Event
 from cow_service.records import AcceptedRequest, Job
@@ -38,9 +39,9 @@ class AsyncSimulation(SimulationView):
     >>> question = "If the yellow ball moves to the left, will it hit the blue mug?"
     >>> simulation = await client.simulate("image.jpg", question)
     >>> [frame.index for frame in simulation.frames]
-    [1, 3, 5]
+    [5, 10, 15, 20]
     >>> (await simulation.numpy_frames()).shape
-    (3, 295, 512, 3)
+    (4, 295, 512, 3)
     """
 
     _files: Files = PrivateAttr(default_factory=Files)
@@ -77,9 +78,8 @@ class AsyncSimulation(SimulationView):
         """Writes frame_*.png, overlay.jpg, video.mp4 and simulation.json into a folder, which is made if missing."""
         return await run(self._files.save(folder, self))
 
-    def picture_bytes(self, sha256: str) -> bytes | None:
-        """The bytes of a picture or the video for a notebook; None where they are not available."""
-        return picture_bytes(self._files, sha256)
+    def _repr_html_(self) -> str:
+        return simulation_html(self, partial(picture_bytes, self._files))
 
 
 class AsyncAnswer(AnswerView):
@@ -108,6 +108,9 @@ class AsyncAnswer(AnswerView):
     async def save(self, folder: str | Path) -> Path:
         """Writes answer.json, and what `Simulation.save` writes, into a folder, which is made if missing."""
         return await run(self.files.save(folder, self))
+
+    def _repr_html_(self) -> str:
+        return answer_html(self, partial(picture_bytes, self.files))
 
 
 R_co = TypeVar("R_co", bound=AsyncSimulation | AsyncAnswer, covariant=True)

@@ -1,10 +1,10 @@
-"""Results in words, and in a notebook: overlay, video, filmstrip and answer as HTML, or as one picture."""
+"""Results in words, and as HTML for a notebook: overlay, video, frames and answer."""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -57,26 +57,23 @@ def worlds(probability: float) -> str:
     return f"{probability:.0%} of the worlds"
 
 
-def encounter_words(encounter: records.Encounter, fps: float) -> str:
-    """What the mover does with the other object, when, and in how many worlds."""
-    sure = "" if encounter.probability is None else f" ({worlds(encounter.probability)})"
-    return f"{records.MEETINGS[encounter.kind]} {encounter.object} at {encounter.first_frame / fps:.1f} s{sure}"
-
-
 def encounters_words(trajectory: records.Trajectory) -> str:
-    """All that the mover encounters."""
-    met = [encounter_words(encounter, trajectory.fps) for encounter in trajectory.encounters]
+    """What the mover encounters, when, and in how many worlds."""
+    met: list[str] = []
+    for each in trajectory.encounters:
+        sure = "" if each.probability is None else f" ({worlds(each.probability)})"
+        met.append(f"{records.MEETINGS[each.kind]} {each.object} at {each.first_frame / trajectory.fps:.1f} s{sure}")
     return ", ".join(met) or ("meets nothing" if trajectory.encounters_known else "encounters were not computed")
 
 
-def contacts_words(trajectory: records.Trajectory, between: str = ", ", digits: int = 1) -> str:
+def contacts_words(trajectory: records.Trajectory) -> str:
     """Which two begin to touch, and when; empty where none do.
 
     Only the first few after the start: a thing that comes to rest touches the floor many times.
     """
     names: dict[int | None, str] = {None: "the floor", **{i: body.object for i, body in enumerate(trajectory.bodies)}}
     first = [contact for contact in trajectory.contacts if contact.time > 0][:MAX_CONTACTS]
-    return between.join(f"{names[each.a]} and {names[each.b]} at {each.time:.{digits}f} s" for each in first)
+    return ", ".join(f"{names[each.a]} and {names[each.b]} at {each.time:.1f} s" for each in first)
 
 
 def outcome_words(outcome: records.Outcome) -> str:
@@ -101,7 +98,7 @@ def outcome_words(outcome: records.Outcome) -> str:
 GetBytes = Callable[[str], bytes | None]  # the bytes of an artifact by its digest, where they are available
 MAX_VIDEO_BYTES = 4 * 1024**2  # of a video that stands in the HTML: a notebook keeps it, a third larger, in its file
 LARGE_PX, SMALL_PX = 260, 168  # heights: of overlay and video, and of frames
-ROW_HEIGHT_PX, PICTURES_PER_ROW, GAP_PX = 240, 4, 6  # of the filmstrip
+GAP_PX = 6  # between frames
 # Inherited colours, dimmed by opacity: notebooks are light or dark. Long words of callers and models break.
 TEXT_STYLE = "font:14px/1.45 system-ui,sans-serif;max-width:72em;overflow-wrap:anywhere"
 DIM_STYLE = "opacity:.7"
@@ -134,7 +131,7 @@ def describe_answer(answer: records.Verdict) -> str:
     """What was answered, in words."""
     if answer.answer is None:
         return "not sure"
-    return answer.answer if answer.option is None else f"{answer.answer}: {answer.option}"
+    return answer.answer if answer.option is None else f"{answer.answer} ({answer.option})"
 
 
 def simulation_html(simulation: records.Simulation, get: GetBytes) -> str:
@@ -148,8 +145,7 @@ def answer_html(answer: records.Answer, get: GetBytes) -> str:
     if answer.reasoning:
         body += _line(answer.reasoning, _LONG_TEXT)
     if sum(answer.votes.values()) > 1:
-        votes = ", ".join(f"{name} {count}" for name, count in answer.votes.items())
-        body += _line(f"votes: {votes}", DIM_STYLE)
+        body += _line(f"votes: {votes_words(answer)}", DIM_STYLE)
     if answer.gate is not None:
         body += _line(f"before looking: {gate_words(answer.gate)}", DIM_STYLE)
     if answer.baseline is not None:
@@ -159,28 +155,6 @@ def answer_html(answer: records.Answer, get: GetBytes) -> str:
         body += _found(answer.simulation, get)
         shown = answer.simulation.warnings
     return _block(answer.question, body + _notes(warning for warning in answer.warnings if warning not in shown))
-
-
-def filmstrip_png(simulation: records.Simulation, get: GetBytes) -> bytes | None:
-    """Overlay and frames, a few in a row, as PNG; None where none of them has been downloaded."""
-    names = [simulation.overlay.sha256, *(frame.sha256 for frame in simulation.frames)]
-    pictures = [picture_of(data) for data in map(get, names) if data is not None]
-    if not pictures:
-        return None
-    from PIL import Image  # noqa: PLC0415
-
-    sized = [p.resize((max(1, round(p.width * ROW_HEIGHT_PX / p.height)), ROW_HEIGHT_PX)) for p in pictures]
-    rows = [sized[first : first + PICTURES_PER_ROW] for first in range(0, len(sized), PICTURES_PER_ROW)]
-    width = max(sum(p.width + GAP_PX for p in row) for row in rows) - GAP_PX
-    strip = Image.new("RGB", (width, len(rows) * (ROW_HEIGHT_PX + GAP_PX) - GAP_PX), "white")
-    for number, row in enumerate(rows):
-        left = 0
-        for picture in row:
-            strip.paste(picture, (left, number * (ROW_HEIGHT_PX + GAP_PX)))
-            left += picture.width + GAP_PX
-    buffer = io.BytesIO()
-    strip.save(buffer, "PNG")
-    return buffer.getvalue()
 
 
 def _found(simulation: records.Simulation, get: GetBytes) -> str:
@@ -240,11 +214,6 @@ def _block(heading: str, body: str) -> str:
     return f'<div style="{TEXT_STYLE}">{_line(heading, f"{DIM_STYLE};{_LONG_TEXT}")}{body}</div>'
 
 
-HEADINGS = ("role", "name", "ready", "licence", "weights", "to make it ready")
-# Words break only where they are wider than their column: else those of narrow columns would.
-_CELL = "padding:3px 14px 3px 0;text-align:left;vertical-align:top;overflow-wrap:break-word"
-
-
 class Models(records.Models):
     """Readers and generators, what each needs, and whether it is ready.
 
@@ -253,43 +222,20 @@ class Models(records.Models):
     """
 
     def __repr__(self) -> str:
-        rows = [
-            (role, name, one_line("; ".join((readiness_words(backend), *commands))))
-            for role, name, commands, backend in self._backends()
-        ]
+        rows: list[tuple[str, str, str]] = []
+        for role, backends in (("reader", self.readers), ("generator", self.generators)):
+            for backend in backends:
+                name = one_line(backend.name) + (" (default)" if backend.default else "")
+                said = "; ".join(filter(None, (readiness_words(backend), backend.install, backend.pull)))
+                rows.append((role, name, one_line(said)))
         widths = [max((len(row[column]) for row in rows), default=0) for column in (0, 1)]
         return "\n".join(f"{role:<{widths[0]}}  {name:<{widths[1]}}  {said}" for role, name, said in rows)
 
     __str__ = __repr__
 
-    def _repr_html_(self) -> str:
-        head = "".join(f'<th style="{_CELL}">{heading}</th>' for heading in HEADINGS)
-        rows = ""
-        for role, name, commands, backend in self._backends():
-            what = f"<b>{escape(name)}</b>{_line(backend.summary, DIM_STYLE)}"
-            code = "".join(f"<div><code>{escape(command)}</code></div>" for command in commands)
-            words = escape(readiness_words(backend)), escape(backend.licence or ""), escape(backend.weights or "none")
-            cells = "".join(f'<td style="{_CELL}">{cell}</td>' for cell in (role, what, *words, code))
-            rows += f"<tr>{cells}</tr>"
-        table = f'<table style="border-collapse:collapse"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>'
-        table = f'<div style="overflow-x:auto">{table}</div>'
-        named = escape(", ".join(self.mllms)) or "none"
-        return f'<div style="{TEXT_STYLE}">{table}<div style="{DIM_STYLE}">COW_MLLM may name: {named}</div></div>'
-
-    def _backends(self) -> Iterator[tuple[str, str, tuple[str, ...], records.BackendInfo]]:
-        """Role, name and the commands that bring what is missing, of each."""
-        for role, backends in (("reader", self.readers), ("generator", self.generators)):
-            for backend in backends:
-                name = one_line(backend.name) + (" (default)" if backend.default else "")
-                yield role, name, tuple(filter(None, (backend.install, backend.pull))), backend
-
 
 class SimulationView(records.Simulation):
-    """A simulation as a notebook and a terminal show it."""
-
-    def picture_bytes(self, sha256: str) -> bytes | None:
-        """The bytes of a picture or the video; None where they are not available."""
-        raise NotImplementedError
+    """A simulation as a terminal shows it."""
 
     def __repr__(self) -> str:
         words = one_line(f"{self.grounding.object} {encounters_words(self.trajectory)}")
@@ -297,15 +243,9 @@ class SimulationView(records.Simulation):
 
     __str__ = __repr__
 
-    def _repr_html_(self) -> str:
-        return simulation_html(self, self.picture_bytes)
-
-    def _repr_png_(self) -> bytes | None:
-        return filmstrip_png(self, self.picture_bytes)
-
 
 class AnswerView(records.Answer):
-    """An answer as a notebook and a terminal show it."""
+    """An answer as a terminal shows it."""
 
     simulation: SimulationView | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it
 
@@ -313,9 +253,3 @@ class AnswerView(records.Answer):
         return f"<{type(self).__name__} {self.id}: {one_line(describe_answer(self))}>"
 
     __str__ = __repr__
-
-    def _repr_html_(self) -> str:
-        return answer_html(self, (lambda _: None) if self.simulation is None else self.simulation.picture_bytes)
-
-    def _repr_png_(self) -> bytes | None:
-        return None if self.simulation is None else self.simulation._repr_png_()  # pyright: ignore[reportPrivateUsage]

@@ -1,59 +1,37 @@
-"""Progress of a job and of a batch, on the terminal or in a notebook: with rich, tqdm, or a function of one's own."""
+"""Progress of a job and of a batch, on the terminal or in a notebook: as a bar, or told to a function of one's own."""
 
 import sys
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.util import find_spec
-from typing import Literal, TypeAlias
+from datetime import timedelta
+from typing import TypeAlias
 
 from cow_service.records import Job
 
-# True takes rich where it is installed, else tqdm.
-ProgressLike: TypeAlias = bool | Literal["rich", "tqdm"] | Callable[[Job], None]
+ProgressLike: TypeAlias = bool | Callable[[Job], None]
 
 
 @contextmanager
 def reporting(progress: ProgressLike) -> Generator[Callable[[Job], None] | None]:
     """Shows the progress of a job; yields the function to call with its state, None for none.
 
-    Raises `ImportError` where the bar is not installed, and `ValueError` for an unknown one.
+    Raises `ValueError` for what is neither a bool nor a function.
     """
     if progress is False:
         yield None
     elif callable(progress):
         yield progress
-    elif progress is not True and progress not in ("rich", "tqdm"):
-        raise ValueError(f"progress must be True, False, 'rich', 'tqdm' or a function, got {progress!r}")
+    elif progress is not True:
+        raise ValueError(f"progress must be True, False or a function, got {progress!r}")
     else:
-        is_rich = progress == "rich" or (progress is True and find_spec("rich") is not None)
-        with _rich() if is_rich else _tqdm() as report:
-            yield report
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
 
-
-@contextmanager
-def _rich() -> Generator[Callable[[Job], None]]:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
-
-    stage, percentage = TextColumn("{task.description:<10}"), TextColumn("{task.percentage:>3.0f}%")
-    with Progress(stage, BarColumn(), percentage, TimeElapsedColumn()) as bar:
-        task = bar.add_task("queued", total=1.0)
-        yield lambda job: bar.update(task, description=describe(job), completed=job.progress)
-
-
-@contextmanager
-def _tqdm() -> Generator[Callable[[Job], None]]:
-    from tqdm.auto import tqdm  # noqa: PLC0415
-
-    with tqdm(total=1.0, bar_format="{desc:<10} {percentage:3.0f}%|{bar}| {elapsed}") as bar:
-
-        def report(job: Job) -> None:
-            bar.set_description_str(describe(job), refresh=False)
-            bar.n = job.progress  # added up by tqdm, rounding could exceed 1, of which it warns
-            bar.refresh()
-
-        yield report
+        stage, percentage = TextColumn("{task.description:<10}"), TextColumn("{task.percentage:>3.0f}%")
+        with Progress(stage, BarColumn(), percentage, TimeElapsedColumn()) as bar:
+            task = bar.add_task("queued", total=1.0)
+            yield lambda job: bar.update(task, description=describe(job), completed=job.progress)
 
 
 def describe(job: Job) -> str:
@@ -86,39 +64,14 @@ class BatchProgress:
         self.failed += not succeeded
         self.earlier += earlier
 
-    @property
-    def rate(self) -> float:
-        """Questions done per second since the start."""
-        return (self.done - self.earlier) / max(time.monotonic() - self.began, 1e-6)
-
-    @property
-    def left(self) -> float | None:
-        """Seconds left at this rate; None where that is not known."""
-        if self.total is None or not self.rate:
-            return None
-        return (self.total - self.done) / self.rate
-
     def __str__(self) -> str:
         of = "" if self.total is None else f"/{self.total}"
-        left = "" if self.left is None else f", {duration(self.left)} left"
-        return (
-            f"{self.done}{of} done, {self.failed} failed, {rate_words(self.rate)}{left}{self.note and '; '}{self.note}"
-        )
-
-
-def rate_words(rate: float) -> str:
-    """A rate in words: per second where that is at least one, else per minute."""
-    return f"{rate:.1f}/s" if rate >= 1 else f"{rate * 60:.1f}/min"
-
-
-def duration(seconds: float) -> str:
-    """A time in words: 45 s, 3:20 min, 2:05 h."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60}:{whole % 60:02d} min"
-    return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+        rate = (self.done - self.earlier) / max(time.monotonic() - self.began, 1e-6)
+        left = ""
+        if self.total is not None and rate:
+            left = f", {timedelta(seconds=round((self.total - self.done) / rate))} left"
+        note = f"; {self.note}" if self.note else ""
+        return f"{self.done}{of} done, {self.failed} failed, {rate * 60:.3g}/min{left}{note}"
 
 
 @contextmanager

@@ -6,6 +6,7 @@ Written by `make unasync` from `async_results.py`.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, Self, TypeVar
 
@@ -14,7 +15,7 @@ from pydantic import PrivateAttr
 
 from cow_service.client import protocol
 from cow_service.client.connection import Connection, Files
-from cow_service.client.display import AnswerView, SimulationView, picture_of, stacked
+from cow_service.client.display import AnswerView, SimulationView, answer_html, picture_of, simulation_html, stacked
 from cow_service.client.progress import ProgressLike, reporting
 from cow_service.client.protocol import Event
 from cow_service.client.sync_io import BlockingIO, iterate, picture_bytes, run
@@ -38,9 +39,9 @@ class Simulation(SimulationView):
     >>> question = "If the yellow ball moves to the left, will it hit the blue mug?"
     >>> simulation = client.simulate("image.jpg", question)
     >>> [frame.index for frame in simulation.frames]
-    [1, 3, 5]
+    [5, 10, 15, 20]
     >>> (simulation.numpy_frames()).shape
-    (3, 295, 512, 3)
+    (4, 295, 512, 3)
     """
 
     _files: Files = PrivateAttr(default_factory=Files)
@@ -77,9 +78,8 @@ class Simulation(SimulationView):
         """Writes frame_*.png, overlay.jpg, video.mp4 and simulation.json into a folder, which is made if missing."""
         return run(self._files.save(folder, self))
 
-    def picture_bytes(self, sha256: str) -> bytes | None:
-        """The bytes of a picture or the video for a notebook; None where they are not available."""
-        return picture_bytes(self._files, sha256)
+    def _repr_html_(self) -> str:
+        return simulation_html(self, partial(picture_bytes, self._files))
 
 
 class Answer(AnswerView):
@@ -108,6 +108,9 @@ class Answer(AnswerView):
     def save(self, folder: str | Path) -> Path:
         """Writes answer.json, and what `Simulation.save` writes, into a folder, which is made if missing."""
         return run(self.files.save(folder, self))
+
+    def _repr_html_(self) -> str:
+        return answer_html(self, partial(picture_bytes, self.files))
 
 
 R_co = TypeVar("R_co", bound=Simulation | Answer, covariant=True)

@@ -156,7 +156,6 @@ def observation_of(case: Case, asked: CaseReplies) -> Observation:
     chosen = leading([case.read(reply.text) for reply in deciding])
     first_shown = asked.evidence[0] if asked.evidence else Evidence()
     usage = sum((part.usage for part in (*asked.replies, *asked.evidence)), NO_USAGE)
-    imagining = sum(each.seconds for each in asked.evidence)
     refusal = next((each.refusal for each in asked.evidence if each.refusal is not None), None)
     return Observation(
         **place_of(case),
@@ -166,8 +165,7 @@ def observation_of(case: Case, asked: CaseReplies) -> Observation:
         calls=usage.calls,
         input_tokens=usage.input_tokens,
         output_tokens=usage.output_tokens,
-        seconds=imagining + sum(reply.seconds for reply in asked.replies),
-        imagining_seconds=imagining,
+        seconds=sum(part.seconds for part in (*asked.replies, *asked.evidence)),
         imaginations=sum(each.simulated for each in asked.evidence),
         refusal=None if refusal is None else refusal.code,
         frames=tuple(digest for each in asked.evidence for digest in each.frames),

@@ -130,7 +130,6 @@ class Observation(Record):
     input_tokens: int = 0
     output_tokens: int = 0
     seconds: float = Field(default=0.0, description="For simulations and replies; what is found again takes less.")
-    imagining_seconds: float = Field(default=0.0, description="Of those, for simulations.")
     imaginations: int = Field(default=0, description="Simulations that the reply rests on.")
     refusal: str | None = Field(default=None, description="Code of the problem for which nothing was imagined.")
     frames: tuple[Sha256, ...] = Field(default=(), description="Pictures shown beside the image, in their order.")

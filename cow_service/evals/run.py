@@ -20,12 +20,13 @@ from inspect_ai.scorer import Score, Scorer, Target, mean, scorer, std
 from inspect_ai.solver import Generate, Solver, TaskState, solver
 
 from cow_service.client import Client
+from cow_service.client.progress import progress_shown
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
 from cow_service.evals import asking, plan, runs
-from cow_service.evals.imagination import Arm, check_arms
+from cow_service.evals.imagination import check_arms
 from cow_service.evals.items import Ask, Item, Observation, Pictures, RunInfo, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
-from cow_service.evals.session import Progress, active_session, session
+from cow_service.evals.session import EvalProgress, active_session, session
 from cow_service.readers.prompts import load_prompt
 
 MAX_RETRIES = 6  # of a call of the multimodal LLM, about three minutes: then the question has failed
@@ -59,12 +60,7 @@ def causalspatial(
     if items is None:
         named = subsets.split(",") if isinstance(subsets, str) else subsets
         items = load(data, shared.pictures, subsets=[part.strip() for part in named if part.strip()]).items[:limit]
-    (one,) = check_arms([arm], ask, items)
-    return arm_task(items, one, ask, repeats, seed)
-
-
-def arm_task(items: Sequence[Item], arm: Arm, ask: Ask, repeats: int, seed: int) -> Task:
-    """The task that asks all items in one arm."""
+    check_arms([arm], ask, items)
     samples = [
         Sample(
             id=item.id,
@@ -76,12 +72,12 @@ def arm_task(items: Sequence[Item], arm: Arm, ask: Ask, repeats: int, seed: int)
         for item in items
     ]
     return Task(
-        dataset=MemoryDataset(samples, name=arm.name),
-        solver=look_and_ask(arm.name, ask, seed),
+        dataset=MemoryDataset(samples, name=arm),
+        solver=look_and_ask(arm, ask, seed),
         scorer=chosen_option(),
         epochs=Epochs(repeats, "mean"),
         config=GenerateConfig(max_tokens=plan.MAX_TOKENS),
-        name=f"{arm.name}",
+        name=arm,
         version=load_prompt("eval-question").version,
     )
 
@@ -105,10 +101,10 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
         try:
             asked = await asker(case)
         except Exception:
-            shared.count(arm, None)
+            shared.on_reply(arm, None)
             raise
         seen = asking.observation_of(case, asked)
-        shared.count(arm, seen)
+        shared.on_reply(arm, seen)
         state.store.set(runs.OBSERVATION, seen.model_dump(mode="json"))
         state.messages = asking.conversation(case, asked, shared.pictures)
         state.output = ModelOutput.from_content(str(state.model), asked.replies[-1].text)
@@ -172,18 +168,25 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
     """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin."""
     logs = wanted.out / runs.LOGS
     logs.mkdir(exist_ok=True)
-    earlier = (each for each in runs.read_observations(logs) if not (wanted.retry_failed and each.failure))
-    progress = Progress(info.arms, len(items) * info.repeats, earlier)
-    if not progress.left:
+    progress = EvalProgress(len(items) * info.repeats * len(info.arms))
+    for each in runs.read_observations(logs):
+        if not (wanted.retry_failed and each.failure):
+            progress.add(each.arm, None if each.failure else each, earlier=True)
+    if progress.done == progress.total:
         return
     keys = f"{info.token} {info.rounds}", info.token
     console = rich.get_console()
     with session(wanted.out, wanted.url, info.settings["requests"], *keys, **settings) as shared, ExitStack() as stack:
         _check_server(shared.url, wanted)
-        shared.items, shared.progress = items, progress
         stack.callback(setattr, console, "quiet", console.quiet)
         console.quiet = True  # Inspect says nothing of its own on standard output
-        with progress.shown():
+        with progress_shown(progress, True) as show:
+
+            def on_reply(arm: str, seen: Observation | None) -> None:
+                progress.add(arm, seen)
+                show()
+
+            shared.items, shared.on_reply = items, on_reply
             _, ended = eval_set(
                 tasks=[
                     causalspatial(data=info.data_digest, arm=arm, ask=wanted.ask, seed=wanted.seed) for arm in info.arms

@@ -1,20 +1,15 @@
 """What every task of an evaluation shares: the server that it asks, where its pictures are kept, and its progress."""
 
 import asyncio
-import time
-from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
-
 from cow_service.client import AsyncClient
+from cow_service.client.progress import BatchProgress
 from cow_service.evals.imagination import Imagination
 from cow_service.evals.items import Item, Observation, Pictures
 from cow_service.evals.runs import PICTURES, SERVER
@@ -23,8 +18,6 @@ from cow_service.service import Service
 from cow_service.settings import load_settings
 
 LOG = "server.log"
-LINES_EVERY = 15.0  # seconds, where nothing can be redrawn
-REDRAWN = 4  # times a second
 TIMEOUT = 600.0  # seconds that a server may say nothing: an MLLM of its own may think for long
 
 
@@ -38,13 +31,9 @@ class Session:
     reply_key: str  # of the run: names its replies
     options: Mapping[str, Any]  # fields of the requests for simulations and answers
     items: Sequence[Item] | None = None  # of its tasks; None: each task loads its own
-    progress: "Progress | None" = None
+    # Called with the arm of every question that has been asked, and with what came of it; None: it failed.
+    on_reply: Callable[[str, Observation | None], None] = lambda arm, seen: None
     _clients: dict[int, tuple[AsyncClient, Imagination]] = field(default_factory=dict)
-
-    def count(self, arm: str, seen: Observation | None) -> None:
-        """Counts a question that has just been asked, where progress is shown; None: it failed."""
-        if self.progress is not None:
-            self.progress.add(arm, seen)
 
     def clients(self) -> tuple[AsyncClient, Imagination]:
         """For the running event loop; all arms share its simulations."""
@@ -97,71 +86,21 @@ def _server(folder: Path, settings: Mapping[str, Any]) -> Generator[str]:
         yield stack.enter_context(serving(service, pool))
 
 
-class Progress:
-    """Rate, time left and accuracy so far of every arm, on standard error.
+@dataclass
+class EvalProgress(BatchProgress):
+    """Rate, time left and accuracy so far. What an earlier process has asked counts as done, and not for the rate."""
 
-    What an earlier process has asked counts as done, and not for the rate.
-    """
+    arms: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter[str]))
 
-    def __init__(self, arms: Iterable[str], questions: int, earlier: Iterable[Observation]) -> None:
-        self._questions = questions  # of each arm
-        self._counts = {arm: Counter[str]() for arm in arms}  # done, of those right and failed
-        for each in earlier:
-            self._count(each.arm, each if each.failure is None else None)
-        self._begun = self._told_at = time.monotonic()
-        self._left_before = self.left
-        self._console = Console(stderr=True)
+    def add(self, arm: str, seen: Observation | None, *, earlier: bool = False) -> None:
+        """Counts a question that has been asked; None: it failed."""
+        self.count(seen is not None, earlier=earlier)
+        self.arms[arm].update(asked=1, failed=int(seen is None), right=int(seen is not None and seen.right))
 
-    def add(self, arm: str, seen: Observation | None) -> None:
-        """Counts a question that has just been asked; None: it failed."""
-        self._count(arm, seen)
-        if not self._console.is_terminal and time.monotonic() - self._told_at > LINES_EVERY:
-            self._told_at = time.monotonic()
-            self._print_line()
-
-    @property
-    def left(self) -> int:
-        """Questions that have not been asked."""
-        return sum(self._questions - count["done"] for count in self._counts.values())
-
-    @contextmanager
-    def shown(self) -> Generator[None]:
-        """Shows the progress meanwhile: redrawn in a terminal, else a line now and then."""
-        if self._console.is_terminal:
-            with Live(get_renderable=self._table, console=self._console, refresh_per_second=REDRAWN):
-                yield
-        else:
-            yield
-            self._print_line()
-
-    def _count(self, arm: str, seen: Observation | None) -> None:
-        if arm in self._counts:
-            self._counts[arm].update(done=1, failed=int(seen is None), right=int(seen is not None and seen.right))
-
-    def _rows(self) -> Iterator[tuple[str, str, str, str]]:
-        """Each arm with what was asked, right and failed; last the rate since the process began, and the time left."""
-        for arm, count in self._counts.items():
-            answered = count["done"] - count["failed"]
-            right = f"{count['right'] / answered:.1%}" if answered else ""
-            yield arm, f"{count['done']} of {self._questions}", right, str(count["failed"] or "")
-        total = self._questions * len(self._counts)
-        rate = (self._left_before - self.left) / max(time.monotonic() - self._begun, 1e-9)
-        left = str(timedelta(seconds=round(self.left / rate))) if rate else "?"
-        yield "", f"{total - self.left} of {total}", f"{rate:.1f}/s", f"{left} left"
-
-    def _table(self) -> Table:
-        *arms, footers = self._rows()
-        found = Table(box=None, pad_edge=False, show_footer=True)
-        for name, footer in zip(("arm", "asked", "right", "failed"), footers, strict=True):
-            found.add_column(name, footer=footer, justify="left" if name == "arm" else "right")
-        for row in arms:
-            found.add_row(*row)
-        return found
-
-    def _print_line(self) -> None:
-        *arms, (_, _, *pace) = self._rows()
-        told = [
-            f"{arm} {asked}" + (f", {right} right" if right else "") + (f", {failed} failed" if failed else "")
-            for arm, asked, right, failed in arms
-        ]
-        self._console.print(f"{'; '.join(told)}; {', '.join(pace)}", soft_wrap=True, highlight=False)
+    def __str__(self) -> str:
+        lines = [super().__str__()]
+        for arm, count in self.arms.items():
+            answered = count["asked"] - count["failed"]
+            right = f", {count['right'] / answered:.1%} right" if answered else ""
+            lines.append(f"{arm}: {count['asked']} asked{right}")
+        return "\n".join(lines)

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
@@ -22,7 +22,6 @@ from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobTable, TakenJob
 from cow_service.media.artifacts import ArtifactStore
-from cow_service.media.images import DecodedImage
 from cow_service.observability.metrics import gpu_memory
 from cow_service.pipeline import answer, simulate
 from cow_service.records import Answer, WorkerInfo
@@ -102,6 +101,7 @@ class StoredStep:
     hold_key: HoldKey
     outages: Outages
     trajectory_key: str | None = None  # of this job's trajectory, where it computed one
+    stages: set[str] = field(default_factory=set[str])  # whose results are stored
 
     def __call__(
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
@@ -125,6 +125,7 @@ class StoredStep:
                 self.looked_for(stage, reused)
                 if reused:
                     self.outages.wait_through(lambda: self.database.reuse_result(self.job_id, stage, result.artifacts))
+                self.stages.add(stage)
                 return result, reused
             self.looked_for(stage, False)
             result = self.outages.wait_through(compute)
@@ -134,6 +135,7 @@ class StoredStep:
                 trajectory, self.trajectory_key = result.value.model_dump_json(), digest
             stored = digest, self.job_id, stage, text, result.artifacts, trajectory
             self.outages.wait_through(lambda: self.database.store_result(*stored))
+            self.stages.add(stage)
             return result, False
 
     def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
@@ -168,7 +170,6 @@ class Work:
     """One job to be computed, and who hears of it."""
 
     job: TakenJob
-    image: DecodedImage | None  # its pixels where they are at hand
     progress: Progress  # raises `Canceled` where nobody wants the result any more
     check: Callable[[], None]  # raises `Canceled` as well, and says nothing
     looked_for: Callable[[Stage, bool], None]  # a stage was looked for among stored results, and whether it was there
@@ -185,6 +186,7 @@ class JobOutcome:
     kept: str  # JSON
     trajectory_key: str | None
     timings: dict[str, float]
+    stages: set[str]  # those of the job, each of which is stored
 
 
 class Computer:
@@ -251,7 +253,7 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     step = StoredStep(job.id, job.owner, spec.fresh, database, service.artifacts, work.looked_for, hold_key, outages)
     request = spec.parsed()
     assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
-    given = work.progress, work.image, step, outages.wait_through, job.id, spec.created_at, spec.turn
+    given = work.progress, step, outages.wait_through, job.id, spec.created_at, spec.turn
     seen = None if spec.fresh else service.seen
     if isinstance(request, AnswerRequest):
         with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
@@ -263,7 +265,7 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     text = result.model_dump_json()
     simulation = result.simulation if isinstance(result, Answer) else result
     if step.trajectory_key is None or simulation is None:
-        return JobOutcome(text, text, None, computed)
+        return JobOutcome(text, text, None, computed, step.stages)
     bare = simulation.model_copy(update={"trajectory": None})
     bare = result.model_copy(update={"simulation": bare}) if isinstance(result, Answer) else bare
-    return JobOutcome(text, bare.model_dump_json(warnings=False), step.trajectory_key, computed)
+    return JobOutcome(text, bare.model_dump_json(warnings=False), step.trajectory_key, computed, step.stages)

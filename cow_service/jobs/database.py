@@ -1,7 +1,4 @@
-"""The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS keeps its tables beside ours.
-
-Results, references and finished stages belong to a job, and are deleted with its row.
-"""
+"""The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS keeps its tables beside ours."""
 
 from __future__ import annotations
 
@@ -28,6 +25,7 @@ from sqlalchemy.exc import DisconnectionError, OperationalError, SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
+from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, STAGES, STORES, schema_of, update_tables
 from cow_service.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
@@ -65,98 +63,6 @@ _ADD_REFERENCES = "INSERT INTO cow_references (sha256, job_id) VALUES {} ON CONF
 
 log = logging.getLogger("cow_service")
 
-METADATA = sa.MetaData()
-JOBS = sa.Table(
-    "cow_jobs",
-    METADATA,
-    sa.Column("id", sa.String(64), primary_key=True),
-    sa.Column("kind", sa.String(16), nullable=False),
-    sa.Column("owner", sa.Text),  # the name of a key; null where the server has none
-    sa.Column("status", sa.String(16), nullable=False),  # a `JobStatus`: queued until work on it begins
-    sa.Column("created_at", sa.String(32), nullable=False),  # RFC 3339 in UTC, to the millisecond: sorts as text
-    sa.Column("ended", sa.Float),  # Unix time, s
-    sa.Column("version", sa.String(16), nullable=False),  # of the workflow that computes it
-    sa.Column("queue", sa.String(64), nullable=False),
-    sa.Column("priority", sa.String(16), nullable=False),
-    sa.Column("turn", sa.Integer, nullable=False),  # among the jobs of its queue: the lowest is taken first
-    sa.Column("executor", sa.String(64)),  # the process that has taken it; null while it waits in its queue
-    sa.Column("run", sa.String(64)),  # names this attempt: an earlier one can change nothing any more
-    sa.Column("starts", sa.Integer, nullable=False),  # how often it was taken
-    sa.Column("generator", sa.Text, nullable=False),
-    sa.Column("question", sa.Text, nullable=False),
-    sa.Column("image", sa.String(64), nullable=False),
-    sa.Column("webhook", sa.Text),
-    sa.Column("spec", sa.LargeBinary, nullable=False),  # a `JobSpec` as JSON, deflated
-    sa.Column("format", sa.Integer),  # of the result: `FORMAT` when it was stored
-    sa.Column("result", sa.LargeBinary),  # JSON, deflated, without the trajectory where `trajectory_key` names one
-    sa.Column("trajectory_key", sa.String(64)),
-    sa.Column("error", sa.Text),  # JSON
-    sa.Index("cow_jobs_of_time", "created_at"),
-    sa.Index("cow_jobs_of_status", "status", "created_at"),
-    sa.Index("cow_jobs_of_owner", "owner", "created_at"),
-    sa.Index("cow_jobs_ended", "ended"),
-)
-
-
-def _of_job(**options: Any) -> sa.Column[str]:
-    return sa.Column("job_id", sa.String(64), sa.ForeignKey(JOBS.c.id, ondelete="CASCADE"), **options)
-
-
-# Results of stages by their cache keys.
-RESULTS = sa.Table(
-    "cow_results",
-    METADATA,
-    sa.Column("key", sa.String(64), primary_key=True),
-    _of_job(nullable=False, index=True),
-    sa.Column("stage", sa.String(32), nullable=False),
-    sa.Column("result", sa.LargeBinary, nullable=False),  # JSON, deflated; without its value where that is a trajectory
-    sa.Column("created_at", sa.Float, nullable=False),
-)
-# A trajectory is most of a result: it is stored once for its stage and its job, under the key of the stage.
-TRAJECTORIES = sa.Table(
-    "cow_trajectories_of_jobs",
-    METADATA,
-    _of_job(primary_key=True),
-    sa.Column("key", sa.String(64), primary_key=True),
-    sa.Column("trajectory", sa.LargeBinary, nullable=False),  # JSON, deflated
-)
-# Which job needs which artifact: one without a reference may be removed.
-REFERENCES = sa.Table(
-    "cow_references",
-    METADATA,
-    sa.Column("sha256", sa.String(64), primary_key=True),
-    _of_job(primary_key=True, index=True),
-)
-# The stages of each job that are done, whoever computed their results.
-STAGES = sa.Table(
-    "cow_stages_of_jobs",
-    METADATA,
-    _of_job(primary_key=True),
-    sa.Column("stage", sa.String(32), primary_key=True),
-)
-# Where the artifacts of all jobs are: one row, once a server has started.
-STORES = sa.Table(
-    "cow_artifact_store",
-    METADATA,
-    sa.Column("id", sa.Integer, primary_key=True),  # always 1
-    sa.Column("address", sa.Text, nullable=False),
-)
-# When a process last began a kind of maintenance, of which each is one process's work at a time.
-MAINTENANCE = sa.Table(
-    "cow_maintenance",
-    METADATA,
-    sa.Column("task", sa.String(16), primary_key=True),
-    sa.Column("begun", sa.Float, nullable=False),  # Unix time, s
-)
-# One row for each process that runs an engine.
-PROCESSES = sa.Table(
-    "cow_executors",
-    METADATA,
-    sa.Column("executor", sa.String(64), primary_key=True),
-    sa.Column("seen", sa.Float, nullable=False),  # Unix time of the database, s
-    sa.Column("info", sa.Text, nullable=False),  # a `ProcessInfo` as JSON
-)
-
 
 class Database:
     """One engine for DBOS and for our own tables. Every method raises `StorageUnavailable` where it cannot be used."""
@@ -170,20 +76,29 @@ class Database:
             self.engine = _engine(self.url, self.file is not None)
         self.stalled = None if self.file is not None else StalledConnections(self.engine)
         self._reading = self.engine.execution_options(isolation_level="AUTOCOMMIT")  # single statements
+        # The database's clock, Unix time in s: those of machines differ.
+        self.now: sa.ColumnElement[float] = (sa.func.julianday("now") - 2440587.5) * 86400.0
+        if self.file is None:
+            self.now = sa.cast(sa.extract("epoch", sa.func.clock_timestamp()), sa.Float)
 
     def create_tables(self) -> None:
-        """Makes our tables where they are missing, and the folder of a file."""
+        """Makes our tables, or adds what those of an earlier version lack, and makes the folder of a file.
+
+        Those of a later version stay as they are. Raises `StorageUnavailable` where this one cannot serve on them, or
+        would change them in a way that processes which run do not bear.
+        """
         if self.file is not None:
             self.file.parent.mkdir(parents=True, exist_ok=True)
         with self.transaction() as connection:
-            if self.file is None:  # two processes that create the same table at the same time would fail one another
-                connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": TABLES_LOCK})
-            METADATA.create_all(connection)
+            # Two processes that create the same table at the same time would fail one another.
+            lock = f"SELECT pg_advisory_xact_lock({TABLES_LOCK})" if self.file is None else "BEGIN IMMEDIATE"
+            connection.execute(sa.text(lock))
+            update_tables(connection, self.now)
 
-    def missing_tables(self) -> set[str]:
-        """Those of ours that are not there."""
-        with database_errors():
-            return METADATA.tables.keys() - set(sa.inspect(self.engine).get_table_names())
+    def schema(self) -> int:
+        """That of the tables; 0 where there are none. Raises `StorageUnavailable` where this version cannot use it."""
+        with database_errors(), self.engine.connect() as connection:
+            return schema_of(connection)
 
     def claim(self, address: str) -> None:
         """Notes where the artifacts of all jobs are. Raises `StorageUnavailable` where they are elsewhere.

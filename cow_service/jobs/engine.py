@@ -9,7 +9,7 @@ process.
 import logging
 import threading
 import uuid
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from http import HTTPStatus
 
@@ -35,7 +35,6 @@ from cow_service.jobs.queues import queue_of, step_of
 from cow_service.jobs.readiness import StorageCheck
 from cow_service.jobs.webhooks import Webhooks, attempt_ids
 from cow_service.jobs.workflows import Dispatcher, Runner, launch, set_runner
-from cow_service.media.images import DecodedImage
 from cow_service.records import TERMINAL, AcceptedRequest, JobPage, ProcessRole
 from cow_service.service import Service
 
@@ -178,20 +177,22 @@ class JobEngine:
         may_start = owner is None or running_limit is None or load.own < running_limit
         return load.waiting if may_start else -1
 
-    def submit(self, job_id: str, spec: JobSpec, owner: str | None, key: str | None, image: DecodedImage) -> bool:
+    def submit(self, job_id: str, spec: JobSpec, owner: str | None, key: str | None, keep: Callable[[], None]) -> bool:
         """Accepts a job; returns whether it is new. It is in the database when this returns.
 
+        `keep` stores what the job needs. It is called before the job is inserted, where nothing speaks against that.
         `key` is the caller's idempotency key: the same key and spec come to the same job, but for one that was refused
         with 503 (an MLLM or a disk that was away): that is tried again.
 
         Raises `IdempotencyKeyReused`, `QueueFull`, `ShuttingDown`, `StorageUnavailable`.
         """
         if key is None:
-            return self._submit(job_id, spec, owner, image)
+            return self._submit(job_id, spec, owner, keep)
         while True:
             known = self.jobs.spec(job_id)
             if known is None:
-                if self._submit(job_id, spec, owner, image):
+                self.check_capacity(owner)  # without a key this was done before the body came
+                if self._submit(job_id, spec, owner, keep):
                     return True
                 continue  # another request with the same key was faster
             if known.digest != spec.digest:
@@ -203,9 +204,10 @@ class JobEngine:
                 continue  # it was deleted just now
             if found.error is None or found.error.status != HTTPStatus.SERVICE_UNAVAILABLE:
                 return False
-            self.remove([job_id], 0)  # its image stays: it was sent just now
+            self.remove([job_id], 0)
 
-    def _submit(self, job_id: str, spec: JobSpec, owner: str | None, image: DecodedImage) -> bool:
+    def _submit(self, job_id: str, spec: JobSpec, owner: str | None, keep: Callable[[], None]) -> bool:
+        keep()
         settings = self.service.settings
         queue = queue_of(spec.reader, spec.generator, settings)
         step = step_of(settings.key_weights.get(owner or "", 1.0))
@@ -217,7 +219,7 @@ class JobEngine:
                 job = self.jobs.insert(job_id, spec, owner, queue, step, self._parts.executor if starts else None)
             if job is not None and starts:
                 unless_started.pop_all()
-                self._dispatcher.hand_over(job, image)
+                self._dispatcher.hand_over(job)
             elif job is not None:
                 self._dispatcher.wake()
                 self._notifications.send(Notification("queued", job_id))

@@ -7,7 +7,7 @@ import base64
 import binascii
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, cast
@@ -19,8 +19,9 @@ from pydantic_core import to_json
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds
 from cow_service.jobs.active import At, share_done
-from cow_service.jobs.database import JOBS, OPEN, REFERENCES, TRAJECTORIES, Database, packed, unpacked
+from cow_service.jobs.database import OPEN, Database, packed, unpacked
 from cow_service.jobs.queues import moves, next_turn
+from cow_service.jobs.schema import JOBS, REFERENCES, STAGES, TRAJECTORIES
 from cow_service.observability.logging import rfc3339
 from cow_service.records import AcceptedRequest, Answer, Job, JobKind, JobPage, JobStatus, Problem, Record, Simulation
 from cow_service.requests import AnswerRequest, Priority, SimulateRequest
@@ -231,10 +232,13 @@ class JobTable:
         with self._database.transaction() as connection:
             connection.execute(sa.update(JOBS).where(*mine).values(_RELEASED))
 
-    def succeed(self, job: TakenJob, result: str, trajectory_key: str | None) -> bool:
-        """Stores the result of a job. False where the job is no longer this process's."""
+    def succeed(self, job: TakenJob, result: str, trajectory_key: str | None, stages: Collection[str]) -> bool:
+        """Stores the result of a job. False where the job is no longer this process's, and where one of its stages is
+        not stored: PostgreSQL loses the latest ones in a crash, with what refers to their artifacts.
+        """
         values = {"result": packed(result), "format": FORMAT, "trajectory_key": trajectory_key}
-        return self._end(job.id, "succeeded", job.run, **values)
+        stored = sa.select(sa.func.count()).where(STAGES.c.job_id == job.id, STAGES.c.stage.in_(stages))
+        return self._end(job.id, "succeeded", job.run, stored.scalar_subquery() == len(stages), **values)
 
     def fail(self, job: TakenJob, error: CowError) -> bool:
         """Stores what a job failed with. False where the job is no longer this process's."""
@@ -290,7 +294,7 @@ class JobTable:
         content: dict[str, Any] = unpacked(rows[0].result)
         if rows[0].trajectory is not None:
             (content.get("simulation") or content)["trajectory"] = unpacked(rows[0].trajectory)  # null until now
-        if rows[0].format != FORMAT:  # as it is written today
+        if rows[0].format < FORMAT:  # as it is written today; what a later version wrote goes out as it is
             model = Answer if found.job.kind == "answer" else Simulation
             content = model.model_validate(content).model_dump(mode="json")
         return replace(found, content=content)
@@ -365,10 +369,18 @@ class JobTable:
             connection.execute(sa.delete(JOBS).where(JOBS.c.id.in_(jobs)))
         return artifacts - self._database.referenced(artifacts)
 
-    def _end(self, job_id: str, status: JobStatus, run: str | None = None, **values: Any) -> bool:
+    def _end(
+        self,
+        job_id: str,
+        status: JobStatus,
+        run: str | None = None,
+        condition: sa.ColumnElement[bool] | None = None,
+        **values: Any,
+    ) -> bool:
         """Ends an open job, and has its webhook called. Of an attempt: only if it is the latest."""
         this = [JOBS.c.id == job_id] if run is None else [JOBS.c.id == job_id, JOBS.c.run == run]
-        ended = sa.update(JOBS).where(*this, JOBS.c.status.in_(OPEN)).values(status=status, ended=time.time(), **values)
+        where = [*this, JOBS.c.status.in_(OPEN), *([] if condition is None else [condition])]
+        ended = sa.update(JOBS).where(*where).values(status=status, ended=time.time(), **values)
         with self._database.transaction(durable=True) as connection:
             row = connection.execute(ended.returning(JOBS.c.webhook)).one_or_none()
             if row is not None and row.webhook is not None:

@@ -17,15 +17,15 @@ from cow_service import __version__
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, NotReady
 from cow_service.jobs.computing import Computer, EngineParts
-from cow_service.jobs.database import PROCESSES, Database
+from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import RATE_SECONDS, VERSION, JobTable, OpenCount
 from cow_service.jobs.queues import LIGHT, known_queues, queue_of
+from cow_service.jobs.schema import ALIVE_SECONDS, PROCESSES
 from cow_service.observability.logging import rfc3339
 from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, WorkerInfo, Workers
 from cow_service.settings import Settings
 
 TELL_SECONDS = 2.0  # between two rows
-ALIVE_SECONDS = 10.0  # since its last row, that a process is shown
 FORGOTTEN_SECONDS = 3600.0  # after which a row is deleted
 JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 MAX_AGE_SECONDS = 1.0  # of an overview that is given out again
@@ -42,11 +42,7 @@ class ProcessTable:
     """
 
     def __init__(self, database: Database) -> None:
-        self._database = database
-        if database.file is None:
-            self._now = sa.cast(sa.extract("epoch", sa.func.clock_timestamp()), sa.Float)
-        else:
-            self._now = (sa.func.julianday("now") - 2440587.5) * 86400.0
+        self._database, self._now = database, database.now
 
     def write(self, info: ProcessInfo) -> None:
         """Notes that a process is alive, and what it does; deletes rows of those long gone."""
@@ -71,7 +67,7 @@ class ProcessTable:
                 found.append(ProcessInfo.model_validate_json(info, extra="ignore"))  # a later version has more fields
             except ValueError:
                 log.warning("the process %s is of a version that this one does not understand", executor)
-        return tuple(sorted(found, key=lambda one: (one.role, one.host, one.pid)))
+        return tuple(sorted(found, key=lambda one: (one.role, one.host or "", one.pid or 0)))
 
 
 class Processes(BackgroundThread):
@@ -151,9 +147,10 @@ class Overview:
         self._picture: tuple[Workers, list[OpenCount]] = Workers(processes=(), queues=()), []
         self._read_at = -MAX_AGE_SECONDS
 
-    def workers(self) -> Workers:
+    def workers(self, *, for_admin: bool = True) -> Workers:
         """What `GET /workers` returns. Raises `StorageUnavailable`."""
-        return self._latest()[0]
+        found = self._latest()[0]
+        return found if for_admin else found.model_copy(update={"processes": tuple(map(_public, found.processes))})
 
     def counts(self) -> list[OpenCount]:
         """The jobs that wait or run. Raises `StorageUnavailable`."""
@@ -173,8 +170,6 @@ class Overview:
         with self._lock:
             if time.monotonic() - self._read_at >= MAX_AGE_SECONDS:
                 processes, counts = self._table.alive(), self._jobs.open_counts()
-                if self._settings.api_keys:
-                    processes = tuple(map(_without_ids, processes))
                 queues = _queues(processes, counts, self._jobs.ended_lately())
                 found = Workers(processes=processes, queues=queues, unserved=unserved(processes, counts))
                 self._picture, self._read_at = (found, counts), time.monotonic()
@@ -196,8 +191,8 @@ def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> t
 def unserved_jobs(settings: Settings) -> tuple[Unserved, ...]:
     """Queued jobs that no live process takes, of a database that is not changed. Raises `StorageUnavailable`."""
     with closing(Database(settings, read_only=True)) as database:
-        if (database.file is not None and not database.file.exists()) or database.missing_tables():
-            return ()  # no server of this version has used it
+        if (database.file is not None and not database.file.exists()) or not database.schema():
+            return ()  # no server has used it
         return unserved(ProcessTable(database).alive(), JobTable(database).open_counts())
 
 
@@ -253,10 +248,12 @@ def _queues(
     )
 
 
-def _without_ids(process: ProcessInfo) -> ProcessInfo:
-    """Where there are keys, nobody is told the ids of others' jobs."""
+def _public(process: ProcessInfo) -> ProcessInfo:
+    """What every caller may know of a process: not where it is, nor the ids of others' jobs."""
     workers = tuple(
-        worker.model_copy(update={"jobs": tuple(job.model_copy(update={"id": None}) for job in worker.jobs)})
+        worker.model_copy(
+            update={"pid": None, "jobs": tuple(job.model_copy(update={"id": None}) for job in worker.jobs)}
+        )
         for worker in process.workers
     )
-    return process.model_copy(update={"workers": workers})
+    return process.model_copy(update={"host": None, "pid": None, "workers": workers})

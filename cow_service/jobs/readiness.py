@@ -130,9 +130,9 @@ def warm_up(settings: Settings) -> None:
         with TemporaryDirectory(prefix="cow-warm-up-") as folder:
             alone = {"data_dir": Path(folder), "artifacts": None, "reader": "embedded", "generator": "cutout"}
             service = Service(settings.model_copy(update=alone))
-            artifact, image = service.keep_image(encode_png(picture))
+            artifact = service.keep_image(encode_png(picture))
             request = SimulateRequest(image=ImageArtifact(artifact=artifact.sha256), question=QUESTION, num_frames=9)
-            service.simulate(request, image=image).model_dump_json()
+            service.simulate(request).model_dump_json()
             service.close()
     except (CowError, OSError) as error:
         log.warning("the warm-up failed, the first request will take longer: %s", error)

@@ -27,8 +27,8 @@ from cow_service.jobs.computing import Computer, EngineParts, Outages, Work
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import VERSION, JobTable, TakenJob
 from cow_service.jobs.notifications import Notification, Notifications
+from cow_service.jobs.schema import SCHEMA
 from cow_service.jobs.webhooks import Webhooks
-from cow_service.media.images import DecodedImage
 from cow_service.observability import logging as context
 from cow_service.observability import tracing
 from cow_service.requests import Stage
@@ -37,8 +37,6 @@ from cow_service.settings import Settings
 WORKFLOW = "job"  # the name of an attempt's workflow
 POLL_SECONDS = 0.25  # between two looks at the queues, besides whenever it is woken: other processes add jobs, too
 STOP_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
-
-Start = Callable[[TakenJob, DecodedImage | None], None]
 
 log = logging.getLogger("cow_service")
 
@@ -61,12 +59,12 @@ class Runner:
         """`on_end` is called when an attempt is over, with the outcome of the job where it has one."""
         self._parts, self._jobs, self._active, self._computer = parts, parts.jobs, parts.active, computer
         self._hooks, self._notifications, self._on_end = hooks, notifications, on_end
-        self._starting: dict[str, tuple[TakenJob, DecodedImage | None]] = {}  # by the ids of their workflows
+        self._starting: dict[str, TakenJob] = {}  # by the ids of their workflows
 
-    def start(self, job: TakenJob, image: DecodedImage | None = None) -> None:
-        """Starts an attempt to compute a job in a thread; `image` has its pixels where they are at hand."""
+    def start(self, job: TakenJob) -> None:
+        """Starts an attempt to compute a job in a thread."""
         workflow_id = f"{job.id}.{job.run}"
-        self._starting[workflow_id] = job, image
+        self._starting[workflow_id] = job
         try:
             with SetWorkflowID(workflow_id):
                 DBOS.start_workflow(compute_job, workflow_id)
@@ -77,7 +75,7 @@ class Runner:
 
     def compute(self, workflow_id: str) -> None:
         """Computes a job, and stores its outcome."""
-        job, image = self._starting.pop(workflow_id)
+        job = self._starting.pop(workflow_id)
         outcome: str | CowError | None = None
         try:
             with (
@@ -85,7 +83,7 @@ class Runner:
                 tracing.span(f"job {job.spec.kind}", parent=job.spec.traceparent, job_id=job.id),
                 self._active.running(job.id, job.spec.kind, job.run) as running,
             ):
-                outcome = self._outcome(job, image, running)
+                outcome = self._outcome(job, running)
         finally:
             self._on_end(job, outcome)
 
@@ -109,7 +107,7 @@ class Runner:
         if wait is not None:
             patient.wait_through(enqueue)
 
-    def _outcome(self, job: TakenJob, image: DecodedImage | None, running: ActiveJob) -> str | CowError | None:
+    def _outcome(self, job: TakenJob, running: ActiveJob) -> str | CowError | None:
         """The result or the error of a job, once it is stored; None where it has none, as it was canceled."""
         metrics, begun = self._parts.service.metrics, False
 
@@ -129,7 +127,7 @@ class Runner:
         patient = Outages(math.inf, running.check)  # the work is done: its outcome is not given up
         try:
             try:
-                computed = self._computer.compute(Work(traced, image, progress, running.check, metrics.stage_cache))
+                computed = self._computer.compute(Work(traced, progress, running.check, metrics.stage_cache))
             except Canceled:
                 raise
             except Exception as error:
@@ -144,13 +142,13 @@ class Runner:
                 for stage, seconds in computed.timings.items():
                     metrics.stage_seconds.labels(stage).observe(seconds)
                 outcome = computed.result
-                kept = job, computed.kept, computed.trajectory_key
+                kept = job, computed.kept, computed.trajectory_key, computed.stages
                 stored = patient.wait_through(lambda: self._jobs.succeed(*kept))
+            if not stored:
+                raise Canceled("The job is another process's, or has lost a stage.")
         except Canceled:
             with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
                 self._jobs.release(job.id, job.run)  # where it was interrupted; one that was canceled stays so
-            return None
-        if not stored:
             return None
         metrics.jobs.labels(job.spec.kind, "succeeded" if isinstance(outcome, str) else "failed").inc()
         return outcome
@@ -186,8 +184,8 @@ def launch(database: Database, executor: str, *, migrate: bool, queues: tuple[st
     """
     if migrate:
         database.create_tables()
-    elif missing := database.missing_tables():
-        raise StorageUnavailable(f"The job database has no table {min(missing)}: run `cow migrate` first.")
+    elif database.schema() < SCHEMA:
+        raise StorageUnavailable("The job database lacks tables of this version of COW: run `cow migrate` first.")
     config = DBOSConfig(
         name=webhooks.APPLICATION,
         system_database_url=database.url,
@@ -242,13 +240,13 @@ def migrate(settings: Settings) -> None:
 class Dispatcher(BackgroundThread):
     """The places of this process, and the thread that fills them. Safe to use from every thread."""
 
-    def __init__(self, parts: EngineParts, capacity: Callable[[str], int], start: Start) -> None:
+    def __init__(self, parts: EngineParts, capacity: Callable[[str], int], start: Callable[[TakenJob], None]) -> None:
         """`capacity`: of a queue by its name; `start` begins the work on a job that has a place."""
         super().__init__("cow-dispatcher", STOP_SECONDS)
         self._parts, self._capacity, self._start = parts, capacity, start
         self._places = threading.Lock()
         self._held: Counter[str] = Counter()  # the places of each queue that are held
-        self._handed: SimpleQueue[tuple[TakenJob, DecodedImage | None]] = SimpleQueue()
+        self._handed: SimpleQueue[TakenJob] = SimpleQueue()
         self._woken = threading.Event()
         self._look = True  # at the queues: there may be jobs that wait
 
@@ -282,9 +280,9 @@ class Dispatcher(BackgroundThread):
             self._held[queue] -= 1
         self.wake()
 
-    def hand_over(self, job: TakenJob, image: DecodedImage) -> None:
+    def hand_over(self, job: TakenJob) -> None:
         """Has a job started that holds a place already."""
-        self._handed.put((job, image))
+        self._handed.put(job)
         self._woken.set()
 
     def run(self) -> None:
@@ -307,7 +305,7 @@ class Dispatcher(BackgroundThread):
     def _start_handed(self) -> None:
         with suppress(Empty):
             while True:
-                self._start(*self._handed.get_nowait())
+                self._start(self._handed.get_nowait())
 
     def _fill(self, queue: str) -> None:
         places = 0
@@ -323,4 +321,4 @@ class Dispatcher(BackgroundThread):
                 self._held[queue] -= places - len(taken)
         for job in taken:
             self._start_handed()  # these wait for nothing but this thread
-            self._start(job, None)
+            self._start(job)

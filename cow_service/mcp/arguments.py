@@ -43,7 +43,7 @@ _LEFT_OUT_OF = {"simulate": {"options"}, "answer": {"video"}}
 _OF_OBJECTS = ("object", "bbox")
 _OF_PLACE = ("object", "relation", "targets")
 # `simulate` is for a caller who looks at the pictures.
-DEFAULTS: dict[ToolName, dict[str, Any]] = {"simulate": {"frames_policy": "events", "video": False}, "answer": {}}
+DEFAULTS: dict[ToolName, dict[str, Any]] = {"simulate": {"video": False}, "answer": {}}
 
 
 def input_schema(tool: ToolName, image: str) -> dict[str, Any]:

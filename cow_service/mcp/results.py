@@ -11,7 +11,7 @@ from PIL import Image
 
 from cow_service.client import AsyncClient, display
 from cow_service.mcp.arguments import ARTIFACTS, ToolName, inlined
-from cow_service.records import MEETINGS, Answer, Body, Simulation, Verdict
+from cow_service.records import Answer, Body, Simulation
 
 # What a model has no use for: thousands of numbers, and who made it how.
 _OF_OBJECT = {"mask": True, "prior": True, "source": True, "role": True}
@@ -84,7 +84,7 @@ def simulation_text(simulation: Simulation, video: str) -> str:
 
 def answer_text(answer: Answer, video: str) -> str:
     """The answer first, then what was imagined for it."""
-    lines = [f"Answer: {_verdict(answer)}."]
+    lines = [f"Answer: {display.describe_answer(answer)}."]
     if answer.reasoning:
         lines.append(f"Reasoning: {answer.reasoning}")
     if sum(answer.votes.values()) > 1:
@@ -93,14 +93,12 @@ def answer_text(answer: Answer, video: str) -> str:
         lines.append(f"Before looking: {display.gate_words(answer.gate)}.")
     if (baseline := answer.baseline) is not None:
         votes = f"; votes {display.votes_words(baseline)}" if sum(baseline.votes.values()) > 1 else ""
-        lines.append(f"Without imagined frames: {_verdict(baseline)}{votes}.")
-    warnings = answer.warnings
+        lines.append(f"Without imagined frames: {display.describe_answer(baseline)}{votes}.")
     if answer.simulation is not None:
         lines += ["", "Imagined:", *_simulation_lines(answer.simulation, video)]
-        warnings += answer.simulation.warnings
     else:
         lines.append("Nothing was imagined: the answer is from the image alone.")
-    return _text(lines, warnings, answer.image.sha256)
+    return _text(lines, answer.warnings, answer.image.sha256)
 
 
 def _text(lines: Iterable[str], warnings: Iterable[str], image: str) -> str:
@@ -120,18 +118,8 @@ def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
         f"It is the {simulation.grounding.object} at [{box}] in the image of {image.width} x {image.height} px; "
         f"{motion.kind}, {way}law {trajectory.law}."
     )
-    meetings: list[str] = []
-    for each in sorted(trajectory.encounters, key=lambda encounter: encounter.first_frame):
-        sure = "" if each.probability is None else f", {display.worlds(each.probability)}"
-        when = f"from {each.first_frame / trajectory.fps:.2f} s (frame {each.first_frame}{sure})"
-        meetings.append(f"{MEETINGS[each.kind]} {each.object} {when}")
-    if meetings:
-        yield f"On its way (hypotheses) it {'; '.join(meetings)}."
-    elif simulation.encounters_known:
-        yield "It meets nothing on its way, as far as the image tells."
-    else:
-        yield "What it meets was not computed."
-    if contacts := display.contacts_words(trajectory, "; ", digits=2):
+    yield f"On its way (hypotheses): {display.encounters_words(trajectory)}."
+    if contacts := display.contacts_words(trajectory):
         yield f"Contacts: {contacts}."
     if trajectory.outcome is not None and (summary := display.outcome_words(trajectory.outcome)):
         yield f"Outcome (a hypothesis of the simulated world): {summary}."
@@ -144,12 +132,6 @@ def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
     if video:
         yield f"Video: {video}"
     yield f"Simulation {simulation.id}; generator {simulation.generator.name}, reader {simulation.reader.name}."
-
-
-def _verdict(verdict: Verdict) -> str:
-    if verdict.answer is None:
-        return "not sure"
-    return verdict.answer if verdict.option is None else f"{verdict.answer} ({verdict.option})"
 
 
 # Pictures

@@ -6,8 +6,7 @@ know, and reports wrong ones in pydantic's words.
 
 import base64
 import logging
-import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from functools import partial
@@ -89,7 +88,7 @@ class Caller:
 
 Connect: TypeAlias = Callable[[Caller], AbstractAsyncContextManager[AsyncClient]]
 Lifespan: TypeAlias = Callable[[Server[Any]], AbstractAsyncContextManager[Any]]
-Report: TypeAlias = Callable[[float, str], Awaitable[None]]  # the share that is done, 0 to 1, and the stage
+Report: TypeAlias = Callable[[float, str], Coroutine[Any, Any, None]]  # the share that is done, 0 to 1, and the stage
 
 
 def create_server(connect: Connect, lifespan: Lifespan, *, paths: bool, links: bool) -> Server[Any]:
@@ -205,24 +204,20 @@ async def result_of(
     call: Callable[..., Awaitable[AsyncSimulation | AsyncAnswer]]
     call = client.simulate if tool == "simulate" else client.answer
     result: AsyncSimulation | AsyncAnswer | CowError | None = None
-    updates, updated = anyio.create_memory_object_stream[Job](math.inf)
+    done, stage = -MIN_STEP, ""
 
-    async def report_all() -> None:
-        done, stage = -MIN_STEP, ""
-        with updated:
-            async for job in updated:
-                now = describe(job)
-                if job.progress > done or now != stage:
-                    done, stage = max(job.progress, done + MIN_STEP), now
-                    await report(done, stage)
+    def on_update(job: Job) -> None:
+        nonlocal done, stage
+        now = describe(job)
+        if job.progress > done or now != stage:
+            done, stage = max(job.progress, done + MIN_STEP), now
+            reports.start_soon(report, done, stage)
 
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(report_all)
-        with updates:
-            try:
-                result = await call(image, progress=updates.send_nowait, **fields)
-            except CowError as error:  # raised below: the group would wrap it
-                result = error
+    async with anyio.create_task_group() as reports:
+        try:
+            result = await call(image, progress=on_update, **fields)
+        except CowError as error:  # raised below: the group would wrap it
+            result = error
     if isinstance(result, CowError):
         raise result
     assert result is not None

@@ -157,7 +157,8 @@ def for_its_owner(settings: Settings) -> Settings:
     soon after its standard input, before it is killed: unfinished jobs go on at the next start.
     """
     return settings.model_copy(
-        update={"api_keys": {}, "rate_limit": None, "cors_origins": (), "host": "127.0.0.1", "shutdown_grace": 0.0}
+        update={"api_keys": {}, "cors_origins": (), "host": "127.0.0.1", "shutdown_grace": 0.0}
+        | dict.fromkeys(("rate_limit", "rate_limit_mb", "rate_limit_cpu"))
     )
 
 

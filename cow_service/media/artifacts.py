@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Protocol, TypeVar
+from typing import IO, Any, TypeAlias
 from uuid import uuid4
 
 from filelock import FileLock
@@ -35,8 +35,6 @@ MEDIA_TYPES = {
 MAX_VERIFIED = 10_000  # digests that a process remembers to have compared with their bytes
 TEMPORARY_SUFFIX = ".part"
 
-Value = TypeVar("Value")
-
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _MAX_SHOWN_CHARACTERS = 80
@@ -53,15 +51,12 @@ class ListedArtifact:
     used_at: float
 
 
-class RetryPolicy(Protocol):
-    """Does what writes to a store, and repeats it while the store is away."""
-
-    def __call__(self, work: Callable[[], Value], /) -> Value:
-        """What `work` returns. Raises `StorageUnavailable` after the last try, and `Canceled`."""
-        ...
+# Does what writes an artifact, and repeats it while the store is away. Raises `StorageUnavailable` after the last try,
+# and `Canceled`.
+RetryPolicy: TypeAlias = Callable[[Callable[[], Artifact]], Artifact]
 
 
-def try_once(work: Callable[[], Value], /) -> Value:
+def try_once(work: Callable[[], Artifact]) -> Artifact:
     """The `RetryPolicy` that repeats nothing."""
     return work()
 
@@ -81,11 +76,10 @@ class ArtifactWriter(ABC):
 
     def put_file(self, path: Path, media_type: str) -> Artifact:
         """Moves in a finished file of `scratch`; afterwards `path` no longer exists. Raises as `put` does."""
-        extension_of(media_type)
         with disk_errors():
-            data = path.read_bytes()
+            artifact = self.put(path.read_bytes(), media_type)
             path.unlink()
-        return self.put(data, media_type)
+        return artifact
 
     @contextmanager
     def scratch(self) -> Generator[Path]:
@@ -104,7 +98,6 @@ class ArtifactStore(ArtifactWriter):
 
     def __init__(self, scratch_folder: Path) -> None:
         super().__init__(scratch_folder)
-        self._guard = threading.Lock()
         self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
     @property
@@ -140,13 +133,14 @@ class ArtifactStore(ArtifactWriter):
     def listed(self) -> Iterator[ListedArtifact]:
         """All artifacts, in no particular order."""
 
-    @abstractmethod
-    def batch(self, retry: RetryPolicy = try_once) -> AbstractContextManager[ArtifactWriter]:
+    @contextmanager
+    def batch(self, retry: RetryPolicy = try_once) -> Generator[ArtifactWriter]:
         """A writer several of whose puts may run at the same time; all are done when its block ends.
 
         `retry` does each of them: what is written took long to make, and is not made again for an outage. The end of
-        the block raises what any of them raises.
+        the block raises what any of them raises. Here they run one after another: a disk is no faster for many threads.
         """
+        yield _RetryingWriter(self, retry)
 
     @abstractmethod
     def check(self) -> None:
@@ -161,10 +155,9 @@ class ArtifactStore(ArtifactWriter):
                         path.unlink()
 
     def _note_verified(self, sha256: str, version: object) -> None:
-        with self._guard:
-            if len(self._verified) >= MAX_VERIFIED:
-                self._verified.clear()
-            self._verified[sha256] = version
+        if len(self._verified) >= MAX_VERIFIED:
+            self._verified.clear()
+        self._verified[sha256] = version
 
 
 class DiskArtifacts(ArtifactStore):
@@ -205,27 +198,14 @@ class DiskArtifacts(ArtifactStore):
                 with temporary.open("xb") as file:
                     file.write(data)
                     _sync(file)
-                return self._commit(temporary, sha256, extension)
-
-    def put_file(self, path: Path, media_type: str) -> Artifact:
-        """Moves in a file, hashing it in chunks."""
-        extension = extension_of(media_type)
-        with disk_errors():
-            with path.open("rb+") as file:
-                sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-                _sync(file)
-            return self._commit(path, sha256, extension)
-
-    def _commit(self, temporary: Path, sha256: str, extension: str) -> Artifact:
-        with self._commit_lock:  # two threads may store the same bytes under two media types: the first one decides
-            stored = self._find_intact(sha256)
-            if stored is None:
-                stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
-                stored.parent.mkdir(parents=True, exist_ok=True)
-                _move(temporary, stored)
-                self._note_verified(sha256, _version(stored))
-            else:
-                temporary.unlink()
+                # Two threads may store the same bytes under two media types: the first one decides.
+                with self._commit_lock:
+                    stored = self._find_intact(sha256)
+                    if stored is None:
+                        stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
+                        stored.parent.mkdir(parents=True, exist_ok=True)
+                        _move(temporary, stored)
+                        self._note_verified(sha256, _version(stored))
             return _artifact_at(stored)
 
     def get(self, sha256: str) -> Artifact:
@@ -273,11 +253,6 @@ class DiskArtifacts(ArtifactStore):
                             if extension and is_digest(sha256):
                                 status = entry.stat()
                                 yield ListedArtifact(sha256, status.st_size, status.st_mtime)
-
-    @contextmanager
-    def batch(self, retry: RetryPolicy = try_once) -> Generator[ArtifactWriter]:
-        """One after another: a disk writes no faster for several threads."""
-        yield _RetryingWriter(self, retry)
 
     def check(self) -> None:
         """Writes, syncs and removes a small file."""
@@ -331,9 +306,6 @@ class _RetryingWriter(ArtifactWriter):
 
     def put(self, data: bytes, media_type: str) -> Artifact:
         return self._retry(lambda: self._store.put(data, media_type))
-
-    def put_file(self, path: Path, media_type: str) -> Artifact:
-        return self._retry(lambda: self._store.put_file(path, media_type))
 
 
 def _artifact_at(path: Path) -> Artifact:

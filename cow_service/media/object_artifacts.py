@@ -29,8 +29,7 @@ from cow_service.settings import SettingsError
 
 RENEWED_AFTER_SECONDS = 300.0
 REQUEST_SECONDS, CONNECT_SECONDS = 8.0, 3.0  # that a request with its bytes, and a connection, may take
-RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request
-FIRST_BACKOFF_SECONDS, MAX_BACKOFF_SECONDS = 0.1, 2.0
+RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request; obstore waits 0.1 s before the first retry, then twice as long
 MAX_PARALLEL = 8  # requests for one job
 CHECKED = "check"  # the object that shows that the store can be written and read
 
@@ -63,15 +62,7 @@ class ObjectArtifacts(artifacts.ArtifactStore):
                     "timeout": timedelta(seconds=REQUEST_SECONDS),
                     "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
                 },
-                retry_config={
-                    "max_retries": MAX_RETRIES,
-                    "retry_timeout": timedelta(seconds=RETRY_SECONDS),
-                    "backoff": {
-                        "init_backoff": timedelta(seconds=FIRST_BACKOFF_SECONDS),
-                        "max_backoff": timedelta(seconds=MAX_BACKOFF_SECONDS),
-                        "base": 2,
-                    },
-                },
+                retry_config={"max_retries": MAX_RETRIES, "retry_timeout": timedelta(seconds=RETRY_SECONDS)},
             )
         except (exceptions.BaseError, ValueError) as error:
             reason = str(error).partition("\n")[0]

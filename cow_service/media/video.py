@@ -63,7 +63,7 @@ class YuvFrames:
         return self._planes
 
 
-CRF_DEFAULT = 18  # x264's constant rate factor, 0 (lossless) to 51; 18 looks lossless
+_CRF = "18"  # x264's constant rate factor, 0 (lossless) to 51; 18 looks lossless
 _PRESET = "veryfast"
 # x264's AVX-512 code gives the same frames other bytes from run to run, and so another digest.
 _AVX_512 = 13  # OpenCV's number of the feature
@@ -74,28 +74,21 @@ _BT709 = 1  # code point of its matrix, primaries and transfer alike (ITU-T H.27
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
-def write_mp4(
-    frames: Iterable[Pixels], path: Path, *, fps: float, width: int, height: int, crf: int = CRF_DEFAULT
-) -> int:
+def write_mp4(frames: Iterable[Pixels], path: Path, *, fps: float, width: int, height: int) -> int:
     """Write frames, each [height, width, 3] RGB, as H.264 (High, 4:2:0, BT.709) and return how many there were.
 
     Frames are taken one at a time, and frame i is shown at exactly i / fps seconds. The index stands before the
     pictures, so that a browser can start before it has all. H.264 4:2:0 needs even sides: an odd one is padded by
     repeating its last row or column.
 
-    Raises `ValueError` for no frames, a frame of another shape, or a rate or size that is not positive;
-    `StorageUnavailable` if the disk is full; `InternalError` if FFmpeg fails otherwise. What `frames` raises passes
-    through. After an error no file is left.
+    Raises `ValueError` for no frames or a frame of another shape; `StorageUnavailable` if the disk is full;
+    `InternalError` if FFmpeg fails otherwise. What `frames` raises passes through. After an error no file is left.
     """
-    rate = Fraction(fps).limit_denominator(_MAX_DENOMINATOR) if 0 < fps < float("inf") else Fraction(0)
-    if rate == 0:
-        raise ValueError(f"fps is {fps}: give at least {1 / _MAX_DENOMINATOR:.4f} frames per second.")
-    if width < 1 or height < 1:
-        raise ValueError(f"The video is {width} x {height} px: both sides must be at least 1 px.")
+    rate = Fraction(fps).limit_denominator(_MAX_DENOMINATOR)
     with ExitStack() as on_error:
         on_error.callback(path.unlink, missing_ok=True)
         try:
-            count = _encode(frames, path, rate, width, height, crf)
+            count = _encode(frames, path, rate, width, height)
         except FFmpegError as error:
             if error.errno in _FULL:
                 raise StorageUnavailable(
@@ -109,8 +102,8 @@ def write_mp4(
     return count
 
 
-def _encode(frames: Iterable[Pixels], path: Path, rate: Fraction, width: int, height: int, crf: int) -> int:
-    options = {"crf": str(crf), "preset": _PRESET, "profile": "high"}
+def _encode(frames: Iterable[Pixels], path: Path, rate: Fraction, width: int, height: int) -> int:
+    options = {"crf": _CRF, "preset": _PRESET, "profile": "high"}
     if cv2.checkHardwareSupport(_AVX_512):
         options["x264-params"] = _UP_TO_AVX2
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:

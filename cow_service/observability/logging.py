@@ -68,6 +68,7 @@ def rfc3339(seconds: float) -> str:
 
 
 ACCESS = "cow_service.access"
+MAX_TEXT = 10_000  # characters of a line, or of a value of one: errors of libraries repeat what a caller sent
 _NOT_EXTRA = frozenset((*vars(logging.makeLogRecord({})), "message", "asctime", "color_message", "taskName"))
 _SHOWN = ("request_id", "job_id", "owner")  # shown in a line of text
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
@@ -82,8 +83,18 @@ def add_ids(record: logging.LogRecord) -> bool:
     return True
 
 
+def _shortened(text: str) -> str:
+    """The begin and the end of a long text: the last line of a trace says what happened."""
+    half = MAX_TEXT // 2
+    return text if len(text) <= MAX_TEXT else f"{text[:half]} [{len(text) - 2 * half} characters] {text[-half:]}"
+
+
 class TextFormatter(logging.Formatter):
     """`2026-01-31 12:00:00 INFO cow_service: message request_id=...`; a trace follows on lines of its own."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line, and the trace."""
+        return _shortened(super().format(record))
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         """One line. Control characters are escaped: no value can forge a second one."""
@@ -109,7 +120,10 @@ class JsonFormatter(logging.Formatter):
         if exception or stack:
             fields["exception"] = "\n".join(filter(None, (exception, stack)))
         extra = {name: value for name, value in vars(record).items() if name not in _NOT_EXTRA and value is not None}
-        return json.dumps(extra | fields, default=str, ensure_ascii=False)
+        shown = {
+            name: _shortened(value) if isinstance(value, str) else value for name, value in (extra | fields).items()
+        }
+        return json.dumps(shown, default=str, ensure_ascii=False)
 
 
 def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None = None) -> None:

@@ -3,6 +3,8 @@
 They lie in the plane of the first depth unless the motion leads out of it, as the paper has it: there is no floor.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Sequence
@@ -18,6 +20,7 @@ from cow_service.vision.types import Floats, Mask
 GRAVITY = 9.81  # m/s^2
 DEFAULT_SPEED = 0.26  # image widths per second
 DEFAULT_SCENE_WIDTH = 3.0  # m across the image at the object's depth, where nothing tells the scale
+COURSE_TIME = 5.0  # s: of a motion of several legs whose lengths are not told, whatever the clip shows of it
 NEAREST_FREE = 0.08  # of the first depth: closer than this the object has passed the camera
 
 
@@ -103,10 +106,10 @@ class Course:
         return moved / (end - start)
 
 
-def course_of(motion: Motion, velocities: Sequence[Floats], speed: float, clip: float) -> Course | None:
+def course_of(motion: Motion, velocities: Sequence[Floats], speed: float) -> Course | None:
     """The course with the velocity [3] (m/s) of each leg, at a speed in px/s; None where it just goes on.
 
-    Legs before the last that have no length of their own share what is left of the clip's seconds.
+    Legs before the last that have no length of their own share what is left of `COURSE_TIME`.
     """
     extents = [(motion.distance, motion.duration), *((step.distance, step.duration) for step in motion.steps)]
     seconds: list[float] = []
@@ -117,7 +120,7 @@ def course_of(motion: Motion, velocities: Sequence[Floats], speed: float, clip: 
         return None
     if not all(map(math.isfinite, seconds[:-1])):
         open_ones = sum(not math.isfinite(each) for each in seconds)
-        share = max(0.0, clip - sum(filter(math.isfinite, seconds))) / open_ones
+        share = max(0.0, COURSE_TIME - sum(filter(math.isfinite, seconds))) / open_ones
         seconds = [*(each if math.isfinite(each) else share for each in seconds[:-1]), seconds[-1]]
     pairs = zip(seconds, (velocity.tolist() for velocity in velocities), strict=True)
     return Course(tuple(Leg(length, (x, y, z)) for length, (x, y, z) in pairs), motion.until == "contact")
@@ -132,14 +135,18 @@ class FreePath:
     scale: Floats  # [F]
     visible: Mask  # [F]
 
+    def cut(self, frames: int) -> FreePath:
+        """The first frames of it."""
+        return FreePath(self.states[:frames], self.points[:frames], self.scale[:frames], self.visible[:frames])
+
 
 def ballistic_path(camera: Camera, grounding: Grounding, motion: Motion, times: Floats) -> FreePath:
     """The path of the motion from the grounded point, at times [F] (s); along legs, where it has several or an end."""
     metres = motion.metres_per_pixel.value
     velocity = metres * motion.speed * _unit(motion.direction, motion.depth)
-    start, clip = camera.lift(grounding.point), float(times[-1] - times[0])
+    start = camera.lift(grounding.point)
     legs = [velocity, *(metres * motion.speed * _unit(step.direction, step.depth) for step in motion.steps)]
-    course = course_of(motion, legs, motion.speed, clip)
+    course = course_of(motion, legs, motion.speed)
     if course is not None and motion.kind == "linear":
         moved = np.array([course.mean_velocity(0.0, t) * t if t > 0 else np.zeros(3) for t in times])
         now = np.array([course.mean_velocity(t, t + 1e-6) for t in times])

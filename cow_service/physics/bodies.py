@@ -11,6 +11,7 @@ import numpy as np
 
 from cow_service.records import BBox, ObjectPrior, Shape, Source
 from cow_service.vision.masks import CroppedMask
+from cow_service.vision.types import Floats
 
 ON_TOP = 0.72  # of a support's height in the image, from its upper edge: a foot below that stands before it
 SHOWN = 0.1  # of a body's width: so much of its support's top is seen beside it, above its foot
@@ -18,6 +19,9 @@ BESIDE = 3.0  # px beside a body's box where the support's upper edge is looked 
 ENDS = 0.2  # of the height, at the upper and at the lower end, where a vessel has no handle
 HANDLE, BARE = 0.12, 0.05  # of the width: so far a handle reaches at least, and the other side at most
 WIDER = 1.15  # a support is so much wider than what stands on it
+RIM = 0.9  # of half the width of its upper edge: what lies further out rises too steeply to be measured
+LEAST_RIM = 12  # px across
+RIM_SIGMA, RIM_OFF = 0.08, 0.08  # of half its width: its deviation at best, and that of what is no ellipse
 LEAST_OVERLAP = 0.1  # of the narrower box: with less of it above the other, it is seen beside that
 
 
@@ -34,6 +38,7 @@ class SeenBody:
     prior: ObjectPrior | None = None
     elongated: bool = False  # a vehicle: longer along its heading than across
     equal_sided: bool = False  # a cube: as wide as high
+    is_form_known: bool = True  # its shape was seen or said; else how deep it is, is not known
     taper: float = 1.0  # its width at its lower end, of that at its upper end
 
     @property
@@ -56,10 +61,56 @@ class SeenBody:
         return (x0 + left, y0, x1, y1) if left > right else (x0, y0, x1 - right, y1)
 
     @cached_property
+    def rim(self) -> tuple[float, float] | None:
+        """Minor to major axis of its round top as the upper edge of its outline shows it, and its deviation.
+
+        None where that edge is no half of an ellipse.
+        """
+        patch = self.mask.patch
+        top = patch[: max(3, len(patch) // 6)]
+        columns = np.nonzero(top.any(axis=0))[0]
+        if not len(columns):
+            return None
+        middle, half = (columns[0] + columns[-1]) / 2, (columns[-1] + 1 - columns[0]) / 2
+        inner = columns[np.abs(columns - middle) < RIM * half]
+        if len(inner) < LEAST_RIM:
+            return None
+        arc = np.sqrt(1 - ((inner - middle) / half) ** 2)
+        level = patch[:, inner].argmax(axis=0).astype(np.float64)
+        height, _ = np.polyfit(arc, level, 1)
+        off = float(np.std(level - height * arc)) / half
+        return (float(-height / half), RIM_SIGMA + off) if off < RIM_OFF else None
+
+    @cached_property
+    def widths(self) -> Floats:
+        """Of its outline per row [R] from the top, of the widest; a cylinder's where there is none."""
+        widths = self.mask.patch.sum(axis=1)
+        return widths / widths.max() if self.mask.area else np.ones(1)
+
+    @cached_property
     def fullness(self) -> float:
         """Volume of the body that its outline would turn to about its axis, of that of the cylinder around it."""
-        widths = self.mask.patch.sum(axis=1)
-        return float(np.mean((widths / max(1, int(widths.max()))) ** 2)) if len(widths) else 1.0
+        return float(np.mean(self.widths**2))
+
+    @cached_property
+    def middle(self) -> float:
+        """Height of the centre of mass of that body, of its height."""
+        volumes = self.widths**2
+        return float(1 - (np.arange(len(volumes)) + 0.5) @ volumes / volumes.sum() / len(volumes))
+
+    def stance(self, sine: float) -> tuple[float, float]:
+        """Width on which it stands, of its width, and the height up to which it is that narrow, of its height.
+
+        `sine` is that of the angle at which it is looked down on: so far the near half of a round base reaches below
+        its ends.
+        """
+        pixels = float(self.mask.patch.sum(axis=1).max()) if self.mask.area else 1.0
+        base, row = 0.0, len(self.widths) - 1
+        for _ in range(12):  # upwards: what is wider higher up is no part of the base
+            row = min(row, max(0, len(self.widths) - 1 - round(base * pixels / 2 * sine)))
+            base = float(self.widths[row])
+        wide = np.nonzero(self.widths[: row + 1] > (1 + base) / 2)[0]
+        return base, (row - float(wide[-1]) if len(wide) else 0.0) / len(self.widths)
 
     def is_above(self, other: SeenBody) -> bool:
         """Whether the picture shows it above another one."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -104,9 +104,14 @@ def axes_of(pitch: Floats, roll: Floats) -> Floats:
     return np.stack([right, up, ahead], axis=1)
 
 
-FOCAL_WIDTHS = 1.0  # focal length in image widths: a horizontal field of view of 53 degrees
-PITCH, PITCH_SIGMA = math.radians(28), math.radians(8)
-FOCAL_SIGMA = 0.1  # of its natural logarithm
+FOCAL_WIDTHS = 1.0  # focal length in image widths, where no floor is computed
+PITCHES = 0.0, math.radians(55)  # that pictures of things on a floor have
+FOCALS = 0.6, 2.2  # image widths
+FLAT = math.sqrt(3)  # half the width of a uniform distribution, in its deviations
+GRID = 16  # pitches, and focal lengths, that are weighed
+CUBE_SIGMA = 0.1  # of a cube's height in the image against its width
+TURNED = np.linspace(1.0, math.sqrt(2), 6)  # widths, in its side, of a cube whose yaw is not known
+OUT_OF_SIGHT = 50.0  # what a foot above the horizon costs: no such camera is left beside one without any
 ROLL_SIGMA = math.radians(1.0)
 HEIGHT_RADII, HEIGHT_SIGMA = 5.0, 0.6  # above the floor of what is in the air, in its radii; of the logarithm
 SLANT = (0.0, 0.1)  # of the light: right and ahead, per unit of height
@@ -132,9 +137,58 @@ class CameraFit:
 
 def prior(roll: float = 0.0) -> CameraFit:
     """What is known of the camera before anything is measured."""
-    mean = np.array([PITCH, math.log(FOCAL_WIDTHS), math.log(HEIGHT_RADII), *SLANT])
-    sigma = np.array([PITCH_SIGMA, FOCAL_SIGMA, HEIGHT_SIGMA, *SLANT_SIGMA])
+    (lowest, highest), (shortest, longest) = PITCHES, np.log(FOCALS)
+    mean = np.array([(lowest + highest) / 2, (shortest + longest) / 2, math.log(HEIGHT_RADII), *SLANT])
+    flat = (highest - lowest) / 2 / FLAT, (longest - shortest) / 2 / FLAT
+    sigma = np.array([*flat, HEIGHT_SIGMA, *SLANT_SIGMA])
     return CameraFit(mean, np.diag(sigma**2), roll, ROLL_SIGMA, "prior")
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What one thing that stands on the floor shows of the camera."""
+
+    bbox: BBox
+    rim: tuple[float, float] | None = None  # of a round top: minor to major axis as seen, and its deviation
+    is_cube: bool = False
+
+
+def narrowed(fit: CameraFit, things: Sequence[Standing], size: tuple[int, int]) -> CameraFit:
+    """The camera by what stands on the floor of an image of a size (width, height), px.
+
+    All feet lie below the horizon. A circle is seen as an ellipse whose axes have the ratio of the sine of the angle at
+    which it is looked down on; a cube shows the more of its top the larger that angle is.
+    """
+    if not things:
+        return fit
+    steps = np.sqrt(np.diag(fit.covariance))[:2, None] * np.linspace(-FLAT, FLAT, GRID)
+    pitch, log_focal = (axis.ravel() for axis in np.meshgrid(*(fit.mean[:2, None] + steps), indexing="ij"))
+    up = axes_of(pitch, np.full(len(pitch), fit.roll))[:, 1]
+    boxes = np.array([thing.bbox for thing in things])
+
+    def sinks(height: Floats) -> Floats:
+        """Sines [K, N] of the angles at which rays through the boxes' middles at image heights [N] lead down."""
+        points = np.stack([(boxes[:, 0] + boxes[:, 2]) / 2, height], axis=1) - np.array(size) / 2
+        across = points / (np.exp(log_focal) * size[0])[:, None, None]
+        rays = np.concatenate([across, np.ones((*across.shape[:2], 1))], axis=2)
+        return -np.einsum("kni,ki->kn", rays, up) / np.linalg.norm(rays, axis=2)
+
+    sine, at_top = sinks(boxes[:, 3]), sinks(boxes[:, 1])
+    fits = -OUT_OF_SIGHT * (sine < HORIZON).sum(axis=1).astype(np.float64)
+    for index, thing in enumerate(things):
+        if thing.rim is not None:
+            fits -= 0.5 * ((at_top[:, index] - thing.rim[0]) / thing.rim[1]) ** 2
+        if thing.is_cube:
+            x0, y0, x1, y1 = thing.bbox
+            seen = np.sqrt(1 - np.clip(sine[:, index], 0, 1) ** 2)[:, None] / TURNED + sine[:, index, None]
+            off = ((y1 - y0) / (x1 - x0) - seen) / CUBE_SIGMA
+            fits += np.log(np.exp(-0.5 * off**2).mean(axis=1) + 1e-9)
+    weight = np.exp(fits - fits.max())
+    found = np.stack([pitch, log_focal])
+    mean, covariance = fit.mean.copy(), fit.covariance.copy()
+    mean[:2] = found @ weight / weight.sum()
+    covariance[:2, :2] = np.cov(found, aweights=weight, ddof=0) + np.diag(np.full(2, 1e-12))
+    return replace(fit, mean=mean, covariance=covariance)
 
 
 def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, int]) -> CameraFit | None:

@@ -27,6 +27,10 @@ PARAMETERS: dict[str, Doubt] = {
     "opening": "size",
     "let_go_right": "place",
     "let_go_ahead": "place",
+    "deep": "size",
+    "base": "size",
+    "middle": "size",
+    "weight": "friction",
 }  # what is uncertain in a world, and the kind of doubt that it belongs to
 NAMES = tuple(PARAMETERS)
 COLUMN = {name: place for place, name in enumerate(NAMES)}

@@ -56,6 +56,9 @@ class RigidShape:
     ghost: bool = False  # passes through everything; what it meets is told all the same
     course: Course | None = None  # of what glides: its legs, and where it stops
     hollow: Hollow | None = None  # it is an open container
+    middle: float | None = None  # height of a solid body's centre of mass, of its height; None: as of one stuff
+    base: float = 1.0  # width on which a cylinder stands, of its width
+    waist: float = 0.0  # height up to which it is that narrow, of its height
     follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
 
     @property
@@ -84,11 +87,13 @@ SPACING = 24.0  # m inside the engine, between worlds
 COLOURS = 5  # worlds so many places apart, along and across, share a collision group
 REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what gets further away is taken out
 LEAST_STEPS, LEAST_STEPS_OF_MANY = 60.0, 30.0  # steps per second, at least, of a world alone and of many
-FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.25
+FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.5
 MOST_GRAVITY = 500.0  # m/s^2 inside the engine: what is smaller than 3 mm would sink into the floor between two steps
 FORESEEN = 10.0  # m inside the engine, at most: contacts are found that far ahead of what is fast
 GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
 FLOOR = (-1, -1)  # its owner
+LEAST_WAIST = 0.05  # of the height: a thinner foot would let its edge through the floor
+AT_REST = 0.05  # of a body's half width, per second: what moves more slowly is at rest
 AT_START = 0.1  # s: what stands on a body meets it then, which is no end of gliding over it
 
 
@@ -112,6 +117,12 @@ class WorldRun:
     meetings: list[Meeting]
     moved: set[int]  # bodies that did not stay where they were
 
+    def cut(self, frames: int, until: float = math.inf) -> WorldRun:
+        """So many recorded frames of it, the last one repeated as needed, with the meetings up to a time (s)."""
+        rows = np.minimum(np.arange(frames), self.positions.shape[1] - 1)
+        met = [each for each in self.meetings if each.time <= until]
+        return WorldRun(self.positions[:, rows], self.velocities[:, rows], self.turns[:, rows], met, self.moved)
+
 
 Finished = Callable[[Floats, Floats], Mask]
 """Of which worlds [K] the rest does not matter, by positions and velocities [K, 3] (m, m/s) of their first bodies."""
@@ -124,15 +135,18 @@ def run_worlds(
     every: int = 1,
     finished: Finished | None = None,
     turns_wanted: bool = False,
+    until_rest: bool = False,
+    path_fps: float | None = None,
 ) -> list[WorldRun]:
-    """Runs worlds for the time of a clip, recording every `every`-th frame. They have equally many bodies each.
+    """Runs worlds for the time of so many frames, recording every `every`-th. They have equally many bodies each.
 
     With more than one world, impulses are not recorded, nor turns where they are not wanted, and worlds that are
-    finished go on in a straight line.
+    finished go on in a straight line. `until_rest`: fewer frames are recorded where from some frame on nothing moves
+    that is not finished. `path_fps` is the rate of the positions that bodies follow, by default that of the frames.
 
     The same input gives the same output, bit by bit.
     """
-    return _Engine(worlds, num_frames, fps, every, finished, turns_wanted).run()
+    return _Engine(worlds, num_frames, fps, every, finished, turns_wanted, path_fps or fps).run(until_rest)
 
 
 class _Engine:
@@ -146,8 +160,9 @@ class _Engine:
         every: int,
         finished: Finished | None,
         turns_wanted: bool,
+        path_fps: float,
     ) -> None:
-        self.worlds, self.fps, self.every, self.finished = worlds, fps, every, finished
+        self.worlds, self.fps, self.every, self.finished, self.path_fps = worlds, fps, every, finished, path_fps
         self.is_alone = len(worlds) == 1
         self.records_turns = turns_wanted or self.is_alone
         self.frames = range(0, num_frames, every)
@@ -179,12 +194,14 @@ class _Engine:
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
         self.meetings: list[list[Meeting]] = [[] for _ in worlds]
         self.awake = [{i for i, body in enumerate(bodies) if body.is_active} for bodies in worlds]
+        self.slow = np.array([[_slow(body) for body in bodies] for bodies in worlds])  # [K, B] m/s: less is at rest
         self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
         self.touching: list[dict[int, set[int]]] = [{} for _ in worlds]
         self.joined: dict[frozenset[tuple[int, int]], int] = {}  # pairs of colliders that touch, per pair of bodies
 
-    def run(self) -> list[WorldRun]:
+    def run(self, until_rest: bool) -> list[WorldRun]:
         self.record([(k, i) for k, bodies in enumerate(self.worlds) for i in range(len(bodies))], 0)
+        row = 0
         for row in range(1, len(self.frames)):
             self.advance(self.frames[row - 1])
             for moving in (self.positions, self.velocities, self.turns):
@@ -194,10 +211,21 @@ class _Engine:
             if self.finished is not None:
                 for k in np.nonzero(self.finished(self.positions[:, 0, row], self.velocities[:, 0, row]))[0].tolist():
                     self.take_out(k, 0, row)
+            if until_rest and self.is_at_rest(row):
+                break
+        positions, velocities, turns = (v[:, :, : row + 1] for v in (self.positions, self.velocities, self.turns))
         return [
-            WorldRun(self.positions[k], self.velocities[k], self.turns[k], self.meetings[k], set(self.awake[k]))
+            WorldRun(positions[k], velocities[k], turns[k], self.meetings[k], set(self.awake[k]))
             for k in range(len(self.worlds))
         ]
+
+    def is_at_rest(self, row: int) -> bool:
+        """Whether nothing moves that is not taken out, and nothing will set out any more."""
+        if self.followers or self.courses or row < 2:
+            return False
+        still = np.linalg.norm(self.velocities[:, :, row], axis=2) < self.slow
+        still &= np.linalg.norm(self.velocities[:, :, row - 1], axis=2) < self.slow
+        return bool((still | self.drift).all())
 
     def add(self, k: int, i: int, body: RigidShape) -> rapier.RigidBodyHandle:
         """Adds a body; what neither moves nor is touched costs nothing."""
@@ -231,6 +259,8 @@ class _Engine:
             .active_events(rapier.ActiveEvents.COLLISION_EVENTS)
             for part in _colliders(body, self.scale)
         ]
+        if body.middle is not None and body.hollow is None:
+            builder = builder.additional_mass_properties(_mass_properties(body, self.scale))
         handle = self.world.add_body(builder, colliders=colliders)
         for collider in self.body_of(handle).colliders:
             self.owner[collider.index] = k, i
@@ -260,7 +290,7 @@ class _Engine:
     def steer(self, time: float, step: float) -> None:
         """Has bodies follow their paths and courses from a time on for one step (s)."""
         for (k, i), path in self.followers.items():
-            at = min((time + step) * self.fps, len(path) - 1.0)
+            at = min((time + step) * self.path_fps, len(path) - 1.0)
             low = min(int(at), len(path) - 2)
             there = (path[low] + (at - low) * (path[low + 1] - path[low])) * self.scale + self.origin[k]
             self.body_of(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
@@ -346,6 +376,24 @@ def _combined(collider: rapier.ColliderBuilder) -> rapier.ColliderBuilder:
     return collider.friction_combine_rule(rule).restitution_combine_rule(rule)
 
 
+def _slow(body: RigidShape) -> float:
+    """The speed (m/s) below which a body is at rest; what glides slowly from the start is not."""
+    glides = math.hypot(*body.velocity) if body.glides else 0.0
+    return min(AT_REST * body.half_width, glides / 2) if glides else AT_REST * body.half_width
+
+
+def _mass_properties(body: RigidShape, scale: float) -> rapier.MassProperties:
+    """Of a solid body whose centre of mass is not in its middle: as heavy as if it were of one stuff."""
+    width, depth, height = (half * scale for half in (body.half_width, body.half_depth, body.half_height))
+    share = {"box": 8.0, "cylinder": 2 * math.pi, "cone": 2 * math.pi / 3, "sphere": 4 * math.pi / 3}[body.shape]
+    mass = body.density * share * width * depth * height
+    # Half widths squared, about the axes, of a box; what is round has less of it far out.
+    w, d, h = width**2, depth**2, height**2
+    spread = 3 if body.shape == "box" else 4
+    inertia = (mass * (d / spread + h / 3), mass * (w + d) / spread, mass * (w / spread + h / 3))
+    return rapier.MassProperties((0.0, (2 * (body.middle or 0.0) - 1) * height, 0.0), mass, inertia)
+
+
 def _colliders(body: RigidShape, scale: float) -> list[rapier.ColliderBuilder]:
     """Of one solid piece, or a container's floor and the convex segments of the wall that stands on it."""
     width, height, hollow = body.half_width * scale, body.half_height * scale, body.hollow
@@ -354,9 +402,16 @@ def _colliders(body: RigidShape, scale: float) -> list[rapier.ColliderBuilder]:
             solid = rapier.Collider.ball(width)
         elif body.shape == "box":
             solid = rapier.Collider.cuboid(width, height, body.half_depth * scale)
+        elif body.shape == "cone":
+            solid = rapier.Collider.cone(height, width)
+        elif body.base < 1:
+            low = max(body.waist, LEAST_WAIST) * height
+            foot = rapier.Collider.cylinder(low, body.base * width).translation((0.0, low - height, 0.0))
+            rest = rapier.Collider.cylinder(height - low, width).translation((0.0, low, 0.0))
+            return [part.density(0.0 if body.middle is not None else body.density) for part in (foot, rest)]
         else:
-            solid = (rapier.Collider.cylinder if body.shape == "cylinder" else rapier.Collider.cone)(height, width)
-        return [solid.density(body.density)]
+            solid = rapier.Collider.cylinder(height, width)
+        return [solid.density(0.0 if body.middle is not None else body.density)]
     half_width, half_height = body.half_width, body.half_height
     foot = hollow.bottom + half_width - hollow.opening  # m: outer radius of the floor, or half its side
     turn = math.pi / hollow.sides

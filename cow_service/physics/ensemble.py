@@ -17,7 +17,7 @@ from cow_service.physics.world import WorldInput, Worlds, run_world
 from cow_service.records import Asked, AskedForm, AskedRelation, Doubt, EncounterKind
 from cow_service.vision.types import Floats, Mask
 
-EVERY = 2  # frames between those that are recorded of the ensemble
+EVERY = 2  # frames of its clock between those that are recorded of the ensemble
 TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
 SURE = 0.7  # share of the worlds from which an answer is given
 ROBUST = 0.9
@@ -111,7 +111,7 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
 
 def _run(world: WorldInput, draws: Floats, every: int = 1) -> ObservedWorlds:
     worlds = run_world(world, draws, every)
-    return ObservedWorlds(worlds, find_world_events(worlds, world.bodies, world.fps, draws, world.size))
+    return ObservedWorlds(worlds, find_world_events(worlds.within_horizon, world.bodies, draws, world.size))
 
 
 def _agreeing(

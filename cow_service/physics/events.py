@@ -213,19 +213,17 @@ class Events:
     partly: PerKind  # as times, where any part is covered
     subject: int = 0  # the body that meets the others
 
-    def share(self, kind: EncounterKind, body: int) -> float:
-        """Of the draws, in which the encounter happens."""
-        return float(np.isfinite(self.times[kind])[:, body].mean())
+    def share(self, kind: EncounterKind, body: int, partly: bool = False) -> float:
+        """Of the draws, in which the encounter happens; `partly`: also where any part is hidden."""
+        return float(np.isfinite((self.partly if partly else self.times)[kind])[:, body].mean())
 
 
 class _EventsOf(dict[int, Events]):
     """The events of each body, found when first asked for."""
 
-    def __init__(
-        self, worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, paths: Sequence[SeenPaths]
-    ) -> None:
+    def __init__(self, worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats, paths: Sequence[SeenPaths]) -> None:
         super().__init__()
-        self.worlds, self.bodies, self.fps, self.draws, self.paths = worlds, bodies, fps, draws, paths
+        self.worlds, self.bodies, self.draws, self.paths = worlds, bodies, draws, paths
 
     def __missing__(self, subject: int) -> Events:
         enough = COVERED * np.exp(COVERED_SIGMA * self.draws[:, COLUMN["outline"]])[:, None]
@@ -244,7 +242,7 @@ class _EventsOf(dict[int, Events]):
                     if other != on and other not in loads:
                         times["touches"][k, other] = min(times["touches"][k, other], meeting.time)
         partly["touches"] = times["touches"]
-        path, step = self.paths[subject], self.worlds.every / self.fps
+        path, step = self.paths[subject], self.worlds.every / self.worlds.fps
         clock = np.arange(path.depth.shape[1]) * step
         for other in range(count):
             if other in (subject, on) or other in loads:
@@ -273,9 +271,7 @@ class WorldEvents:
     order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
 
 
-def find_world_events(
-    worlds: Worlds, bodies: Sequence[SeenBody], fps: float, draws: Floats, size: tuple[int, int]
-) -> WorldEvents:
+def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats, size: tuple[int, int]) -> WorldEvents:
     """The events of every draw [K, P] in an image of a size (width, height; px)."""
     runs, shapes, count = worlds.runs, worlds.shapes, len(bodies)
     started = set_off(shapes[0], runs[0])
@@ -299,7 +295,7 @@ def find_world_events(
             if meeting.b is None:
                 landed[k, meeting.a] = min(landed[k, meeting.a], meeting.time)
     return WorldEvents(
-        of=_EventsOf(worlds, bodies, fps, draws, paths),
+        of=_EventsOf(worlds, bodies, draws, paths),
         moved=_first(displaced, worlds),
         tipped=_first(leans, worlds),
         gone=_first(~np.stack(inside, axis=1), worlds),
@@ -320,6 +316,7 @@ def encounters(
     """Those of the likeliest world, in the order of their first frame, with their share of the ensemble's worlds.
 
     Of two that both move, the one that was set in motion first is the subject. `partly`: also where any part is hidden.
+    What happens after the clip has its last frame.
     """
     found: list[Encounter] = []
     for (place, subject), kind in itertools.product(enumerate(likeliest.order), KINDS):
@@ -333,10 +330,11 @@ def encounters(
                 subject=subject,
                 kind=kind,
                 first_frame=min(math.ceil(times[body] * fps - 1e-6), num_frames - 1),
+                time=float(times[body]),
                 share=None if kind == "touches" else float(events.shares[kind][0, body]),
-                probability=None if ensemble is None else ensemble.of[subject].share(kind, body),
+                probability=None if ensemble is None else ensemble.of[subject].share(kind, body, partly),
             )
             for body in np.nonzero(np.isfinite(times))[0].tolist()
             if body not in likeliest.order[:place]
         ]
-    return tuple(sorted(found, key=lambda encounter: encounter.first_frame))
+    return tuple(sorted(found, key=lambda encounter: (encounter.first_frame, encounter.time)))

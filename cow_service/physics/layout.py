@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import HORIZON, CameraFit, axes_of
+from cow_service.physics.camera import FLAT, HORIZON, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN, quantiles
 from cow_service.records import FALLING_KINDS, BBox, Cue, Motion, Shape
 from cow_service.vision.types import Floats
@@ -30,12 +30,14 @@ TURN_SIGMA: dict[Cue, float] = {
     "arrow": 1.5, "trail": 1.5, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
+TOWARDS_SIGMA = math.radians(2)  # of the heading of what moves towards another thing: it is aimed at its middle
 RISE, RISE_SIGMA = math.radians(20), math.radians(8)  # above the horizontal: how things are thrown
+AIMED, AIM_SIGMA = 4.0, math.radians(9)  # how much likelier a heading to what stands there is, and how exact
 TURNS = np.linspace(-4, 4, 65)  # in deviations: turns out of the plane of the image that are weighed
-AIMED, AIM_SIGMA = 4.0, math.radians(9)  # how much likelier a heading to what is asked about is, and how exact
 LOW = 0.08  # sine of the angle between a ray and a horizontal plane below which the plane through the foot is taken
 APART = 0.98  # of the distance of two bodies: together they are so wide at most
 VEHICLE_WIDTH = 0.5  # of a vehicle's length
+DEPTHS = 0.3, 2.0  # of an unknown thing, of its width
 LEAST_SHRUNK = 0.5  # of its width: bodies that overlap more are left to the engine
 
 
@@ -53,7 +55,8 @@ class Cameras:
     def drawn(fit: CameraFit, size: tuple[int, int], draws: Floats) -> tuple[Cameras, Floats]:
         """Cameras 1 m above the floor, and the five fitted parameters [K, 5], for draws [K, P]."""
         names = ("pitch", "focal", "height", "slant_right", "slant_ahead")
-        normal = draws[:, [COLUMN[name] for name in names]]
+        normal = draws[:, [COLUMN[name] for name in names]].copy()
+        normal[:, :2] = np.clip(normal[:, :2], -FLAT, FLAT)  # no pitch and no focal length that no picture has
         parameters = fit.mean + normal @ np.linalg.cholesky(fit.covariance).T
         roll = fit.roll + fit.roll_sigma * draws[:, COLUMN["roll"]]
         pitch = np.clip(parameters[:, 0], -1.4, 1.4)
@@ -103,7 +106,7 @@ class LiftedBody:
     half_width: Floats  # [K]
     half_height: Floats  # [K]
     stands: bool  # on the floor or on another body; else it is in the air
-    depth_share: float = 1.0  # how deep it is along the line of sight, of its width
+    depth_share: Floats | float = 1.0  # [K]: how deep it is along the line of sight, of its width
 
     def repeated(self, count: int) -> LiftedBody:
         """As the first draw has it, so many times."""
@@ -122,7 +125,7 @@ def above(
     shape: Shape,
     draws: Floats,
     plane: Floats,
-    depth_share: float = 1.0,
+    depth_share: Floats | float = 1.0,
     taper: float = 1.0,
 ) -> LiftedBody | None:
     """A body that stands on a horizontal plane at a height [K] (m); None where its foot lies at or above the horizon.
@@ -220,21 +223,29 @@ def lay_out(
     fit: CameraFit,
     size: tuple[int, int],
     draws: Floats,
-    asked: int | None = None,
     others: Mapping[int, Motion] = MappingProxyType({}),
 ) -> Layout:
-    """Places bodies seen in an image of a size (width, height), px. `asked` is the body that the question is about.
+    """Places bodies seen in an image of a size (width, height), px.
 
     `others` are motions of other bodies, by their places among `bodies`.
     """
     cameras, parameters = Cameras.drawn(fit, size, draws)
     picture = _Picture(bodies, supports_of(bodies), motion, draws)
-    cameras, placed = picture.placed(cameras, parameters, fit, asked)
-    target = None if asked is None else placed[asked]
-    velocity = _velocity(placed[0], motion, cameras, draws, target)
-    legs = [motion.model_copy(update={"direction": step.direction, "depth": step.depth}) for step in motion.steps]
-    further = tuple(_velocity(placed[0], leg, cameras, draws, None) for leg in legs)
-    also = {i: _velocity(placed[i], each, cameras, draws, None, "other_speed") for i, each in others.items()}
+    cameras, placed = picture.placed(cameras, parameters, fit)
+    if motion.rises:
+        placed[0] = replace(placed[0], stands=False)
+    places = {body.bbox: each for body, each in zip(bodies, placed, strict=True)}
+
+    def velocity_of(body: int, motion: Motion, speed_name: str = "speed") -> Floats:
+        goal = None if motion.towards is None else places.get(motion.towards.bbox)
+        others = [each for index, each in enumerate(placed) if index != body]
+        return _velocity(placed[body], motion, cameras, draws, goal, others, speed_name)
+
+    velocity = velocity_of(0, motion)
+    turned = {"towards": None, "rises": motion.rises}
+    legs = [motion.model_copy(update=turned | {"direction": s.direction, "depth": s.depth}) for s in motion.steps]
+    further = tuple(velocity_of(0, leg) for leg in legs)
+    also = {i: velocity_of(i, each, "other_speed") for i, each in others.items()}
     placed = _apart(placed)
     resting = tuple(on if body.stands else None for on, body in zip(picture.supports, placed, strict=True))
     return Layout(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
@@ -244,9 +255,7 @@ def flies(mover: SeenBody, motion: Motion) -> bool:
     """Whether the mover is in the air at the first frame, as far as is said."""
     if mover.prior is not None and mover.prior.stands_on is not None:
         return mover.prior.stands_on == "air"
-    # Words, not a drawn cue, that say that something moves up: not along the floor, then.
-    said = motion.kind == "linear" and motion.cue == "text" and motion.depth == 0
-    return motion.kind in FALLING_KINDS or (said and motion.direction is not None and motion.direction[1] < -0.5)
+    return motion.kind in FALLING_KINDS
 
 
 @dataclass(frozen=True)
@@ -258,9 +267,7 @@ class _Picture:
     motion: Motion
     draws: Floats
 
-    def placed(
-        self, cameras: Cameras, parameters: Floats, fit: CameraFit, asked: int | None
-    ) -> tuple[Cameras, list[LiftedBody]]:
+    def placed(self, cameras: Cameras, parameters: Floats, fit: CameraFit) -> tuple[Cameras, list[LiftedBody]]:
         """The cameras at the heights that the mover tells, and the bodies."""
         bodies, motion, draws = self.bodies, self.motion, self.draws
         mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
@@ -269,14 +276,15 @@ class _Picture:
             unit = self.standing(0, cameras, draws, share)
             if unit is not None:
                 cameras = cameras.at_height(depth / np.maximum(cameras.depth(unit.centre), 1e-6))
-                return cameras, [self.body_at(i, cameras, depth, share if i == 0 else 1.0) for i in range(len(bodies))]
+                return cameras, [self.body_at(i, cameras, depth, share if i == 0 else None) for i in range(len(bodies))]
         ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
         height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
-        if motion.kind == "fall" and asked is not None and mover.is_above(bodies[asked]):
-            below = self.standing(asked, cameras.at_height(np.ones(len(draws))), draws)
-            if below is not None and not bodies[asked].is_flying:
-                # In most draws it hangs over what is asked about, which is seen at a distance of so many heights of
-                # the camera. What a shadow tells of the height weighs against it.
+        under = self.below() if motion.kind == "fall" else None
+        if under is not None:
+            below = self.standing(under, cameras.at_height(np.ones(len(draws))), draws)
+            if below is not None:
+                # In most draws it hangs over what is seen below it, at a distance of so many heights of the camera.
+                # What a shadow tells of the height weighs against it.
                 aside = HUNG_SIGMA * ball.half_width * draws[:, COLUMN["turn"]]
                 aligned = (ball.centre[:, 2] + aside) / below.centre[:, 2]
                 in_radii = 2 * (aligned[0] + ball.centre[0, 1]) / (ball.half_width[0] + ball.half_height[0])
@@ -289,18 +297,39 @@ class _Picture:
         flying = in_the_air(cameras, mover.bbox, mover.shape, depth)
         return cameras, [flying, *(self.body_at(i, cameras, depth) for i in range(1, len(bodies)))]
 
-    def body_at(self, index: int, cameras: Cameras, depth: Floats, depth_share: float = 1.0) -> LiftedBody:
+    def below(self) -> int | None:
+        """The body that is seen below the mover: of several, the one that lies beneath its middle the most."""
+        x = (self.bodies[0].bbox[0] + self.bodies[0].bbox[2]) / 2
+
+        def off(index: int) -> float:
+            x0, _, x1, _ = self.bodies[index].bbox
+            return abs(x0 + x1 - 2 * x) / (x1 - x0)
+
+        seen = [i for i, b in enumerate(self.bodies) if i and self.bodies[0].is_above(b) and not b.is_flying]
+        return min(seen, key=off, default=None)
+
+    def body_at(self, index: int, cameras: Cameras, depth: Floats, depth_share: Floats | None = None) -> LiftedBody:
         """A body where it stands, or else in the air, about at the depth [K] (m) of the mover."""
         body = self.bodies[index]
+        said = None if body.prior is None else body.prior.height
+        if body.is_flying and said is not None:
+            height = np.clip(said.value + said.deviation * self.draws[:, COLUMN["foot"]], 0, 0.95 * cameras.height)
+            hanging = above(cameras, body.core, body.shape, self.draws, height)
+            if hanging is not None:
+                return replace(hanging, stands=False)
         standing = None if body.is_flying else self.standing(index, cameras, self.draws, depth_share)
         if standing is not None and NEAREST < cameras.depth(standing.centre)[0] / depth[0] < FARTHEST:
             return standing
         guess = depth if index == 0 else depth * np.exp(DEPTH_SIGMA * self.draws[:, COLUMN["foot"]])
         return in_the_air(cameras, body.bbox, body.shape, guess)
 
-    def standing(self, index: int, cameras: Cameras, draws: Floats, depth_share: float = 1.0) -> LiftedBody | None:
+    def standing(
+        self, index: int, cameras: Cameras, draws: Floats, depth_share: Floats | None = None
+    ) -> LiftedBody | None:
         """A body on the floor, or on the body that carries it, which stands on the floor."""
         body, on = self.bodies[index], self.supports[index]
+        if depth_share is None:
+            depth_share = self.depth_of(body, draws)
         plane = np.zeros(len(draws))
         if on is not None:
             support = above(cameras, self.bodies[on].core, self.bodies[on].shape, draws, plane)
@@ -308,17 +337,25 @@ class _Picture:
                 plane = np.minimum(support.top, 0.95 * cameras.height)
         return above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper)
 
-    def depth_share(self, cameras: Cameras) -> float:
+    def depth_of(self, body: SeenBody, draws: Floats) -> Floats:
+        """How deep a body is along the line of sight [K], of its width: nothing tells that of an unknown thing."""
+        if body.is_form_known or any(self.bodies[on] is body for on in self.supports if on is not None):
+            return np.ones(len(draws))  # what carries something is deep enough for it
+        shallowest, deepest = np.log(DEPTHS)
+        return np.exp(shallowest + (deepest - shallowest) * quantiles(draws[:, COLUMN["deep"]]))
+
+    def depth_share(self, cameras: Cameras) -> Floats:
         """How deep the mover is along the line of sight, of its width: a vehicle is longer along its heading."""
         motion, first = self.motion, cameras.repeated(1)
         unit = self.standing(0, first, self.draws[:1]) if self.bodies[0].elongated else None
         if unit is None or motion.direction is None or motion.kind != "linear":
-            return 1.0
+            return self.depth_of(self.bodies[0], self.draws)
         way = _along_floor(unit, motion, first, np.array([motion.direction]))[0]
         sight = unit.centre[0, [0, 2]] / np.linalg.norm(unit.centre[0, [0, 2]])
         along = abs(float(way[[0, 2]] @ sight))
         across = math.sqrt(max(0.0, 1 - along**2))
-        return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
+        share = (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
+        return np.full(len(self.draws), share)
 
 
 def _velocity(
@@ -326,10 +363,11 @@ def _velocity(
     motion: Motion,
     cameras: Cameras,
     draws: Floats,
-    asked: LiftedBody | None,
-    speed_name: str = "speed",
+    goal: LiftedBody | None,
+    others: Sequence[LiftedBody],
+    speed_name: str,
 ) -> Floats:
-    """[K, 3] m/s right, up and ahead."""
+    """[K, 3] m/s right, up and ahead; `goal` is what it moves towards, `others` are all other bodies."""
     if motion.direction is None or motion.speed == 0:
         return np.zeros((len(draws), 3))
     speed = motion.speed * motion.metres_per_pixel.value * speed_factors(motion, draws, speed_name)
@@ -337,8 +375,12 @@ def _velocity(
     cosine, sine = np.cos(turn), np.sin(turn)
     dx, dy = motion.direction
     direction = np.stack([cosine * dx - sine * dy, sine * dx + cosine * dy], axis=1)
-    if motion.kind == "projectile":
-        way = _thrown(mover, motion, cameras, draws, direction, asked)
+    if goal is not None and (mover.stands or motion.kind == "projectile"):
+        way = _towards(mover, goal, motion, draws)
+    elif motion.kind == "projectile":
+        way = _thrown(mover, motion, cameras, draws, direction, others)
+    elif motion.rises:
+        way = _in_plane(mover, cameras, direction, np.full(len(draws), math.asin(motion.depth)))
     elif mover.stands:
         way = _along_floor(mover, motion, cameras, direction)
     else:
@@ -349,6 +391,16 @@ def _velocity(
 def speed_factors(motion: Motion, draws: Floats, name: str = "speed") -> Floats:
     """[K]: speeds of draws, in likeliest ones."""
     return np.exp(motion.speed_deviation * draws[:, COLUMN[name]])
+
+
+def _towards(mover: LiftedBody, goal: LiftedBody, motion: Motion, draws: Floats) -> Floats:
+    """Unit vectors [K, 3] over the floor towards another body; of a throw, upwards at the angles of throws."""
+    away = goal.centre - mover.centre
+    heading = np.arctan2(away[:, 2], away[:, 0]) + TOWARDS_SIGMA * draws[:, COLUMN["turn"]]
+    rise = np.zeros(len(draws))
+    if motion.kind == "projectile":
+        rise = RISE + RISE_SIGMA * draws[:, COLUMN["depth"]]
+    return np.stack([np.cos(rise) * np.cos(heading), np.sin(rise), np.cos(rise) * np.sin(heading)], axis=1)
 
 
 def _out_of_image(motion: Motion, cameras: Cameras, direction: Floats) -> Floats:
@@ -376,12 +428,17 @@ def _along_floor(mover: LiftedBody, motion: Motion, cameras: Cameras, direction:
 
 
 def _thrown(
-    mover: LiftedBody, motion: Motion, cameras: Cameras, draws: Floats, direction: Floats, asked: LiftedBody | None
+    mover: LiftedBody,
+    motion: Motion,
+    cameras: Cameras,
+    draws: Floats,
+    direction: Floats,
+    others: Sequence[LiftedBody],
 ) -> Floats:
     """Unit vectors [K, 3] seen in directions [K, 2]: in a vertical plane, turned from that of the image by the depth.
 
     A drawn direction leaves the depth open. Small turns are likelier; so are throws that rise at the angle at which
-    things are thrown, and throws that lead about to what the question asks about: people ask of what might happen.
+    things are thrown, and throws that lead about to one of the things that stand there.
     """
     mean, sigma = math.asin(motion.depth), math.radians(motion.depth_deviation)
     turn = np.full(len(draws), mean)
@@ -392,10 +449,12 @@ def _thrown(
         if motion.cue != "trail":  # along a trail it may have come to any point of its path
             rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
             weight = weight * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
-        if asked is not None:
-            away = asked.centre[0] - mover.centre[0]
+        aimed = np.ones(count)
+        for other in others:
+            away = other.centre[0] - mover.centre[0]
             bearing = math.atan2(float(away[2]), float(np.sign(direction[0, 0]) * away[0]))
-            weight = weight * (1 + AIMED * np.exp(-0.5 * ((turns - bearing) / AIM_SIGMA) ** 2))
+            aimed += AIMED * np.exp(-0.5 * ((turns - bearing) / AIM_SIGMA) ** 2)
+        weight = weight * aimed
         below = (np.cumsum(weight) - weight / 2) / weight.sum()
         turn = np.interp(quantiles(draws[:, COLUMN["depth"]]), below, turns)
     return _in_plane(mover, cameras, direction, np.clip(turn, -1.5, 1.5))

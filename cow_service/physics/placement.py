@@ -95,14 +95,21 @@ class Settled:
 
 
 def carry(
-    goal: PlacementGoal, shapes: Sequence[Shapes], draws: Floats, num_frames: int, fps: float, every: int
+    goal: PlacementGoal,
+    shapes: Sequence[Shapes],
+    draws: Floats,
+    seconds: float,
+    num_frames: int,
+    fps: float,
+    every: int,
 ) -> tuple[tuple[Shapes, ...], tuple[WorldRun, ...], Placements]:
     """Runs worlds of draws [K, P] in which a body is carried to its goal and released there: there the engine begins.
 
+    The way takes about so many seconds.
     The bodies as they are when the clip begins, what they do in it, and what becomes of the one that is carried.
     """
     # An even number of frames, as worlds are recorded every second frame.
-    carried = 2 * max(1, int(min(CARRIED * fps, MOST_CARRIED * (num_frames - 1)) / 2))
+    carried = 2 * max(1, int(seconds * fps / 2))
     to_run, rows = max(num_frames - carried, math.ceil(SETTLES * fps)) + 2, len(range(0, num_frames, every))
     released = [_released(goal, bodies, row) for bodies, row in zip(shapes, draws, strict=True)]
     settled = run_worlds(released, to_run, fps, every, turns_wanted=True)

@@ -15,13 +15,32 @@ from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
 from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, flies, lay_out, speed_factors
-from cow_service.physics.placement import PlacementGoal, Placements, Settled, carry, new_supports, settle
-from cow_service.records import FALLING_KINDS, Motion
+from cow_service.physics.placement import (
+    CARRIED,
+    MOST_CARRIED,
+    PlacementGoal,
+    Placements,
+    Settled,
+    carry,
+    new_supports,
+    settle,
+)
+from cow_service.records import FALLING_KINDS, Motion, Shape
 from cow_service.vision.types import Floats, Mask
 
-FRICTION, FRICTION_SIGMA = 0.5, 0.3  # of a body; one standard deviation of the logarithm
+FRICTION, FRICTION_SIGMA = 0.5, 0.5  # of a body; one standard deviation of the logarithm
 RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15
+CONE_MIDDLE, MIDDLE_SIGMA = 0.25, 0.12  # of a body's height: its centre of mass; and how uncertain any is
+RAISED = 0.05  # of its height: what engines with other contacts knock over, this one does at such a centre of mass
+LOWEST_MIDDLE, HIGHEST_MIDDLE = 0.15, 0.75
+# Of the width on which a thing seems to stand: what it stands on, as edges are round; and of its logarithm.
+BASE, BASE_SIGMA = 0.85, 0.15
+LEAST_BASE, WHOLE_BASE = 0.3, 0.95  # of the width: from so much on it stands on all of it
+WEIGHT_SIGMA = 0.5  # of the logarithm: how heavy the mover is against the others
 YAW_SIGMA = 0.4  # radians: how a box is turned about the vertical
+CLOCK = 16.0  # frames per second at which worlds of an ensemble run, so that no answer depends on the clip
+HORIZON, LONGEST = 6.0, 60.0  # s for which worlds are followed unless they rest before: in general, and of slow things
+CROSSING = 1.25  # of the image's width: the way that a slow thing is given the time for
 LEFT_BY = 0.2  # of the image's width: so far outside, what goes on outwards does not come back
 LOOK_AHEAD = 0.01  # s
 LEAST_HALF, MOST_HALF = 0.02, 60.0  # half widths and heights of bodies, in those of the mover
@@ -29,7 +48,7 @@ LEAST_HALF, MOST_HALF = 0.02, 60.0  # half widths and heights of bodies, in thos
 
 @dataclass(frozen=True)
 class PrescribedMotion:
-    """A path that is given, per frame of the clip: of what stands by its foot in the image, else by its positions."""
+    """A path that is given, at the rate of the clip: of what stands by its foot in the image, else by its positions."""
 
     positions: Floats  # [F, 3] m in the frame of the camera
     feet: Floats  # [F, 2] px
@@ -45,13 +64,29 @@ class WorldInput:
     size: tuple[int, int]  # px, of the image: width and height
     num_frames: int
     fps: float
-    asked: int | None = None  # the body that the question is about
     prescribed: PrescribedMotion | None = None  # the mover follows it, through everything
+    lasts: float = 0.0  # s, of a path that is given
     others: Mapping[int, Motion] = field(default_factory=dict[int, Motion])  # of other bodies, by their places
     removed: tuple[SeenBody, ...] = ()  # placed with the others, then taken away before anything moves
     turns_wanted: bool = False  # how bodies turn is recorded of an ensemble, too
     placement: PlacementGoal | None = None  # the mover is carried somewhere and released
     placed_before: tuple[PlacementGoal, ...] = ()  # what is put somewhere before anything moves, in this order
+
+    @property
+    def horizon(self) -> float:
+        """Seconds for which it is followed unless it rests before, whatever the clip shows of it."""
+        motion, seconds = self.motion, max(HORIZON, self.lasts)
+        if motion.kind == "linear" and motion.speed > 0:
+            legs = [each.duration or (each.distance or 0.0) / motion.speed for each in (motion, *motion.steps)]
+            seconds += sum(legs) if motion.steps else 0.0
+        slow = [each.speed for each in (motion, *self.others.values()) if each.kind == "linear" and each.speed > 0]
+        seconds = max(seconds, CROSSING * self.size[0] / min(slow, default=math.inf))
+        return min(LONGEST, seconds)
+
+    @property
+    def frames(self) -> int:
+        """Frames of the clip, and of what happens until the horizon."""
+        return max(self.num_frames, math.ceil(self.horizon * self.fps) + 1)
 
     @property
     def is_changed(self) -> bool:
@@ -71,16 +106,33 @@ class Worlds:
     shapes: tuple[tuple[RigidShape, ...], ...]  # per draw
     runs: tuple[WorldRun, ...]  # per draw
     every: int  # frames between recorded ones
-    fps: float  # of the clip
+    fps: float  # of the frames
+    horizon: float  # s: what happens later does not count
     placements: Placements | None = None  # where the mover is put somewhere
     before: tuple[Placements, ...] = ()  # of what is put somewhere before anything moves
     seen: tuple[tuple[RigidShape, ...], ...] | None = None  # per draw, then: bodies as the image shows them
 
+    def cut(self, frames: int, until: float = math.inf) -> Worlds:
+        """With so many recorded frames, the last one repeated as needed, and the meetings up to a time (s)."""
+        return replace(self, runs=tuple(run.cut(frames, until) for run in self.runs))
+
+    @property
+    def within_horizon(self) -> Worlds:
+        """Without what happens after the horizon."""
+        most = math.ceil(self.horizon * self.fps / self.every) + 1
+        return self.cut(min(most, self.runs[0].positions.shape[1]), self.horizon)
+
 
 def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
-    """Places and runs the worlds of draws [K, P], recording every `every`-th frame."""
+    """Places and runs the worlds of draws [K, P], recording every `every`-th frame.
+
+    One world alone runs at the clip's frame rate and covers the clip; many run at a rate of their own.
+    """
+    fps, frames = CLOCK, math.ceil(given.horizon * CLOCK) + 1
+    if len(draws) == 1:
+        fps, frames = given.fps, given.frames
     bodies, goals = (*given.bodies, *given.removed), given.placed_before
-    layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.asked, given.others)
+    layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.others)
     layout = layout.first(len(given.bodies))
     if goals:
         layout = layout.rearranged(new_supports(goals, layout.supports))
@@ -88,21 +140,24 @@ def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     settled = Settled(seen, ())
     if goals:
         flying = [i for i, body in enumerate(layout.bodies) if not body.stands]
-        settled = settle(goals, seen, draws, given.fps, flying)
+        settled = settle(goals, seen, draws, fps, flying)
     shapes, placements = settled.shapes, None
     if given.placement is not None:
-        shapes, runs, placements = carry(given.placement, shapes, draws, given.num_frames, given.fps, every)
+        carried = min(CARRIED, MOST_CARRIED * (given.num_frames - 1) / given.fps)
+        shapes, runs, placements = carry(given.placement, shapes, draws, carried, frames, fps, every)
     else:
 
         def has_left(positions: Floats, velocities: Floats) -> Mask:
-            """Which movers [K] have left the image to the left or the right, and go on that way."""
-            x, width = layout.cameras.project(positions)[0][:, 0], given.size[0]
+            """Which movers [K] have left the image sideways and go on that way, or lie behind the camera."""
+            (points, depth), width = layout.cameras.project(positions), given.size[0]
+            x = points[:, 0]
             step = layout.cameras.project(positions + velocities * LOOK_AHEAD)[0][:, 0] - x
-            return ((x < -LEFT_BY * width) & (step < 0)) | ((x > (1 + LEFT_BY) * width) & (step > 0))
+            return ((x < -LEFT_BY * width) & (step < 0)) | ((x > (1 + LEFT_BY) * width) & (step > 0)) | (depth < 0)
 
         finished = None if len(draws) == 1 or given.motion.steps or given.others else has_left
-        runs = tuple(run_worlds(shapes, given.num_frames, given.fps, every, finished, given.turns_wanted))
-    return Worlds(layout, shapes, runs, every, given.fps, placements, settled.placements, seen if goals else None)
+        runs = run_worlds(shapes, frames, fps, every, finished, given.turns_wanted, True, given.fps)
+    before, shown = settled.placements, seen if goals else None
+    return Worlds(layout, shapes, tuple(runs), every, fps, given.horizon, placements, before, shown)
 
 
 @dataclass(frozen=True)
@@ -130,20 +185,27 @@ class _Draw:
             if given.placement is not None and body.shape == "box" and seen.equal_sided:
                 side = min(max(tall, half / math.sqrt(2)), half)  # it is seen between its face's width and its diagonal
             x, y, z = body.centre[k].tolist()
+            shape, deep, turn = body.shape, side, yaw if body.shape == "box" and not seen.elongated else 0.0
+            if not seen.is_form_known:  # it shows its width, which nothing says is that of something round
+                shape, side, turn = "box", half, math.atan2(x, z)
+                deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
             bodies.append(
                 RigidShape(
-                    shape=body.shape,
+                    shape=shape,
                     half_width=side,
-                    half_depth=side,
+                    half_depth=deep,
                     half_height=tall,
                     position=(x, y, z),
-                    yaw=yaw if body.shape == "box" and not seen.elongated else 0.0,
-                    density=seen.fullness if body.shape == "cylinder" else 1.0,
+                    yaw=turn,
+                    density=seen.fullness if shape == "cylinder" else 1.0,
                     friction=friction,
                     restitution=restitution,
                     falls=body.stands,
+                    **self.balance(seen, shape, tall, (x, y, z)),
                 )
             )
+        weight = math.exp(WEIGHT_SIGMA * float(row[COLUMN["weight"]]))
+        bodies[0] = replace(bodies[0], density=bodies[0].density * weight)
         velocities = [legs[k] for legs in (layout.velocity, *layout.further)]
         bodies[0] = self.set_going(0, bodies[0], given.motion, velocities, "speed")
         for loose in layout.unsupported:
@@ -152,6 +214,22 @@ class _Draw:
             if i < len(bodies):  # else it is taken away
                 bodies[i] = self.set_going(i, bodies[i], motion, [layout.others[i][k]], "other_speed")
         return tuple(bodies)
+
+    def balance(self, seen: SeenBody, shape: Shape, tall: float, centre: tuple[float, float, float]) -> dict[str, Any]:
+        """On what a body stands and where its centre of mass is: fields of its shape; none of what cannot tip."""
+        if shape == "sphere":
+            return {}
+        row = self.draws[self.k]
+        middle = {"cone": CONE_MIDDLE, "cylinder": seen.middle}.get(shape, 0.5)
+        middle += RAISED + MIDDLE_SIGMA * float(row[COLUMN["middle"]])
+        found = {"middle": min(max(middle, LOWEST_MIDDLE), HIGHEST_MIDDLE)}
+        if shape == "cylinder":
+            x, y, z = centre
+            above = float(self.layout.cameras.height[self.k]) - y + tall
+            base, waist = seen.stance(max(0.0, above) / math.hypot(x, above, z))
+            base = max(LEAST_BASE, BASE * base * math.exp(BASE_SIGMA * float(row[COLUMN["base"]])))
+            found |= {"base": base, "waist": waist} if base < WHOLE_BASE else {}
+        return found
 
     def set_going(
         self, index: int, body: RigidShape, motion: Motion, velocities: Sequence[Floats], speed: str
@@ -162,12 +240,11 @@ class _Draw:
         if index == 0 and given.prescribed is not None:
             changes |= {"follows": self.along_path(given.prescribed), "falls": False}
         else:
-            changes["falls"] = motion.kind in FALLING_KINDS or not flies(seen, motion)
+            changes["falls"] = motion.kind in FALLING_KINDS or not (motion.rises or flies(seen, motion))
             changes["glides"] = motion.kind == "linear"
             if motion.kind == "linear":
                 factor = float(speed_factors(motion, self.draws[self.k : self.k + 1], speed)[0])
-                clip = given.num_frames / given.fps
-                changes["course"] = course_of(motion, velocities, motion.speed * factor, clip)
+                changes["course"] = course_of(motion, velocities, motion.speed * factor)
         fast = float(np.hypot(velocity[0], velocity[2]))
         if seen.elongated and fast > 0:  # a vehicle is longer along its heading than across, as wide as it is seen
             placed, k = self.layout.bodies[index], self.k
@@ -190,5 +267,6 @@ class _Draw:
         nearest = drop / (FARTHEST * float(np.linalg.norm(mover.centre[k, [0, 2]])))
         near = rays[:, [0, 2]] * (drop / np.maximum(-rays[:, 1], nearest))[:, None]
         way = near / np.maximum(np.linalg.norm(near, axis=1), 1e-9)[:, None]
-        middle = near + way * float(mover.half_width[k]) * mover.depth_share
+        deep = float(np.broadcast_to(mover.depth_share, len(self.draws))[k])
+        middle = near + way * float(mover.half_width[k]) * deep
         return np.stack([middle[:, 0], np.full(count, mover.centre[k, 1]), middle[:, 1]], axis=1)

@@ -43,6 +43,7 @@ class OtherMotionReading:
     direction: Vector | None  # any length, px
     depth: float = 0.0
     speed: SpeedWord | Quantity | None = None
+    towards: LocatedObject | None = None  # see `Motion.towards`
 
 
 @dataclass
@@ -133,6 +134,7 @@ class GroundingReading:
     mask: Mask | None = None  # [H, W] of the mover, where it does not follow from the box
     asked: records.Asked | None = None  # what the question wants to know; null where the reader cannot say
     changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
+    is_doubtful: bool = False  # what is seen in the box may not be what it is called
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,8 @@ class MotionReading:
     along_arrow: bool | None = None
     depth: float = 0.0  # see `Motion.depth`
     depth_deviation: float | None = None  # degrees; null where the reader says nothing of the depth
+    towards: LocatedObject | None = None  # see `Motion.towards`
+    rises: bool = False  # see `Motion.rises`
     speed: SpeedWord | Quantity | None = None  # a word: as for such a thing
     distance: Quantity | None = None  # after which it is stopped
     duration: float | None = None  # s, after which it is stopped

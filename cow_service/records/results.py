@@ -69,6 +69,7 @@ class GeneratorInfo(Record):
     seed: int
     steps: int | None = Field(default=None, description="Sampling steps; null where there are none.")
     options: dict[str, bool | int | float | str] = Field(default_factory=dict)
+    is_toy: bool = Field(default=False, description="Its weights are random: the frames mean nothing.")
 
 
 class Clip(Record):
@@ -346,7 +347,7 @@ class GpuMemory(Record):
 class WorkerJob(Record):
     """A job that is being computed: how far it is, never what was asked nor who asked."""
 
-    id: str | None = Field(default=None, description="Null where the server has keys.")
+    id: str | None = Field(default=None, description="Null for callers who do not administer the server.")
     kind: JobKind
     stage: str | None = None
     progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
@@ -358,7 +359,7 @@ class WorkerInfo(Record):
 
     name: str = Field(description="Its queue and a number.")
     queue: str | None = Field(description="Whose jobs it computes; null: of all queues.")
-    pid: int
+    pid: int | None = Field(default=None, description="Null for callers who do not administer the server.")
     memory_mb: float = Field(ge=0, description="Resident memory, MB (10^6 bytes).")
     jobs_done: int = Field(ge=0)
     jobs: tuple[WorkerJob, ...] = Field(default=(), description="At hand; several where jobs wait for an MLLM.")
@@ -371,8 +372,8 @@ class ProcessInfo(Record):
     executor_id: str
     seen_at: str = Field(description="RFC 3339, UTC, by the clock of that process.")
     role: ProcessRole
-    host: str
-    pid: int
+    host: str | None = Field(default=None, description="Null for callers who do not administer the server.")
+    pid: int | None = Field(default=None, description="Null for callers who do not administer the server.")
     version: str = Field(description="Of COW.")
     workflow_version: str = Field(description="Jobs of this version are taken, no others.")
     queues: dict[str, int] = Field(

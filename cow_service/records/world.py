@@ -78,7 +78,7 @@ class Asked(Record):
     every: bool = Field(default=False, description="It counts only where it happens with each of `among`.")
     partly: bool = Field(default=False, description="Of `covers` and `covered`: it counts where any part is hidden.")
     within: float | None = Field(
-        default=None, gt=0, description="How long it may take to happen, s; null: as long as the clip."
+        default=None, gt=0, description="How long it may take to happen, s; null: until everything rests or has left."
     )
 
 
@@ -112,6 +112,9 @@ class LocatedObject(Record):
     mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
     prior: ObjectPrior | None = None
     source: Source | None = Field(default=None, description="Who located it; null in results of older versions.")
+    is_doubtful: bool = Field(
+        default=False, description="What is seen there may not be what it is called: no answer that names it is sure."
+    )
 
 
 class Intervention(Record):
@@ -143,6 +146,7 @@ class Grounding(Record):
     trail_named: bool = Field(
         default=False, description="The question speaks of a trail: balls that look alike, one after another, are one."
     )
+    is_doubtful: bool = Field(default=False, description="As `LocatedObject.is_doubtful`, of what moves.")
     source: Source
 
 
@@ -169,6 +173,7 @@ class AlsoMoving(Record):
     object: LocatedObject
     kind: MotionKind
     direction: Vector | None = Field(default=None, description="As `Motion.direction`.")
+    towards: LocatedObject | None = Field(default=None, description="As `Motion.towards`.")
     depth: float = Field(default=0.0, ge=-1, le=1, description="As `Motion.depth`.")
     speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
     speed_deviation: float = Field(default=0.0, ge=0, le=3, description="As `Motion.speed_deviation`.")
@@ -192,6 +197,15 @@ class Motion(Record):
     )
     depth_deviation: float = Field(
         default=0.0, ge=0, le=90, description="Degrees, one standard deviation of that angle."
+    )
+    towards: LocatedObject | None = Field(
+        default=None,
+        description="What it moves or is thrown towards, over the floor: the direction is that to it in the image.",
+    )
+    rises: bool = Field(
+        default=False,
+        description="Of a linear motion: it leaves what it stands on and moves through the air, as what is lifted "
+        "does. What does not rise moves along the floor, away from the camera where the direction is up.",
     )
     cue: Cue
     along_arrow: bool | None = Field(default=None, description="Along or against it, where the cue is an arrow.")
@@ -225,8 +239,9 @@ MEETINGS: dict[EncounterKind, str] = {
     "occluded-by": "passes behind",
 }  # what the mover does with the other object, in words
 BAND_PERCENTILES = (10, 90)  # of the points over the ensemble, across and down apart: what `Path.band` lies between
-Doubt = Literal["speed", "heading", "camera", "size", "place", "friction"]
-"""What a world is uncertain of: `place` is how far from the camera and how high bodies are."""
+Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "faint"]
+"""What a world is uncertain of: `place` is how far from the camera and how high bodies are, `identity` whether things
+are what they are called, `faint` whether what is too faint to tell is a thing."""
 CameraSource = Literal["shadow", "edges", "request", "prior"]
 
 
@@ -330,7 +345,15 @@ class Encounter(Record):
     body: int | None = Field(default=None, ge=0, description="Which of `Trajectory.bodies`.")
     subject: int = Field(default=0, ge=0, description="Which of `Trajectory.bodies` meets it; 0: the mover.")
     kind: EncounterKind
-    first_frame: int = Field(ge=0, description="The first clip frame of the encounter, in the likeliest world.")
+    first_frame: int = Field(
+        ge=0, description="The first clip frame of the encounter, in the likeliest world; the last one if it is later."
+    )
+    time: float | None = Field(
+        default=None,
+        ge=0,
+        description="Seconds until it begins, in the likeliest world: after the last frame's it happens after the clip "
+        "has ended. Null in results of older versions.",
+    )
     share: float | None = Field(
         default=None, ge=0, le=1, description="Of an occlusion: the largest share of what is hidden that is covered."
     )
@@ -437,6 +460,11 @@ class Trajectory(Record):
     )
     anchors: tuple[Point, ...] = Field(description="Static points that hold the camera still, px.")
     encounters: tuple[Encounter, ...] = ()
+    faint: tuple[BBox, ...] = Field(
+        default=(),
+        description="Boxes [x0, y0, x1, y1] (px) of what may be things and is too faint to tell: no world has them. An "
+        "outcome is not sure where the mover's way leads over one.",
+    )
     encounters_known: bool = Field(
         default=True, description="False where the surroundings could not be told apart: then nothing is listed."
     )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
+from cow_service.errors import shortened
 from cow_service.records import (
     DIRECTED_KINDS,
     AnswerOption,
@@ -27,7 +27,19 @@ from cow_service.records import (
     Until,
     Vector,
 )
-from cow_service.requests.values import Finite, Flag, Flags, ImageRef, MaskRef, Name, Points, Whole, Words, writable
+from cow_service.requests.values import (
+    Finite,
+    Flag,
+    Flags,
+    ImageRef,
+    MaskRef,
+    Name,
+    Points,
+    Whole,
+    Words,
+    has_more_values,
+    writable,
+)
 
 MAX_OBJECTS = 64
 
@@ -94,7 +106,7 @@ class AskedRequest(Asked):
         default=(), max_length=MAX_OBJECTS, description="The things that are meant where there are several; empty: any."
     )
     within: Annotated[Finite, Field(gt=0, le=3600)] | None = Field(
-        default=None, description="How long it may take to happen, s; null: as long as the clip."
+        default=None, description="How long it may take to happen, s; null: until everything rests or has left."
     )
 
 
@@ -190,6 +202,9 @@ class MotionRequest(Record):
         "read from the question and from arrows drawn in the image; not needed for a fall or a static object.",
     )
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
+    rises: Flag = Field(
+        default=False, description="See `Motion.rises`: by default what stands on the floor moves along it."
+    )
     speed: Speed | None = Field(
         default=None,
         description="px/s; by default 0.26 image widths per second, and of a throw under the contact law that of a "
@@ -210,7 +225,9 @@ class MotionRequest(Record):
         default=None, description="By default the image is taken to be 3 m wide at the object."
     )
     depth_deviation: Annotated[Finite, Field(ge=0, le=90)] | None = Field(
-        default=None, description="See `Motion.depth_deviation`; 0 by default: what is given is taken as it is."
+        default=None,
+        description="See `Motion.depth_deviation`; by default 15 for a throw without `depth`, else 0: what is given is "
+        "taken as it is.",
     )
     speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(
         default=None, description="See `Motion.speed_deviation`; by default 0 for a `speed` that is given."
@@ -262,15 +279,6 @@ class TrajectoryRequest(Record):
         description="Points that stay where they are. By default spread over the image.",
     )
 
-    @field_validator("points", "anchors", "tracks")
-    @classmethod
-    def _near_the_image(cls, given: Any, info: ValidationInfo) -> Any:
-        paths: Any = given or () if info.field_name == "tracks" else (given or (),)
-        for x, y in itertools.chain.from_iterable(paths):
-            if max(abs(x), abs(y)) > 1e6:
-                raise ValueError(f"points lie at most 1,000,000 px from the image, got {[x, y]}")
-        return given
-
     @model_validator(mode="after")
     def _same_length(self) -> TrajectoryRequest:
         wanted = len(self.points)
@@ -306,6 +314,7 @@ class CameraRequest(Record):
 
 
 MAX_FRAMES = 481
+MAX_VALUES = 10_000  # of each field but the trajectory
 Priority = Literal["low", "normal", "high"]
 PRIORITIES: tuple[Priority, ...] = ("low", "normal", "high")
 MAX_OPTIONS = 26
@@ -337,11 +346,11 @@ class FramesRequest(Record):
     """Which frames of the clip to return as pictures, and how large."""
 
     policy: FramePolicy = Field(
-        default="initial",
-        description="initial: frames 1, 3, 5, ...; uniform: evenly over the clip; "
-        "events: at encounters and on the way.",
+        default="events",
+        description="events: before, at and after what matters, and the end; uniform: evenly over the clip; "
+        "initial: frames 1, 3, 5, ..., as in the paper.",
     )
-    count: Whole = Field(default=3, ge=1, le=64, description="How many pictures.")
+    count: Whole = Field(default=4, ge=1, le=64, description="How many pictures.")
     indices: tuple[Annotated[Whole, Field(ge=0)], ...] | None = Field(
         default=None, min_length=1, max_length=MAX_FRAMES, description="Exactly these frames; overrides the policy."
     )
@@ -458,6 +467,16 @@ class SimulateRequest(Record):
         """The masks that it gives, the mover's first."""
         places = (*([] if self.grounding is None else [self.grounding]), *self.objects)
         return tuple(place.mask for place in places if place.mask is not None)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_too_much(cls, given: Any) -> Any:
+        """Each wrong element of a long list would be an error of its own; of a trajectory's only the first is told."""
+        fields: dict[str, Any] = given if isinstance(given, dict) else {}
+        for name, value in fields.items():
+            if name != "trajectory" and has_more_values(value, MAX_VALUES):
+                raise ValueError(f"holds more than {MAX_VALUES} values in `{shortened(name, 80)}`: none needs so many")
+        return given
 
     @field_validator("options")
     @classmethod

@@ -33,13 +33,25 @@ def _says_something(text: str) -> str:
     return text
 
 
+def has_more_values(value: Any, most: int) -> bool:
+    """Whether a JSON value, with all that it holds, is more than so many. Looks at no more."""
+    held = [value]
+    for _ in range(most):
+        if not held:
+            return False
+        one = held.pop()
+        held.extend(one.values() if isinstance(one, dict) else one if isinstance(one, list) else ())
+    return bool(held)
+
+
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # strict: no strings, no booleans
 Whole = Annotated[int, BeforeValidator(_number)]
 Flag = Annotated[bool, Field(strict=True)]
 Words = Annotated[str, AfterValidator(writable), AfterValidator(_says_something)]
 Name = Annotated[str, Field(max_length=MAX_NAME)]
 # Of a long list only the first wrong element is reported: the others would fill the memory.
-Points = Annotated[tuple[tuple[Finite, Finite], ...], Field(fail_fast=True)]
+Near = Annotated[Finite, Field(ge=-1e6, le=1e6)]  # px, of a point in the image or not too far from it
+Points = Annotated[tuple[tuple[Near, Near], ...], Field(fail_fast=True)]
 Flags = Annotated[tuple[Flag, ...], Field(fail_fast=True)]
 
 

@@ -13,8 +13,8 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.interventions import with_put, without_removed
 from cow_service.media.artifacts import ArtifactWriter
 from cow_service.media.images import encode_jpeg, encode_png, fit_within
-from cow_service.media.overlay import Replaced, draw_overlay
-from cow_service.records import Clip, Frame, Grounding, Motion, Trajectory, Video
+from cow_service.media.overlay import DARK, LIGHT, Label, Replaced, draw_labels, draw_overlay
+from cow_service.records import Clip, Frame, GeneratorInfo, Grounding, Motion, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.reconstruction import obstacles_of
@@ -57,6 +57,7 @@ def stored(frames: Sequence[EncodedFrame], artifacts: ArtifactWriter) -> tuple[F
     )
 
 
+TOY = "'{name}' has random weights: its frames mean nothing, and no answer may rest on them."
 OVERLAY_SIDE = 1280  # px, at most
 MIN_GAP = 0.2  # s between a contact and another chosen frame: closer ones show the same
 
@@ -65,9 +66,10 @@ def choose_frames(wanted: FramesRequest, trajectory: Trajectory) -> tuple[int, .
     """Ascending clip indices of the frames to return, by the policy or as listed in the request.
 
     `initial` is every second frame after the first (1, 3, 5, ...), as in the paper's evaluation code; `uniform` spreads
-    over the whole clip, both ends included; `events` takes the first frame of each encounter, then contacts, in the
-    order of their times, then the frames that lie farthest from those already taken while the object is visible and
-    something moves.
+    over the whole clip, both ends included; `events` takes the first moment that matters, the end of the motion and a
+    frame before that moment, then further moments, then the frames that lie farthest from those already taken while
+    the object is visible and something moves. Moments are the first frames of encounters, of what is asked about
+    before others, and contacts.
     """
     last = trajectory.num_frames - 1
     if wanted.indices is not None:
@@ -80,17 +82,20 @@ def choose_frames(wanted: FramesRequest, trajectory: Trajectory) -> tuple[int, .
         return tuple(int(i) for i in np.linspace(0, last, count).round()) if count > 1 else (last,)
     # The first frames of encounters, then those after contacts, of which those between bodies come first.
     visible = trajectory.path.visible
-    chosen = list(dict.fromkeys(encounter.first_frame for encounter in trajectory.encounters))[:count]
+    asked = None if trajectory.outcome is None else trajectory.outcome.object
+    met = sorted(trajectory.encounters, key=lambda each: (each.object != asked, each.first_frame))
+    moments = list(dict.fromkeys(each.first_frame for each in met if each.first_frame <= last))
     for contact in sorted(trajectory.contacts, key=lambda contact: (contact.b is None, contact.time)):
-        frame, taken = math.ceil(contact.time * trajectory.fps - 1e-6), (0, *chosen)
-        is_apart = all(abs(frame - other) >= MIN_GAP * trajectory.fps for other in taken)
-        if frame <= last and len(chosen) < count and is_apart:
-            chosen.append(frame)
-    # The rest where something is seen to move, else anywhere, far from one another.
+        frame = math.ceil(contact.time * trajectory.fps - 1e-6)
+        is_apart = all(abs(frame - other) >= MIN_GAP * trajectory.fps for other in (0, *moments))
+        if frame <= last and is_apart:
+            moments.append(frame)
     moving = last if trajectory.moving_until is None else max(1, math.ceil(trajectory.moving_until * trajectory.fps))
     seen = [i for i in range(1, min(last, moving) + 1) if visible[i]] or list(range(1, last + 1))
-    if not chosen:
-        chosen = [seen[-1]]
+    # The approach is shown even where everything happens early: a hit is understood by what led to it.
+    story = [*moments[:1], seen[-1], *(moment // 2 for moment in moments[:1] if moment > 1), *moments[1:]]
+    chosen = list(dict.fromkeys(story))[:count]
+    # The rest where something is seen to move, else anywhere, far from one another.
     for pool in (seen, list(range(last + 1))):
         while len(chosen) < count and (left := [i for i in pool if i not in chosen]):
             chosen.append(max(left, key=lambda i: min(abs(i - j) for j in (*chosen, 0))))
@@ -107,8 +112,9 @@ def generate(
     with run.backends.artifacts.batch(run.retry_policy) as artifacts, ThreadPoolExecutor(1) as encoder:
         with run.cpu():
             given, as_it_is = _inputs(run, grounding, motion, trajectory)
+        made_by = run.generator.describe(given)
         with run.device():
-            frames, video = _render(run, given, artifacts, encoder)
+            frames, video = _render(run, given, made_by, artifacts, encoder)
             factual: list[EncodedFrame] = []
             # Those of the scene as it is cost as much as the clip: on a device, made only where they are asked for.
             wanted, is_cheap = run.request.frames, run.generator.concurrency is None
@@ -116,7 +122,7 @@ def generate(
                 indices = [frame.index for frame in frames]
                 pictures = run.generator.render(as_it_is, indices, run.report_share)
                 factual = [
-                    EncodedFrame.of(pixels, index, trajectory.fps, wanted.max_side, encoder)
+                    EncodedFrame.of(_marked(pixels, made_by), index, trajectory.fps, wanted.max_side, encoder)
                     for index, pixels in zip(indices, pictures, strict=True)
                 ]
         with run.cpu():
@@ -126,10 +132,19 @@ def generate(
             factual_frames=stored(factual, artifacts),
             video=video,
             overlay=artifacts.put(overlay, "image/jpeg"),
-            generator=run.generator.describe(given),
+            generator=made_by,
         )
     named = (*clip.frames, *clip.factual_frames, *([] if video is None else [video]), clip.overlay)
-    return StageResult(value=clip, artifacts=tuple(each.sha256 for each in named))
+    warnings = (TOY.format(name=made_by.name),) if made_by.is_toy else ()
+    return StageResult(value=clip, warnings=warnings, artifacts=tuple(each.sha256 for each in named))
+
+
+def _marked(pixels: Image, made_by: GeneratorInfo) -> Image:
+    """A frame [H, W, 3]; that of a toy says so itself, since pictures are passed on without their warnings."""
+    if made_by.is_toy:
+        pixels = pixels.copy()
+        draw_labels(pixels, [Label("toy model", (0, 0, 0, 0), LIGHT, below=True)], 1.0, DARK)
+    return pixels
 
 
 def _inputs(
@@ -168,7 +183,11 @@ def _draw_overlay(image: Image, given: GeneratorInput, as_it_is: GeneratorInput)
 
 
 def _render(
-    run: Run[SimulateRequest], given: GeneratorInput, artifacts: ArtifactWriter, encoder: Executor
+    run: Run[SimulateRequest],
+    given: GeneratorInput,
+    made_by: GeneratorInfo,
+    artifacts: ArtifactWriter,
+    encoder: Executor,
 ) -> tuple[list[EncodedFrame], Video | None]:
     """The chosen frames, and the video of all of them. Only those that are needed are rendered."""
     generator, request, trajectory = run.generator, run.request, given.trajectory
@@ -176,14 +195,15 @@ def _render(
     indices = tuple(range(trajectory.num_frames)) if request.video else chosen
     frames: list[EncodedFrame] = []
 
-    def rendered() -> Iterator[Image]:
-        for index, pixels in zip(indices, generator.render(given, indices, run.report_share), strict=True):
+    def clip() -> Iterator[Image]:
+        for index, rendered in zip(indices, generator.render(given, indices, run.report_share), strict=True):
+            pixels = _marked(rendered, made_by)
             if index in chosen:
                 frames.append(EncodedFrame.of(pixels, index, trajectory.fps, request.frames.max_side, encoder))
             yield pixels
 
     if not request.video:
-        for _ in rendered():
+        for _ in clip():
             pass
         return frames, None
 
@@ -191,7 +211,7 @@ def _render(
 
     width, height = generator.size(given.scene.width, given.scene.height)
     with artifacts.scratch() as path:
-        count = write_mp4(rendered(), path, fps=trajectory.fps, width=width, height=height)
+        count = write_mp4(clip(), path, fps=trajectory.fps, width=width, height=height)
         artifact = artifacts.put_file(path, "video/mp4")
     return frames, Video(
         url=artifact.url,

@@ -66,6 +66,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         prior=reading.prior,
         asked=reading.asked if request.asked is None else Asked(**dict(request.asked)),
         trail_named=question.trail_named,
+        is_doubtful=reading.is_doubtful,
         source=source,
     )
     grounding = understood(grounding, run.backends.words())

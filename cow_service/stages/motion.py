@@ -6,10 +6,13 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
+import numpy as np
+
 from cow_service import records
 from cow_service.errors import FieldError, InvalidRequest, field_of
 from cow_service.narration import bare_name, direction_words, place_words, same_name
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
+from cow_service.physics.camera import FloorCamera, depth_motion
 from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.prompts import load_prompt
@@ -20,6 +23,7 @@ from cow_service.stages.keys import StageResult
 from cow_service.stages.reconstruction import camera_of
 from cow_service.stages.run import Run
 from cow_service.vision.scene import Scene
+from cow_service.vision.shadows import find_shadow
 from cow_service.vision.trails import trail_of
 
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
@@ -27,6 +31,9 @@ THROW_DEPTH_DEVIATION = 15.0  # degrees: words and arrows tell a throw's heading
 SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.28}  # of the logarithm of a default speed
 SPEED_FACTORS: dict[SpeedWord, float] = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
 SCALE_DEVIATION = 0.25  # of the logarithm of metres per pixel, where nobody gave them
+ELSEWHERE_SIGMA = 0.3  # of the logarithm of a scale that is told by the size of what stands elsewhere
+LEAST_SIZE_SIGMA = 0.05
+MOST_APART = 2.0  # factor between two scales from which they disagree
 _OF_A_LINE = ("distance", "duration", "until", "steps")  # what only a motion along a line can have
 
 
@@ -55,6 +62,15 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         reading = replace(reading, distance=None, duration=None, until=None, steps=())
         ends = f"a {reading.kind} ends by what it meets"
         warnings.append(f"The {' and '.join(unused)} of the motion was not used: {ends}.")
+    scale, doubts = scale_of(run, grounding, reading)
+    reading = replace(reading, metres_per_pixel=scale)
+    warnings += doubts
+    if _is_up_the_floor(reading, grounding, request.law):
+        warnings.append(
+            f"Up was taken to lead along the floor, away from the camera. If the {bare_name(grounding.object)} leaves "
+            "the floor, say that it is lifted or thrown, or give `motion.rises`."
+        )
+        reading = replace(reading, depth=depth_motion(1.0)[1])
     motion = _complete(run.image.info.width, grounding, reading, source, request.law)
     if motion.cue == "trail":
         with run.cpu():
@@ -85,12 +101,11 @@ def _given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReadi
     """
     given, path = request.stated_motion, request.trajectory
     if given is not None:
+        # A direction in the image leaves open how far a throw leads into its depth.
+        is_open = given.stated_kind == "projectile" and "depth" not in given.model_fields_set
+        deviation = given.depth_deviation if given.depth_deviation is not None or is_open else 0.0
         return MotionReading(
-            given.stated_kind or "linear",
-            given.direction,
-            "request",
-            depth=given.depth,
-            depth_deviation=given.depth_deviation or 0.0,
+            given.stated_kind or "linear", given.direction, "request", depth=given.depth, depth_deviation=deviation
         )
     if path is not None:
         (x0, y0), last = path.points[0], path.points[-1]
@@ -131,6 +146,7 @@ def _with_request(reading: MotionReading, given: MotionRequest, grounding: Groun
         "distance": _quantity(given.distance, "px"),
         "duration": given.duration,
         "until": given.until,
+        "rises": given.rises or None,
         "steps": tuple(
             StepReading(step.direction, step.depth, _quantity(step.distance, "px"), step.duration)
             for step in given.steps
@@ -143,6 +159,55 @@ def _with_request(reading: MotionReading, given: MotionRequest, grounding: Groun
 
 def _quantity(value: float | None, unit: Literal["px", "px/s"]) -> Quantity | None:
     return None if value is None else Quantity(value, unit)
+
+
+def scale_of(
+    run: Run[SimulateRequest], grounding: Grounding, reading: MotionReading
+) -> tuple[records.MetresPerPixel | None, list[str]]:
+    """Metres per pixel at the mover, and doubts: as given, else by sizes that are given, else as read of it or others.
+
+    What stands elsewhere on the floor is nearer or farther, by the camera as far as it is known. None where nobody
+    says anything of it.
+    """
+    given = reading.metres_per_pixel
+    told = {} if given is None else {"metres_per_pixel": given.value}
+    things = [LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior), *grounding.others]
+    width, height = run.image.info.width, run.image.info.height
+    fit = camera_of((width, height), reading.down, run.request.camera)
+    camera = FloorCamera(width, height, math.exp(fit.mean[1]) * width, float(fit.mean[0]), fit.roll, 1.0)
+    depths = camera.floor_points(np.array([((x0 + x1) / 2, y1) for x0, _, x1, y1 in (each.bbox for each in things)]))
+    sizes: list[tuple[float, float, bool]] = []  # log of the metres per pixel at the mover, deviation, taken as exact
+    for each, depth in zip(things, depths[:, 2] / depths[0, 2], strict=True):
+        size = None if each.prior is None else each.prior.size
+        if size is None or not size.value > 0:
+            continue
+        in_air = reading.kind in records.FALLING_KINDS or (each.prior is not None and each.prior.stands_on == "air")
+        nearer = 1.0 if in_air or not math.isfinite(depth) else float(depth)
+        x0, y0, x1, y1 = each.bbox
+        value = size.value / max(x1 - x0, y1 - y0) / nearer
+        elsewhere = 0.0 if each is things[0] else ELSEWHERE_SIGMA
+        sizes.append((math.log(value), size.deviation / size.value + elsewhere, size.deviation == 0))
+        told[f"the size of '{each.object}'"] = value
+    doubts: list[str] = []
+    if told and max(told.values()) > MOST_APART * min(told.values()):
+        said = ", ".join(f"{value:.4g} by {name}" for name, value in told.items())
+        doubts = [f"What is said of sizes disagrees by more than a factor of two, in metres per pixel: {said}."]
+    exact = [each for each in sizes if each[2]]
+    if (given is not None and (given.source == "request" or not exact)) or not sizes:
+        return given, doubts
+    weights = np.array([1 / (deviation + LEAST_SIZE_SIGMA) ** 2 for _, deviation, _ in exact or sizes])
+    value = math.exp(float(weights @ [each[0] for each in exact or sizes] / weights.sum()))
+    source = "request" if exact else "reference"
+    return records.MetresPerPixel(value=value, source=source, note="by the sizes of objects"), doubts
+
+
+def _is_up_the_floor(reading: MotionReading, grounding: Grounding, law: Law) -> bool:
+    """Whether words alone say that something moves up that may stand on the floor."""
+    said = reading.kind == "linear" and reading.cue == "text" and reading.depth == 0 and reading.towards is None
+    in_air = reading.rises or (grounding.prior is not None and grounding.prior.stands_on == "air")
+    if not said or in_air or law != "contact" or reading.direction is None:
+        return False
+    return reading.direction[1] < -abs(reading.direction[0]) / math.sqrt(3)
 
 
 # --- in pixels and seconds
@@ -199,6 +264,7 @@ def _moving(
         kind=said.kind,
         direction=_unit(said.direction) if moves and said.direction is not None else None,
         depth=said.depth if moves else 0.0,
+        towards=said.towards if moves else None,
         speed=speed if moves else 0.0,
         speed_deviation=deviation,
     )
@@ -241,6 +307,8 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         direction=mover.direction,
         depth=mover.depth,
         depth_deviation=depth_deviation,
+        towards=mover.towards,
+        rises=reading.rises and reading.kind == "linear",
         cue=reading.cue,
         along_arrow=reading.along_arrow,
         speed=mover.speed,
@@ -257,9 +325,11 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         sentence=motion_sentence(
             grounding.object,
             reading.kind,
+            law,
             mover.direction,
             mover.depth,
             reading.sentence,
+            towards=None if mover.towards is None else mover.towards.object,
             further=[direction_words(step.direction, step.depth) for step in reading.steps],
             stops=any(value is not None for value in (reading.distance, reading.duration, reading.until)),
             also=also,
@@ -280,7 +350,8 @@ def along_trail(
         measured["direction"] = straight_direction(trail.positions)
     throw = None
     if motion.kind == "projectile":
-        fit = camera_of(scene, motion, camera, grounding.bbox, fixed_focal=False)
+        shadow = find_shadow(scene, grounding.bbox)
+        fit = camera_of((scene.width, scene.height), motion.down, camera, shadow, grounding.bbox)
         throw = fit_throw(trail.positions, fit, (scene.width, scene.height))
     if throw is not None:
         measured["direction"] = throw.direction
@@ -295,21 +366,25 @@ def along_trail(
 def motion_sentence(
     object: str,
     kind: MotionKind,
+    law: Law,
     direction: Vector | None,
     depth: float,
     sentence: str | None = None,
+    towards: str | None = None,
     further: Sequence[str] = (),
     stops: bool = False,
     also: Sequence[str] = (),
 ) -> str:
     """The motion in one line: a declarative `sentence` of a reader, or one made here; and that the camera stays.
 
+    What obeys contacts only sets off that way: it may be stopped, turned or pushed later. `towards` names its goal,
     `further` are the directions of more legs in words, `also` what else moves, such as "car moves to the left".
     """
     text = load_prompt("motion-sentence").render(
         object=bare_name(object),
         kind=kind,
-        words=direction_words(direction, depth),
+        law=law,
+        words=direction_words(direction, depth) if towards is None else f"towards the {bare_name(towards)}",
         sentence="" if sentence is None else sentence.strip().rstrip(".") + ".",
         further=further,
         stops=stops,

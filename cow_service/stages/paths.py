@@ -100,7 +100,9 @@ class _Shown:
 
     def __init__(self, situation: Situation, result: EnsembleResult) -> None:
         self.situation, self.world = situation, result.world
-        self.worlds, self.events = result.shown.worlds, result.shown.events
+        clip = situation.request.num_frames
+        self.worlds = result.shown.worlds.cut(clip, (clip - 1) / situation.request.fps)
+        self.events = result.shown.events
         self.ensemble = None if result.ensemble is None else result.ensemble.worlds
         self.seen = result.world.bodies  # as the image shows them
         self.paths = [events.seen_paths(self.worlds, index) for index in range(len(self.seen))]
@@ -198,8 +200,14 @@ class _Shown:
         return tuple(
             self._path(index)
             for index, way in ways.items()
-            if index == 0 or float(np.linalg.norm(way, axis=1).max()) > moved
+            # What is set in motion after the clip has a path, too: it tells when.
+            if index == 0 or float(np.linalg.norm(way, axis=1).max()) > moved or self.moves_later(index)
         )
+
+    def moves_later(self, index: int) -> bool:
+        """Whether a body is set in motion after the clip has ended."""
+        clip = (self.situation.request.num_frames - 1) / self.situation.request.fps
+        return clip < float(self.events.moved[0, index]) < math.inf
 
     def _path(self, index: int) -> Path:
         worlds, path, body = self.worlds, self.paths[index], self.bodies[index]
@@ -236,7 +244,8 @@ class _Shown:
         if self.ensemble is None:
             return (), ()
         worlds = events.seen_paths(self.ensemble, index).points
-        stamps, frames = np.arange(worlds.shape[1]), np.arange(len(shift)) / self.ensemble.every
+        stamps = np.arange(worlds.shape[1]) * (self.ensemble.every / self.ensemble.fps)
+        frames = np.arange(len(shift)) / self.worlds.fps
 
         def at_frames(points: Floats) -> Floats:  # which are recorded at every few frames
             return np.stack([np.interp(frames, stamps, points[:, axis]) for axis in (0, 1)], axis=1) + shift

@@ -13,24 +13,25 @@ from cow_service.errors import CannotGround
 from cow_service.narration import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import CameraFit, fit_shadow, prior
+from cow_service.physics.camera import FOCAL_WIDTHS, CameraFit, Standing, fit_shadow, narrowed, prior
 from cow_service.physics.ensemble import BY_EVENTS, Query
 from cow_service.physics.layout import flies
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
-from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, Motion
+from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion, Vector
 from cow_service.requests import CameraRequest, SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Obstacle, Scene
-from cow_service.vision.shadows import find_shadow
+from cow_service.vision.shadows import Shadow, find_shadow
 
 PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
 HIDDEN = 0.25  # of the columns of a body: with so many ending at another one, its foot is hidden
 GIVEN_PITCH_SIGMA, GIVEN_ROLL_SIGMA = math.radians(1.0), math.radians(0.5)
 GIVEN_FOCAL_SIGMA = 0.02  # of the logarithm
+LEAST_HEIGHT_SIGMA = 0.05  # of the logarithm of a height that is said
 FIXED = 1e-6  # deviation of a focal length that must not vary
 
 
@@ -104,36 +105,30 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     present = bodies[: 1 + len(situation.obstacles)]
     carried, before = placement_goals(situation, present)
     query = query_of(situation, bodies, carried)
+    is_ball_in_air = bodies[0].shape == "sphere" and flies(bodies[0], motion)
     fit = camera_of(
-        situation.scene,
-        motion,
+        situation.size,
+        motion.down,
         request.camera,
-        bodies[0].bbox if bodies[0].shape == "sphere" and flies(bodies[0], motion) else None,
+        find_shadow(situation.scene, bodies[0].bbox) if is_ball_in_air else None,
+        bodies[0].bbox,
         fixed_focal=situation.follows_path,
+        standing=standing_things(bodies, motion),
+        radii=_height_in_radii(bodies[0], motion),
     )
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
     # What else moves has a way and a speed of its own, and no end but what it meets.
-    own = ("kind", "direction", "depth", "speed", "speed_deviation")
-    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": ()}
+    own = ("kind", "direction", "depth", "towards", "speed", "speed_deviation")
+    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": (), "rises": False}
     others = {
         index: motion.model_copy(update=alone | {name: getattr(each, name) for name in own})
         for each in motion.others
         for index, body in enumerate(bodies)
         if index and not situation.follows_path and body.bbox == each.object.bbox
     }
-    path = prescribed = None
-    if situation.follows_path:
-        camera = Camera(*situation.size, motion.metres_per_pixel.value)
-        times = np.arange(request.num_frames) / request.fps
-        if request.trajectory is not None:
-            path = given_path(camera, request.trajectory, times)
-        else:
-            path = ballistic_path(camera, situation.grounding, motion, times)
-        to_foot = np.array(bodies[0].foot) - np.array(situation.grounding.point)
-        prescribed = PrescribedMotion(path.states[:, :3], path.points + to_foot)
-    target = None if query is None or situation.grounding.asked is None else query.target
+    given = request.trajectory
     world = WorldInput(
         bodies=tuple(replace(body, taper=bottoms.get(index, body.taper)) for index, body in enumerate(present)),
         motion=motion,
@@ -141,16 +136,24 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         size=situation.size,
         num_frames=request.num_frames,
         fps=request.fps,
-        # People aim at what they ask about; where that is put elsewhere, not at its place in the image.
-        asked=None if target in [each.body for each in before] else target,
-        prescribed=prescribed,
+        lasts=0.0 if given is None else (len(given.points) - 1) / given.fps,
         others=others,
         removed=bodies[len(present) :],
         turns_wanted=query is not None and query.asked.relation == "tips",
         placement=carried,
         placed_before=before,
     )
-    return world, query, path
+    if not situation.follows_path:
+        return world, query, None
+    camera = Camera(*situation.size, motion.metres_per_pixel.value)
+    times = np.arange(world.frames) / request.fps
+    if given is not None:
+        path = given_path(camera, given, times)
+    else:
+        path = ballistic_path(camera, situation.grounding, motion, times)
+    to_foot = np.array(bodies[0].foot) - np.array(situation.grounding.point)
+    prescribed = PrescribedMotion(path.states[:, :3], path.points + to_foot)
+    return replace(world, prescribed=prescribed), query, path.cut(request.num_frames)
 
 
 # --- bodies
@@ -177,6 +180,8 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
         )
         if said is not None and said.shape is not None:
             body = replace(body, shape=said.shape)
+        elif body.shape != "sphere":
+            body = replace(body, is_form_known=False)
         if said is not None and not bodies:
             body = replace(body, elongated=said.elongated, equal_sided=said.equal_sided)
         bodies.append(body)
@@ -221,25 +226,58 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], carried: Placemen
 
 
 def camera_of(
-    scene: Scene, motion: Motion, given: CameraRequest | None, flying: BBox | None, fixed_focal: bool
+    size: tuple[int, int],
+    down: Vector,
+    given: CameraRequest | None,
+    shadow: Shadow | None = None,
+    flying: BBox = (0, 0, 0, 0),
+    fixed_focal: bool = False,
+    standing: Sequence[Standing] = (),
+    radii: Estimate | None = None,
 ) -> CameraFit:
-    """The camera, by the shadow of what flies in a box too; `fixed_focal` holds the focal length where it is."""
-    fit, given = prior(math.atan2(*motion.down)), given or CameraRequest.model_construct()
+    """The camera of an image of a size (width, height; px), by what stands on the floor and the shadow of what flies.
+
+    `fixed_focal` holds the focal length where it is; `radii` is what is said of the height of what flies, in its radii.
+    """
+    fit, given = prior(math.atan2(*down)), given or CameraRequest.model_construct()
     mean, sigma = fit.mean.copy(), np.sqrt(np.diag(fit.covariance))
     if given.pitch is not None:
         mean[0], sigma[0] = math.radians(given.pitch), GIVEN_PITCH_SIGMA
     if given.focal is not None and not fixed_focal:
-        mean[1], sigma[1] = math.log(given.focal / scene.width), GIVEN_FOCAL_SIGMA
+        mean[1], sigma[1] = math.log(given.focal / size[0]), GIVEN_FOCAL_SIGMA
     if given.roll is not None:
         fit = replace(fit, roll=math.radians(given.roll), roll_sigma=GIVEN_ROLL_SIGMA)
+    if radii is not None:
+        mean[2], sigma[2] = math.log(radii.value), max(radii.deviation / radii.value, LEAST_HEIGHT_SIGMA)
     if fixed_focal:
-        sigma[1] = FIXED
+        mean[1], sigma[1] = math.log(FOCAL_WIDTHS), FIXED
     source = "request" if given.model_fields_set else fit.source
     fit = replace(fit, mean=mean, covariance=np.diag(sigma**2), source=source)
-    shadow = None if flying is None else find_shadow(scene, flying)
-    if flying is None or shadow is None:
-        return fit
-    return fit_shadow(fit, flying, shadow, (scene.width, scene.height)) or fit
+    fit = narrowed(fit, standing, size)
+    return fit if shadow is None else fit_shadow(fit, flying, shadow, size) or fit
+
+
+def _height_in_radii(mover: SeenBody, motion: Motion) -> Estimate | None:
+    """What is said of the height of the middle of what flies above the floor, in its radii."""
+    said = None if mover.prior is None else mover.prior.height
+    if said is None or not flies(mover, motion):
+        return None
+    x0, y0, x1, y1 = mover.bbox
+    radius = (x1 - x0 + y1 - y0) / 4 * motion.metres_per_pixel.value
+    return Estimate(value=1 + said.value / radius, deviation=said.deviation / radius)
+
+
+def standing_things(bodies: Sequence[SeenBody], motion: Motion) -> list[Standing]:
+    """What the bodies that stand on the floor show of the camera."""
+    return [
+        Standing(
+            body.bbox,
+            rim=body.rim if body.shape == "cylinder" and body.is_form_known else None,
+            is_cube=body.prior is not None and body.prior.equal_sided,
+        )
+        for index, (body, on) in enumerate(zip(bodies, supports_of(bodies), strict=True))
+        if on is None and not (body.is_flying if index else flies(body, motion))
+    ]
 
 
 # --- what is put somewhere

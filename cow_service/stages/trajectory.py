@@ -4,12 +4,14 @@ from collections.abc import Sequence
 
 from cow_service.narration import facts_of, facts_of_both, warnings_of
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
-from cow_service.records import Asked, Grounding, Motion, Outcome, Trajectory
+from cow_service.records import BBox, Doubt, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
+from cow_service.stages.grounding import others_of, removed_of
 from cow_service.stages.keys import StageResult
 from cow_service.stages.paths import record_trajectory
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
+from cow_service.vision.masks import iou
 
 
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
@@ -27,13 +29,35 @@ def simulate_world(situation: Situation) -> Trajectory:
     """
     world, query, path = reconstruct(situation)
     results = run_ensemble(world, query, situation.request.ensemble)
-    outcomes = [judge(situation.grounding.asked, each) for each in results]
+    outcomes = [judge(situation.grounding, each) for each in results]
     trajectories = [
         record_trajectory(situation, result, outcome, path) for result, outcome in zip(results, outcomes, strict=True)
     ]
+    # What was located, by whomever, is there: it may be pale, but it is no doubt.
+    known = [body.bbox for body in (*results[0].world.bodies, *results[0].world.removed)]
+    faint = [box for box in situation.scene.faint if not any(is_inside(box, each) for each in known)]
+    trajectories = [add_faint(faint, each) for each in trajectories]
     first, *as_it_is = add_facts(situation, trajectories)
     factual = as_it_is[0].model_copy(update={"anchors": ()}) if as_it_is else None
     return first.model_copy(update={"factual": factual})
+
+
+def is_inside(box: BBox, other: BBox) -> bool:
+    """Whether the middle of a box lies in another one."""
+    x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+    return other[0] < x < other[2] and other[1] < y < other[3]
+
+
+def add_faint(faint: Sequence[BBox], trajectory: Trajectory) -> Trajectory:
+    """The trajectory with what may be things, and with an outcome that is not sure where it moves over one."""
+    outcome = trajectory.outcome
+    (x0, y0, x1, y1), (x, y) = trajectory.bodies[0].bbox, trajectory.path.points[0]
+    swept = [(x0 + px - x, y0 + py - y, x1 + px - x, y1 + py - y) for px, py in trajectory.path.points]
+    if outcome is not None and any(iou(box, each) > 0 for box in swept for each in faint):
+        outcome = outcome.model_copy(
+            update={"sure": False, "robust": False, "depends_on": ("faint", *outcome.depends_on)}
+        )
+    return trajectory.model_copy(update={"faint": tuple(faint), "outcome": outcome})
 
 
 def add_facts(situation: Situation, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
@@ -52,8 +76,12 @@ def add_facts(situation: Situation, trajectories: Sequence[Trajectory]) -> list[
     return [each.model_copy(update={"outcome": outcome}) for each, outcome in zip(trajectories, outcomes, strict=True)]
 
 
-def judge(asked: Asked | None, result: EnsembleResult) -> Outcome | None:
-    """What the worlds say to what is asked, if anything is; without a probability where they cannot tell."""
+def judge(grounding: Grounding, result: EnsembleResult) -> Outcome | None:
+    """What the worlds say to what is asked, if anything is; without a probability where they cannot tell.
+
+    However the worlds agree, nothing is sure of a thing that may be another one than the question means.
+    """
+    asked = grounding.asked
     if asked is None:
         return None
     query, names = result.query, [body.name for body in (*result.world.bodies, *result.world.removed)]
@@ -67,4 +95,8 @@ def judge(asked: Asked | None, result: EnsembleResult) -> Outcome | None:
     if result.decided is None:
         return outcome
     first = None if result.decided.first is None else names[result.decided.first]
-    return outcome.model_copy(update=vars(result.decided) | {"first": first})
+    decided = vars(result.decided) | {"first": first}
+    if any(thing.is_doubtful for thing in (grounding, *others_of(grounding), *removed_of(grounding))):
+        doubts: tuple[Doubt, ...] = ("identity", *result.decided.depends_on)
+        decided |= {"sure": False, "robust": False, "depends_on": doubts}
+    return outcome.model_copy(update=decided)

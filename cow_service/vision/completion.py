@@ -24,7 +24,7 @@ BEYOND_IMAGE = 0.85  # share of those rays for a circle that the image's border 
 RAY = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray is searched
 RAY_ERROR = (1.0, 0.03)  # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
 ON_EDGES = 0.8  # share of the circle
-FILLED, SPILLED = 0.72, 0.14  # share of the disc that the region fills; share of the region outside it
+FILLED, SPILLED = 0.72, 0.25  # share of the disc that the region fills; share of the region outside it
 CAP_FILLED, CAP_RAYS = 0.55, 0.9  # the same share where so many rays are strongest on the circle: a ball's lit cap
 BLED = 2.5  # px by which compression may have spread a colour beyond its outline
 SAMPLES = 72  # points tried on the circle
@@ -217,6 +217,7 @@ def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
 INSIDE = 0.8  # of a dark part's box that lies in the thing's, grown by `BESIDE` and by `LOW`
 BESIDE = 0.08  # of the thing's height
 LOW = 0.22  # of the thing's height: so far from its lower end the dark part ends at most
+NARROW = 0.7  # of the thing's width: what stands on it is narrower
 FLAT = 1.5  # width of a dark part over its height, at least
 
 
@@ -230,12 +231,27 @@ def is_underside(part: BBox, thing: BBox) -> bool:
     return low and width > 0 and wide >= FLAT * high and inside >= INSIDE * wide * high
 
 
+def is_top(part: BBox, thing: BBox) -> bool:
+    """Whether the box [x0, y0, x1, y1] of a dark part stands on a thing's, as the neck of a bottle does."""
+    width, height = thing[2] - thing[0], thing[3] - thing[1]
+    within = part[0] >= thing[0] - BESIDE * width and part[2] <= thing[2] + BESIDE * width
+    return within and part[2] - part[0] < NARROW * width and part[3] < thing[1] + LOW * height
+
+
 BRIGHT_REACH = 1.6  # Lab lightness above the surroundings: another lit face
 LEAST_TOP, LEAST_WHITE = 20, 60  # px: a bright top, and one that is surely of something white
 LEAST_FACE_SIDE = 12  # px
 MAX_SIDE, MAX_RATIO = 0.1, 12  # of the image, and of the top's area: one shaded side
 HANGS = 0.7  # of a side's width that lies below the top
 SHARP_TOP = 0.7  # of a top's outline that lies on edges: with less it is a shine on the floor
+SHADE, SAME_CHROMA = 0.8, 4.0  # of the surroundings' light, and Lab units from their hue: a shadow
+STRONG_EDGE = 3.0  # Lab units per px: no soft shadow ends in so strong an edge
+LIT_BLACK, SAME_LIGHT = (
+    0.85,
+    0.05,
+)  # of the surroundings' light: the lit face of something black; shadows differ by less
+LEAST_TOUCHED = 1.0  # of the side of a patch: so much of something black lies next to it
+TEXTURE_EDGE = 0.4  # of the surroundings' spread in lightness: weaker edges are texture
 WEAK_EDGES = (0.45, 1.8)  # as `EDGE_THRESHOLDS`: the sides of something surely white stand out by as little
 
 _Box = tuple[int, int, int, int]  # x, y, width, height
@@ -287,8 +303,11 @@ def white_sides(view: View, core: Mask) -> Mask:
             surely_white.add(top)
     for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if surely_white else [])):
         weak = thresholds == WEAK_EDGES
-        for near, patch, box in _enclosed(view, *thresholds):
-            if weak and float(np.median(view.chroma[near][patch])) > CHROMA_STEP:
+        for near, patch, box in enclosed(view, *thresholds):
+            is_shade = (
+                np.median(view.light[near][patch]) < SHADE and np.median(view.chroma_gap[near][patch]) < SAME_CHROMA
+            )
+            if is_shade or (weak and float(np.median(view.chroma[near][patch])) > CHROMA_STEP):
                 continue
             touched = set(np.unique(tops.labels[near][dilated(patch, times=4)]).tolist()) - {0}
             lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > BRIGHT_REACH
@@ -298,10 +317,23 @@ def white_sides(view: View, core: Mask) -> Mask:
     return sides
 
 
-def _enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[slice, slice], Mask, _Box]]:
+def black_faces(view: View, black: Mask) -> Mask:
+    """Black patches with the lit faces beside them: dark patches between strong edges."""
+    faces = black.copy()
+    for near, patch, _ in enclosed(view, STRONG_EDGE, 0.0):
+        touched = np.count_nonzero(dilated(patch, times=4) & black[near])
+        if (
+            touched > LEAST_TOUCHED * math.sqrt(np.count_nonzero(patch))
+            and np.median(view.light[near][patch]) < LIT_BLACK
+        ):
+            faces[near] |= dilated(patch, times=2)
+    return faces
+
+
+def enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[slice, slice], Mask, _Box]]:
     """Patches between edges that do not reach the image's border: where they lie, their mask there, and their box."""
     height, width = view.edges.shape
-    edge_threshold = max(floor, factor * view.median_edge)
+    edge_threshold = np.maximum(max(floor, factor * view.median_edge), TEXTURE_EDGE * view.spread)
     edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
     for i, (x, y, w, h, area) in enumerate(stats.tolist()):

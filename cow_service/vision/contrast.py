@@ -15,6 +15,10 @@ from cow_service.vision.types import Floats32, Image
 CHROMA_STEP = 9.0  # Lab units from the surroundings: an object
 BRIGHT_STEP = 5.0  # Lab lightness above the surroundings: an object
 STRONG_CHROMA_STEP = 18.0  # Lab units from the surroundings: no wall or floor
+LIGHT_OFFSET = np.float32(16.0)  # L* + 16 is proportional to the cube root of the light, as a* and b* are
+WIDE, STRIP = 0.5, (1.2, 0.16)  # of the image's shorter side: the windows of the surroundings, across and down
+MEDIAN_SIDE = 15  # px: windows are squeezed to this size
+SPREAD_LIMIT = 25.0  # Lab lightness: what differs by more is no texture
 EDGE_THRESHOLDS = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median gradient; the larger counts
 
 
@@ -24,48 +28,78 @@ class View:
 
     lab: Floats32  # [h, w, 3] CIE Lab
     chroma: Floats32  # distance from grey in the a*b* plane
-    chroma_gap: Floats32  # distance from the surroundings in the a*b* plane
+    chroma_gap: Floats32  # distance in the a*b* plane from the surroundings, lit or shaded as the pixel is
     bright: Floats32  # lightness above the surroundings
     around: Floats32  # lightness of the surroundings
+    spread: Floats32  # how far the lightness of the surroundings varies: the texture of a floor is no thing
     edges: Floats32  # Lab gradient per px
     median_edge: float  # of the whole image
     edge_threshold: float  # gradient from which the outline of an object may lie on it
 
+    @property
+    def light(self) -> Floats32:
+        """Share (0..1 and more) of the surroundings' light that a pixel gets if it is of the same matter, cube root."""
+        return np.asarray((self.lab[..., 0] + LIGHT_OFFSET) / (self.around + LIGHT_OFFSET), np.float32)
+
     def crop(self, window: tuple[slice, slice]) -> View:
         """The same measurements for a part of the image."""
-        names = ("lab", "chroma", "chroma_gap", "bright", "around", "edges")
+        names = ("lab", "chroma", "chroma_gap", "bright", "around", "spread", "edges")
         return replace(self, **{name: getattr(self, name)[window] for name in names})
 
 
 def view_of(small: Image) -> View:
-    """Measures every pixel against a median over half the image around it."""
+    """Measures every pixel against the surface around it: the nearer in colour of two medians.
+
+    One is over half the image around the pixel. The other is over a strip as wide and much lower, so that on either
+    side of the line between floor and wall each is compared with itself. Light scales L* + 16, a* and b* alike, so
+    that a shadow and the texture of a floor differ from it in lightness alone.
+    """
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
     lab = lab_of(np.asarray(smooth, np.uint8))
     coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
-    wide = _wide_median(coarse)
+    wide = _median(coarse, WIDE, WIDE)
     # Strong colours, seen in a first pass, are left out: a large object would count as its own surroundings.
     off = np.hypot(*np.moveaxis(coarse[..., 1:].astype(np.float32) - wide[..., 1:], 2, 0))
     plain = (~dilated(off > STRONG_CHROMA_STEP)).astype(np.float32)
     if plain.mean() >= 0.5 and not plain.all():
         side = (min(coarse.shape[:2]),) * 2
         filled = cv2.blur(coarse * plain[..., None], side) / np.maximum(cv2.blur(plain, side)[..., None], 1e-3)
-        wide = _wide_median(np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8))
-    around = cv2.resize(wide, small.shape[1::-1], interpolation=cv2.INTER_LINEAR).astype(np.float32)
-    (lightness, a, b), (around_l, around_a, around_b) = cv2.split(lab), cv2.split(around)
-    around_l = around_l / np.float32(2.55)
-    gap = cv2.magnitude(a - (around_a - 128), b - (around_b - 128))
+        coarse = np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8)
+        wide = _median(coarse, WIDE, WIDE)
+    strip = _median(coarse, *STRIP)
+    distance, gap, around = _against(lab, wide)
+    # The line is known to a pixel of the strip.
+    for shifted in (np.concatenate([strip[1:], strip[-1:]]), np.concatenate([strip[:1], strip[:-1]])):
+        other = _against(lab, shifted)
+        nearer = other[0] < distance
+        distance, gap, around = (np.where(nearer, *pair) for pair in zip(other, (distance, gap, around), strict=True))
+    bright = np.asarray(lab[..., 0] - around, np.float32)
+    off_light = np.where(gap < CHROMA_STEP, np.minimum(np.abs(bright), SPREAD_LIMIT), 0)
+    deviation = scaled(np.asarray(off_light * (255 / SPREAD_LIMIT), np.uint8), 0.25)
+    typical = np.maximum(_median(deviation, WIDE, WIDE), _median(deviation, *STRIP)).astype(np.float32)
+    spread = cv2.resize(typical * np.float32(1.48 * SPREAD_LIMIT / 255), small.shape[1::-1])
     edges = lab_gradients(lab)[2]
     median_edge = float(np.median(edges))
     return View(
         lab=lab,
-        chroma=np.asarray(cv2.magnitude(a, b), np.float32),
+        chroma=np.asarray(cv2.magnitude(lab[..., 1], lab[..., 2]), np.float32),
         chroma_gap=np.asarray(gap, np.float32),
-        bright=np.asarray(lightness - around_l, np.float32),
-        around=np.asarray(around_l, np.float32),
+        bright=bright,
+        around=np.asarray(around, np.float32),
+        spread=np.asarray(spread, np.float32),
         edges=edges,
         median_edge=median_edge,
         edge_threshold=max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge),
     )
+
+
+def _against(lab: Floats32, surface: Image) -> tuple[Floats32, Floats32, Floats32]:
+    """How far pixels [h, w] are from a surface's colours [h', w', 3], in the a*b* plane alone, and its lightness."""
+    enlarged = cv2.resize(surface, lab.shape[1::-1], interpolation=cv2.INTER_LINEAR).astype(np.float32)
+    lightness, a, b = enlarged[..., 0] / np.float32(2.55), enlarged[..., 1] - 128, enlarged[..., 2] - 128
+    light = (lab[..., 0] + LIGHT_OFFSET) / (lightness + LIGHT_OFFSET)
+    gap = np.asarray(cv2.magnitude(lab[..., 1] - light * a, lab[..., 2] - light * b), np.float32)
+    return gap + np.float32(0.5) * np.abs(lab[..., 0] - lightness), gap, lightness
 
 
 def lab_gradients(lab: Floats32) -> tuple[Floats32, Floats32, Floats32]:
@@ -75,13 +109,19 @@ def lab_gradients(lab: Floats32) -> tuple[Floats32, Floats32, Floats32]:
     return dx, dy, np.asarray(cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3), np.float32))), np.float32)
 
 
-def _wide_median(coarse: Image) -> Image:
-    """The median over half the image around every pixel of an 8-bit Lab image [h, w, 3]."""
-    side = int(0.5 * min(coarse.shape[:2])) | 1
-    pad = side // 2
-    padded = cv2.copyMakeBorder(coarse, pad, pad, pad, pad, cv2.BORDER_REFLECT)
-    median = cv2.medianBlur(padded, side)[pad : pad + coarse.shape[0], pad : pad + coarse.shape[1]]
-    return np.asarray(median, np.uint8)
+def _median(coarse: Image, across: float, down: float) -> Image:
+    """The median of an 8-bit image [h, w, ...] over a window around every pixel, in shares of the shorter side."""
+    height, width = coarse.shape[:2]
+    shorter = min(height, width)
+    squeezed = (
+        max(1, round(width * MEDIAN_SIDE / (across * shorter))),
+        max(1, round(height * MEDIAN_SIDE / (down * shorter))),
+    )
+    small = cv2.resize(coarse, (min(width, squeezed[0]), min(height, squeezed[1])), interpolation=cv2.INTER_AREA)
+    pad = MEDIAN_SIDE // 2
+    padded = cv2.copyMakeBorder(small, pad, pad, pad, pad, cv2.BORDER_REFLECT)
+    median = cv2.medianBlur(padded, MEDIAN_SIDE)[pad : pad + small.shape[0], pad : pad + small.shape[1]]
+    return np.asarray(cv2.resize(median, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 CHROMATIC = 9.0  # Lab chroma from which a surface has a hue
@@ -89,7 +129,10 @@ BROWN_LIGHTNESS = 42.0  # below it and muted, orange is called brown
 BROWN_CHROMA = 36.0
 RED_CHROMA = 34.0  # a paler red is called pink
 
-GREYS = (28.0, 70.0)  # lightness of what people may call grey: white in shade too
+PURE_BLUE = (309.0, 2.2)  # degrees, chroma over L* + 16: Lab bends the hue of the purest blues towards purple
+DARK_REDS = 42.0  # lightness below which people may call red or orange brown
+OLIVE = 60.0  # lightness below which people may call yellow green
+GREYS = (28.0, 80.0)  # lightness of what people may call grey: white in shade too
 
 # Upper end of each name's hue range, degrees in the a*b* plane.
 HUES = (
@@ -114,6 +157,8 @@ def colour_name(lightness: float, a: float, b: float) -> str:
         return "black" if lightness < 28 else "white" if lightness > 52 else "grey"
     hue = math.degrees(math.atan2(b, a)) % 360
     name = next(name for end, name in HUES if hue <= end)
+    if name == "purple" and hue < PURE_BLUE[0] and chroma > PURE_BLUE[1] * (lightness + LIGHT_OFFSET):
+        return "blue"
     if name == "red" and chroma < RED_CHROMA and lightness > 50:
         return "pink"
     if name in ("orange", "red") and chroma < BROWN_CHROMA and lightness < BROWN_LIGHTNESS:
@@ -129,4 +174,8 @@ def colour_names(lightness: float, a: float, b: float) -> frozenset[str]:
         angle, radius = hue + math.radians(turn * HUE_MARGIN), max(0.0, chroma + more * CHROMA_MARGIN)
         l_star = lightness + lift * LIGHTNESS_MARGIN
         names.add(colour_name(l_star, radius * math.cos(angle), radius * math.sin(angle)))
+    if lightness < DARK_REDS and names & {"red", "orange"}:
+        names.add("brown")
+    if lightness < OLIVE and "yellow" in names:
+        names.add("green")
     return frozenset(names)

@@ -15,15 +15,39 @@ from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision import masks
-from cow_service.vision.completion import as_disc, is_underside, neck_between, standing_on, white_sides
-from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, View, colour_name, colour_names, view_of
+from cow_service.vision.completion import (
+    as_disc,
+    black_faces,
+    is_top,
+    is_underside,
+    neck_between,
+    standing_on,
+    white_sides,
+)
+from cow_service.vision.contrast import (
+    BRIGHT_STEP,
+    CHROMA_STEP,
+    STRONG_CHROMA_STEP,
+    View,
+    colour_name,
+    colour_names,
+    view_of,
+)
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats32, Image, Mask
 
 WORKING_SIDE = 512  # px: images are searched at this size
 SHARP_SHARE = 0.65  # of an outline that must lie on edges
+OUT_OF_TEXTURE = 1.7  # of the surroundings' spread in lightness: the least step in an outline, per px
+SPREADS, BRIGHT_SPREADS = 3.0, 3.7  # of that spread: what is so much darker, or brighter, is no texture
+# Of the surroundings' light: below it something may be black; the darker part of what is, and of what may be shadow.
+BLACK, BLACK_LIGHT, BLACKEST_LIGHT = 0.61, 0.47, 0.375
+BLACKEST = 16.5  # Lab lightness of the darker part of what is black and may be shadow
+SAME_LIGHT, SAME_CHROMA = 0.05, 4.0  # of two shadows, and Lab units between a shadow and the floor it lies on
+LEAST_SHADOW, MOST_SHADOW = 0.05, 3.0  # of the area of what may be another shadow, and of the thing that casts it
 BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
-MIN_AREA = 0.0004  # of the image
+HALFWAY = 0.35  # of the largest step nearby
+MIN_AREA = 0.0003  # of the image
 MAX_AREA = 0.25
 ALONG_BORDER = 0.5  # of the height or width of something bright and pale that runs along the image's border: a wall
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
@@ -88,15 +112,26 @@ class _Found:
         return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc)
 
 
-def find_regions(image: Image) -> tuple[Region, ...]:
-    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
+def measure(image: Image) -> View:
+    """The view of an RGB image [H, W, 3] at the working size."""
+    return view_of(masks.scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2]))))
+
+
+def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
+    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image.
+
+    `view` is what `measure` gives for the image, where that is known.
+    """
     height, width = image.shape[:2]
-    scale = min(1.0, WORKING_SIDE / max(height, width))
-    view = view_of(masks.scaled(image, scale))
+    view = measure(image) if view is None else view
     # What is surely of an object: of another hue, clearly brighter, or nearly black.
-    black = (view.lab[..., 0] < BLACK_SHARE * view.around).astype(np.uint8)
-    solid_black = cv2.morphologyEx(black, cv2.MORPH_OPEN, _DISC) > 0  # a contact shadow is a thin strip
-    core = (view.chroma_gap > CHROMA_STEP) | (view.bright > BRIGHT_STEP) | solid_black
+    coloured = view.chroma_gap > CHROMA_STEP
+    body = coloured | (view.bright > np.maximum(BRIGHT_STEP, BRIGHT_SPREADS * view.spread))
+    core = body | _black(view, body)
+    # Blur and the compression of colour spread a thing by a few px: its outline lies halfway up to its own colour.
+    step = np.maximum(view.chroma_gap, np.abs(view.bright))
+    low = step < HALFWAY * cv2.dilate(step, np.ones((7, 7), np.uint8))
+    core &= ~(low & masks.dilated(~core, 5))
     if core.mean() > CLUTTER:
         return ()
     solid = (core | white_sides(view, core)).astype(np.uint8)
@@ -120,7 +155,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
             disc = as_disc(part, near.edges, view.edge_threshold)
             # An object's outline lies on edges; that of a patch of light does not.
             strong = cv2.dilate(near.edges, np.ones((5, 5), np.uint8))[masks.outline_of(part)] > view.edge_threshold
-            if disc is not None or float(np.mean(strong)) > SHARP_SHARE:
+            if disc is not None or (float(np.mean(strong)) > SHARP_SHARE and _stands_out(near, part)):
                 whole = np.zeros(solid.shape, bool)
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
@@ -128,6 +163,55 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
     regions = [one.region((height, width)) for one in whole_ones]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
+
+
+def _black(view: View, body: Mask) -> Mask:
+    """What is black. `body` [h, w] is surely of things: what is dark next to it is a part of it inside its outline.
+
+    Outside it is the thing's shadow, unless it is as dark as black things are and large, or lies below it as wheels
+    do. What is dark elsewhere is a shadow, too, if it gets as little light as those.
+    """
+    dark = (view.light < BLACK).astype(np.uint8)
+    dark = cv2.morphologyEx(dark, cv2.MORPH_OPEN, _DISC) > 0  # contact shadows are thin
+    outlines, near, black = np.zeros((3, *body.shape), bool)
+    things: list[tuple[Mask, int]] = []
+    for thing in _blobs(body, MIN_AREA * body.size):
+        things.append((masks.dilated(thing, 7), int(np.count_nonzero(thing))))
+        near |= things[-1][0]
+        outlines |= masks.dilated(masks.hull(thing), 5)
+    shadows: list[tuple[float, int]] = []
+    alone: list[tuple[float, Mask]] = []
+    for blob in _blobs(dark & ~outlines, 0):
+        area, light, box = int(np.count_nonzero(blob)), float(np.percentile(view.light[blob], 30)), masks.bbox_of(blob)
+        beside = [masks.bbox_of(t) for t, size in things if area < MOST_SHADOW * size and (t & blob).any()]
+        is_texture = np.median(view.bright[blob]) > -SPREADS * np.median(view.spread[blob])
+        is_darkest = light < BLACKEST_LIGHT and np.percentile(view.lab[blob, 0], 30) < BLACKEST
+        if is_texture or light > BLACK_LIGHT:
+            shadows.append((light, area))
+        elif (
+            np.median(view.chroma_gap[blob]) > SAME_CHROMA  # a shadow keeps the floor's hue
+            or any(is_top(box, thing) for thing in beside)
+            or (is_darkest and beside and (area > OWN_AREA or any(is_underside(box, thing) for thing in beside)))
+        ):
+            black |= blob
+        elif beside:
+            shadows.append((light, area))
+        else:
+            alone.append((light, blob))
+    for light, blob in alone:
+        least = LEAST_SHADOW * np.count_nonzero(blob)
+        if not any(abs(light - shade) < SAME_LIGHT and area > least for shade, area in shadows):
+            black |= blob
+    return black | (black_faces(view, black) & ~near) | (dark & outlines)
+
+
+def _stands_out(view: View, part: Mask) -> bool:
+    """Whether the steps along its outline are larger than the texture of what is around it makes them."""
+    if float(np.median(view.chroma_gap[part])) > STRONG_CHROMA_STEP:
+        return True
+    outline = masks.outline_of(part)
+    steps = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))[outline]
+    return float(np.median(steps)) > OUT_OF_TEXTURE * float(np.median(view.spread[outline]))
 
 
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:

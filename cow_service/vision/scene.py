@@ -14,15 +14,18 @@ import numpy as np
 from cow_service.errors import CannotReadDirection
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
+from cow_service.vision.contrast import View
+from cow_service.vision.faint import find_faint
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, dilated, is_among, is_same_object, without_holes
-from cow_service.vision.regions import Region, disc_region, find_regions, region_of
+from cow_service.vision.regions import WORKING_SIDE, Region, disc_region, find_regions, measure, region_of
 from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 from cow_service.vision.types import Image, Mask
 
+SHARP_SIDE = 2 * WORKING_SIDE  # px: in a larger image the outlines of regions are coarse, and are cut again
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
 REACH = 1.5  # sizes of an object: an arrow further away is not its own
 RIVAL = 0.6  # of a rival's distance: what is nearer than that is clearly the nearest
@@ -171,13 +174,22 @@ class Scene:
         return image
 
     @cached_property
+    def _view(self) -> View:
+        return measure(self.clean)
+
+    @cached_property
     def regions(self) -> tuple[Region, ...]:
         """Objects of the image, largest first; empty where it is too cluttered to tell."""
-        found = find_regions(self.clean)
+        found = find_regions(self.clean, self._view)
         for trail in self.trails:
             if region_of(found, trail.present.bbox) is None:
                 found = (*found, disc_region(self.clean, trail.present.disc((self.height, self.width))))
         return tuple(sorted(found, key=lambda region: -region.mask.area))
+
+    @cached_property
+    def faint(self) -> tuple[BBox, ...]:
+        """Boxes [x0, y0, x1, y1] of what may be things of the image, too faint to tell."""
+        return find_faint(self._view, (self.width, self.height), self.regions)
 
     def with_mover(self, bbox: BBox) -> Scene:
         """This scene where its trails end as they are, else the scene in which the one in a box ends there."""
@@ -202,7 +214,7 @@ class Scene:
         """What was measured so far that depends on nothing but the image: not to be written to."""
         alone = OF_THE_IMAGE
         if self.__dict__.get("_all_trails") == ():  # then nothing depends on which end of one is meant
-            alone = (*alone, "clean", "regions")
+            alone = (*alone, "clean", "regions", "faint")
         return {key: self.__dict__[key] for key in alone if key in self.__dict__}
 
     def take(self, measured: Measured) -> None:
@@ -245,7 +257,7 @@ class Scene:
             if bbox in self._preset:
                 return self._preset[bbox]()
             region = self.region_of(bbox)
-            if region is not None and region.is_disc:
+            if region is not None and (region.is_disc or max(self.width, self.height) <= SHARP_SIDE):
                 return region.mask.full()
             return mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
 
@@ -258,8 +270,10 @@ class Scene:
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
         other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
-        known = {"cues": self.cues, "arrows": self.arrows, "boxes": self.boxes, "regions": self.regions}
-        other.__dict__.update(known, clean=clean)  # where cached properties are kept
+        names = ("cues", "arrows", "boxes", "regions", "faint")
+        other.__dict__.update(
+            {name: getattr(self, name) for name in names}, clean=clean
+        )  # where cached properties are kept
         return other
 
     def with_mask(self, bbox: BBox, mask: Mask) -> Scene:

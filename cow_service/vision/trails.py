@@ -113,7 +113,7 @@ class Trail:
             gaps = [-position.x * end.side[0] - position.y * end.side[1] for position in ends]
         else:
             return self
-        is_last = (gaps[1] <= gaps[0]) != end.is_oldest
+        is_last = gaps[1] <= gaps[0]
         return Trail(self.positions if is_last else self.positions[::-1], self.evident, True)
 
 
@@ -123,7 +123,6 @@ class TrailEnd:
 
     near: BBox | None = None  # of another object
     side: Vector | None = None  # in the image: (-1, 0) for the leftmost
-    is_oldest: bool = False  # that end is the oldest position, the other one the present
 
 
 def trail_of(trails: Sequence[Trail], bbox: BBox) -> Trail | None:

@@ -14,7 +14,6 @@ the repository at each call and reports one bar for all files: both are not used
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import shutil
@@ -25,7 +24,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 from uuid import uuid4
 
@@ -44,7 +42,6 @@ if TYPE_CHECKING:
 LOCK_NAME = "cow.lock.json"
 PICKLED = (".bin", ".ckpt", ".pickle", ".pkl", ".pt", ".pth")  # reading one of these can run code that it holds
 
-_CHUNK_BYTES = 8 * 2**20
 _MAX_LISTED = 10
 _LISTING_SECONDS = 30.0  # timeout
 _LOG_IN = "Log in with `hf auth login`, or set HF_TOKEN, for an account that may read it"
@@ -219,7 +216,6 @@ def chosen(lock: Lock, patterns: Sequence[str]) -> tuple[LockedFile, ...]:
 def examine(lock: Lock, files: Iterable[LockedFile], weights_dir: Path, digests: bool = True) -> tuple[Finding, ...]:
     """Compares files with their record, hashing several at a time. Raises `WeightsUnavailable` if one is unreadable."""
     folder = folder_of(weights_dir, lock.repository)
-    stop = Event()
 
     def compare(file: LockedFile) -> Finding | None:
         path = folder / file.path
@@ -235,23 +231,16 @@ def examine(lock: Lock, files: Iterable[LockedFile], weights_dir: Path, digests:
             state = hashlib.sha256() if file.algorithm == "sha256" else hashlib.sha1(usedforsecurity=False)
             if file.algorithm == "git-sha1":
                 state.update(b"blob %d\0" % file.size)
-            buffer = memoryview(bytearray(min(_CHUNK_BYTES, max(file.size, 1))))
-            with path.open("rb", buffering=0) as data:
-                while (count := data.readinto(buffer)) and not stop.is_set():
-                    state.update(buffer[:count])
-            if (found := state.hexdigest()) != file.digest:
+            with path.open("rb") as data:
+                found = hashlib.file_digest(data, lambda: state).hexdigest()
+            if found != file.digest:
                 wanted, found = f"{file.algorithm} {file.digest}", f"{file.algorithm} {found}"
                 return Finding(file=file.path, problem="wrong-digest", wanted=wanted, found=found)
         return None
 
     # Hashing releases the GIL, so threads are enough; beyond a few, the disk is the limit.
     with disk_errors(lock.repository), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        try:
-            findings = tuple(pool.map(compare, files))
-        except BaseException:
-            stop.set()  # else an interrupted check would first finish the files in progress
-            raise
-    return tuple(finding for finding in findings if finding is not None)
+        return tuple(finding for finding in pool.map(compare, files) if finding is not None)
 
 
 @contextmanager
@@ -476,12 +465,9 @@ def _hub_errors(repository: str, revision: str | None) -> Generator[None]:
             reason, remedy = f"it is not open to this account (HTTP {status})", _LOG_IN
         elif status is not None:
             reason, remedy = f"the hub answered with HTTP {status}", "Wait a little and run it again"
-        elif number in (errno.ENOSPC, errno.EDQUOT):
-            reason = "the disk is full"
-            remedy = "Free some space, or set COW_MODELS_DIR to a folder on a larger disk"
         elif number:
-            reason = f"the folder for weights cannot be used ({errno.errorcode.get(number)})"
-            remedy = "Make it writable"
+            reason = f"the folder for weights cannot be used ({os.strerror(number)})"
+            remedy = "Make it writable or free some space, or set COW_MODELS_DIR to another folder"
         else:
             reason, remedy = f"the download failed ({type(cause).__name__})", _AGAIN
         raise _unavailable(repository, reason, remedy) from error

@@ -23,7 +23,6 @@ from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import TakenJob, error_as_json
 from cow_service.jobs.readiness import warm_up
-from cow_service.media.images import DecodedImage
 from cow_service.observability import logging as context
 from cow_service.observability import tracing
 from cow_service.observability.metrics import gpu_memory
@@ -43,8 +42,8 @@ log = logging.getLogger("cow_service")
 class _Job:
     """One job at work here."""
 
-    def __init__(self, job: TakenJob, image: DecodedImage | None, send: Callable[[FromWorker], None]) -> None:
-        self.job, self._image, self._send = job, image, send
+    def __init__(self, job: TakenJob, send: Callable[[FromWorker], None]) -> None:
+        self.job, self._send = job, send
         self.canceled, self.key_held = threading.Event(), threading.Event()
         self._told: tuple[Stage | None, float] = (None, 0.0)
 
@@ -54,7 +53,6 @@ class _Job:
         self._send(messages.Progressed(job_id, None, 0.0))  # from here on the job may be what ends the process
         work = Work(
             job=self.job,
-            image=self._image,
             progress=self._progress,
             check=self._check,
             looked_for=lambda stage, found: self._send(messages.LookedFor(job_id, stage, found)),
@@ -110,9 +108,8 @@ class WorkerProcess:
         threading.Thread(target=self._load, name="load", daemon=True).start()
         while True:
             match messages.receive_by_worker(self._pipe):
-                case messages.Start(job=job, image=sent):
-                    image = None if sent is None else messages.receive_image(self._pipe, sent)
-                    self._jobs[job.id] = _Job(job, image, self._send)
+                case messages.Start(job=job):
+                    self._jobs[job.id] = _Job(job, self._send)
                     self._threads.submit(self._work, job.id)
                 case messages.Cancel(job_id) if job_id in self._jobs:
                     self._jobs[job_id].canceled.set()

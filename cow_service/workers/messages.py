@@ -8,28 +8,18 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, TypeAdapter
 from pydantic_core import to_json
 
 from cow_service.jobs.computing import JobOutcome
 from cow_service.jobs.job_table import TakenJob
-from cow_service.media.images import DecodedImage
-from cow_service.records import GpuMemory, ImageInfo
+from cow_service.records import GpuMemory
 from cow_service.requests import Stage
 
 MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
 
 
 # To the worker.
-
-
-@dataclass(frozen=True)
-class SentImage:
-    """The image of a job; its pixels are the next message, as they lie in memory."""
-
-    info: ImageInfo
-    media_type: str
 
 
 @dataclass(frozen=True)
@@ -45,7 +35,6 @@ class Start:
     """Compute a job."""
 
     job: TakenJob
-    image: SentImage | None  # else it is read from the artifacts
     kind: Literal["start"] = "start"
 
 
@@ -159,18 +148,6 @@ _FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(
 def send(connection: Connection, message: ToWorker | FromWorker) -> None:
     """Sends a message. Only one thread may do so at a time. Raises `OSError` where the other process has ended."""
     connection.send_bytes(to_json(message))
-
-
-def send_image(connection: Connection, image: DecodedImage) -> None:
-    """Sends the pixels of the job's image, right behind its `Start`."""
-    connection.send_bytes(image.pixels.data.cast("B"))
-
-
-def receive_image(connection: Connection, sent: SentImage) -> DecodedImage:
-    """The image whose pixels are the next message."""
-    shape = sent.info.height, sent.info.width, 3
-    pixels = np.frombuffer(connection.recv_bytes(), np.uint8).reshape(shape)
-    return DecodedImage(pixels, sent.info, sent.media_type)
 
 
 def receive_by_worker(connection: Connection) -> ToWorker:

@@ -15,7 +15,7 @@ from itertools import count
 import psutil
 
 from cow_service.concurrency import PrioritySemaphore
-from cow_service.errors import DeviceFailed, ShuttingDown, WorkerEnded
+from cow_service.errors import Canceled, DeviceFailed, WorkerEnded
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, JobOutcome, KeyLocks, Work
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
@@ -129,8 +129,8 @@ class Group:
             worker.close()
 
     def _start(self) -> Worker:
-        if self._closed:
-            raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
+        if self._closed:  # no failure of a job whose worker just ended: it goes on after the next start
+            raise Canceled("The server is stopping.")
         names = {one.name for one in self._taken}
         name = next(name for number in count(1) if (name := f"{self.name}-{number}") not in names)
         worker = Worker(name, self._settings, self._note_end)

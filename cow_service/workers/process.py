@@ -16,7 +16,6 @@ from cow_service.concurrency import spawn
 from cow_service.errors import Canceled, CowError, JobTimeout
 from cow_service.jobs.computing import JobOutcome, KeyLocks, Work
 from cow_service.jobs.job_table import error_from_json
-from cow_service.media.images import DecodedImage
 from cow_service.records import GpuMemory
 from cow_service.settings import Settings
 from cow_service.workers import messages
@@ -33,7 +32,6 @@ from cow_service.workers.messages import (
     OfJob,
     Progressed,
     ReleaseKey,
-    SentImage,
     Start,
     Succeeded,
     ToWorker,
@@ -125,8 +123,7 @@ class Worker:
         inbox = self._inboxes[work.job.id] = SimpleQueue()
         try:
             with ExitStack() as keys:
-                image = None if work.image is None else SentImage(work.image.info, work.image.media_type)
-                self._send(Start(work.job, image), work.image)
+                self._send(Start(work.job))
                 return self._follow(work, inbox, locks, keys)
         finally:
             del self._inboxes[work.job.id]
@@ -206,11 +203,9 @@ class Worker:
             never_began = not (begun or self.is_loaded)
             raise WorkerGone(self.end_reason, is_final=self._is_final, never_began=never_began)
 
-    def _send(self, message: ToWorker, image: DecodedImage | None = None) -> None:
+    def _send(self, message: ToWorker) -> None:
         with self._sending, suppress(OSError):  # its end is noticed where its messages are read
             messages.send(self._pipe, message)
-            if image is not None:
-                messages.send_image(self._pipe, image)
 
     def _listen(self) -> None:
         """Hands each message to the job that it is about, until the process has ended."""

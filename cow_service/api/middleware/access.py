@@ -7,8 +7,10 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
+from contextvars import ContextVar
 from hashlib import sha256
 from ipaddress import ip_address, ip_network
+from typing import Literal
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
@@ -16,6 +18,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from cow_service.api.problems import respond
 from cow_service.errors import CowError, OriginNotAllowed, RateLimited, Unauthorized
+from cow_service.settings import Settings
 
 PREFIX = "cow_"  # lets scanners for leaked secrets know one
 ENTROPY_BYTES = 32
@@ -71,18 +74,30 @@ class Guard:
         await (self.app if error is None else respond(error, scope))(scope, receive, send)
 
 
-class Callers:
-    """Finds the owner of the key of each request, `scope["state"]["owner"]`, and limits requests by key.
+Unit = Literal["requests", "MB of bodies", "CPU seconds for reading bodies"]
 
-    Without keys the owner is None, and requests are limited by address. Probes, and pages with their files, are open to
+
+charge: ContextVar[Callable[[Unit, float], None]] = ContextVar("charge", default=lambda unit, amount: None)
+"""Counts what the request at hand has used towards the limits of its caller, whatever becomes of it."""
+
+
+class Callers:
+    """Finds the owner of the key of each request, `scope["state"]["owner"]`, and limits what each key uses in a minute.
+
+    Without keys the owner is None, and the limits are of addresses. Probes, and pages with their files, are open to
     everybody: what a page then asks for needs the key as ever. Refusing stands before the router, so that a route that
     is added tomorrow is closed as well.
     """
 
-    def __init__(self, keys: KeyRing, per_minute: int | None) -> None:
+    def __init__(self, keys: KeyRing, settings: Settings) -> None:
         self._keys = keys
-        self._requests = None if per_minute is None else Buckets(per_minute)
-        self._failures = None if per_minute is None else Buckets(MAX_FAILURES)
+        per_minute: dict[Unit, float | None] = {
+            "requests": settings.rate_limit,
+            "MB of bodies": settings.rate_limit_mb,
+            "CPU seconds for reading bodies": settings.rate_limit_cpu,
+        }
+        self._limits = {unit: Buckets(most) for unit, most in per_minute.items() if most is not None}
+        self._failures = Buckets(MAX_FAILURES) if self._limits else None
 
     def refuse(self, scope: Scope) -> CowError | None:
         """Why a request is refused, if it is."""
@@ -107,12 +122,23 @@ class Callers:
                     "server's operator gave you.",
                     headers={"WWW-Authenticate": "Bearer"},
                 )
-        if self._requests is None:
-            return None
-        whose = "your address" if owner is None else "this key"
-        wait = self._requests.take(f"address {address_of(scope)}" if owner is None else f"key {owner}")
-        detail = f"The server takes {self._requests.per_minute} requests a minute with {whose}."
-        return rate_limited(detail, wait) if wait else None
+        if self._limits:
+            return self._limit(f"address {address_of(scope)}" if owner is None else f"key {owner}")
+        return None
+
+    def _limit(self, caller: str) -> CowError | None:
+        """Takes a request of the caller's; the rest that it uses is charged when that is known."""
+
+        def charge_caller(unit: Unit, amount: float) -> None:
+            if unit in self._limits:
+                self._limits[unit].charge(caller, amount)
+
+        charge.set(charge_caller)
+        for unit, buckets in self._limits.items():
+            if wait := buckets.take(caller, 1 if unit == "requests" else 0):
+                whose = "this key" if caller.startswith("key ") else "your address"
+                return rate_limited(f"The server takes {buckets.per_minute:g} {unit} a minute with {whose}.", wait)
+        return None
 
 
 def rate_limited(detail: str, wait: float) -> RateLimited:
@@ -136,7 +162,7 @@ def address_of(scope: Scope) -> str:
 class Buckets:
     """A token bucket for each caller, full at first. For the event loop alone: it takes no lock."""
 
-    def __init__(self, per_minute: int, most: int = MAX_CALLERS, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, per_minute: float, most: int = MAX_CALLERS, clock: Callable[[], float] = time.monotonic) -> None:
         self.per_minute = per_minute
         self._rate = per_minute / 60  # tokens per second
         self._most = most
@@ -146,16 +172,23 @@ class Buckets:
     def __len__(self) -> int:
         return len(self._levels)
 
-    def take(self, caller: str) -> float:
-        """Takes a token: 0 where there was one, else the seconds until there is."""
+    def take(self, caller: str, tokens: float = 1) -> float:
+        """Takes tokens: 0 where there were as many, else the seconds until there are."""
+        missing = tokens - self.charge(caller, 0)
+        if missing > 0:
+            return missing / self._rate
+        self.charge(caller, tokens)
+        return 0.0
+
+    def charge(self, caller: str, tokens: float) -> float:
+        """Takes tokens, also those that come later; returns how many are left, below 0 where too many were used."""
         now = self._clock()
         level, at = self._levels.pop(caller, (float(self.per_minute), now))
-        level = min(self.per_minute, level + (now - at) * self._rate)
-        wait = 0.0 if level >= 1 else (1 - level) / self._rate
-        self._levels[caller] = (level if wait else level - 1, now)
+        level = min(self.per_minute, level + (now - at) * self._rate) - tokens
+        self._levels[caller] = (level, now)
         if len(self._levels) > self._most:
             self._levels.popitem(last=False)
-        return wait
+        return level
 
 
 _PORT = re.compile(r":\d*$", re.ASCII)

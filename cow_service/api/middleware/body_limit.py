@@ -1,13 +1,16 @@
 """Refuses a body that is too large, as soon as that is known, also without a Content-Length, too slow, or too much."""
 
 import asyncio
+from collections import Counter
 
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from cow_service.api.middleware.access import charge
 from cow_service.api.problems import respond
 from cow_service.errors import BodyTooLarge, BodyTooSlow, CowError, MalformedBody, QueueFull
 
+SHARE_OF_ONE = 0.75  # of the bodies that are held, that one key may have: others find room
 _RELEASE = "release_body"  # in the state of a request
 
 
@@ -22,7 +25,7 @@ class BodyLimit:
         self.megabytes = megabytes
         self.seconds = seconds
         self.megabytes_at_once = max(megabytes_at_once, megabytes)
-        self._held = 0  # bytes of all bodies that are not read yet
+        self._held = Counter[str | None]()  # bytes of all bodies that are not read yet, by owner
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Passes the request on; past a limit the app gets `BodyTooLarge` or `BodyTooSlow` where it reads the body."""
@@ -34,6 +37,9 @@ class BodyLimit:
             await respond(refusal, scope)(scope, receive, send)
             return
         deadline = asyncio.get_running_loop().time() + self.seconds
+        owner: str | None = scope.get("state", {}).get("owner")
+        share = 1.0 if owner is None else SHARE_OF_ONE
+        most, most_own = 1e6 * self.megabytes_at_once, 1e6 * max(self.megabytes, share * self.megabytes_at_once)
         seen = 0
         released = False
         waiting = True  # for more of the body, which the app still wants
@@ -54,14 +60,16 @@ class BodyLimit:
             waiting = bool(message.get("more_body", False))
             size = len(message.get("body", b""))
             seen += size
+            charge.get()("MB of bodies", size / 1e6)
             if not released:
-                self._held += size
+                self._held[owner] += size
             if seen > limit:
                 raise self._too_large()
-            if self._held > self.megabytes_at_once * 1e6:
+            if self._held.total() > most or self._held[owner] > most_own:
                 raise QueueFull(
-                    f"The server holds {self.megabytes_at_once:g} MB of bodies that it has not read yet, all that "
-                    "COW_MAX_BODIES_MB lets it. Send the request again in a while.",
+                    f"The server holds {self._held.total() / 1e6:.0f} MB of bodies that it has not read yet, of which "
+                    f"{self._held[owner] / 1e6:.0f} MB are of this caller: COW_MAX_BODIES_MB allows "
+                    f"{most / 1e6:.0f} in all and {most_own / 1e6:.0f} for one. Send the request again in a while.",
                     headers={"Retry-After": "1", "Connection": "close"},
                 )
             return message
@@ -70,7 +78,7 @@ class BodyLimit:
             nonlocal released
             if not released:
                 released = True
-                self._held -= seen
+                self._held[owner] -= seen
 
         async def answered(message: Message) -> None:
             nonlocal waiting

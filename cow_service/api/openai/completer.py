@@ -104,7 +104,9 @@ class Completer:
         if media_type != "application/json" and not media_type.endswith("+json"):
             shown = errors.shortened(media_type, SHOWN_CHARACTERS)
             raise errors.BodyTypeUnsupported(f"The body has the media type '{shown}'. Send application/json.")
-        return await self._submitter.in_thread(partial(read_object, await request.body(), "The body"))
+        return await self._submitter.in_thread(
+            submitting.owner_of(request), partial(read_object, await request.body(), "The body")
+        )
 
     async def complete(
         self, request: Request, chat: Chat, *, stored: bool = True
@@ -121,15 +123,15 @@ class Completer:
         if reader is None:
             return await self._answer(request, chat, answerer, stored=stored)
         prefer, submitter = preferences_without_key(request), self._submitter
-        what_if = find_what_if(chat, answerer)
+        owner = submitting.owner_of(request)
+        what_if = await submitter.in_thread(owner, partial(find_what_if, chat, answerer))
         if isinstance(what_if, ChatImagination):
             return await self._forward(request, EnrichedChat(chat, chat.messages, what_if), reader)
-        owner = submitting.owner_of(request)
         submitter.engine.check_capacity(owner)
         submission = submitting.Submission("simulate", owner, prefer, new_job_id(owner, None))
         try:
             if chat.stream:
-                created_at = await submitter.submit(submission, what_if.request, None)
+                created_at = await submitter.submit(submission, what_if.request)
                 return self._stream(submission, created_at, chat, what_if, reader)
             result = await submitter.result(request, submission, what_if.request)
         except errors.CowError as error:
@@ -147,10 +149,10 @@ class Completer:
         submission = submitter.submission(request, "answer")
         if not stored:
             submission = replace(submission, prefer=preferences_without_key(request))
-        parsed = await submitter.in_thread(partial(parse_chat, chat, answerer))
+        parsed = await submitter.in_thread(submission.owner, partial(parse_chat, chat, answerer))
         try:
             if chat.stream:
-                created_at = await submitter.submit(submission, parsed.request, None)
+                created_at = await submitter.submit(submission, parsed.request)
                 return stream.Streamed(
                     answer_events(submitter, submission, parsed, created_at),
                     locate=lambda error: locate_in_chat(error, parsed.pointers),

@@ -6,16 +6,18 @@ import zipfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import datetime
+from http import HTTPStatus
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Path, Query
 from fastapi.responses import FileResponse, RedirectResponse, Response
-from starlette import responses as starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers
 from starlette.requests import Request
-from starlette.types import Receive, Scope, Send
+from starlette.responses import MalformedRangeHeader
+from starlette.types import Message, Receive, Scope, Send
 
 from cow_service import errors
 from cow_service.api.problems import documented
@@ -43,30 +45,30 @@ class ArtifactResponse(FileResponse):
         self._release = release
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Sends the file and releases it, also where the caller leaves."""
+        """Sends the file and releases it, also where the caller leaves.
+
+        Starlette answers a wrong `Range` in plain text. Here one that lies outside is a problem, and a malformed one is
+        ignored, as the RFC has it.
+        """
+
+        async def checked(message: Message) -> None:
+            status = message.get("status")
+            if status == HTTPStatus.BAD_REQUEST:
+                raise MalformedRangeHeader
+            if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+                size = self.headers["content-length"]
+                detail = f"The file has {size} bytes; '{Headers(scope=scope)['range'][:80]}' lies outside."
+                raise errors.RangeNotSatisfiable(detail, headers={"Content-Range": f"bytes */{size}"})
+            await send(message)
+
         try:
-            await super().__call__(scope, receive, send)
+            try:
+                await super().__call__(scope, receive, checked)
+            except MalformedRangeHeader:
+                others = [(name, value) for name, value in scope["headers"] if name != b"range"]
+                await super().__call__({**scope, "headers": others}, receive, send)
         finally:
             await run_in_threadpool(self._release)
-
-    @classmethod
-    def check_range(cls, request: Request, size: int) -> None:
-        """Raises `RangeNotSatisfiable` where another server is to answer, which would say it in its own words."""
-        if wanted := request.headers.get("range"):
-            cls._parse_range_header(wanted, size)
-
-    @classmethod
-    def _parse_range_header(cls, http_range: str, file_size: int) -> list[tuple[int, int]]:
-        """Starlette answers both errors in plain text; the RFC has a malformed header ignored."""
-        try:
-            return super()._parse_range_header(http_range, file_size)
-        except starlette.MalformedRangeHeader:
-            return []
-        except starlette.RangeNotSatisfiable as error:
-            raise errors.RangeNotSatisfiable(
-                f"The artifact has {file_size} bytes; '{http_range[:80]}' lies outside.",
-                headers={"Content-Range": f"bytes */{file_size}"},
-            ) from error
 
 
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
@@ -215,7 +217,6 @@ def artifact(
         if request.method == "HEAD":  # the URL is signed for GET alone
             sizes = {"Content-Length": str(stored.size), "Accept-Ranges": "bytes"}
             return Response(media_type=stored.media_type, headers=headers | sizes)
-        ArtifactResponse.check_range(request, stored.size)
         return RedirectResponse(url, headers={"Cache-Control": f"private, max-age={REDIRECT_SECONDS}"})
     with ExitStack() as stack:
         path = stack.enter_context(store.local_file(sha256))

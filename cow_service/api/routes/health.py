@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 from cow_service import errors
 from cow_service.api.problems import documented
-from cow_service.api.submission import Engine, from_app
+from cow_service.api.submission import Engine, Owner, from_app
 from cow_service.jobs.readiness import Readiness
 from cow_service.observability.metrics import MEDIA_TYPE
 from cow_service.records import Models, Workers
@@ -63,11 +63,12 @@ def models(engine: Engine) -> Models:
     summary="Processes, their workers, and the queues",
     responses=documented(errors.StorageUnavailable),
 )
-def workers(engine: Engine) -> Workers:
+def workers(engine: Engine, owner: Owner) -> Workers:
     """Every process on the job database, what its workers compute, how full the queues are, and jobs that no
-    process takes. A second old at most; processes tell of themselves every two seconds.
+    process takes. A second old at most; processes tell of themselves every two seconds. Where the server has keys,
+    only those that administer it (`COW_ADMIN_KEYS`) are told hosts, process ids and ids of jobs.
     """
-    return engine.processes.overview.workers()
+    return engine.processes.overview.workers(for_admin=engine.service.settings.is_admin(owner))
 
 
 @router.get("/metrics", tags=["health"], summary="Counters for Prometheus", response_class=PlainTextResponse)

@@ -15,12 +15,10 @@ from cow_service.evals.report.summary import BASELINE, ArmSummary
 from cow_service.evals.report.tables import points
 from cow_service.evals.statistics import Calibration, Cost, Gain, Rates, Spread
 
-# The page replaces these four by the colours of its light or dark style; nothing else may use them.
-INK, DIM, LINE, GROUND = "#17211f", "#566360", "#d5dbd8", "#fefefe"
-# Okabe and Ito 2008. Their yellow is too pale on white, and their black too dark on a dark page: grey instead.
+INK, DIM, LINE, GROUND = "black", "#566360", "#d5dbd8", "white"
+# Okabe and Ito 2008. Their yellow is too pale on white, and their black too like the ink: grey instead.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "<", "p", "h", ">")  # a circle is the baseline
-LINES = ("-", "--", "-.", ":")
 LONGEST_NAME = 44  # characters; longer names keep their start and their end
 LEGEND_WIDTH = 110  # characters of a row of the legend
 ROUND_FIRST = ("o", *MARKERS)
@@ -32,7 +30,6 @@ LABELLED = 0.13  # inches between arms, at least, for a number at each
 SQUARE = 5.2  # inches
 LARGEST = 420.0  # area of the marker of the fullest bin, points²
 SMALLEST = 14.0
-COUNTED = 2  # curves, at most, whose markers have their counts beside them
 COST_PANEL, COST_WIDTH = 2.9, 7.5  # inches
 RANGE_FOR_LOG = 12.0  # between the dearest and the cheapest arm
 STYLE = {
@@ -42,21 +39,11 @@ STYLE = {
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
     "axes.titleweight": "bold",
-    "axes.labelcolor": INK,
-    "axes.edgecolor": DIM,
-    "axes.linewidth": 0.8,
-    "axes.facecolor": GROUND,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "figure.facecolor": GROUND,
     "grid.color": LINE,
     "grid.linewidth": 0.7,
-    "text.color": INK,
     "text.parse_math": False,  # a name with two dollar signs is a name
-    "xtick.color": DIM,
-    "xtick.labelcolor": INK,
-    "ytick.color": DIM,
-    "ytick.labelcolor": INK,
     "legend.frameon": False,
     "svg.fonttype": "none",  # text stays text: it can be searched, and read aloud
     "axes.axisbelow": True,
@@ -270,28 +257,19 @@ def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
     axes = figure.add_subplot()
     (diagonal,) = axes.plot([0, 100], [0, 100], color=DIM, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
     lines, names = [diagonal], ["as told (perfect calibration)"]
-    counted = len(curves) <= COUNTED  # the counts of the bins stand beside the markers
     for place, (arms, found) in enumerate(curves):
         base = sum(each.count * each.happened for each in found.bins) / found.count
         scores = f"Brier score {found.brier:.3f}; base rate {100 * base:.0f}%, always told: {found.base_brier:.3f}"
         colour, marker = COLOURS[place % len(COLOURS)], ROUND_FIRST[place % len(ROUND_FIRST)]
-        stroke = LINES[place % len(LINES)]
         told = [100 * each.told for each in found.bins]
         happened = [100 * each.happened for each in found.bins]
         fullest = max(each.count for each in found.bins)
         areas = [max(SMALLEST, LARGEST * each.count / fullest) for each in found.bins]
-        axes.plot(told, happened, color=colour, linestyle=stroke, linewidth=1.6, zorder=2)
+        axes.plot(told, happened, color=colour, linewidth=1.6, zorder=2)
         dots: dict[str, Any] = {"marker": marker, "facecolor": colour, "edgecolor": INK, "linewidth": 0.8}
         axes.scatter(told, happened, s=areas, zorder=3, alpha=0.75, **dots)
-        for x, y, area, each in zip(told, happened, areas, found.bins, strict=True) if counted else ():
-            # The first curve's counts stand below to the right, the second's above to the left: a curve that rises
-            # runs through neither.
-            side = -1 if place else 1
-            offset = side * (0.36 * area**0.5 + 1.5)
-            label = axes.annotate(f"{each.count}", (x, y), (offset, -offset), textcoords="offset points", fontsize=7.5)
-            label.set(va="top" if side > 0 else "bottom", ha="left" if side > 0 else "right")
         edge: dict[str, Any] = {"markersize": 7, "markeredgecolor": INK, "markeredgewidth": 0.7}
-        lines.append(Line2D([], [], color=colour, linestyle=stroke, marker=marker, **edge))
+        lines.append(Line2D([], [], color=colour, marker=marker, **edge))
         names.append(f"{short(', '.join(arms), 70)}\n{scores}; n = {found.count}")
     axes.set(xlim=(-6, 108), ylim=(-10, 106), aspect="equal")
     axes.grid()

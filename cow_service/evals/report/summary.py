@@ -26,6 +26,7 @@ class ArmSummary(Record):
     name: str = Field(description="Unique in the report: the arm, and the multimodal LLM where there are several.")
     rates: Rates
     cells: dict[tuple[str, str | None], Rates] = Field(description="By task and level; level null: all levels.")
+    baseline: int | None = Field(description="The run whose arm `never` it is compared with; null for that arm.")
     gain: Gain | None = Field(default=None, description="Over the arm `never`; null for itself, or without one.")
     gains: dict[str, Gain] = Field(description="The same per task, p values adjusted over them.")
     calibration: Calibration | None = None
@@ -60,6 +61,7 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
                     name=f"{name} ({place + 1})" if any(each.name == name for each in found) else name,
                     rates=of_all,
                     cells=_cells(observations),
+                    baseline=None if compared is None else runs.index(compared),
                     gain=statistics.gain(observations, baseline),
                     gains=_gains(observations, baseline),
                     calibration=statistics.calibration(observations),

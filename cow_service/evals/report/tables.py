@@ -5,7 +5,7 @@ import io
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from cow_service.evals.asking import DIFFERENCES as READING
 from cow_service.evals.items import TASKS, Task
@@ -40,8 +40,6 @@ DATA = (
 DIFFERENCES = {"Protocol": PROTOCOL, "Reading replies": READING, "Data": DATA}  # from the paper, by what they are about
 ALL = "all"
 NONE = ""  # a cell of which nothing is known
-_IN_SHORT = ("arm", "replies", "failed", "TPR, %", "NSR, %", "unreadable", "imagined", "refused")
-_GAINS_IN_SHORT = ("arm", "task", "questions", "gain, points", "95% interval", "helped", "hurt", "McNemar p")
 
 
 @dataclass(frozen=True)
@@ -121,17 +119,6 @@ def gains(summaries: Sequence[ArmSummary]) -> Table:
     return Table("gains", title, ("arm", "task", *columns), tuple(rows))
 
 
-def in_short(summaries: Sequence[ArmSummary]) -> tuple[Table, ...]:
-    """The rates and gains of each arm, for a terminal: without the figures of the paper, and those that have rows."""
-    rates, whole = overview(summaries), gains(summaries)
-    measured = replace(whole, rows=tuple(row for row in whole.rows if row[-1] or row[1] == ALL))
-    return tuple(
-        Table(f"{table.name}-in-short", table.title, header, rows)
-        for table, header in ((rates, _IN_SHORT), (measured, _GAINS_IN_SHORT))
-        if (rows := tuple(tuple(row[table.header.index(name)] for name in header) for row in table.rows))
-    )
-
-
 def calibration(summaries: Sequence[ArmSummary]) -> Table:
     """How good the probabilities are that the simulations told."""
     known = [(each.name, found) for each in summaries if (found := each.calibration) is not None]
@@ -155,27 +142,16 @@ def costs(summaries: Sequence[ArmSummary]) -> Table:
     return Table("cost", title, ("arm", *columns), rows)
 
 
-def pairs(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> Table:
-    """Every question and repeat, with what each arm chose; for further analysis."""
-    chosen = {
-        (run, each.arm, of.info.data_digest, each.item, each.repeat): each
-        for run, of in enumerate(runs)
-        for each in of.observations
-    }
-    places = {(of.info.data_digest, each.item, each.repeat): each for of in runs for each in of.observations}
+def replies(runs: Sequence[EvalRun]) -> Table:
+    """Every reply, a row each; for further analysis."""
+    header = ("mllm", "arm", "repeat", "item", "task", "level", "scene", "truth", "chosen", "right")
     rows: list[tuple[str, ...]] = []
-    for (data, item, repeat), each in sorted(places.items(), key=lambda place: place[0]):
-        told: list[str] = []
-        for one in summaries:
-            seen = chosen.get((one.run, one.arm, data, item, repeat))
-            if seen is None or seen.failure is not None:
-                told += (NONE, NONE)
-            else:
-                told += (seen.read or NONE, str(int(seen.right)))
-        rows.append((data[:12], item, each.task, each.level, each.scene, str(repeat), each.truth, *told))
-    columns = tuple(f"{each.name}: {what}" for each in summaries for what in ("chosen", "right"))
-    header = ("data", "item", "task", "level", "scene", "repeat", "truth", *columns)
-    return Table("pairs", "Every question and repeat", header, tuple(rows))
+    for run in runs:
+        for each in (each for each in run.observations if each.failure is None):
+            question = each.item, each.task, each.level, each.scene
+            chosen = each.truth, each.read or NONE, str(int(each.right))
+            rows.append((run.info.mllm, each.arm, str(each.repeat), *question, *chosen))
+    return Table("replies", "Every reply", header, tuple(rows))
 
 
 def _spread(spread: Spread) -> str:

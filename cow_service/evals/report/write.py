@@ -32,16 +32,17 @@ def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]
         _write(runs, summaries, out)
     except OSError as error:
         raise StorageUnavailable(f"'{out}' cannot be written: {error.strerror or error}.") from error
-    return "\n\n".join(map(tables.markdown, tables.in_short(summaries)))
+    main = tables.overview(summaries), tables.gains(summaries)
+    return "\n\n".join(tables.markdown(table) for table in main if table.rows)
 
 
 def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) -> None:
     (out / "tables").mkdir(parents=True, exist_ok=True)
     known = tables.tables(summaries)
-    for table in (*known, tables.pairs(runs, summaries)):
+    for table in known:
         for extension, text in FORMATS.items():
-            if table.name != "pairs" or extension == "csv":
-                (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
+            (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
+    (out / "tables" / "replies.csv").write_text(tables.csv_text(tables.replies(runs)), encoding="utf-8")
     plots = write_plots(out / "plots", summaries)
     differs = {f"Differences from the paper: {about.lower()}": told for about, told in tables.DIFFERENCES.items()}
     write_page(out, runs, summaries, plots, [(heading, "\n".join(told)) for heading, told in differs.items()])
@@ -83,8 +84,7 @@ def write_plots(folder: Path, summaries: Sequence[ArmSummary]) -> tuple[Path, ..
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name, draw in figures.DRAWINGS.items():
-        # A salt of its own for each plot: their ids must differ when they stand in one page.
-        style: dict[Any, Any] = {**figures.STYLE, "svg.hashsalt": f"cow-{name}"}
+        style: dict[Any, Any] = {**figures.STYLE, "svg.hashsalt": "cow"}
         with matplotlib.rc_context(style), warnings.catch_warnings():
             # Names of models may have letters that the font has not: the SVG keeps them as text.
             warnings.filterwarnings("ignore", message="Glyph .* missing from")

@@ -2,14 +2,13 @@
 
 The order of `accelerate` follows how the parts enclose each other: weights, attention, the compiled block, the cache
 that skips blocks, memory, and last, in `ranks`, context parallelism around the cache. A block compiled together with
-its cache hooks breaks its graph (first-block) or is not compiled at all (mag); a cache around context parallelism would
-compare a whole tensor with a shard.
+its cache hooks breaks its graph; a cache around context parallelism would compare a whole tensor with a shard.
 """
 
 import os
 import re
 import sys
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -17,24 +16,25 @@ import torch
 from torch import nn
 
 from cow_service.errors import CowError, GeneratorUnavailable
-from cow_service.generators.wan.capabilities import detect_capabilities, refusals
+from cow_service.generators.wan.capabilities import AUTO, detect_capabilities, refusals
 from cow_service.generators.wan.profiles import Acceleration
 
-WARM_UP_SHARE = 5  # dbcache never skips in the first fifth of the steps, as mag does not
-MAX_SKIPPED = 3  # steps in a row that dbcache skips, as mag does
+WARM_UP_SHARE = 5  # dbcache never skips in the first fifth of the steps
+MAX_SKIPPED = 3  # steps in a row that dbcache skips
 FIRST_LAYERS = 5  # dbcache computes a fifth of the layers in every step, and decides by them
 
 
-def check_device(
-    acceleration: Acceleration, device: torch.device, others: Mapping[str, Acceleration] | None = None
-) -> None:
-    """Raises `GeneratorUnavailable` for all that the device cannot do, naming those of `others` that it can run."""
+def check_device(acceleration: Acceleration, device: torch.device) -> None:
+    """Raises `GeneratorUnavailable` for all that the device cannot do."""
     with naming_option(f"device: {device}"):
         machine = detect_capabilities(device)
     if sentences := refusals(acceleration, machine):
-        able = ", ".join(name for name, each in (others or {}).items() if not refusals(each, machine))
-        remedy = f"This machine can run: {able}" if able else "Another profile may do"
-        raise GeneratorUnavailable(f"{' '.join(sentences)} {remedy} (COW_PROFILE).")
+        raise GeneratorUnavailable(f"{' '.join(sentences)} Another profile may do (COW_PROFILE).")
+    if acceleration.attention != AUTO:
+        from diffusers.models.attention_dispatch import attention_backend  # noqa: PLC0415
+
+        with naming_option(f"attention: {acceleration.attention}"), attention_backend(acceleration.attention):
+            pass  # diffusers has looked for what the backend needs, and fetched its kernel
 
 
 def accelerate(pipeline: Any, wanted: Acceleration, device: torch.device) -> None:
@@ -52,35 +52,27 @@ def accelerate(pipeline: Any, wanted: Acceleration, device: torch.device) -> Non
             pipeline.to(device)
         elif wanted.offload == "model":
             pipeline.enable_model_cpu_offload(device=device)
-        elif wanted.offload == "sequential":
-            pipeline.enable_sequential_cpu_offload(device=device)
         else:  # the transformer by block and the encoders by layer; the VAE is small and stays on the device
             from diffusers.hooks.group_offloading import apply_group_offloading  # noqa: PLC0415
 
-            streams = device.type == "cuda"
-            models: dict[str, Any] = {n: part for n, part in pipeline.components.items() if isinstance(part, nn.Module)}
-            for name, model in models.items():
-                if name == "vae":
-                    model.to(device)
-                elif name == "transformer":
-                    for block in model.blocks if streams else ():
-                        pin(block)
-                    # With `record_stream` the CPU does not wait for the copies of each block.
-                    apply_group_offloading(
-                        model, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams
-                    )
-                else:
-                    apply_group_offloading(model, device, offload_type="leaf_level")
+            transformer, streams = pipeline.transformer, device.type == "cuda"
+            for block in transformer.blocks if streams else ():
+                pin(block)
+            # With `record_stream` the CPU does not wait for the copies of each block.
+            apply_group_offloading(
+                transformer, device, num_blocks_per_group=1, use_stream=streams, record_stream=streams
+            )
+            if pipeline.vae is not None:
+                pipeline.vae.to(device)
+            for encoder in filter(None, (pipeline.text_encoder, pipeline.image_encoder)):
+                apply_group_offloading(encoder, device, offload_type="leaf_level")
 
 
 def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch.device) -> None:
     """The same for a transformer without the other parts, which stays where it is."""
     check_device(wanted, device)
     with naming_option(f"fp8: {wanted.fp8}"):
-        if wanted.fp8 == "stored":
-            if all(type(layer.weight) is nn.Parameter for layer in _linear_layers(transformer)):
-                raise ValueError("the checkpoint holds no weights in float8: give one that does (COW_CHECKPOINTS)")
-        elif wanted.fp8 != "none":
+        if wanted.fp8 in {"weights", "dynamic"}:
             from torchao import quantization as torchao  # noqa: PLC0415
 
             # torchao's recommended compiler settings hold for the whole process; they are left alone.
@@ -95,9 +87,6 @@ def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch
                 torchao.quantize_(block, config)
                 if wanted.offload != "none":
                     block.to("cpu")
-            # torchao silently skips layers whose shape its kernels do not support.
-            if any(type(layer.weight) is nn.Parameter for layer in _linear_layers(transformer)):
-                raise ValueError("the sides of some weights are not multiples of 16")
     with naming_option(f"attention: {wanted.attention}"):
         transformer.set_attention_backend(wanted.attention)
     if wanted.compile != "none":
@@ -112,30 +101,15 @@ def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch
         _enable_cache(transformer, wanted)
 
 
-def _linear_layers(transformer: Any) -> list[nn.Linear]:
-    return [layer for layer in transformer.blocks.modules() if isinstance(layer, nn.Linear)]
-
-
 def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
     if wanted.cache == "first-block":
         from diffusers.hooks.first_block_cache import FirstBlockCacheConfig  # noqa: PLC0415
 
         transformer.enable_cache(FirstBlockCacheConfig(threshold=wanted.cache_threshold))
-    elif wanted.cache == "mag":
-        from diffusers.hooks.mag_cache import MagCacheConfig  # noqa: PLC0415
-
-        ratios = torch.tensor(wanted.mag_ratios)
-        config: Any = MagCacheConfig(
-            threshold=wanted.cache_threshold, num_inference_steps=len(ratios), mag_ratios=ratios
-        )
-        config.measured = ratios
-        transformer.enable_cache(config)
     elif wanted.cache == "dbcache":
         os.environ.setdefault("CACHE_DIT_LOG_LEVEL", "WARNING")
         import cache_dit  # noqa: PLC0415
 
-        if _has_dbcache(transformer):
-            raise ValueError("a cache has already been enabled")
         dbcache = cache_dit.DBCacheConfig(
             Fn_compute_blocks=max(1, len(transformer.blocks) // FIRST_LAYERS),
             residual_diff_threshold=wanted.cache_threshold,
@@ -151,7 +125,7 @@ def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
 def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -> None:
     """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next.
 
-    `steps`: denoising steps of the coming clip; by default one per ratio of mag. `branches`: passes of each step here.
+    `steps`: denoising steps of the coming clip, which dbcache counts. `branches`: passes of each step here.
     Run every pass in `transformer.cache_context("cond")` or `("uncond")`, one after the other: each has its own state.
     """
     if "cache_dit" in sys.modules and _has_dbcache(transformer):
@@ -166,14 +140,7 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -
         for name in transformer._context_names:  # else the old one would be held until the next pass
             transformer._context_manager.set_context(name)
         return
-    from diffusers.hooks.mag_cache import MagCacheConfig, nearest_interp  # noqa: PLC0415
-
     transformer._reset_stateful_cache()  # removed and added anew, the hooks would be in another order
-    config = transformer._cache_config
-    if isinstance(config, MagCacheConfig):  # the hooks of all blocks share this one object
-        ratios = config.measured  # pyright: ignore[reportAttributeAccessIssue] - of `_enable_cache`
-        config.num_inference_steps = steps or len(ratios)
-        config.mag_ratios = nearest_interp(ratios, config.num_inference_steps)
 
 
 def _has_dbcache(transformer: Any) -> bool:

@@ -19,7 +19,7 @@ import torch
 from diffusers.models.attention_dispatch import attention_backend, dispatch_attention_fn
 from torch import Tensor
 
-from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities, is_from_hub, refusals
+from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities
 from cow_service.generators.wan.checkpoints import diffusers_config
 from cow_service.generators.wan.memory import has_failed, wait_until_done
 from cow_service.generators.wan.pipeline import token_count
@@ -129,14 +129,14 @@ def with_attention(
     if wanted.attention != AUTO:
         return profile
     machine, shape = detect_capabilities(device), shape_of(architecture, width, height)
-    names = backends_for_auto(wanted, machine)
+    names = tuple(name for name in backends_for_auto(wanted, machine) if _fetched(name) is None)
     situation = repr((machine.name, torch.__version__, diffusers.__version__, profile.dtype, tuple(shape), names))
     before: dict[str, str] = {}
     if kept is not None:
         with suppress(OSError, ValueError, TypeError):  # there is none yet, or it is damaged
             before = dict(json.loads(kept.read_text()))
     chosen = before.get(situation)
-    if chosen in names and _fetched(chosen) is None:
+    if chosen in names:
         log.info("attention: %s, as was chosen before", chosen)
     else:
         timed = () if len(names) < 2 else time_backends(names, shape, getattr(torch, profile.dtype), device)
@@ -157,13 +157,13 @@ def fetch_kernels(wanted: Iterable[Acceleration], device: torch.device) -> dict[
         name
         for each in wanted
         for name in (backends_for_auto(each, machine) if each.attention == AUTO else (each.attention,))
-        if is_from_hub(name) and not refusals(each.model_copy(update={"attention": name}), machine)
+        if name.endswith("_hub")
     ]
     return {name: _fetched(name) for name in dict.fromkeys(names)}
 
 
 def _fetched(name: str) -> str | None:
-    """Fetches a backend's kernel where it has one. Returns why that failed; None where it did not."""
+    """Fetches a backend's kernel where it has one. Returns why it cannot be used; None where it can."""
     try:
         with attention_backend(name):
             return None

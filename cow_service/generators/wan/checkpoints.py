@@ -59,14 +59,14 @@ def load_transformer(
     Raises `CheckpointInvalid` naming every file, name or shape that is wrong.
     """
     folder, files = checkpoint_files(path)
-    config, original = _configuration(folder, architecture)
     entries = read_headers(files)
     try:
         with init_empty_weights():
-            model = WanTransformer3DModel(**config)
-    except (TypeError, ValueError, ZeroDivisionError, RuntimeError) as error:
-        raise CheckpointInvalid(f"The configuration does not make a Wan transformer: {error}.") from error
-    sources = _match_names(entries, model.state_dict(), original)
+            model = WanTransformer3DModel(**_configuration(folder, architecture))
+    except (KeyError, TypeError, ValueError, ZeroDivisionError, RuntimeError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise CheckpointInvalid(f"The configuration does not make a Wan transformer: {reason}.") from error
+    sources = _match_names(entries, model.state_dict())
     # The weights are read one at a time and file after file, straight to their device.
     precise = tuple(model._keep_in_fp32_modules or ())  # pyright: ignore[reportPrivateUsage] - they stay in float32
     state: dict[str, Tensor] = {}
@@ -98,25 +98,20 @@ def diffusers_config(architecture: Architecture) -> dict[str, Any]:
     """The model's arguments in diffusers from the names of the original configuration (`dim`, `num_heads`, ...)."""
     if architecture.get("text_len", TEXT_LENGTH) != TEXT_LENGTH:
         raise CheckpointInvalid(f"`text_len` is {architecture['text_len']}: the model takes {TEXT_LENGTH} tokens only.")
-    try:
-        return {
-            "patch_size": (1, 2, 2),
-            "num_attention_heads": architecture["num_heads"],
-            "attention_head_dim": architecture["dim"] // architecture["num_heads"],
-            "in_channels": architecture["in_dim"],
-            "out_channels": architecture["out_dim"],
-            "text_dim": architecture.get("text_dim", 4096),
-            "freq_dim": architecture["freq_dim"],
-            "ffn_dim": architecture["ffn_dim"],
-            "num_layers": architecture["num_layers"],
-            "eps": architecture.get("eps", 1e-6),
-            "image_dim": architecture.get("image_dim", IMAGE_DIM),
-            "added_kv_proj_dim": architecture["dim"],
-        }
-    except KeyError as error:
-        raise CheckpointInvalid(f"The configuration does not say `{error.args[0]}`.") from error
-    except (TypeError, ZeroDivisionError) as error:
-        raise CheckpointInvalid(f"The configuration holds sizes that cannot be: {error}.") from error
+    return {
+        "patch_size": (1, 2, 2),
+        "num_attention_heads": architecture["num_heads"],
+        "attention_head_dim": architecture["dim"] // architecture["num_heads"],
+        "in_channels": architecture["in_dim"],
+        "out_channels": architecture["out_dim"],
+        "text_dim": architecture.get("text_dim", 4096),
+        "freq_dim": architecture["freq_dim"],
+        "ffn_dim": architecture["ffn_dim"],
+        "num_layers": architecture["num_layers"],
+        "eps": architecture.get("eps", 1e-6),
+        "image_dim": architecture.get("image_dim", IMAGE_DIM),
+        "added_kv_proj_dim": architecture["dim"],
+    }
 
 
 def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
@@ -133,11 +128,9 @@ def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
         pickles = [file.name for file in sorted(folder.iterdir()) if file.suffix in PICKLES]
         found = f"only pickles ({', '.join(pickles)}), which can run code when opened" if pickles else "none"
         raise CheckpointInvalid(f"'{path.name}' has no safetensors files: {found}.")
-    # Every shard that the index or a name like -00001-of-00007 promises must be there.
+    # Every shard that a name like -00001-of-00007 promises must be there.
     present = {file.name for file in files}
     promised: set[str] = set()
-    for index in folder.glob("*.safetensors.index.json"):
-        promised |= set(_json(index).get("weight_map", {}).values())
     for name in present:
         if numbered := re.fullmatch(r"(.*-)\d+-of-(\d+)\.safetensors", name):
             promised |= {f"{numbered[1]}{i + 1:05d}-of-{numbered[2]}.safetensors" for i in range(int(numbered[2]))}
@@ -146,11 +139,11 @@ def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
     return folder, files
 
 
-def _configuration(folder: Path | None, architecture: Architecture) -> tuple[dict[str, Any], bool | None]:
-    """The model's arguments, and whether names are the original ones; null where only the names can tell."""
+def _configuration(folder: Path | None, architecture: Architecture) -> dict[str, Any]:
+    """The model's arguments."""
     file = folder / "config.json" if folder else None
     if file is None or not file.is_file():
-        return diffusers_config(architecture), None
+        return diffusers_config(architecture)
     config = _json(file)
     kind = config.get("_class_name")
     if kind == "WanTransformer3DModel":
@@ -158,13 +151,13 @@ def _configuration(folder: Path | None, architecture: Architecture) -> tuple[dic
             raise CheckpointInvalid(
                 "The model of config.json takes no image: `in_channels` is not 36, or no `image_dim`."
             )
-        return {name: value for name, value in config.items() if not name.startswith("_")}, False
+        return {name: value for name, value in config.items() if not name.startswith("_")}
     if kind == "WanModel":
         if config.get("model_type", "i2v") != "i2v":
             raise CheckpointInvalid(
                 f"`model_type` in config.json is '{config['model_type']}', not 'i2v': no image input."
             )
-        return diffusers_config(config), True
+        return diffusers_config(config)
     raise CheckpointInvalid(f"config.json is of class '{kind}': neither WanModel nor WanTransformer3DModel.")
 
 
@@ -202,12 +195,12 @@ def read_headers(files: Iterable[Path]) -> dict[str, Entry]:
     return entries
 
 
-def _match_names(entries: dict[str, Entry], wanted: Mapping[str, Tensor], original: bool | None) -> dict[str, str]:
+def _match_names(entries: dict[str, Entry], wanted: Mapping[str, Tensor]) -> dict[str, str]:
     """For each of the model's names, the checkpoint's. Raises `CheckpointInvalid` listing all that does not fit."""
     weights = {name for name in entries if not name.endswith((SCALE, *UNUSED))}
-    if original is None:
-        original = not any(name.startswith("condition_embedder.") for name in weights)
-    sources = diffusers_names(sorted(weights)) if original else {name: name for name in sorted(weights)}
+    sources = {name: name for name in sorted(weights)}
+    if not any(name.startswith("condition_embedder.") for name in weights):  # the original names
+        sources = diffusers_names(sources)
     unknown = sorted(set(sources.values()) - {sources[name] for name in sources.keys() & wanted.keys()})
     unknown += sorted(weights - set(sources.values()))  # two names became one
     unknown += sorted(n for n in entries if n.endswith(SCALE) and n.removesuffix(SCALE) + ".weight" not in weights)
@@ -302,8 +295,8 @@ class _Change:
 
 
 @torch.no_grad()
-def add_lora(transformer: nn.Module, file: Path, scale: float) -> None:
-    """Adds `scale` times the LoRA in a safetensors file to the weights of a transformer.
+def add_lora(transformer: nn.Module, file: Path) -> None:
+    """Adds the LoRA in a safetensors file to the weights of a transformer.
 
     Before `accelerate`: weights in float8 cannot be added to. Raises `CheckpointInvalid` for a file with a tensor that
     does not belong to the model or has another shape, before anything is changed; `WeightsUnavailable` without a file.
@@ -328,10 +321,12 @@ def add_lora(transformer: nn.Module, file: Path, scale: float) -> None:
                 f"LoRA '{file.name}' is scaled by its metadata. Save it with the scale in its weights."
             )
     if broken := [key for key, tensor in tensors.items() if not tensor.isfinite().all()]:
-        raise CheckpointInvalid(f"LoRA '{file.name}' holds infinite or undefined values: {_some(broken)}.")
+        raise CheckpointInvalid(
+            f"LoRA '{file.name}' holds infinite or undefined values: {listed(sorted(broken), MAX_LISTED)}."
+        )
     for name, change in _changes(tensors, parameters, file.name).items():
         parameter = parameters[name]
-        parameter.copy_(parameter.float() + scale * change.on(parameter.device))
+        parameter.copy_(parameter.float() + change.on(parameter.device))
 
 
 def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], file: str) -> dict[str, _Change]:
@@ -353,15 +348,12 @@ def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], fi
         names = {original: name for name, original in diffusers_names(names).items()}
     unknown += [target for target in found if names[target] not in parameters]
     if unknown or not found:
-        misplaced = _some(unknown) or "an empty one"
+        misplaced = listed(sorted(unknown), MAX_LISTED) or "an empty one"
         raise CheckpointInvalid(f"LoRA '{file}' is not one for this model, which has no place for {misplaced}.")
     changes = {names[target]: _Change(**parts) for target, parts in found.items()}
     if misfits := [name for name, change in changes.items() if not change.fits(parameters[name])]:
         raise CheckpointInvalid(
-            f"LoRA '{file}' does not fit this model: half of a pair or another shape for {_some(misfits)}."
+            f"LoRA '{file}' does not fit this model: half of a pair or another shape for "
+            f"{listed(sorted(misfits), MAX_LISTED)}."
         )
     return changes
-
-
-def _some(names: list[str]) -> str:
-    return listed(sorted(names), MAX_LISTED)

@@ -35,7 +35,8 @@ def ati(condition: Tensor, tracks: Tracks, width: int, height: int) -> tuple[Ten
 def wan_move(condition: Tensor, tracks: Tracks, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Wan-Move: only the guided pass is conditioned on the tracks."""
     points, visible = torch.from_numpy(tracks.points), torch.from_numpy(tracks.visible)
-    return wan_move_condition(condition, points, visible), condition
+    latent = wan_move_latent(condition[MASK_CHANNELS:], points, visible)
+    return torch.cat([condition[:MASK_CHANNELS], latent]), condition
 
 
 def ati_condition(condition: Tensor, tracks: Tensor) -> Tensor:
@@ -56,11 +57,6 @@ def ati_condition(condition: Tensor, tracks: Tensor) -> Tensor:
     changed[:MASK_CHANNELS, 1:] = total.to(changed.dtype)
     changed[MASK_CHANNELS:, 1:] = (carried + latent[:, 1:] * (1 - total.clamp(max=1))).to(changed.dtype)
     return changed
-
-
-def wan_move_condition(condition: Tensor, points: Tensor, visible: Tensor) -> Tensor:
-    """The condition [20, T, h, w] with Wan-Move's features in it: see `wan_move_latent`."""
-    return torch.cat([condition[:MASK_CHANNELS], wan_move_latent(condition[MASK_CHANNELS:], points, visible)])
 
 
 def wan_move_latent(latent: Tensor, points: Tensor, visible: Tensor) -> Tensor:

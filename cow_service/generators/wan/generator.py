@@ -2,21 +2,20 @@
 
 import logging
 import math
-import os
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import sha256
-from pathlib import Path
 from typing import TypeAlias, cast
 
 import torch
 
+from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.wan.conditioning import TrackConditioning
-from cow_service.generators.wan.memory import exclusive_use, within_memory
+from cow_service.generators.wan.memory import within_memory
 from cow_service.generators.wan.pipeline import (
     TEXT_LENGTH,
     Conditioning,
@@ -43,6 +42,8 @@ COMPILED_FRAMES = (81, 17)
 CONDITION_CHANNELS = 20
 
 ClipSize: TypeAlias = tuple[int, int, int]  # width and height (px), frames
+
+_DEVICES: dict[str, PrioritySemaphore] = {}  # by name: each makes one clip at a time, whatever the model
 
 log = logging.getLogger("cow_service")
 
@@ -112,7 +113,7 @@ class WanGenerator(WanLimits):
     @contextmanager
     def _own_device(self, what: str, check_canceled: Callable[[], None]) -> Generator[None]:
         with (
-            exclusive_use(self.device, check_canceled),
+            _DEVICES.setdefault(str(self.device), PrioritySemaphore(1)).held(check_canceled=check_canceled),
             cpu_threads(self.threads),
             within_memory(self.device, self._embeddings.clear, what),
         ):
@@ -134,12 +135,12 @@ class WanGenerator(WanLimits):
             revision=self.revision,
             seed=given.seed,
             steps=sampling.steps,
+            is_toy=not self.manifest.sources,
             options={
                 "profile": self.profile_name,
                 "solver": sampling.solver,
                 "shift": sampling.shift,
                 "guidance_scale": sampling.guidance_scale,
-                "guidance_window": str(list(sampling.guidance_window)),
                 "dtype": self.profile.dtype,
                 "vae_dtype": self.profile.vae_dtype,
                 "device": self.device.type,
@@ -205,12 +206,7 @@ class WanGenerator(WanLimits):
         sampling = self.profile.sampling.model_copy(update=update)
         prompt = sentence if options.prompt is None else options.prompt
         negative = self._negative_prompt if options.negative_prompt is None else options.negative_prompt
-        return sampling, prompt, negative if sampling.guided else None
-
-
-def keep_compiled_code(folder: Path) -> None:
-    """Makes PyTorch keep compiled code in a folder for the next start, unless the environment names another one."""
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(folder))
+        return sampling, prompt, negative if sampling.is_guided else None
 
 
 def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling, sizes: Iterable[ClipSize]) -> None:
@@ -227,6 +223,6 @@ def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling
         begun = time.perf_counter()
         noise = torch.zeros(latent_shape(*size))
         condition = torch.zeros(CONDITION_CHANNELS, *noise.shape[2:])
-        given = Conditioning(text, text if step.guided else None, image, condition, condition)
+        given = Conditioning(text, text if step.is_guided else None, image, condition, condition)
         denoise(noise, given, step, lambda done, total: None)
         log.info("compiled for %d x %d px and %d frames in %.1f s", *size, time.perf_counter() - begun)

@@ -6,7 +6,8 @@ nothing; it is for tests, and to try a deployment out.
 """
 
 import logging
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -20,8 +21,8 @@ from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT
 from cow_service.errors import CheckpointInvalid, GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan import acceleration, checkpoints, conditioning
 from cow_service.generators.wan.attention import with_attention
-from cow_service.generators.wan.generator import USUAL_SIDES, WanGenerator, clip_size, keep_compiled_code
-from cow_service.generators.wan.memory import check_memory, within_memory
+from cow_service.generators.wan.generator import USUAL_SIDES, WanGenerator, clip_size
+from cow_service.generators.wan.memory import check_machine, within_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.generators.wan.ranks import RankGroup
@@ -30,6 +31,8 @@ from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device
 from cow_service.weights.manifests import Manifest, Source, load_manifests
 from cow_service.weights.repositories import folder_of, read_lock, verify, weights_identity
+
+CODE_FOLDER = "TORCHINDUCTOR_CACHE_DIR"
 
 log = logging.getLogger("cow_service")
 
@@ -40,23 +43,24 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     Raises `WeightsUnavailable`, `CheckpointInvalid`, `GeneratorOutOfMemory`, or `GeneratorUnavailable` for what this
     machine cannot do.
     """
-    keep_compiled_code(settings.data_dir / "compiled")  # first: PyTorch sets its own folder when it is first used
+    # Compiled code is kept for the next start. First of all: PyTorch sets a folder of its own when it is first used.
+    os.environ.setdefault(CODE_FOLDER, str(settings.data_dir / "compiled"))
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)
     device = choose_device(settings.device, GeneratorUnavailable)
     own = settings.checkpoints.get(name)
-    others = {each: profile_of(manifest, each).acceleration for each in manifest.profiles}
-    if own is None:  # what is pulled is not in float8
-        others = {each: other for each, other in others.items() if other.fp8 != "stored"}
-    acceleration.check_device(profile.acceleration, device, others)
     if own is not None:
         checkpoints.checkpoint_files(own)
+    weights = Weights(manifest, profile, settings)
+    folders = {part: weights.folder(part) for part in manifest.sources}
+    check_machine(manifest, settings.profile, folders, device)
+    acceleration.check_device(profile.acceleration, device)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
     max_area = int(manifest.defaults["max_area"])
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
         kept = settings.data_dir / "attention.json"
         profile = with_attention(profile, manifest.architecture, *clip_size(max_area, *USUAL_SIDES), device, kept)
-        weights = Weights(manifest, profile, settings)
+        weights = replace(weights, profile=profile)
         pipeline, group = weights.load_pipeline(device)
     revisions = weights.revisions()
     repository = manifest.sources["transformer"].repository if manifest.sources else None
@@ -95,7 +99,7 @@ create_tiny_wan_move = partial(load, "tiny-wan-move", conditioning.wan_move)
 
 def load_rank(name: str, profile: Profile, settings: Settings, device: torch.device) -> WanTransformer3DModel:
     """The transformer alone, for one more process that shares clips; rank 0 has checked it. Raises as `load` does."""
-    keep_compiled_code(settings.data_dir / "compiled")
+    os.environ.setdefault(CODE_FOLDER, str(settings.data_dir / "compiled"))
     manifest = load_manifests()[name]
     with within_memory(device, lambda: None, f"'{name}' on {device}"):
         if manifest.sources:
@@ -117,7 +121,7 @@ class Weights:
 
     def pulled(self) -> dict[str, Source]:
         """By part, the sources that the model is made of and that are not the user's own."""
-        used = {"transformer", "base"} | ({self.profile.lora.source} if self.profile.lora is not None else set())
+        used = {"transformer", "base"} | ({self.profile.lora} if self.profile.lora is not None else set())
         used -= set(self.settings.own_parts(self.manifest.name))
         return {part: source for part, source in sorted(self.manifest.sources.items()) if part in used}
 
@@ -145,18 +149,16 @@ class Weights:
             keep_float8=fp8 == "stored",
         )
         if lora is not None:
-            file = self.folder(lora.source) / self.manifest.sources[lora.source].files[0]
-            checkpoints.add_lora(transformer, file, lora.scale)
+            checkpoints.add_lora(transformer, self.folder(lora) / self.manifest.sources[lora].files[0])
         return transformer
 
     def load_pipeline(self, device: torch.device) -> tuple[WanTrackPipeline, RankGroup | None]:
         """The pipeline on its device, and the processes that share its clips, which load at the same time.
 
-        Weights that cannot fit are refused before any is read, and so are files that are not those that were pulled.
+        Files that are not those that were pulled are refused before any is read.
         """
         manifest, profile, settings, ranks = self.manifest, self.profile, self.settings, self.profile.acceleration.ranks
         if manifest.sources:
-            check_memory(manifest, settings.profile, self.folder("transformer"), self.folder("base"), device)
             for source in self.pulled().values():
                 verify(source, settings.weights_dir, manifest.name)
         if ranks > 1 and distributed.is_initialized():

@@ -1,18 +1,18 @@
-"""The memory of a device: whether a model's weights fit, who uses it, and what happens when it runs out."""
+"""What a machine can run: what profiles it supports, whether weights fit, and what happens when memory runs out."""
 
 import gc
 import math
 import os
 import traceback
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 
 import torch
 
 from cow_service.errors import CheckpointInvalid, DeviceFailed, GeneratorOutOfMemory, GeneratorUnavailable
+from cow_service.generators.wan.acceleration import naming_option
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
 from cow_service.generators.wan.checkpoints import FLOAT8, checkpoint_files, read_headers
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
@@ -26,9 +26,6 @@ BLOCKS_AT_ONCE = 2  # of the transformer's, with `offload: group`: one computes 
 PINNED = 1.5
 BASE_PARTS = ("text_encoder", "image_encoder", "vae")
 CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes or "max"
-CANCEL_POLL_SECONDS = 0.2  # how often a caller that waits for the device checks whether it was canceled
-
-_locks: dict[str, Lock] = {}
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,6 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
         "none": sum(kept.values()),
         "model": max(kept.values()),
         "group": kept["vae"] + BLOCKS_AT_ONCE * kept["transformer"] // blocks,
-        "sequential": 0,
     }[wanted.offload]
     if wanted.offload == "none" and wanted.fp8 not in {"weights", "dynamic"}:  # read straight to the device
         return Need(on_device, 0)
@@ -63,44 +59,50 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
     return Need(on_device, wanted.ranks * on_host)
 
 
-def check_memory(manifest: Manifest, name: str, checkpoint: Path, base: Path, device: torch.device) -> None:
-    """Raises `GeneratorUnavailable` where the weights of the profile of that name cannot fit, naming those that can.
+def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], device: torch.device) -> None:
+    """Raises `GeneratorUnavailable` for what the profile of that name needs and is not here, naming those that can run.
 
-    Of the files only the headers are read; where that fails, loading says why.
+    Whether weights fit is told by the headers of the files in `folders` (`transformer` and `base`), once all are here.
     """
-    found = _read_headers(checkpoint, base)
-    if found is None:
-        return
-    parameters, has_float8 = found
-    if profile_of(manifest, name).acceleration.fp8 == "stored" and not has_float8:
-        raise GeneratorUnavailable(
-            f"The profile '{name}' keeps the float8 of a checkpoint, and that of '{manifest.name}' has none: give one "
-            "that does (COW_CHECKPOINTS), or set COW_PROFILE."
-        )
-    room = Need(_room(device), _host())
+    with naming_option(f"device: {device}"):
+        machine = detect_capabilities(device)
+    parameters, has_float8 = _read_headers(folders)
 
-    def shortage(profile: Profile) -> str | None:
+    def lacking(profile: Profile) -> str:
+        if sentences := refusals(profile.acceleration, machine):
+            return " ".join(sentences)
+        if profile.acceleration.fp8 == "stored" and not has_float8:
+            return "fp8: stored keeps the float8 of a checkpoint: give one that has some (COW_CHECKPOINTS)."
+        if not parameters:
+            return ""
         need = need_of(profile, parameters, int(manifest.architecture["num_layers"]))
+        room, host = _room(device), _host()
         if device.type == "cpu":  # where both are the same memory
             need = Need(0, max(need.device, need.host))
-        if need.device > room.device:
-            return f"{need.device / 1e9:.0f} GB of the GPU's memory, and it has {room.device / 1e9:.0f} GB"
-        if need.host > room.host:
-            return f"{need.host / 1e9:.0f} GB of this machine's memory, and it has {room.host / 1e9:.0f} GB"
-        return None
+        if need.device > room:
+            return f"Its weights take {need.device / 1e9:.0f} GB of the GPU's memory, which has {room / 1e9:.0f} GB."
+        if need.host > host:
+            return f"Its weights take {need.host / 1e9:.0f} GB of this machine's memory, which has {host / 1e9:.0f} GB."
+        return ""
 
-    if (short := shortage(profile_of(manifest, name))) is not None:
-        machine = detect_capabilities(device)
-        profiles = {other: profile_of(manifest, other) for other in manifest.profiles}
-        fitting = [
-            other
-            for other, profile in profiles.items()
-            if (has_float8 or profile.acceleration.fp8 != "stored")
-            and shortage(profile) is None
-            and not refusals(profile.acceleration, machine)
-        ]
-        able = f"Of its profiles fit: {', '.join(fitting)} (COW_PROFILE)." if fitting else "None of its profiles fits."
-        raise GeneratorUnavailable(f"The weights of '{manifest.name}' with the profile '{name}' take {short}. {able}")
+    if problem := lacking(profile_of(manifest, name)):
+        able = [other for other in manifest.profiles if not lacking(profile_of(manifest, other))]
+        remedy = f"can run: {', '.join(able)} (COW_PROFILE)" if able else "can run none of its profiles"
+        raise GeneratorUnavailable(f"'{manifest.name}', profile '{name}': {problem} This machine {remedy}.")
+
+
+def _read_headers(folders: Mapping[str, Path]) -> tuple[dict[str, int], bool]:
+    """How many numbers each part has, nothing where one is not here, and whether the transformer has some in float8."""
+    counts: dict[str, int] = {}
+    has_float8 = False
+    with suppress(CheckpointInvalid, OSError, KeyError):  # loading says why
+        files = {"transformer": checkpoint_files(folders["transformer"])[1]}
+        files |= {part: tuple((folders["base"] / part).glob("*.safetensors")) for part in BASE_PARTS}
+        for part, some in files.items():
+            entries = [each for file in some for each in read_headers([file]).values()]
+            has_float8 = has_float8 or any(each.dtype in FLOAT8 for each in entries)
+            counts[part] = sum(math.prod(each.shape) for each in entries)
+    return counts if len(counts) > len(BASE_PARTS) and all(counts.values()) else {}, has_float8
 
 
 def _room(device: torch.device) -> int:
@@ -113,31 +115,6 @@ def _host() -> int:
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     limit = CGROUP.read_text().strip() if CGROUP.is_file() else "max"
     return min(there, int(limit)) if limit.isdecimal() else there
-
-
-def _read_headers(checkpoint: Path, base: Path) -> tuple[dict[str, int], bool] | None:
-    """How many numbers each part has, and whether the transformer has some in float8; None where it cannot be read."""
-    try:
-        files = {"transformer": checkpoint_files(checkpoint)[1]}
-        files |= {part: tuple((base / part).glob("*.safetensors")) for part in BASE_PARTS}
-        held = {part: [each for file in some for each in read_headers([file]).values()] for part, some in files.items()}
-    except (CheckpointInvalid, OSError):
-        return None
-    counts = {part: sum(math.prod(each.shape) for each in entries) for part, entries in held.items()}
-    has_float8 = any(each.dtype in FLOAT8 for each in held["transformer"])
-    return (counts, has_float8) if all(held.values()) else None
-
-
-@contextmanager
-def exclusive_use(device: torch.device, check_canceled: Callable[[], None]) -> Generator[None]:
-    """Holds the device for one clip. While another clip has it, `check_canceled` is called, and may raise."""
-    lock = _locks.setdefault(str(device), Lock())
-    while not lock.acquire(timeout=CANCEL_POLL_SECONDS):
-        check_canceled()
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def wait_until_done(device: torch.device) -> None:

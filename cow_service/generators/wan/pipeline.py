@@ -1,11 +1,10 @@
 """diffusers' image-to-video pipeline in three parts that can be timed, cached and canceled: encode, denoise, decode.
 
 The encoding methods and the models are those of the parent class. Other than in its own loop, the condition differs
-between the guided and the unconditional pass, guidance holds for a window of steps, several processes can share the
-steps of a clip, and a callback is called after every step.
+between the guided and the unconditional pass, several processes can share the steps of a clip, and a callback is called
+after every step.
 """
 
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -79,8 +78,7 @@ def compose(**parts: Any) -> "WanTrackPipeline":
 
     The parent class requires a scheduler, which is not used: every clip is sampled with one of its own.
     """
-    scheduler = UniPCMultistepScheduler(prediction_type="flow_prediction", use_flow_sigmas=True, flow_shift=3.0)
-    return WanTrackPipeline(scheduler=scheduler, **parts)  # pyright: ignore[reportArgumentType]: any flow scheduler
+    return WanTrackPipeline(scheduler=FlowMatchEulerDiscreteScheduler(), **parts)
 
 
 class WanTrackPipeline(WanImageToVideoPipeline):
@@ -145,18 +143,17 @@ class EmbeddingCache:
 
     def __init__(self, pipeline: WanTrackPipeline) -> None:
         self._pipeline = pipeline
-        self._images: OrderedDict[tuple[object, ...], ImageEmbedding] = OrderedDict()
+        self._images: dict[tuple[object, ...], ImageEmbedding] = {}  # the one that was used last is the last one
         self.text = lru_cache(MAX_TEXTS)(pipeline.embed_text)
 
     def image(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> ImageEmbedding:
         """Embedding of the first frame of a clip of this size (px) and length."""
         key = (sha256(image.tobytes()).digest(), image.shape, width, height, num_frames)
-        if key not in self._images:
-            self._images[key] = self._pipeline.embed_image(image, width, height, num_frames)
-        self._images.move_to_end(key)
+        found = self._images.pop(key, None) or self._pipeline.embed_image(image, width, height, num_frames)
+        self._images[key] = found
         if len(self._images) > MAX_IMAGES:
-            self._images.popitem(last=False)
-        return self._images[key]
+            del self._images[next(iter(self._images))]
+        return found
 
     def clear(self) -> None:
         """Drops everything."""
@@ -225,7 +222,7 @@ def denoise(
     try:
         for step, time in enumerate(schedule.timesteps):
             velocity = velocity_of("cond", guided, time, prompt)
-            if negative is not None and sampling.guides(step):
+            if negative is not None and sampling.is_guided:
                 plain = velocity_of("uncond", unguided, time, negative)
                 velocity = plain + sampling.guidance_scale * (velocity - plain)
             latents = schedule.step(velocity, time, latents, return_dict=False)[0]

@@ -3,9 +3,9 @@
 Without the model's libraries: a server that has none checks requests and passes them on.
 """
 
-from typing import Literal, Self
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import GeneratorUnavailable
 from cow_service.generators.wan.tracks import nearest_lengths
@@ -29,26 +29,11 @@ class Sampling(Record):
     guidance_scale: float = Field(
         ge=0, le=30, description="How strongly the prompt steers; at 1 the second pass of each step falls away."
     )
-    guidance_window: tuple[float, float] = Field(
-        default=(0.0, 1.0),
-        description="Share of the steps, from and to, that are guided; each step outside takes half the time.",
-    )
-
-    @model_validator(mode="after")
-    def _window_is_ordered(self) -> Self:
-        if not 0 <= self.guidance_window[0] <= self.guidance_window[1] <= 1:
-            raise ValueError(f"`guidance_window` [from, to] lies within 0 to 1 in order, got {self.guidance_window}")
-        return self
-
-    def guides(self, step: int) -> bool:
-        """Whether step 0 <= `step` < `steps` takes the second, unconditional pass."""
-        begin, end = self.guidance_window
-        return self.guidance_scale != 1 and begin <= step / self.steps < end
 
     @property
-    def guided(self) -> bool:
-        """Whether any step takes the second pass."""
-        return any(self.guides(step) for step in range(self.steps))
+    def is_guided(self) -> bool:
+        """Whether each step takes a second, unconditional pass."""
+        return self.guidance_scale != 1
 
 
 class Acceleration(Record):
@@ -67,20 +52,19 @@ class Acceleration(Record):
         description="regional compiles the transformer's block once for all of its layers; the same to rounding. The "
         "first clips of new shapes wait for the compiler.",
     )
-    cache: Literal["none", "first-block", "mag", "dbcache"] = Field(
+    cache: Literal["none", "first-block", "dbcache"] = Field(
         default="none",
         description="Skips the transformer in steps that would change little, and so changes the frames. first-block "
         "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`. "
-        "mag decides by `mag_ratios` alone: never in the first fifth of the steps, never more than 3 in a row. dbcache "
-        "(the package cache-dit) decides as first-block by a fifth of the layers, with the limits of mag, and can "
-        "extrapolate what it skips (`cache_taylor_order`). All keep one to three copies of the hidden states per "
-        "guidance branch, dbcache as many more as its order. Of no use with few, distilled steps.",
+        "dbcache (the package cache-dit, for one GPU) decides as first-block by a fifth of the layers, never skips in "
+        "the first fifth of the steps or more than 3 in a row, and can extrapolate what it skips "
+        "(`cache_taylor_order`). Both keep one to three copies of the hidden states per guidance branch, dbcache as "
+        "many more as its order. Of no use with few, distilled steps.",
     )
     cache_threshold: float = Field(
         default=0.05,
         ge=0,
-        description="For first-block and dbcache, relative change of the first layers; for mag, the error that may add "
-        "up. 0 skips nothing; the larger, the faster and the worse.",
+        description="Relative change of the first layers. 0 skips nothing; the larger, the faster and the worse.",
     )
     cache_taylor_order: int = Field(
         default=0,
@@ -89,11 +73,6 @@ class Acceleration(Record):
         description="For dbcache: 0 takes what was computed last for what is skipped, 1 and 2 extrapolate it from its "
         "last values (TaylorSeer).",
     )
-    mag_ratios: tuple[float, ...] = Field(
-        default=(),
-        description="For mag: by how much the model's residual grows from each step to the next, measured on these "
-        "weights. They are spread over the steps of a clip.",
-    )
     fp8: Literal["none", "stored", "weights", "dynamic"] = Field(
         default="none",
         description="Stores the linear layers of the transformer's blocks as float8, half of bfloat16's memory; norms, "
@@ -101,12 +80,11 @@ class Acceleration(Record):
         "value; weights and dynamic round, and so change the frames slightly. stored and weights compute in the "
         "model's precision, slower than none; dynamic also computes in float8, and is faster where compiled.",
     )
-    offload: Literal["none", "model", "group", "sequential"] = Field(
+    offload: Literal["none", "model", "group"] = Field(
         default="none",
         description="Keeps parts in the CPU's memory; the frames stay the same. model moves one whole part at a time, "
         "which costs seconds per clip. group moves one block while the one before it computes: far less memory, and "
-        "little time where the connection is fast; it pins the transformer in the CPU's memory. sequential moves every "
-        "layer by itself: the least memory of all, and many times slower.",
+        "little time where the connection is fast; it pins the transformer in the CPU's memory.",
     )
     vae_tiling: bool = Field(
         default=False,
@@ -132,13 +110,6 @@ class Acceleration(Record):
         return self.context_parallel * (2 if self.guidance_parallel else 1)
 
 
-class Lora(Record):
-    """Low-rank weights that are added to the transformer's when it is loaded."""
-
-    source: str = Field(description="Which of the manifest's sources it is.")
-    scale: float = 1.0
-
-
 class Profile(Record):
     """One way to run a model."""
 
@@ -149,15 +120,10 @@ class Profile(Record):
         default="float32", description="Of the VAE; bfloat16 decodes in less time, with slightly banded gradients."
     )
     acceleration: Acceleration = Acceleration()
-    lora: Lora | None = None
-
-    @model_validator(mode="after")
-    def _ratios_meet_their_steps(self) -> Self:
-        if self.acceleration.cache == "mag" and self.sampling.guidance_window[0] > 0:
-            raise ValueError("`cache: mag` counts the steps of each branch: `guidance_window` must begin at 0")
-        if self.acceleration.cache == "dbcache" and self.sampling.guidance_window != (0, 1):
-            raise ValueError("`cache: dbcache` counts passes: `guidance_window` must be [0, 1]")
-        return self
+    lora: str | None = Field(
+        default=None,
+        description="Which of the manifest's sources is a LoRA, which is added to the transformer's weights.",
+    )
 
 
 def profile_of(manifest: Manifest, name: str) -> Profile:
@@ -166,14 +132,7 @@ def profile_of(manifest: Manifest, name: str) -> Profile:
         raise GeneratorUnavailable(
             f"'{manifest.name}' has no profile '{name}'. It has: {', '.join(manifest.profiles)}. Set COW_PROFILE."
         )
-    try:
-        profile = Profile.model_validate(manifest.profiles[name])
-        if profile.lora is not None and profile.lora.source not in manifest.sources:
-            raise GeneratorUnavailable(f"'{manifest.name}' has no source '{profile.lora.source}' for its LoRA.")
-        return profile
-    except ValidationError as error:
-        problems = "; ".join(f"{'.'.join(str(p) for p in item['loc'])}: {item['msg']}" for item in error.errors())
-        raise GeneratorUnavailable(f"Profile '{name}' of '{manifest.name}' is not valid: {problems}.") from error
+    return Profile.model_validate(manifest.profiles[name])
 
 
 class WanOptions(BaseModel):

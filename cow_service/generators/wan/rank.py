@@ -22,7 +22,7 @@ from cow_service.errors import CowError, unforeseen
 from cow_service.generators.wan.loading import load_rank
 from cow_service.generators.wan.memory import within_memory
 from cow_service.generators.wan.pipeline import denoise
-from cow_service.generators.wan.ranks import HOST, FromRank, Load, RankFailed, Share, Sharing, ToRank
+from cow_service.generators.wan.ranks import HOST, FromRank, Load, Share, Sharing, ToRank
 from cow_service.observability import logging as logs
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import load_manifests
@@ -85,7 +85,7 @@ def main(descriptor: int) -> None:
     except Exception:
         log.exception("a rank failed")
     try:
-        pipe.send(RankFailed(failed.code, failed.detail))
+        pipe.send(failed)
     finally:
         os._exit(1)  # without waiting for the other ranks
 

@@ -12,21 +12,20 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Literal, cast
 
 import diffusers
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from safetensors.torch import load, save
 from torch import Tensor, distributed
 from torch.distributed import distributed_c10d
 from torch.distributed.device_mesh import init_device_mesh
 
 from cow_service.concurrency import spawn
-from cow_service.errors import CowError, DeviceFailed, GeneratorOutOfMemory, InternalError, WorkerEnded, kinds
+from cow_service.errors import CowError, DeviceFailed, GeneratorOutOfMemory, InternalError, WorkerEnded
 from cow_service.generators.wan.pipeline import Branch, Conditioning, StepCallback, denoise
 from cow_service.generators.wan.profiles import Acceleration, Profile, Sampling
 from cow_service.settings import Settings
@@ -53,37 +52,27 @@ class Load:
 
 @dataclass(frozen=True)
 class Share:
-    """To a rank: take part in a clip. The arguments of `denoise`, exact in float32: no tensor of a clip has more."""
+    """To a rank: take part in a clip. The arguments of `denoise`."""
 
-    tensors: Mapping[str, NDArray[np.float32] | None]  # the noise, and the conditioning by its fields
+    tensors: bytes  # the noise, and the conditioning by its fields, as a safetensors file
     sampling: Sampling
 
     @classmethod
     def pack(cls, noise: Tensor, given: Conditioning, sampling: Sampling) -> Share:
         """The message for tensors of any device."""
         parts: dict[str, Tensor | None] = {"noise": noise, **vars(given)}
-        arrays = {name: None if part is None else part.detach().float().cpu().numpy() for name, part in parts.items()}
-        return cls(arrays, sampling)
+        tensors = {name: part.cpu().contiguous().clone() for name, part in parts.items() if part is not None}
+        return cls(save(tensors), sampling)
 
     def unpack(self) -> tuple[Tensor, Conditioning]:
         """The noise and the conditioning, on the CPU."""
-        tensors: dict[str, Any] = {
-            name: None if array is None else torch.from_numpy(array) for name, array in self.tensors.items()
-        }
+        tensors: dict[str, Any] = {"negative_prompt": None, **load(self.tensors)}
         return tensors.pop("noise"), Conditioning(**tensors)
-
-
-@dataclass(frozen=True)
-class RankFailed:
-    """From a rank: it ends, for the `CowError` of this code."""
-
-    code: str
-    detail: str
 
 
 Port = int  # where the ranks meet, once all have loaded
 ToRank = Load | Port | Share
-FromRank = Literal["loaded"] | RankFailed
+FromRank = Literal["loaded"] | CowError  # that it ends, and why
 
 
 class RankGroup:
@@ -222,8 +211,8 @@ class _Rank:
             try:
                 while True:
                     message: FromRank = self._spawned.pipe.recv()
-                    if isinstance(message, RankFailed):
-                        self.error = kinds().get(message.code, InternalError)(message.detail)
+                    if isinstance(message, CowError):
+                        self.error = message
                     else:
                         self.loaded.set()
             except (EOFError, OSError):
@@ -270,9 +259,6 @@ class Sharing:
         )
         self._context: Any = None
         if (parts := wanted.context_parallel) > 1:
-            heads = self._transformer.config.num_attention_heads
-            if heads % parts:
-                raise ValueError(f"{heads} attention heads cannot be split among {parts} GPUs")
             size = 2 if wanted.guidance_parallel else 1, 1, parts
             mesh = init_device_mesh(device.type, size, mesh_dim_names=("guidance", "ring", "ulysses"))
             self._context = cast(Any, diffusers).ContextParallelConfig(ulysses_degree=parts, mesh=mesh)

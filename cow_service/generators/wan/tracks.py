@@ -12,11 +12,8 @@ Sources: the public implementations of ATI (arXiv 2505.22944) and Wan-Move (arXi
 
 import io
 import warnings
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -187,9 +184,11 @@ def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
         if path.suffix == ".npy":
             return _wan_move(path, visibility)
         return from_ati_file(_ati_array(path))
-    except (OSError, ValueError, TypeError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        missing = isinstance(error, FileNotFoundError)
-        reason = "there is no such file" if missing else f"it is damaged, or no {path.suffix} file of plain numbers"
+    except InvalidRequest:
+        raise
+    except Exception as error:  # NumPy, zipfile and PyTorch raise a dozen kinds on damaged files
+        reason = f"it is damaged, or holds more than the plain numbers of a {path.suffix} file, which could run code"
+        reason = "there is no such file" if isinstance(error, FileNotFoundError) else reason
         raise InvalidRequest(f"{path.name} cannot be read: {reason}.") from error
 
 
@@ -198,14 +197,9 @@ def _ati_array(path: Path) -> Floats32:
         data: Any = path.read_bytes()
     else:
         torch = _import_torch()
-        try:
-            with warnings.catch_warnings():  # PyTorch remarks on how it was pickled
-                warnings.simplefilter("ignore")
-                data = torch.load(path, map_location="cpu", weights_only=True)
-        except (UnpicklingError, RuntimeError, KeyError, EOFError) as error:
-            raise InvalidRequest(
-                f"{path.name} is damaged, or holds more than plain data, which is not read: it could run code."
-            ) from error
+        with warnings.catch_warnings():  # PyTorch remarks on how it was pickled
+            warnings.simplefilter("ignore")
+            data = torch.load(path, map_location="cpu", weights_only=True)
         if isinstance(data, torch.Tensor):
             data = data.detach().float().numpy()
         elif not isinstance(data, bytes):

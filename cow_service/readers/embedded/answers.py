@@ -27,8 +27,6 @@ _COVERING = lex.words("hidden hide hides occluded occlude occludes occlusion cov
 _MISSING = lex.words("miss misses missed missing avoid avoids avoided untouched")
 _SEEN = lex.words("visible unobstructed unoccluded uncovered")
 _NEGATIONS = lex.words("not no never n't without nothing neither")
-# They change nothing beside such a word.
-_FILLERS = lex.SETS["fillers"]
 _ANY_WORDS = lex.words("anything something any object objects nothing")
 _PASSIVE = lex.words("is are be get gets stays stay remains remain being")
 _BARE = {
@@ -61,7 +59,7 @@ def says_it_happens(text: str, asked: Asked) -> bool | None:
     about = [at for at, word in enumerate(words) if word in yes | no]
     if len(about) != 1:
         return None
-    known = yes | no | _NEGATIONS | _FILLERS
+    known = yes | no | _NEGATIONS | lex.SETS["fillers"]
     known = known | _ANY_WORDS if asked.target is None else (known | set(plain(asked.target).split())) - {"nothing"}
     before, after = words[: about[0]], words[about[0] + 1 :]
     acting = asked.relation != "covered" and _PASSIVE.isdisjoint(before)  # then the mover is spoken of, by any name
@@ -74,11 +72,6 @@ def says_it_happens(text: str, asked: Asked) -> bool | None:
 def names_none(text: str) -> bool:
     """Whether an option says that there is no such object, or that it never happens."""
     return _NONE.fullmatch(_unfolded(text)) is not None
-
-
-def names_several(text: str) -> bool:
-    """Whether an option says that it is more than one object."""
-    return _SEVERAL.search(text) is not None and not names_none(text)
 
 
 def _unfolded(text: str) -> str:
@@ -192,6 +185,10 @@ NOT_FOUND = "Not sure, because what the question asks about was not found in the
 NOT_TOLD = "Not sure, because nothing in the image tells what was asked: its objects could not be told apart."
 NO_OPTION = "The world's answer is '{said}', but not exactly one of the options says so."
 NOT_AMONG = "Not sure, because what is met first, '{said}', is not one of what the question asks about."
+NOT_IDENTIFIED = (
+    "Not sure, because something that the question names looks like another kind of thing; the warnings say which."
+)
+TOO_FAINT = "Not sure, because something may stand in the way that is too faint to tell; the warnings say where."
 TOO_CLOSE = "Not sure: the probability of {what} is {probability:.2f}{depends}."
 
 _DOUBTS: dict[Doubt, str] = {
@@ -201,6 +198,8 @@ _DOUBTS: dict[Doubt, str] = {
     "size": "how large things are",
     "place": "where things are in depth",
     "friction": "how much the floor brakes",
+    "identity": "whether the things are those that the question names",
+    "faint": "whether something stands in the way that is too faint to tell",
 }
 
 
@@ -249,6 +248,10 @@ def why_not_sure(outcome: Outcome) -> str:
         return NOT_TOLD
     if outcome.sure:
         return ""
+    if "identity" in outcome.depends_on:
+        return NOT_IDENTIFIED
+    if "faint" in outcome.depends_on:
+        return TOO_FAINT
     what = "what is asked" if outcome.asked.form == "whether" else f"the likeliest answer, '{_in_words(outcome)}',"
     depends = f"; it depends most on {_DOUBTS[outcome.depends_on[0]]}" if outcome.depends_on else ""
     return TOO_CLOSE.format(what=what, probability=outcome.probability, depends=depends)
@@ -288,8 +291,10 @@ def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOp
         return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
     if (form == "which-first" and first is None) or (form == "when" and outcome.time is None):
         return [option for option in options if names_none(option.text)]
-    if form == "which-first" and first is not None and not any(names_several(option.text) for option in options):
-        named = [(option, parse_noun_phrase(option.text)) for option in options if not names_none(option.text)]
+    if form == "which-first" and first is not None:
+        things = [option for option in options if not names_none(option.text)]
+        several = any(_SEVERAL.search(option.text) for option in things)
+        named = [(option, parse_noun_phrase(option.text)) for option in things if not several]
         return [option for option, phrase in named if phrase is not None and may_name(phrase, first)]
     if form == "when" and outcome.time is not None:
         # The one option in whose span the time lies, where no other option's meets the band of times.

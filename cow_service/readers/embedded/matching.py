@@ -10,9 +10,17 @@ from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, words
-from cow_service.readers.embedded.english.noun_phrases import TABLES, Kind, kind_of, may_name
+from cow_service.readers.embedded.english.noun_phrases import TABLES, Kind, kind_of, may_name, shape_of
 from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.outlines import contradicts, form_of, is_cut, log_ratio
+from cow_service.readers.embedded.outlines import (
+    contradicts,
+    fits_better,
+    form_of,
+    is_cut,
+    is_other_kind,
+    log_ratio,
+    looks_like,
+)
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.masks import is_same_object
@@ -212,8 +220,12 @@ def _foremost(
     ranked = sorted((ratio for ratio in ratios if ratio > IMPOSSIBLE), reverse=True)
     least = ranked[min(count, len(ranked)) - 1] - CLEARLY_WORSE if ranked else 0.0
     fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(IMPOSSIBLE, least)]
-    # Where no colour says for certain that one is meant, and the outlines speak against it, none is.
-    is_sure = any(each.colour == phrase.colour or _shape_ratio(each, phrase) >= POOR for each in fitting)
+    # Where no colour says for certain that one is meant, and the outlines speak against it, none is; nor is what is
+    # clearly another kind of thing, such as a candle where a cone of its colour was not seen.
+    is_sure = any(
+        _shape_ratio(each, phrase) >= POOR or (each.colour == phrase.colour and not is_other_kind(each, phrase.head))
+        for each in fitting
+    )
     return fitting if is_sure else []
 
 
@@ -299,19 +311,29 @@ def is_kind_asked(phrase: ObjectPhrase, question: Question) -> bool:
     return asked is not None and any(kind_of(name) and name.endswith(phrase.text.lower()) for name in asked.among)
 
 
-def noun_warnings(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> list[str]:
-    """A warning for each thing whose noun is not known, or whose outline is not that of the noun."""
-    warnings: list[str] = []
+def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tuple[list[str], frozenset[BBox]]:
+    """A warning for each thing whose noun is not known, or whose outline is not that of the noun; and the boxes of
+    those that look like something else, of which nothing is sure."""
+    warnings, doubtful = list[str](), set[BBox]()
     for phrase, bbox in found:
         region = next((each for each in scene.regions if is_same_object(each.bbox, bbox)), None)
         if region is None or phrase.inside_box:
             continue
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
-        if not is_known(phrase):
+        # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
+        head, looks, is_odd = phrase.head or "", looks_like(region), contradicts(region, phrase.head)
+        is_other, own = shape_of(head) != shape_of(looks or ""), form_of(head)
+        if own is not None:
+            # Its colour speaks for the thing, and a torn outline does not outweigh that; else the likelier kind counts.
+            is_other = is_other_kind(region, head) if phrase.colour else is_odd or fits_better(region, looks, own)
+        if looks is not None and is_other and phrase.noun is not None and head not in _ANYTHING:
+            warnings.append(f"'{phrase.text}' was taken for what is {place}, which looks like a {looks}, not '{head}'.")
+            doubtful.add(bbox)
+        elif is_odd:
+            warnings.append(f"'{phrase.text}' was taken for what is {place}, which does not look like '{head}'.")
+        elif not is_known(phrase):
             warnings.append(
                 f"'{phrase.text}' was taken for what is {place}: whether '{phrase.head}' is right, the embedded reader "
                 "cannot tell."
             )
-        elif contradicts(region, phrase.head):
-            warnings.append(f"'{phrase.text}' was taken for what is {place}, which does not look like '{phrase.head}'.")
-    return warnings
+    return warnings, frozenset(doubtful)

@@ -12,7 +12,7 @@ from cow_service.readers.embedded.english.motion import MotionWords, OtherWords,
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.matching import best_matches, describe, match_one
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, Until, Vector
+from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, Until, Vector
 from cow_service.vision.scene import Scene
 from cow_service.vision.trails import TrailEnd, trail_of
 
@@ -42,9 +42,8 @@ def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | N
         )
     distances += [Quantity(share * (way or 0.0), "px") for share in shares]
     if bbox is not None:
-        x0, y0, x1, y1 = bbox
+        x0, _, x1, _ = bbox
         distances += [Quantity(each.own_widths * (x1 - x0), "px") for each in words if each.own_widths is not None]
-        distances += [Quantity(each.own_heights * (y1 - y0), "px") for each in words if each.own_heights is not None]
     speeds: list[SpeedWord | Quantity] = [each.speed for each in words if each.speed is not None]
     ends: list[Until] = [each.until for each in words if each.until is not None]
     return Said(
@@ -79,18 +78,18 @@ def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[
         found = next((each for each in grounding.others if each.object == name), None)
         if found is None:
             raise CannotReadDirection(f"'{name}' moves, too, and was not found. {GIVE_DIRECTION}")
-        way = None, 0.0
+        way, goal = (None, 0.0), None
         if kind in DIRECTED_KINDS:
             direction = motion.direction
             if direction is None and motion.towards is not None:
-                things = [(each.object, each.bbox) for each in grounding.others] + [(grounding.object, grounding.bbox)]
-                goal = next((bbox for thing, bbox in things if thing == motion.towards.text), None)
+                things = (*grounding.others, LocatedObject(object=grounding.object, bbox=grounding.bbox))
+                goal = next((each for each in things if each.object == motion.towards.text), None)
                 if goal is not None:  # from centre to centre
-                    (x0, y0, x1, y1), start = goal, found.bbox
+                    (x0, y0, x1, y1), start = goal.bbox, found.bbox
                     direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
             way = _way(direction, motion.depth)
         speed = quantities(motion.quantities, None)["speed"]
-        readings.append(OtherMotionReading(found, kind, way[0], way[1], speed))
+        readings.append(OtherMotionReading(found, kind, way[0], way[1], speed, goal))
     return tuple(readings)
 
 
@@ -124,7 +123,7 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
                 f"The question tells the end of the trail by '{words.near.text}', which was not found, or not for "
                 f"certain. Seen: {describe(scene.regions)}. {GIVE_PLACE}"
             )
-        trail = trail.ending(TrailEnd(None if near is None else near.bbox, words.side, is_oldest=not words.last))
+        trail = trail.ending(TrailEnd(None if near is None else near.bbox, words.side))
     if not trail.end_known:
         # What may lie ahead: the first thing that is asked about, else the middle of the image.
         asked = ((each.text, match_one(beside, each)) for each in question.others)

@@ -21,6 +21,7 @@ Range = tuple[float, float]
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
 CONTRADICTS = 7.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
+FITS = 2.0  # misfit below which an outline is well described
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
 CIRCLE = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
 ODD = 0.05  # share of outlines that are nobody's: half hidden, or with a shadow
@@ -56,6 +57,8 @@ _ALIKE = {
     "car": "bus truck van taxi lorry train",
 }  # fmt: skip
 _FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALIKE.items() for other in words(said)}
+# Rows that tell a thing for what it is (nearly anything can look like a box or a can), from this log ratio on.
+_TELLING, _CLEARLY = ("ball", "bottle", "bowl", "car", "cone", "mug", "vase"), 1.5
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
 _SAME = {"cube": {"cube", "box"}, "box": {"cube", "box"}, "mug": {"mug", "cylinder", "box"}}
 
@@ -69,6 +72,30 @@ def contradicts(region: Region, noun: str | None) -> bool:
     """Whether an outline is clearly not that of a noun."""
     form = form_of(noun)
     return form is not None and not is_cut(region) and _misfit(_measures(region), form) >= CONTRADICTS
+
+
+def looks_like(region: Region) -> str | None:
+    """The noun of the one row of `OUTLINES` that an outline clearly is; None where it could be many things."""
+    if is_cut(region):
+        return None
+    ratio, form = max((log_ratio(region, form), form) for form in _TELLING)
+    return form if ratio >= _CLEARLY else None
+
+
+def is_other_kind(region: Region, noun: str | None) -> bool:
+    """Whether an outline is that of another kind of thing for certain, as it is not where it is torn or half hidden."""
+    form = form_of(noun)
+    if form is None or is_cut(region):
+        return False
+    measured = _measures(region)
+    misfits = {name: _misfit(measured, name) for name in OUTLINES}
+    return misfits[form] >= 2 * CONTRADICTS and min(misfits.values()) < FITS
+
+
+def fits_better(region: Region, form: str | None, other: str) -> bool:
+    """Whether an outline lies nearer to the ranges of one row of `OUTLINES` than to those of another."""
+    measured = _measures(region)
+    return form is not None and _misfit(measured, form) < _misfit(measured, other)
 
 
 def log_ratio(region: Region, form: str) -> float:

@@ -116,17 +116,17 @@ class EmbeddedReader:
             ]
             boxes |= {mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (mover, *question.others) if each.text in boxes]
-            doubts = matching.noun_warnings(scene, things)
-        doubts += [f"Read '{error}' as '{meant}'." for error, meant in question.errors]
+            doubts, doubtful = matching.noun_doubts(scene, things)
         doubts += [f"The words '{each}' were not understood, so no outcome is told." for each in left.turning]
         doubts += [f"The words '{each}' were not understood and changed nothing." for each in left.beside]
         return base.GroundingReading(
             mover.text,
             bbox,
-            others=located,
+            others=tuple(each.model_copy(update={"is_doubtful": each.bbox in doubtful}) for each in located),
             warnings=(*assumed, *missing, *doubts),
             interventions=(*removed, *placed),
             asked=read_asked(question),
+            is_doubtful=bbox in doubtful,
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: base.MotionHints | None) -> MotionReading:
@@ -140,7 +140,8 @@ class EmbeddedReader:
             on = motions.along_trail(scene, grounding, words) if words.trail is not None else None
             reading = on or _read_motion(scene, question, grounding)
             parted = any(each.share is not None for each in words.quantities)
-            way = _towards(scene, words.towards, grounding) if parted and words.towards is not None else None
+            goal = _towards(scene, words.towards, grounding) if parted and words.towards is not None else None
+            way = None if goal is None else _way_to(goal, reading.kind, grounding)
             return replace(
                 reading,
                 steps=motions.step_readings(words.steps, grounding.bbox),
@@ -170,6 +171,7 @@ class EmbeddedReader:
 
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
 _ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # what does so keeps touching what it stands on
+_RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
 _SEVERAL = frozenset({"both", "two", "three", "all", "four", "several"})
 
 
@@ -265,12 +267,14 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
         direction, depth = depth_motion(-math.copysign(1.0, words.direction[1]))  # up the image is away on the floor
         return MotionReading(kind, direction, "text", depth=depth)
     if words.direction is not None:
-        return MotionReading(kind, words.direction, "text", depth=words.depth)
+        rises = words.verb in _RISES and words.direction[1] < 0
+        return MotionReading(kind, words.direction, "text", depth=words.depth, rises=rises)
     if words.depth:
         direction, depth = depth_motion(words.depth)
         return MotionReading(kind, direction, "text", depth=depth)
     if words.towards is not None:
-        return MotionReading(kind, _towards(scene, words.towards, grounding), "text")
+        goal = _towards(scene, words.towards, grounding)
+        return MotionReading(kind, _way_to(goal, kind, grounding), "text", towards=goal)
     return None
 
 
@@ -298,14 +302,24 @@ def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: M
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
 
 
-def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Vector:
-    """From the mover to the thing that it moves towards."""
-    goal = next((other.bbox for other in grounding.others if other.object == phrase.text), None)
-    bbox = goal or _bbox_of(scene.regions, phrase, grounding.bbox, ())
+def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> LocatedObject:
+    """The thing that the mover moves towards. Raises `CannotReadDirection`."""
+    goal = next((other for other in grounding.others if other.object == phrase.text), None)
+    if goal is not None:
+        return goal
+    bbox = _bbox_of(scene.regions, phrase, grounding.bbox, ())
     if bbox is None:
         raise CannotReadDirection(
             f"The {grounding.object} moves towards '{phrase.text}', which was not found. "
             f"Seen: {describe(scene.regions)}. {GIVE_DIRECTION}"
         )
-    x, y = grounding.point
-    return (bbox[0] + bbox[2]) / 2 - x, (bbox[1] + bbox[3]) / 2 - y
+    return LocatedObject(object=phrase.text, bbox=bbox)
+
+
+def _way_to(goal: LocatedObject, kind: MotionKind, grounding: Grounding) -> Vector:
+    """From the mover to a thing in the image: from foot to foot on the floor, else between the middles."""
+    (x0, y0, x1, y1), (left, top, right, bottom) = goal.bbox, grounding.bbox
+    across = (x0 + x1 - left - right) / 2
+    if kind == "linear" and (across, y1) != (0.0, bottom):
+        return across, y1 - bottom
+    return across, (y0 + y1 - top - bottom) / 2

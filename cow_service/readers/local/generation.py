@@ -22,6 +22,7 @@ from llguidance.hf import from_tokenizer
 from PIL import Image
 from pydantic_ai import messages as ai
 from pydantic_ai.exceptions import UserError
+from pydantic_ai.usage import RequestUsage
 from torch import Tensor
 
 from cow_service.errors import ImageUnreadable
@@ -38,21 +39,14 @@ Finish = Literal["stop", "length"]
 Turn = dict[str, Any]  # as chat templates take it: {"role": ..., "content": [{"type": "text", "text": ...}, ...]}
 
 
-@dataclass(frozen=True)
-class Conversation:
-    """All that was said up to the reply that is wanted. `images` are in the order of their places in the turns."""
-
-    turns: tuple[Turn, ...]
-    images: tuple[Image.Image, ...]
-
-
 def conversation_of(
     messages: Iterable[ai.ModelMessage], instructions: Sequence[str], special_tokens: Sequence[str]
-) -> Conversation:
-    """The conversation of prepared messages. Text that spells one of the special tokens is not taken for it.
+) -> tuple[list[Turn], list[Image.Image]]:
+    """The turns of prepared messages, and their images in the order of their places there.
 
-    What one role says in a row is one turn, and texts that meet are one text. Raises `UserError` for what such a model
-    cannot be given (tools, files other than images), and the errors of `images.decode`.
+    Text that spells one of the special tokens is not taken for it. What one role says in a row is one turn, and texts
+    that meet are one text. Raises `UserError` for what such a model cannot be given (tools, files other than images),
+    and the errors of `images.decode`.
     """
     said: list[tuple[str, object]] = [("system", text) for text in instructions]
     for message in messages:
@@ -90,7 +84,7 @@ def conversation_of(
             text = special.sub(lambda match: f"{match[0][0]} {match[0][1:]}", text)
             content.append({"type": "text", "text": text})
         turns.append({"role": role, "content": content})
-    return Conversation(tuple(turns), tuple(images))
+    return turns, images
 
 
 def _closed(schema: Any) -> Any:
@@ -118,6 +112,22 @@ class TokenSampling:
     seed: int | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class PendingGeneration:
+    """What a reply is wanted for, and the reply to come. Canceling the future ends the reply at the next token.
+
+    The future is never marked as running: such a future could no longer be canceled. A reply with the finish `length`
+    was cut off, and is no whole JSON; what the model wrote for itself before it is a part of its own.
+    """
+
+    turns: list[Turn]
+    images: list[Image.Image]
+    sampling: TokenSampling
+    limit: int  # the most tokens that the reply may have
+    grammar: str | None = None  # what it is held to
+    future: Future[ai.ModelResponse] = field(default_factory=Future[ai.ModelResponse])
+
+
 @dataclass(eq=False)
 class BatchRow:
     """One reply of a batch while it is written. It knows no other row, and not how it came to be in the batch.
@@ -126,12 +136,10 @@ class BatchRow:
     token that ends it, and the grammar holds from there.
     """
 
-    sampling: TokenSampling
-    limit: int
+    pending: PendingGeneration
     ends: Collection[int]
     matcher: LLMatcher | None
     on_end: Callable[["BatchRow", Finish], None]
-    is_canceled: Callable[[], bool]
     thought_end: int | None = None  # None once the thought is over
     thought: list[int] = field(default_factory=list[int])
     tokens: list[int] = field(default_factory=list[int])
@@ -140,7 +148,7 @@ class BatchRow:
 
     def done(self) -> bool:
         """Whether nothing more is to be written."""
-        return self._is_finished or self.is_canceled()
+        return self._is_finished or self.pending.future.done()
 
     def choose(self, logits: Tensor) -> Tensor:
         """The id, [], of a token with which the reply can go on, from logits, [vocabulary]."""
@@ -151,24 +159,22 @@ class BatchRow:
             bits = np.frombuffer(self.matcher.compute_bitmask(), np.uint8)
             allowed = torch.from_numpy(np.unpackbits(bits, count=len(logits), bitorder="little")).to(logits.device)
             logits = logits.masked_fill(allowed == 0, -torch.inf)
-        if self.sampling.temperature == 0:
+        sampling = self.pending.sampling
+        if sampling.temperature == 0:
             return logits.argmax()
-        logits = logits / self.sampling.temperature
-        if self.sampling.top_k > 0:
-            least = logits.topk(min(self.sampling.top_k, len(logits))).values[-1]
-            logits = logits.masked_fill(logits < least, -torch.inf)
-        chances = logits.softmax(-1)
-        if self.sampling.top_p < 1:
-            ordered, order = chances.sort(descending=True)
-            # What comes before a token decides about it, so that the likeliest always stays.
-            chances = chances.index_fill(0, order[ordered.cumsum(0) - ordered >= self.sampling.top_p], 0.0)
+        scores: Any = logits[None] / sampling.temperature
+        none: Any = None  # these ask for the tokens before, and do not use them
+        if sampling.top_k > 0:
+            scores = transformers.TopKLogitsWarper(sampling.top_k)(none, scores)
+        if sampling.top_p < 1:
+            scores = transformers.TopPLogitsWarper(sampling.top_p)(none, scores)
         if self._random is None:
             self._random = torch.Generator(logits.device)
-            if self.sampling.seed is None:
+            if sampling.seed is None:
                 self._random.seed()
             else:
-                self._random.manual_seed(self.sampling.seed)
-        return chances.multinomial(1, generator=self._random)[0]
+                self._random.manual_seed(sampling.seed)
+        return scores[0].softmax(-1).multinomial(1, generator=self._random)[0]
 
     def take(self, token: int) -> None:
         """Adds the chosen token, and ends the reply where that completes it or reaches its limit.
@@ -188,7 +194,7 @@ class BatchRow:
                 raise RuntimeError(f"The grammar of a reply broke down: {self.matcher.get_error()}")
         if self.matcher is not None and self.matcher.is_stopped():
             self._end("stop")
-        elif len(self.thought) + len(self.tokens) >= self.limit:
+        elif len(self.thought) + len(self.tokens) >= self.pending.limit:
             complete = self.thought_end is None and self.matcher is not None and self.matcher.is_accepting()
             self._end("stop" if complete else "length")
 
@@ -198,69 +204,23 @@ class BatchRow:
 
 
 class RowSampler(transformers.LogitsProcessor):
-    """Leaves to each row of a batch the one token that it has chosen; to rows that are over, the padding."""
+    """Leaves to each row of a batch the one token that it has chosen; to rows that are over, the one that ends them."""
 
-    def __init__(self, rows: Sequence[BatchRow], padding: int) -> None:
+    def __init__(self, rows: Sequence[BatchRow], end: int) -> None:
         self._rows = rows
-        self._padding = padding
+        self._end = end
 
     def __call__(self, input_ids: Tensor, scores: Tensor) -> Tensor:
         """`scores` is [rows, vocabulary]; what is returned is 0 at each row's token and minus infinity elsewhere."""
         tokens: list[int] = []
         for row, logits in zip(self._rows, scores, strict=True):
-            token = self._padding
+            token = self._end
             if not row.done():
                 token = int(row.choose(logits))
                 row.take(token)
             tokens.append(token)
         only = torch.tensor(tokens, device=scores.device)[:, None]
         return torch.full_like(scores, -torch.inf).scatter_(1, only, 0.0)
-
-
-class RowsDone(transformers.StoppingCriteria):
-    """Ends the rows that are complete, and those that nobody waits for any more."""
-
-    def __init__(self, rows: Sequence[BatchRow]) -> None:
-        self._rows = rows
-
-    def __call__(self, input_ids: Tensor, scores: Any, **kwargs: Any) -> Any:
-        """[rows], bool."""
-        return torch.tensor([row.done() for row in self._rows], device=input_ids.device)
-
-
-@dataclass(frozen=True)
-class GenerationRequest:
-    """What a reply is wanted for. `limit` is the most tokens that it may have; `grammar`, what it is held to."""
-
-    conversation: Conversation
-    sampling: TokenSampling
-    limit: int
-    grammar: str | None = None
-
-
-@dataclass(frozen=True)
-class Generation:
-    """What was written. With the finish `length` it was cut off, and is no whole JSON.
-
-    `thought` is what the model wrote for itself before, where its chat template opens a thought.
-    """
-
-    text: str
-    thought: str
-    finish: Finish
-    input_tokens: int
-    output_tokens: int
-
-
-@dataclass(frozen=True, eq=False)
-class PendingGeneration:
-    """A request and its reply to come. Canceling the future ends the reply at the next token.
-
-    The future is never marked as running: such a future could no longer be canceled.
-    """
-
-    request: GenerationRequest
-    future: Future[Generation] = field(default_factory=Future[Generation])
 
 
 class BatchGenerator:
@@ -276,10 +236,8 @@ class BatchGenerator:
         known: dict[str, Any] = {"temperature": 1.0}
         known |= {name: value for name, value in given.items() if value is not None}
         self.default_sampling = TokenSampling(**known) if advice.do_sample else TokenSampling()
-        ends = advice.eos_token_id
-        self._ends = _as_tuple(self._tokenizer.eos_token_id if ends is None else ends)
-        padding = self._tokenizer.pad_token_id
-        self._padding: int = self._ends[0] if padding is None else _as_tuple(padding)[0]
+        ends: Any = self._tokenizer.eos_token_id if advice.eos_token_id is None else advice.eos_token_id
+        self._ends: tuple[int, ...] = (ends,) if isinstance(ends, int) else tuple(ends)
         # Else the checkpoint's advice on sampling would be mixed into every call, after ours.
         self._model.generation_config = self._config()
         self.special_tokens = tuple(self._tokenizer.get_added_vocab())
@@ -304,12 +262,11 @@ class BatchGenerator:
 
         Raises `ImageUnreadable` for an image that the model's processor refuses, and whatever the model raises.
         """
-        conversations = [pending.request.conversation for pending in batch]
         texts: list[str] = [
-            self._processor.apply_chat_template(list(each.turns), add_generation_prompt=True, tokenize=False)
-            for each in conversations
+            self._processor.apply_chat_template(each.turns, add_generation_prompt=True, tokenize=False)
+            for each in batch
         ]
-        images = [list(each.images) for each in conversations]
+        images = [each.images for each in batch]
         try:
             # Replies grow on the right, so that padding belongs on the left.
             inputs = self._processor(
@@ -327,41 +284,36 @@ class BatchGenerator:
         inputs = inputs.to(self._model.device, dtype=self._model.dtype)
         counts: list[int] = inputs["attention_mask"].sum(-1).tolist()
         rows = [self._row(*row) for row in zip(batch, texts, counts, strict=True)]
-        limit = max(pending.request.limit for pending in batch)
+        limit = max(pending.limit for pending in batch)
         self._model.generate(
             **inputs,
             generation_config=self._config(do_sample=False, max_new_tokens=limit),
-            logits_processor=transformers.LogitsProcessorList([RowSampler(rows, self._padding)]),
-            stopping_criteria=transformers.StoppingCriteriaList([RowsDone(rows)]),
+            logits_processor=transformers.LogitsProcessorList([RowSampler(rows, self._ends[0])]),
         )
 
     def _config(self, **rest: Any) -> transformers.GenerationConfig:
-        return transformers.GenerationConfig(eos_token_id=list(self._ends), pad_token_id=self._padding, **rest)
+        return transformers.GenerationConfig(eos_token_id=list(self._ends), pad_token_id=self._ends[0], **rest)
 
     def _row(self, pending: PendingGeneration, text: str, input_tokens: int) -> BatchRow:
-        request, thinks = pending.request, text.rstrip().endswith(_THOUGHT_START)
+        thinks = text.rstrip().endswith(_THOUGHT_START)
 
         def resolve(row: BatchRow, finish: Finish) -> None:
             thought = self._decoded(row.thought).removesuffix(_THOUGHT_END).strip()
-            output_tokens = len(row.thought) + len(row.tokens)
+            reply = ai.ModelResponse(
+                parts=[*([ai.ThinkingPart(thought)] if thought else []), ai.TextPart(self._decoded(row.tokens))],
+                usage=RequestUsage(input_tokens=input_tokens, output_tokens=len(row.thought) + len(row.tokens)),
+                finish_reason=finish,
+            )
             with suppress(InvalidStateError):  # it was canceled
-                pending.future.set_result(
-                    Generation(self._decoded(row.tokens), thought, finish, input_tokens, output_tokens)
-                )
+                pending.future.set_result(reply)
 
         return BatchRow(
-            request.sampling,
-            request.limit,
+            pending,
             self._ends,
-            None if request.grammar is None else LLMatcher(self.grammar_tokens, request.grammar),
+            None if pending.grammar is None else LLMatcher(self.grammar_tokens, pending.grammar),
             on_end=resolve,
-            is_canceled=pending.future.done,
             thought_end=self._tokenizer.get_vocab().get(_THOUGHT_END) if thinks else None,
         )
 
     def _decoded(self, tokens: list[int]) -> str:
         return str(self._tokenizer.decode(tokens, skip_special_tokens=True, clean_up_tokenization_spaces=False))
-
-
-def _as_tuple(ids: Any) -> tuple[int, ...]:
-    return (ids,) if isinstance(ids, int) else tuple(ids)

@@ -5,18 +5,17 @@ import gc
 import traceback
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from threading import Lock, Thread
 from typing import Literal
 
 import torch
 from pydantic import Field
 from pydantic_ai.exceptions import UserError
-from pydantic_ai.messages import ModelMessage, ModelResponse, TextPart, ThinkingPart
+from pydantic_ai.messages import ModelMessage, ModelResponse
 from pydantic_ai.models import Model, ModelRequestParameters
 from pydantic_ai.profiles import ModelProfile
 from pydantic_ai.settings import ModelSettings
-from pydantic_ai.usage import RequestUsage
 
 from cow_service.errors import MllmUnavailable
 from cow_service.readers.local import generation
@@ -31,10 +30,6 @@ class LocalOptions(Record):
     dtype: Literal["float32", "bfloat16", "float16", "auto"] = Field(
         default="auto", description="Of the weights; auto takes them as they are saved."
     )
-    device_map: str = Field(
-        default="auto", description="Over which GPUs accelerate spreads it, where COW_DEVICE is auto and there are any."
-    )
-    attn_implementation: str = "sdpa"
     max_batch: int = Field(default=4, ge=1, le=256, description="Replies that are written together.")
     max_new_tokens: int = Field(default=2048, ge=1, description="The most tokens of a reply, whatever a request says.")
     threads: int | None = Field(default=None, ge=1, description="Of the CPU; null for PyTorch's own number.")
@@ -51,12 +46,11 @@ class BatchWorker:
     _lock: Lock = field(default_factory=Lock)
     _running: bool = False
 
-    def submit(self, request: generation.GenerationRequest) -> Future[generation.Generation]:
+    def submit(self, pending: PendingGeneration) -> Future[ModelResponse]:
         """The reply to come; canceling it takes it out of the queue, or ends it at the next token.
 
         Its errors: `MllmUnavailable` out of memory, and those of `BatchGenerator.generate`.
         """
-        pending = PendingGeneration(request)
         with self._lock:
             self._queue.append(pending)
             if not self._running:
@@ -113,9 +107,6 @@ PROFILE = ModelProfile(
     default_structured_output_mode="native",
     # A grammar holds the reply to the schema but tells the model nothing: what it may write stands in its prompt.
     native_output_requires_schema_in_instructions=True,
-    supports_document_input=False,
-    supports_audio_file_input=False,
-    supports_video_input=False,
 )
 _UNPREPARED = ("retry-feedback", "retry-prompt")
 
@@ -148,7 +139,6 @@ class LocalModel(Model[None]):
         self._name = name
         self._generator = generator
         self._worker = BatchWorker(generator, name, options)
-        self._max_new_tokens = options.max_new_tokens
 
     @property
     def model_name(self) -> str:
@@ -180,29 +170,23 @@ class LocalModel(Model[None]):
         settings, parameters = self.prepare_request(model_settings, model_request_parameters)
         settings = settings or ModelSettings()
         # Decoding images takes long enough to hold up an event loop.
-        request = await asyncio.to_thread(self._generation_request, messages, settings, parameters)
+        pending = await asyncio.to_thread(self._pending, messages, settings, parameters)
         timeout = settings.get("timeout")
         seconds = timeout if isinstance(timeout, int | float) else None
         try:
             # Giving up cancels the future, and so takes the call out of the queue or ends its reply.
             async with asyncio.timeout(seconds):
-                reply = await asyncio.wrap_future(self._worker.submit(request))
+                reply = await asyncio.wrap_future(self._worker.submit(pending))
         except TimeoutError as error:
             raise MllmUnavailable(
                 f"'{self._name}' gave no reply in {seconds:g} s. Allow it more (COW_MLLM_TIMEOUT), send fewer requests "
                 f"at a time, or set COW_MLLM to a smaller model."
             ) from error
-        return ModelResponse(
-            parts=[*([ThinkingPart(reply.thought)] if reply.thought else []), TextPart(reply.text)],
-            usage=RequestUsage(input_tokens=reply.input_tokens, output_tokens=reply.output_tokens),
-            model_name=self._name,
-            provider_name=self.system,
-            finish_reason=reply.finish,
-        )
+        return replace(reply, model_name=self._name, provider_name=self.system)
 
-    def _generation_request(
+    def _pending(
         self, messages: list[ModelMessage], settings: ModelSettings, parameters: ModelRequestParameters
-    ) -> generation.GenerationRequest:
+    ) -> PendingGeneration:
         if parameters.function_tools:
             raise UserError("A model in this process takes no tools.")
         if any(part.part_kind in _UNPREPARED for message in messages for part in message.parts):
@@ -214,7 +198,7 @@ class LocalModel(Model[None]):
             top_k=settings.get("top_k", default.top_k),
             seed=settings.get("seed"),
         )
-        limit = settings.get("max_tokens", self._max_new_tokens)
+        limit = settings.get("max_tokens", self._worker.options.max_new_tokens)
         if sampling.temperature < 0 or not 0 < sampling.top_p <= 1 or sampling.top_k < 0 or limit < 1:
             raise UserError(
                 "A model in this process takes a temperature from 0, a top_p above 0 and up to 1, a top_k from 0 and "
@@ -222,9 +206,9 @@ class LocalModel(Model[None]):
             )
         output = parameters.output_object if parameters.output_mode == "native" else None
         instructions = [part.content for part in self._get_instruction_parts(messages, parameters) or []]
-        return generation.GenerationRequest(
-            conversation=generation.conversation_of(messages, instructions, self._generator.special_tokens),
+        return PendingGeneration(
+            *generation.conversation_of(messages, instructions, self._generator.special_tokens),
             sampling=sampling,
-            limit=min(limit, self._max_new_tokens),
+            limit=min(limit, self._worker.options.max_new_tokens),
             grammar=None if output is None else self._generator.grammar(output.json_schema),
         )

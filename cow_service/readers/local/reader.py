@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 import transformers
-from pydantic import ValidationError
 from pydantic_ai.settings import ModelSettings
 from transformers.models.auto.processing_auto import PROCESSOR_MAPPING
 
@@ -28,8 +27,6 @@ from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed
 from cow_service.weights.manifests import Manifest, load_families
 from cow_service.weights.repositories import verify, weights_identity
-
-MAX_LISTED = 4  # weights in an error
 
 
 def create(settings: Settings) -> MllmReader:
@@ -51,24 +48,14 @@ def load_local(settings: Settings) -> LocalModel:
     usable = ", ".join(each.name for each in manifests.values() if each.sources or each.architecture)
     if name is None:
         raise ReaderUnavailable(f"No multimodal LLM is chosen: set COW_MLLM to one of {usable}.")
-    manifest = manifests.get(name)
-    if manifest is None:
+    manifest, own = manifests.get(name), settings.checkpoints.get(name)
+    if manifest is None or not (own or manifest.sources or manifest.architecture):
         raise ReaderUnavailable(
-            f"'{name}' is no multimodal LLM that runs in this process: set COW_MLLM to one of {usable}, or take the "
-            "reader 'mllm'."
+            f"'{name}' has no weights that run in this process. If it is served by others, take the reader 'mllm', or "
+            f"set COW_MLLM to one of {usable}."
         )
-    own = settings.checkpoints.get(manifest.name)
-    if own is None and not manifest.sources and not manifest.architecture:
-        raise ReaderUnavailable(
-            f"'{manifest.name}' has no weights that run here: it is served by others. Take the reader 'mllm', or set "
-            f"COW_MLLM to one of {usable}."
-        )
-    try:
-        options = LocalOptions.model_validate(manifest.local)
-    except ValidationError as error:
-        places = ", ".join(".".join(str(part) for part in found["loc"]) for found in error.errors())
-        raise ReaderUnavailable(f"The manifest of '{manifest.name}' is wrong in `local`: {places}.") from error
-    places = device_map(settings.device, options.device_map)
+    options = LocalOptions.model_validate(manifest.local)
+    places = device_map(settings.device)
     with BUILD_LOCK, _translated(manifest.name):
         if own is None and not manifest.sources:
             model, processor = make_tiny(manifest.architecture)
@@ -81,10 +68,10 @@ def load_local(settings: Settings) -> LocalModel:
     return LocalModel(manifest.name, generator, options, ModelSettings(**defaults))
 
 
-def device_map(device: str, spread: str) -> str | dict[str, str]:
+def device_map(device: str) -> str | dict[str, str]:
     """Where the weights go, as accelerate takes it. Raises `ReaderUnavailable` for a GPU that is not here."""
-    if device == "auto":
-        return spread if torch.cuda.is_available() else {"": "cpu"}
+    if device == "auto" and torch.cuda.is_available():
+        return "auto"  # over all GPUs that it takes
     return {"": str(choose_device(device, ReaderUnavailable))}
 
 
@@ -123,7 +110,6 @@ def _from_folder(
         folder,
         dtype=dtype,
         device_map=places,
-        attn_implementation=options.attn_implementation,
         use_safetensors=True,
         output_loading_info=True,
         **as_it_is,
@@ -132,9 +118,7 @@ def _from_folder(
     # transformers only warns of these, and fills what is missing with random numbers.
     for kind, what in (("missing_keys", "lacks"), ("unexpected_keys", "has, beyond its model,")):
         if names := sorted(found[kind]):
-            raise CheckpointInvalid(
-                f"The checkpoint '{folder.name}' {what} {listed(names, MAX_LISTED)}. Download it again."
-            )
+            raise CheckpointInvalid(f"The checkpoint '{folder.name}' {what} {listed(names)}. Download it again.")
     return model, processor
 
 
@@ -153,8 +137,7 @@ def _translated(name: str) -> Generator[None]:
                 f"'{name}' does not fit into memory. Set COW_MLLM to a smaller model, or COW_DEVICE to a larger device."
             ) from error
         reason = re.sub(r"(?<!\w)(/[\w.+-]+)+/?", "…", (str(error).splitlines() or [""])[0])[:300]
+        kind, remedy = CheckpointInvalid, ""
         if isinstance(error, ImportError):
-            raise ReaderUnavailable(
-                f"'{name}' cannot be loaded: {type(error).__name__}: {reason} Install what it names."
-            ) from error
-        raise CheckpointInvalid(f"'{name}' cannot be loaded: {type(error).__name__}: {reason}") from error
+            kind, remedy = ReaderUnavailable, " Install what it names."
+        raise kind(f"'{name}' cannot be loaded: {type(error).__name__}: {reason}{remedy}") from error

@@ -212,12 +212,12 @@ class MllmClient:
         if isinstance(error, errors.ContentFilterError):
             return MllmBadReply(f"{self._name} refused to look at this: its content filter held the reply back.")
         if isinstance(error, TimeoutError):
-            reason = "" if model.last_error is None else f": {reason_of(model.last_error)}"
+            reasons = f": {model.reasons}" if model.failures else ""
             return MllmUnavailable(
-                f"{self._name} gave no usable reply within {self._budget:g} s (COW_MLLM_BUDGET) and {tries}{reason}."
+                f"{self._name} gave no usable reply within {self._budget:g} s (COW_MLLM_BUDGET) and {tries}{reasons}."
             )
         if isinstance(error, errors.ModelAPIError):
-            return MllmUnavailable(f"{self._name} could not be asked ({tries}): {reason_of(error)}.")
+            return MllmUnavailable(f"{self._name} could not be asked ({tries}): {model.reasons}.")
         fault = parser.fault
         if model.truncated:
             fault += ", and it was cut off: it has no more room than `max_tokens` of the model's manifest"
@@ -266,7 +266,8 @@ _MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
 class RetryingModel(WrapperModel):
     """A model that repeats a failed request while that may help and `budget` seconds are not over.
 
-    Each attempt waits for one of `slots`, then takes `timeout` seconds at most. `calls` counts the attempts.
+    Each attempt waits for one of `slots`, then takes `timeout` seconds at most. `calls` counts the attempts, `failures`
+    keeps the errors of those that failed.
     """
 
     def __init__(
@@ -278,8 +279,13 @@ class RetryingModel(WrapperModel):
         self._budget = budget
         self._schema = schema
         self.calls = 0
-        self.last_error: errors.ModelAPIError | None = None
+        self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens
+
+    @property
+    def reasons(self) -> str:
+        """Why attempts failed, each reason once: the last attempt alone may hide what the others failed of."""
+        return "; ".join(dict.fromkeys(reason_of(error) for error in self.failures))
 
     async def request(
         self,
@@ -329,14 +335,14 @@ class RetryingModel(WrapperModel):
         except errors.ContentFilterError:
             raise
         except errors.ModelAPIError as error:
-            self.last_error = error
+            self.failures.append(error)
             raise
         except TimeoutError as error:
-            self.last_error = errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
-            raise self.last_error from error
+            self.failures.append(errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s"))
+            raise self.failures[-1] from error
         except (errors.AgentRunError, *_MALFORMED) as error:
-            self.last_error = errors.ModelAPIError(self.model_name, "the reply was no chat completion")
-            raise self.last_error from error
+            self.failures.append(errors.ModelAPIError(self.model_name, "the reply was no chat completion"))
+            raise self.failures[-1] from error
         self.truncated = response.finish_reason == "length"
         return response
 

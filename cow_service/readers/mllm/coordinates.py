@@ -125,12 +125,6 @@ class CoordinateFrame:
             raise ReplyError(f"the direction {_shown(written)} has no length; give two different points")
         return start, end
 
-    def overshoots(self, written: object) -> bool:
-        """Whether a box reaches over the image's edge, so that it was cut off there."""
-        limits = self._full
-        pairs = self._pairs(written, 2, "a box")
-        return any(not 0 <= value <= limit for pair in pairs for value, limit in zip(pair, limits, strict=True))
-
     def write(self, *points: Point) -> list[float]:
         """Points as the family writes them, one after the other."""
         numbers: list[float] = []

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from cow_service.media.overlay import named_strip
 from cow_service.narration import bare_name, state_words
 from cow_service.readers.base import Imagined
+from cow_service.readers.mllm.replies import text_of
 from cow_service.records import MEETINGS, AskedRelation, Doubt, Outcome, Simulation
 
 AS_IT_IS = "As it is"  # the name of the frames with nothing changed
@@ -28,6 +29,8 @@ DOUBTS: dict[Doubt, str] = {
     "size": "the sizes",
     "place": "how far away and how high things are",
     "friction": "the friction",
+    "identity": "whether the things are those that the question names",
+    "faint": "whether something stands in the way that is too faint to tell",
 }
 
 
@@ -49,7 +52,7 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
     outcomes = {name: (each, each.outcome) for name, each in worlds.items() if each.outcome is not None}
     facts: list[str] = []
     if trajectory.outcome is not None and len(outcomes) == len(worlds):
-        facts += [_one_line(trajectory.outcome.facts)] if trajectory.outcome.facts else []
+        facts += [text_of(trajectory.outcome.facts)] if trajectory.outcome.facts else []
         for name, (world, outcome) in outcomes.items():
             if outcome.probability is not None:
                 event = _event(outcome, simulation.grounding.object)
@@ -93,13 +96,13 @@ def _event(outcome: Outcome, mover: str) -> str:
     does_not = does.replace("is ", "is not ", 1) if does.startswith("is ") else f"does not {do}"
     doing = does_not if asked.negated else does
     subject = f"the {bare_name(outcome.subject or mover)}"
-    thing = _one_line(outcome.object or asked.target or ("anything" if asked.negated else "something"))
+    thing = text_of(outcome.object or asked.target or ("anything" if asked.negated else "something"))
     if asked.form == "changes":
         same = " not" if asked.negated else ""
         what = f"whether {subject} {does} {thing}" if asked.target is not None else f"what {subject} {does} first"
         return f"it does{same} make a difference to {what}"
     if asked.form in ("which-first", "where", "what-happens"):
-        return f"the first thing that {subject} {does} is {_one_line(outcome.first or 'nothing')}"
+        return f"the first thing that {subject} {does} is {text_of(outcome.first or 'nothing')}"
     if asked.form == "how-many":
         return f"the number of things that {subject} {does} is {outcome.count or 0}"
     if asked.relation in OF_TARGET:
@@ -117,7 +120,3 @@ def _share(probability: float, worlds: int) -> str:
     if not worlds:
         return f"With a computed probability of {probability:.0%}"
     return f"In {probability:.0%} of {worlds} computed worlds"
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())

@@ -130,7 +130,6 @@ class Located:
     bbox: BBox | None = None
     point: Point | None = None
     label: str = ""
-    clipped: bool = False  # the box reached over the image's edge
     others: tuple[LocatedObject, ...] = ()
     prior: ObjectPrior | None = None
     line: Line | None = None
@@ -230,7 +229,6 @@ def read_located(
         bbox=mover.bbox,
         point=frame.point(place.point) if mover.bbox is None else None,
         label=place.label,
-        clipped=mover.bbox is not None and frame.overshoots(place.box),
         others=tuple(objects),
         prior=mover.prior,
         line=line,

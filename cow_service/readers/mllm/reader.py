@@ -94,7 +94,7 @@ class MllmReader:
             raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image. {GIVE_PLACE}")
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
-            warnings = box_warnings(given.scene, bbox, identified.object, located.clipped)
+            warnings = box_warnings(given.scene, bbox, identified.object)
         others, doubles = separate_objects(bbox, located.others)
         mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
         known = {name_words(each.object): each for each in (mover, *others)}
@@ -279,14 +279,9 @@ def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading) -> MotionRead
     return replace(reading, direction=drawn, along_arrow=along, sentence=None, warnings=warnings)
 
 
-def box_warnings(scene: Scene, bbox: BBox, name: str, clipped: bool) -> tuple[str, ...]:
-    """What speaks against a box that was given for an object of this name; empty where nothing does.
-
-    `clipped`: the box reached over the image's edge.
-    """
+def box_warnings(scene: Scene, bbox: BBox, name: str) -> tuple[str, ...]:
+    """What speaks against a box that was given for an object of this name; empty where nothing does."""
     found: list[str] = []
-    if clipped:
-        found.append("The reader's box reaches over the image's edge; it was cut off there.")
     if covers_image(scene.width, scene.height, bbox):
         found.append("The reader's box covers nearly the whole image: it may not be that of one object.")
     colours = set(name_words(name))

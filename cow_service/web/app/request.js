@@ -23,7 +23,7 @@ export function requestOf({ question, settings, corrections }) {
   for (const name of ["reader", "generator"]) if (settings[name]) request[name] = settings[name];
   for (const name of OF_CLIP) if (!same(settings[name], DEFAULT_SETTINGS[name])) request[name] = settings[name];
   if (settings.seed !== null) request.seed = settings.seed;
-  if (!same(settings.frames, { policy: "initial" })) request.frames = settings.frames;
+  if (!same(settings.frames, {})) request.frames = settings.frames;
   if (settings.video !== !answering) request.video = settings.video; // the server's default: of simulations alone
   if (answering) {
     if (settings.baseline) request.baseline = true;
@@ -35,7 +35,7 @@ export function requestOf({ question, settings, corrections }) {
 
 /** Question, settings and corrections of a request that was accepted earlier. */
 export function stateOf(kind, { question, image, options, baseline, ...request }) {
-  const settings = { ...DEFAULT_SETTINGS, kind, baseline: baseline ?? false, frames: { policy: "initial" }, video: kind !== "answer", rest: {} };
+  const settings = { ...DEFAULT_SETTINGS, kind, baseline: baseline ?? false, frames: {}, video: kind !== "answer", rest: {} };
   const corrections = {};
   for (const name of CORRECTED) corrections[name] = request[name] ?? null;
   for (const name of LISTS) corrections[name] = request[name] ?? [];

@@ -21,7 +21,7 @@ export const DEFAULT_SETTINGS = Object.freeze({
   choices: "",
   num_frames: 81,
   fps: 16,
-  frames: { policy: "events" },
+  frames: {},
   video: true,
   ensemble: 50,
   seed: null,

@@ -31,6 +31,8 @@ export const DOUBTS = {
   size: "how large things are",
   place: "how far away things are",
   friction: "how slippery the floor is",
+  identity: "whether these are the things that you mean",
+  faint: "whether something stands in the way that is too faint to tell",
 };
 
 /** An answer in words. */

@@ -61,8 +61,7 @@ export function Result({ state }) {
   const { result, compared, models, run } = state;
   const { answer, simulation } = result;
   // Why nothing was imagined is told as a problem, with what can be done.
-  const told = answer?.simulation_problem ? [] : [...(answer?.warnings ?? []), ...(simulation?.warnings ?? [])];
-  const warnings = [...new Set(told)];
+  const warnings = answer?.simulation_problem ? [] : (answer ?? simulation).warnings;
   return html`<section class=${run ? "result old" : "result"} aria-label="Result" aria-busy=${Boolean(run)} data-job=${result.jobId}>
     ${run && html`<p class="hint">Of the request before:</p>`}
     ${answer && html`<div class="verdicts">

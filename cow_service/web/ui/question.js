@@ -71,9 +71,9 @@ function Settings({ settings, models }) {
         options=${[["always", "always"], ["auto", "only where first answers disagree"], ["never", "never"]]} />`}
       ${models && html`<${Choice} label="Reader" value=${settings.reader} options=${backends(models.readers)} onChange=${(reader) => changeSettings({ reader })} />`}
       ${models && html`<${Choice} label="Generator" value=${settings.generator} options=${backends(models.generators)} onChange=${(generator) => changeSettings({ generator })} />`}
-      <${Choice} label="Frames" value=${settings.frames.policy ?? "initial"} onChange=${(policy) => changeSettings({ frames: { ...settings.frames, policy } })}
+      <${Choice} label="Frames" value=${settings.frames.policy ?? "events"} onChange=${(policy) => changeSettings({ frames: { ...settings.frames, policy } })}
         options=${[["events", "where something happens"], ["initial", "the first ones"], ["uniform", "all over the clip"]]} />
-      <${Whole} label="How many frames" value=${settings.frames.count ?? 3} min="1" max="64" onChange=${(count) => changeSettings({ frames: { ...settings.frames, count } })} />
+      <${Whole} label="How many frames" value=${settings.frames.count ?? 4} min="1" max="64" onChange=${(count) => changeSettings({ frames: { ...settings.frames, count } })} />
       ${answering && html`<${Whole} label="Votes" value=${settings.votes} min="1" max="32" onChange=${(votes) => changeSettings({ votes })} />`}
       <${Whole} label="Length of the clip, frames" value=${settings.num_frames} min="2" max="481" onChange=${(num_frames) => changeSettings({ num_frames })} />
       <${Whole} label="Worlds" value=${settings.ensemble} min="0" max="500" onChange=${(ensemble) => changeSettings({ ensemble })} />

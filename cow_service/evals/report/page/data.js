@@ -11,20 +11,18 @@ function repliesOf(place) {
   return blocks.get(number);
 }
 
-function readObservation(row) {
-  const [repeat, order, read, paper, reply, shown, overlay, refusal, failure, probability, happens, seconds, imaginations] = row;
+function readObservation(told) {
   return {
-    repeat, order, read, paper, reply, overlay, probability, happens, seconds, imaginations,
-    frames: core.shown[shown], shown, refusal: core.reasons[refusal], failure: core.reasons[failure],
+    ...told, order: told.options.join(""), paper: told.read_as_paper, shown: told.frames.join(),
+    refusal: told.refusal ?? undefined, failure: told.failure ?? undefined,
   };
 }
 
-function readItem(row, place) {
-  const [data, id, source, scene, task, level, question, options, answer, abstain, image, oracle, seen] = row;
-  const item = { place, data: core.data[data], id, source, scene, task, level, question, options, answer, abstain, image, oracle };
-  item.seen = seen.map((rows) => rows.map(readObservation));
+function readItem(told, place) {
+  const item = { ...told, place, source: told.row, options: told.options.map(({ letter, text }) => [letter, text]) };
+  item.seen = told.seen.map((rows) => rows.map(readObservation));
   item.tallies = item.seen.map((of) => tally(item, of));
-  item.text = [id, source, scene, questionText(item)].join("\n").toLowerCase();
+  item.text = [item.id, item.source, item.scene, questionText(item)].join("\n").toLowerCase();
   return item;
 }
 

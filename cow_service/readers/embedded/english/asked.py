@@ -10,7 +10,7 @@ from functools import lru_cache
 from itertools import dropwhile, groupby, pairwise
 
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.asking import MAX_TOKENS, Asking, Sentence, read_clause, sentences
+from cow_service.readers.embedded.english.asking import MAX_TOKENS, Asking, Clause, Sentence, sentences
 from cow_service.readers.embedded.english.grammar import parse_all
 from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, Word, key_at
 from cow_service.readers.embedded.english.motion import NO_MATTER, is_during, read_adverbial
@@ -19,7 +19,6 @@ from cow_service.records import Asked
 
 _MAX_TRIES = 8  # of one sentence: each takes some ms
 MAX_SENTENCES = 12  # of one question; more are not read
-_CLAIM = ("true", "or", "false")
 _OPENERS = lex.words(", and then so but now please")
 _ASKING = lex.words("how what why who whom whose")  # in front of what was read they make another question of it
 _SUBJECTS = lex.words("it they the a an be this its i you we someone somebody there")
@@ -82,15 +81,10 @@ def _in_full(thing: ObjectPhrase | None, question: Question) -> str | None:
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
 def _read(question: Question) -> Asking | None:
     """The one clause of the question that asks; None where none is understood, or several ask."""
-    found, claim = sentences(question), frozenset[int]()
-    if found and tuple(found[0].tokens[: len(_CLAIM)]) == _CLAIM:  # in front of them all
-        number = len(_CLAIM) + (found[0].tokens[len(_CLAIM) : len(_CLAIM) + 1] == [","])
-        claim = frozenset(word.at for word in found[0].words[:number])
-        rest = replace(found[0], words=found[0].words[number:])
-        found = [each for each in (rest, *found[1:]) if each.words]
+    found = sentences(question)
     if len(found) > MAX_SENTENCES or any(len(sentence.words) > MAX_TOKENS for sentence in found):
         return None
-    read = ((at, _read_sentence(sentence, question, bool(claim))) for at, sentence in enumerate(found))
+    read = ((at, _read_sentence(sentence, question)) for at, sentence in enumerate(found))
     readings = [(at, *reading) for at, reading in read if reading is not None]
     if len(readings) != 1:
         return None
@@ -103,7 +97,7 @@ def _read(question: Question) -> Asking | None:
     if listed and asking.form != "which-first":
         return None
     items = question.items
-    said = {found[at].words[place].at for place in places} | claim
+    said = {found[at].words[place].at for place in places}
     said |= _premise(found[: at + 1], places[0], asking, question)
     phrases = [word.phrase for word in listed]
     said |= {at for at, item in enumerate(items) if listed and (item.phrase in phrases or item.key == "or")}
@@ -119,7 +113,6 @@ def _read(question: Question) -> Asking | None:
         among=tuple(listed) or asking.among,
         within=min(limits.values(), default=None),
         items=frozenset(said | limits.keys()),
-        is_claim=bool(claim),
     )
 
 
@@ -140,20 +133,14 @@ def _premise(told: Sequence[Sentence], first: int, asking: Asking, question: Que
     return set()
 
 
-def _read_sentence(sentence: Sentence, question: Question, claim: bool) -> tuple[Asking, list[int]] | None:
-    """The longest part of a sentence, up to its end or to a condition, that a pattern covers, and its places.
-
-    Where the question begins with "true or false", a statement asks, too.
-    """
+def _read_sentence(sentence: Sentence, question: Question) -> tuple[Asking, list[int]] | None:
+    """The longest part of a sentence, up to its end or to a condition, that a pattern covers, and its places."""
     tokens = sentence.tokens
     tries = 0
     rolling = [[word, question.motion.verb, "-ing"] for word in ("by", "of")]
     ends = [at for at in range(len(tokens)) if tokens[at] in _CONDITIONS or tokens[at : at + 3] in rolling]
     for start in range(len(tokens)):
-        # A statement begins with what does something, at the start or behind a condition.
-        subject = sentence.words[start].kind in {"PRONOUN", "M", "T", "S"}
-        claims = claim and subject and (not start or tokens[start - 1] in _OPENERS) and _may_open(tokens[:start])
-        if not claims and not _starts(sentence, start, question):
+        if not _starts(sentence, start, question):
             continue
         for end in (end for end in (len(tokens), *ends) if end > start):
             tries += 1
@@ -167,20 +154,20 @@ def _read_sentence(sentence: Sentence, question: Question, claim: bool) -> tuple
                 places = [at for at in places if not commas[0] <= at <= commas[1]]
             elif commas and commas[-1] == end - 1:
                 places.pop()
-            asking = _read_words([sentence.words[at] for at in places], question, claims)
+            asking = _read_words([sentence.words[at] for at in places], question)
             if asking is not None:
                 return asking, places
     return None
 
 
-def _read_words(words: Sequence[Word], question: Question, claims: bool) -> Asking | None:
-    """What all of some words ask. `claims`: as a statement behind "true or false"."""
+def _read_words(words: Sequence[Word], question: Question) -> Asking | None:
+    """What all of some words ask."""
     tokens = {word.text for word in words}
     senses = tokens & {"along", "against"}
     if "arrow" in tokens and senses and senses != {question.motion.arrow}:
         return None  # the motion that was read is another
-    tree = parse_all("asked", [*(Word("", word, 0) for word in _CLAIM if claims), *words])
-    asking = None if tree is None else read_clause(tree, question)
+    tree = parse_all("asked", words)
+    asking = None if tree is None else Clause(tree, question).read()
     if asking is None or asking.target is None or asking.relation != "touches" or asking.form != "whether":
         return asking
     # "Roll into the bowl": it would be in it, not only touch it; "fall into the vase" is to hit it.
@@ -198,7 +185,7 @@ def _starts(sentence: Sentence, at: int, question: Question) -> bool:
     if word.text in lex.SETS["starts"] and not (at and sentence.words[at - 1].at == word.at):
         return _may_open(before)
     # "Let go of the ball, it lands on the mug?"
-    verb = sentence.words[at + 1] if word.kind == "PRONOUN" and at and at + 1 < len(tokens) else word
+    verb = sentence.words[at + 1] if word.kind in {"PRONOUN", "M", "T"} and at + 1 < len(tokens) else word
     finite = lex.is_form(question.items[verb.at].key, "s")
     return finite and sentence.asks and (at == 0 or tokens[at - 1] == ",")
 
@@ -259,9 +246,6 @@ def unread(question: Question) -> Unread:
         for run in _unread_runs(question, sentence, covered):
             text = " ".join(item.phrase.text if item.phrase else " ".join(item.words) or item.key for item in run)
             (beside if only_described else turning).append(text[:MAX_TEXT])
-    if asking is not None and asking.is_claim:
-        turning += beside  # "true or false" is asked of those words, too
-        beside = []
     return Unread(tuple(dict.fromkeys(turning)), tuple(dict.fromkeys(beside)))
 
 

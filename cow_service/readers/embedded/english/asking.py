@@ -21,9 +21,9 @@ _ACTS = {
 _FORMS: dict[str, AskedForm] = {"either": "which-first"}
 _FORMS.update({form.replace("-", "_"): form for form in get_args(AskedForm)})
 _BY_MOVER: dict[AskedRelation, AskedRelation] = {"covers": "covered", "covered": "covers"}  # "the mug hides it"
-_SPARING = lex.words("misses missed avoids stays stays_up stays_in stays_on sticks_out stops_short spared safe seen")
-_NEGATIONS = _SPARING | {"no", "none", "no_contact"}
-_ANY_PART = frozenset({"any_part", "all_seen", "partly", "wholly", "in_full", "at_some_time"})  # hidden in part or once
+_SPARING = lex.words("misses avoids stays stays_up stays_in stays_on spared safe seen")
+_NEGATIONS = _SPARING | {"no", "none"}
+_ANY_PART = frozenset({"any_part", "partly", "wholly", "at_some_time"})  # hidden in part or once
 
 
 @dataclass(frozen=True)
@@ -40,17 +40,6 @@ class Asking:
     every: bool = False
     within: float | None = None  # s
     items: frozenset[int] = frozenset()  # the places of what asks
-    is_claim: bool = False  # a statement behind "true or false"
-
-
-def read_clause(tree: Node, question: Question) -> Asking | None:
-    """What the tree of a clause asks."""
-    met: set[ObjectPhrase | str | None] = {word.phrase or word.text for word in _things(tree.find("once"))}
-    kept = (each for each in tree.children if isinstance(each, Word) or each.name != "once")
-    asking = _Clause(Node(tree.name, tuple(kept)), question).read()
-    # What is met before must be what then acts, or is moved: else it says something of the time.
-    in_time = asking is not None and met and met.isdisjoint({asking.subject or asking.target, "it"})
-    return None if in_time else asking
 
 
 def _things(nodes: Iterable[Node], *kinds: str) -> list[Word]:
@@ -58,7 +47,7 @@ def _things(nodes: Iterable[Node], *kinds: str) -> list[Word]:
     return [word for node in nodes for word in node.words if word.kind and (not kinds or word.kind in kinds)]
 
 
-class _Clause:
+class Clause:
     """The parts of a clause: its subject, the one thing that is acted on or acts, and the things of a kind."""
 
     def __init__(self, tree: Node, question: Question) -> None:
@@ -75,6 +64,7 @@ class _Clause:
         self.mover_acted = any(word.kind in {"M", "PRONOUN"} for word in self.objects)
 
     def read(self) -> Asking | None:
+        """What the clause asks; None where that is not plain."""
         names, nodes, others = self.names, set(self.names), self.question.others
         form: AskedForm = next(_FORMS[name] for name in names if name in _FORMS)
         things = [] if form == "where" else self.things  # "what does it land on, the floor or the mug?"
@@ -93,14 +83,13 @@ class _Clause:
         # "Does the ball hit it?": not the ball itself, but the one other thing.
         mover_asked = any(word.kind == "M" for word in self.subject)
         of_it = mover_asked and any(word.text == "it" for word in self.objects)
-        of_it = of_it or ("inside_bare" in nodes and any(word.kind in {"M", "PRONOUN"} for word in self.subject))
         pronoun = next((word.text for word in self.subject if word.kind == "PRONOUN"), None)
         beside = [each.object for each in self.question.motion.others]
         if pronoun == "they" and target is None and not of_it:
             # "Will they collide?": the two things that move, or the mover and the one other thing.
             of_it = len(beside) != 1
             target = None if of_it else beside[0]
-        elif pronoun == "they" or of_another or "meet_bare" in nodes or (pronoun is not None and len(beside) == 1):
+        elif pronoun == "they" or of_another or (pronoun is not None and len(beside) == 1):
             return None  # which of the two movers is meant is open
         elif not of_it and not (self.listed and form == "which-first"):
             return self._of_one(asking)
@@ -191,8 +180,6 @@ def sentences(question: Question) -> list[Sentence]:
             continue
         if item.phrase is not None:
             found[-1].words += _phrase_words(at, item.phrase, question, found[-1])
-        elif item.key in {"them", "these", "those"} and found[-1].counts:
-            found[-1].words.append(Word("S", "them", at))
         elif item.key != "still" or not question.interventions:  # "will it still hit it?": with what is taken away
             found[-1].words += lex.plain_words(["," if item.key in {":", "—", "–"} else item.key], at)
     found[-1].asks = True

@@ -107,11 +107,6 @@ def _grammar() -> _Grammar:
     return _Grammar()
 
 
-def listed_words() -> Set[str]:
-    """The words that the grammar lists."""
-    return _grammar().terminals.keys()
-
-
 def terminals(word: str) -> Set[str]:
     """The terminals of the grammar that a word may be."""
     return _grammar().terminals.get(word, frozenset())
@@ -162,8 +157,8 @@ def read_from(start: str, found: Sequence[Item], at: int, window: int) -> tuple[
     """
     words = list(islice(words_of(found, at), min(window, MAX_WORDS)))
     trees = parse_ends(start, words)
-    # "the ball is going" is not "the ball is gone"
-    whole = [end for end in trees if end and (end == len(words) or words[end].text != "-ing")]
+    # Whole items: "the ball is going" is not "the ball is gone".
+    whole = [end for end in trees if end and (end == len(words) or words[end].at != words[end - 1].at)]
     if not whole:
         return None
     end = max(whole)

@@ -50,7 +50,7 @@ def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords,
         if said and said[0].kind == "remove" and ahead[0].kind and _goes_on(found, at, end):
             said = [replace(change, then_moves=True) for change in said]
         changes += [change for change in said if change not in changes]
-        gone |= _emptied(found, at, end, gone) if said else set()
+        gone |= _emptied(found, at, end) if said else set()
     return tuple(changes), [item for at, item in enumerate(found) if at not in gone]
 
 
@@ -97,12 +97,10 @@ def _goes_on(found: Sequence[Item], start: int, end: int) -> bool:
     return joined and verb is not None and lex.moves(verb) and verb.form != "ing"
 
 
-def _emptied(found: Sequence[Item], start: int, end: int, gone: set[int]) -> set[int]:
-    """The places of an intervention, with the "and" or the condition that it leaves without a clause."""
+def _emptied(found: Sequence[Item], start: int, end: int) -> set[int]:
+    """The places of an intervention, with the "and" behind it or the condition that it leaves without a clause."""
     places = set(range(start, end))
     before, after = start - 1, end
-    while before >= 0 and (before in gone or found[before].key in {"then", "also"}):
-        before -= 1
     opened = before >= 0 and found[before].key in lex.CONDITIONALS
     if key_at(found, after) == "," and key_at(found, after + 1) in {"and", "then"}:
         after += 1
@@ -110,7 +108,7 @@ def _emptied(found: Sequence[Item], start: int, end: int, gone: set[int]) -> set
         return places | {after} | ({after - 1} if found[after - 1].key == "," else set())
     if opened:
         return places | {before} | ({after} if key_at(found, after) == "," else set())
-    return places | ({before} if before >= 0 and found[before].key in {"and", "but"} else set())
+    return places
 
 
 def implied_placing(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...], frozenset[int]]:
@@ -124,18 +122,13 @@ def implied_placing(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...
     return (), frozenset()
 
 
-_SIDES = {"leftmost": "left", "rightmost": "right", "topmost": "up", "lowest": "down", "highest": "up",
-          "uppermost": "up"}  # fmt: skip
+_SIDES = {"leftmost": "left", "rightmost": "right", "lowest": "down", "highest": "up"}
 
 
 @dataclass(frozen=True)
 class TrailWords:
-    """Which end of a trail is the present position; where neither field says so, the image must.
+    """Which end of a trail is the present position; where neither field says so, the image must."""
 
-    `last`: the end described by `near` or `side` is the present one; else it is the oldest.
-    """
-
-    last: bool = True
     near: ObjectPhrase | None = None
     side: Vector | None = None  # unit vector in the image
 
@@ -149,5 +142,5 @@ def split_trail(found: Sequence[Item]) -> tuple[TrailWords | None, list[Item]]:
             near = next((word.phrase for word in tree.words if word.kind in {"NP", "PRONOUN"}), None)
             side = next((node.words[0].text for node in tree.find("side")), None)
             way = None if side is None else lex.DIRECTIONS[_SIDES.get(side, side)]
-            return TrailWords("first_end" not in tree, near, way), [*found[:at], *found[end:]]
+            return TrailWords(near, way), [*found[:at], *found[end:]]
     return None, list(found)

@@ -28,6 +28,7 @@ _VECTORS: dict[str, Vector] = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (
 DIRECTIONS = {word: _VECTORS[way] for way, text in TABLES["directions"].items() for word in text.split()}
 NUMBER_WORDS = {word: value for value, word in enumerate(TABLES["sets"]["numerals"].split(), 1)}
 NUMERALS = NUMBER_WORDS | {"twenty": 20, "thirty": 30, "forty": 40, "fifty": 50, "sixty": 60, "hundred": 100}
+NOUNS = words(*TABLES["shapes"].values())
 METRES = {  # of a unit of length
     word: float(text.split()[0])
     for unit, text in TABLES["metres"].items()
@@ -160,7 +161,6 @@ class QuantityWords:
     distance: Quantity | None = None
     share: float | None = None  # of the way to what it moves towards
     own_widths: float | None = None  # a distance, in widths of what moves
-    own_heights: float | None = None
     duration: float | None = None  # s
     until: Until | None = None
     within: float | None = None  # s: a limit of what is asked about, not of the motion

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from typing import Literal
 
 from cow_service.readers.embedded.english import lexicon as lex
@@ -23,7 +24,7 @@ _GOES_ON = lex.PLACES | lex.words(
 )
 # A conditional clause is where the motion stands; a question without one may still hold it.
 _RANKS: dict[_ClauseKind, int] = {"cond": 30, "plain": 20, "question": 10}
-_STAYS, _UNKNOWN_VERB, _CONTACT = 5, 15, 16  # ranks, too
+_STAYS, _UNKNOWN_VERB = 5, 15  # ranks, too
 _EVENTS = lex.TOUCH | lex.OCCLUDE | lex.LAND
 _WINDOW = 60  # items: no clause is longer
 _PARTICLES = lex.words("up down away off out over go loose of")
@@ -140,11 +141,8 @@ def _candidate(found: Sequence[Item], at: int, clause: _Clause) -> MotionCandida
         return None
     kind, passive = verb.kind, is_passive(found, at)
     if kind is None:
-        struck = verb.lemma in {"hit", "strike", "knock", "bump"} and verb.form in {"past", "base"} and passive
-        if not struck or clause.kind != "cond":
-            return None
-        rank, kind = _CONTACT, "linear"
-    elif kind == "static" and clause.kind != "cond":
+        return None
+    if kind == "static" and clause.kind != "cond":
         rank = _STAYS
     elif verb.form in {"ing", "past"} and not passive:
         rank = max(rank, _RANKS["plain"])
@@ -159,10 +157,6 @@ def _is_idle(found: Sequence[Item], at: int, verb: lex.Verb) -> bool:
     before = key_at(found, at - 1)
     if verb.kind == "static" and (verb.form == "ing" or before in {"that", "which"}):
         return True
-    if verb.lemma == "rest" and before == "at" and key_at(found, at - 2) not in lex.BE:
-        return True
-    if verb.lemma == "reverse" and before == "in":
-        return True
     for item in found[at + 1 : at + 5] if verb.lemma in lex.SETS["weak"] else ():
         if item.key in lex.VERBS and lex.VERBS[item.key].kind:
             return True
@@ -173,7 +167,7 @@ def _is_idle(found: Sequence[Item], at: int, verb: lex.Verb) -> bool:
 
 def is_passive(found: Sequence[Item], at: int) -> bool:
     """Whether the verb at a place is in the passive voice: a participle behind a form of "be"."""
-    past = lex.is_form(found[at].key, "past") or lex.lemma(found[at].key) in {"hit", "cast"}
+    past = lex.is_form(found[at].key, "past") or lex.lemma(found[at].key) == "hit"
     return past and not lex.BE.isdisjoint(key_at(found, at - back) for back in (1, 2, 3))
 
 
@@ -236,17 +230,15 @@ def clause_end(found: Sequence[Item], at: int) -> int:
 
 ArrowSense = Literal["along", "against"]
 
-SLIGHTLY = math.tan(math.pi / 8)  # "slightly up": half of a diagonal's 45 degrees
 _ADVERBIAL = 14  # words of one
 _MAX_TRIES = 16  # of one motion: each takes a part of a ms
-_FIRST_LEG_ONLY = frozenset({"along", "against", "reversed", "towards", "forward", "backward"})
+_FIRST_LEG_ONLY = frozenset({"along", "against", "towards", "forward", "backward"})
 _THEN = lex.words("then afterwards finally")
 _BEFORE_VERB = lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}
-_KICKED = lex.words("kick hit knock strike push send flick tap go swing")
 _TIPPED = lex.words("knock push kick hit turn blow go")
 _RISING = lex.words("lift raise rise climb ascend")
 _SETS_GOING = lex.words("send start keep get")
-_FALLING = lex.words("fall drop release plummet plunge descend sink")
+_FALLING = lex.words("fall drop release plummet plunge descend")
 _SINKING = _FALLING | {"lower"}
 _CLIMBING = lex.words("rise ascend")
 _GOES_STRAIGHT = lex.words("go move drive roll travel continue run")
@@ -315,34 +307,29 @@ class _Leg:
     ahead: set[bool] = field(default_factory=set[bool])
     towards: ObjectPhrase | None = None
     marks: set[str] = field(default_factory=set[str])
-    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
+    quantities: dict[int, QuantityWords] = field(default_factory=dict[int, QuantityWords])  # by place in the text
 
-    def take(self, node: Node, mover: ObjectPhrase | None, open_end: bool, arrow: bool) -> bool:
+    def take(self, node: Node, mover: ObjectPhrase | None, open_end: bool) -> bool:
         """Takes an adverbial; false where it says nothing here."""
         match node.name:
             case "heading":
-                weight = SLIGHTLY if "slight" in node else 1.0
-                said = [lex.DIRECTIONS[word.text] for ways in node.find("ways") for word in ways.words]
-                self.ways += [(weight * x, weight * y) for x, y in said]
+                self.ways += [lex.DIRECTIONS[word.text] for word in node.words]
             case "away" | "near":
                 self.depths.add(1 if node.name == "away" else -1)
             case "along" | "against":
                 self.senses.add(node.name)
-            case "reversed" if arrow:
-                self.senses.add("against")
             case "forward" | "backward":
                 self.ahead.add(node.name == "forward")
-            case "reversed" | "beside_it":
+            case "beside_it":
                 return False
-            case "airborne":
-                self.marks.add(node.name)
-                flies = self.verb in lex.VERBS and lex.VERBS[self.verb].kind in {"projectile", "fall"}
-                return flies or self.verb in _KICKED  # "rolls through the air": the worlds have nothing that does
             case "stops":
                 return bool(self.quantities)
             case "towards":
                 phrase = node.words[0].phrase
                 named = phrase is not None and (phrase.is_thing or (phrase.noun is None and phrase.colour is not None))
+                # "To the rigth": what may be a misspelt direction is no goal.
+                head = "" if phrase is None or phrase.head in lex.NOUNS else phrase.head or ""
+                named = named and not get_close_matches(head, lex.DIRECTIONS, 1, 0.8)
                 aims = named and phrase != mover and not (open_end and "to_goal" in node)
                 self.towards = self.towards or (phrase if aims else None)
                 return aims and self.towards == phrase
@@ -381,12 +368,10 @@ def read_motion(
     kind: MotionKind | None,
     mover: ObjectPhrase | None,
     asked: bool = False,
-    arrow: bool = False,
 ) -> MotionWords:
     """The motion in a clause whose verb is the first of `found`.
 
     `asked`: the verb itself is in question, so where it gets to is not given ("will the ball roll into the vase?").
-    `arrow`: the question names an arrow elsewhere, so "the opposite direction" is opposite to it.
     """
     read = {found[0].start} if found and found[0].phrase is None else set[int]()
     legs = [_Leg(verb)]
@@ -401,12 +386,12 @@ def read_motion(
             later = len(legs) > 1 and node.name in _FIRST_LEG_ONLY
             if node.name == "stops" and len(legs) > 1 and not leg.says_more():
                 leg = legs[-2]
-            if later or aside or not leg.take(node, mover, asked or kind == "fall", arrow):
+            if later or aside or not leg.take(node, mover, asked or kind == "fall"):
                 continue
         elif item.quantity is not None and item.quantity.within is not None:
             continue
         elif item.quantity is not None:
-            leg.quantities.append(item.quantity)
+            leg.quantities[item.start] = item.quantity
         elif item.key in _THEN:
             legs += [_Leg("")] if leg.says_more() else []
         elif item.key in lex.VERBS and len(legs) > 1 and not leg.verb:
@@ -419,12 +404,11 @@ def read_motion(
 
 def _in_words(legs: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int]) -> MotionWords:
     first, *rest = legs
+    lost = [leg.quantities.keys() for leg in rest if leg.way(None)[0] is None and not leg.depths]
     rest = [leg for leg in rest if leg.way(None)[0] is not None or leg.depths]
     comes_down = first.verb == "come" and any(y > 0 for _, y in first.ways)
     if comes_down or (first.verb in _TIPPED and "over" in first.marks):
         kind = "fall"
-    elif first.verb in _KICKED and "airborne" in first.marks:
-        kind = "projectile"
     sense, forward = next(iter(first.senses), None), next(iter(first.ahead), None)
     if forward is None and sense is None and first.verb == "reverse":
         forward = False
@@ -432,23 +416,15 @@ def _in_words(legs: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int
         forward = True
     return MotionWords(
         kind, sense, *first.way(kind), None if sense is not None and not forward else forward, first.verb,
-        first.towards, quantities=tuple(first.quantities),
-        steps=tuple(StepWords(*leg.way(None), tuple(leg.quantities)) for leg in rest),
-        contradictory=any(leg.contradicts() for leg in (first, *rest)), read=read,
+        first.towards, quantities=tuple(first.quantities.values()),
+        steps=tuple(StepWords(*leg.way(None), tuple(leg.quantities.values())) for leg in rest),
+        contradictory=any(leg.contradicts() for leg in (first, *rest)), read=read.difference(*lost),
     )  # fmt: skip
 
 
-def with_front(motion: MotionWords, before: Sequence[Item], found: Sequence[Item]) -> MotionWords:
+def with_front(motion: MotionWords, before: Sequence[Item]) -> MotionWords:
     """The motion with what stands in front of its verb: "along the arrow, the ball ...", "at 20 px/s it would ..."."""
-    told = frozenset[int]()  # the places of "The arrow shows the way", wherever the question says so
-    for at in range(len(found)):
-        opens = key_at(found, at - 1) in _ENDS or key_at(found, at - 1) in {",", "that", "and"}
-        near = opens and any(word.text in lex.ARROWS for word in lex.words_of(found[at : at + 4]))
-        parsed = read_adverbial(found, at, _ADVERBIAL) if near else None
-        if parsed is not None and parsed[0].name == "told":
-            told = frozenset(item.start for item in found[at : parsed[1]])
-            break
-    read, senses, quantities = set(told), set[ArrowSense](), list[QuantityWords]()
+    read, senses, quantities = set[int](), set[ArrowSense](), list[QuantityWords]()
     for node, items in _adverbials(before, 0):
         quantity = items[0].quantity
         if node is None and quantity is not None and quantity.within is None:
@@ -458,10 +434,9 @@ def with_front(motion: MotionWords, before: Sequence[Item], found: Sequence[Item
         elif node is None or node.name not in NO_MATTER:
             continue
         read |= {item.start for item in items}
-    said = motion.direction is not None or motion.depth or motion.forward is not None or motion.towards is not None
     return replace(
         motion,
-        arrow=motion.arrow or next(iter(senses), None) or ("along" if told and not said else None),
+        arrow=motion.arrow or next(iter(senses), None),
         quantities=(*quantities, *motion.quantities),
         contradictory=motion.contradictory or len({motion.arrow, *senses} - {None}) > 1,
         read=motion.read | read,

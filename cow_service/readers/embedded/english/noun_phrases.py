@@ -17,10 +17,10 @@ from cow_service.readers.options import plain
 from cow_service.records import Shape
 
 _QUANTITY_WINDOW, _PLACE_WINDOW = 14, 9  # words
-_MEASURES = frozenset({"_SLOWLY", "_QUICKLY", "_SECOND", "_TEMPO", "LENGTH", "WIDTH"})  # terminals
-_BARE = lex.words("width diameter height halfway midway way until till push shove")  # measures, too
+_MEASURES = frozenset({"_SLOWLY", "_QUICKLY", "_SECOND", "_TEMPO", "LENGTH"})  # terminals
+_BARE = lex.words("width widths diameter diameters halfway midway until till push shove")  # measures, too
 _ADJECTIVE_BEHIND = lex.DETERMINERS | lex.COLOURS.keys() | lex.SETS["adjectives"] | lex.words("how as so is are be")
-_PARTS = {"half": 0.5, "halfway": 0.5, "quarter": 0.25, "third": 1 / 3, "two_thirds": 2 / 3, "twice": 2.0}
+_PARTS = {"half": 0.5, "halfway": 0.5, "twice": 2.0}
 
 
 def _joined(found: Sequence[Item], join: Callable[[int], tuple[Item, int] | None]) -> list[Item]:
@@ -58,24 +58,19 @@ def _read_quantity(tree: Node) -> QuantityWords:
     part = next((_PARTS[name] for name in names if name in _PARTS), None)
     numeral = next((word.text for word in tree.words if word.text in lex.NUMERALS or word.text[0].isdigit()), None)
     number = part or (1.0 if numeral is None else float(lex.NUMERALS.get(numeral, numeral)))  # 1 for "a second"
-    number += 0.5 * ("plus_half" in names)
-    units: tuple[float, Unit, Unit] = (1.0, "widths", "widths/s")
     length = next((node.words[0].text for node in tree.find("length")), None)
-    if length is not None and not length.startswith("width"):
-        units = (1.0, "px", "px/s") if length.startswith("p") else (lex.METRES[length], "m", "m/s")
-    size, unit, per_second = units
+    units: tuple[float, Unit, Unit] = (1.0, "px", "px/s")
+    size, unit, per_second = (lex.METRES[length], "m", "m/s") if length in lex.METRES else units
     match names[1]:
         case "speed":
             pace: SpeedWord = "fast" if {"slow", "slowly"}.isdisjoint(names) else "slow"
             said = QuantityWords(speed=pace if length is None else Quantity(number * size, per_second))
         case "distance" if "own_width" in names:
             said = QuantityWords(own_widths=number)
-        case "distance" if "own_height" in names:
-            said = QuantityWords(own_heights=number)
         case "distance":
             said = QuantityWords(distance=Quantity(number * size, unit))
         case "until":
-            said = QuantityWords(until="contact" if "contact" in names else "out-of-view")
+            said = QuantityWords(until="contact")
         case "limit":
             said = QuantityWords(within=number)
         case "duration":
@@ -159,18 +154,13 @@ def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: b
     determined, inside = first > start, at > first
     if key == "and":
         return inside and not has_noun and before in lex.COLOURS and after in lex.COLOURS
-    if key == "a" and (inside or before in _NUMBERED):
-        return not _is_determiner(found, at)
     adverb = key == "first" or (len(key) > 4 and key.endswith("ly") and key not in lex.SETS["not_adverbs"])
     if key in lex.PLACES or key in {"one", "far", "can"}:
         return determined and not has_noun
     if has_noun:
         # "the mug 10 cm to the left": the measure is no part of the mug.
         measure = key[0].isdigit() and (not key.isdecimal() or after in lex.SETS["measures"])
-        # "The ball and the mug move to the right": a verb of two subjects is in its base form.
-        moving = lex.is_form(key, "base") and lex.moves(lex.VERBS.get(key))
-        shared = moving and key_at(found, start - 1) == "and" and (after in lex.PLACES or after in lex.CLOSED)
-        ends = measure or shared or adverb or key in _BEHIND  # "will it hit the mug first?"
+        ends = measure or adverb or key in _BEHIND  # "will it hit the mug first?"
     else:
         ends = (at == start and key in {"both", "each"} and after in lex.VERBS) or (adverb and not determined)
     if ends or key in lex.PUNCTUATION or key in lex.CLOSED:
@@ -189,11 +179,6 @@ def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, b
             return False  # "will the two collide?", "any chance of those two running into each other?"
         if verb.form == "s" and before == "one":
             return False  # "the orange one slides"
-        # "block 3", "block C"; but not "hit 3 balls", where a noun follows the number
-        label = after.isdecimal() or (len(after) == 1 and after.isalpha() and after not in lex.CLOSED)
-        ahead = key_at(found, at + 2)
-        ended = any(ahead in listed for listed in (lex.PUNCTUATION, lex.CLOSED, lex.VERBS, lex.PLACES))
-        begun = begun or (verb.form == "base" and label and ended)
         # "orange" is the one colour that is also a thing that moves: "the orange falls".
         return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
     if verb.form == "base":
@@ -268,8 +253,8 @@ def with_tables(found: Sequence[Item]) -> list[Item]:
 def with_nouns(found: Sequence[Item]) -> list[Item]:
     """The items, where a reference has what it means.
 
-    "The latter" is what was named last, "the other one" is of the kind named, and "the red one" of the kind that is
-    asked for ("which cone", "which of the cones"), or of that of all things before it.
+    "The red one" is of the kind that is asked for ("which cone", "which of the cones"), or of that of all things
+    before it.
     """
     which = {("which",), ("what",)}
     asked = {
@@ -279,29 +264,17 @@ def with_nouns(found: Sequence[Item]) -> list[Item]:
     } - {""}
     before: set[str] = set()
     said: list[Item] = []
-    things: list[Item] = []
+    things: list[ObjectPhrase] = []
     for item in found:
         nouns, phrase, words = asked or before, item.phrase, item.words
         noun = next(iter(nouns)) if len(nouns) == 1 else ""
-        if words in {("the", "latter"), ("the", "former")} and len(things) > 1:
-            meant = things[-1] if words == ("the", "latter") else things[-2]
-            said.append(replace(item, phrase=meant.phrase, words=meant.words))
+        bare = phrase is not None and phrase.text.lower() == phrase.noun
+        last = next((each for each in reversed(things) if phrase is not None and each.noun == phrase.noun), None)
+        if words[:1] == ("that",) and bare and last is not None:  # "That mug": the mug that was named last.
+            said.append(replace(item, phrase=last, words=("that", *last.text.split())))
             continue
-        if words[:1] == ("that",) and phrase is not None and phrase.text.lower() == phrase.noun:
-            # "That mug": the mug that was named last.
-            again = (each.phrase for each in reversed(things) if each.phrase and each.phrase.noun == phrase.noun)
-            if (last := next(again, None)) is not None:
-                said.append(replace(item, phrase=last, words=("that", *last.text.split())))
-                continue
-        if words in {("the", "other", "one"), ("the", "other")} and noun:
-            other = ObjectPhrase(f"other {noun}", None, noun)
-            said.append(replace(item, phrase=other, words=("the", "other", *noun.split())))
-            continue
-        if item.thing is not None and phrase is not None and phrase.noun and all(phrase != e.phrase for e in things):
-            things.append(item)
-        colour_alone = len(words) == 2 and words[0] == "the" and words[1] in lex.COLOURS.keys() - {"orange"}
-        if phrase is not None and asked and colour_alone:
-            phrase = replace(phrase, noun=None)  # "which mug does it hit first, the blue or the white?"
+        if item.thing is not None:
+            things.append(item.thing)
         # "The red one", "the left one".
         one = words[-1:] == ("one",)
         if phrase is not None and phrase.noun is None and noun and (phrase.colour or (one and len(phrase.words) > 1)):

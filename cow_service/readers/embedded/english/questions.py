@@ -12,12 +12,11 @@ from cow_service.readers.base import Quantity
 from cow_service.readers.embedded.english import interventions, motion, noun_phrases, wording
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.interventions import InterventionWords, TrailWords
-from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, key_at, phrase_at
+from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, key_at
 from cow_service.readers.embedded.english.motion import MotionCandidate, MotionWords, OtherWords
 from cow_service.readers.options import plain, split_options
 
 MAX_WORDS = 240  # of a question that are read
-_EACH_OF_TWO = lex.words("both each together")
 _HOW_MANY = lex.words("the all both either none two three")
 _SAME_TIME = re.compile(
     r"\b(?:at the (?:very )?same (?:time|moment|instant)|simultaneously)\b(?P<joins> as\b)?", re.IGNORECASE
@@ -25,7 +24,8 @@ _SAME_TIME = re.compile(
 # Words that say which way, wherever they stand.
 _DIRECTION_WORDS = re.compile(
     r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
-    r"|clockwise|counterclockwise|towards?|away|diagonal(ly)?|degrees?|sideways|back|backwards?|forwards?|other way)\b",
+    r"|clockwise|counterclockwise|opposite|reversed?|towards?|away|diagonal(ly)?|degrees?|sideways|back|backwards?"
+    r"|forwards?|other way)\b",
     re.IGNORECASE,
 )
 
@@ -51,7 +51,6 @@ class Question:
     beyond: str = ""  # how what is not read any more begins
     pronoun: str = ""  # that stands for the mover where it may stand for two things
     read: frozenset[int] = frozenset()
-    errors: tuple[tuple[str, str], ...] = ()  # typing errors, each with the word that it was read as
 
     def has_read(self, at: int) -> bool:
         """Whether the item at a place tells the motion and was understood."""
@@ -72,8 +71,7 @@ def parse(question: str) -> Question:
     if len(found) > MAX_WORDS:
         text, rest = text[: found[MAX_WORDS].start], found[MAX_WORDS : MAX_WORDS + 7]
         beyond = " ".join(each.key for each in rest)
-    text, errors = wording.without_typing_errors(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
-    text = wording.without_openings(text)
+    text = wording.without_openings(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
     arrow = any(token.key.startswith("arrow") for token in lex.tokens(text))
     found = noun_phrases.with_nouns(noun_phrases.with_tables(noun_phrases.items(text)))
     changes, found = interventions.split_interventions(noun_phrases.with_places(found))
@@ -81,7 +79,7 @@ def parse(question: str) -> Question:
     candidates, subjects = motion.read_clauses(found)
     best = _best(found, candidates)
     mover = _mover(found, subjects, best, changes)
-    clause, told = _motion(found, candidates, best, mover, arrow, changes)
+    clause, told = _motion(found, candidates, best, mover, changes)
     if trail is not None and trail.near is None and trail.side is None:
         trail = replace(trail, side=told.direction)  # "on along its trail to the right": its last end is there
     told, fitted = replace(told, trail=trail), frozenset[int]()
@@ -90,7 +88,7 @@ def parse(question: str) -> Question:
     read = told.read.union(fitted, *(other.motion.read for other in told.others))
     put = next((change for change in changes if change.kind == "place"), None)
     # "If you lift the ball and put it into the mug": the lifting is a part of it.
-    lifted = best.subject if best is not None and best.verb in {"lift", "raise", "carry", "bring"} else None
+    lifted = best.subject if best is not None and best.verb in {"lift", "raise", "carry"} else None
     carried = put is not None and lifted == put.object
     if carried:
         read = read.union(item.start for item in found[clause.start : clause.stop])
@@ -109,7 +107,6 @@ def parse(question: str) -> Question:
         beyond=beyond,
         pronoun=_open_pronoun(found, best, mover),
         read=read,
-        errors=errors,
     )
 
 
@@ -164,7 +161,6 @@ def _motion(
     candidates: Sequence[MotionCandidate],
     best: MotionCandidate | None,
     mover: ObjectPhrase | None,
-    arrow: bool,
     changes: Sequence[InterventionWords],
 ) -> tuple[range, MotionWords]:
     """The places of the clause that tells the motion, and what it tells."""
@@ -180,23 +176,20 @@ def _motion(
             verb, kind = "fall", "fall"
     beside = _movers_beside(found, candidates, best)
     end = min([motion.clause_end(found, at) if best else at, *(other.start for other in beside)])
-    shared: int | None = None  # "the ball moves left and the car to the right"
-    for place in range(at + 1, end - 2):
-        if found[place].key in {"and", "while"} and found[place + 1].thing:
-            way = motion.read_motion(found[place + 1 : end], "", None, None)
-            if way.direction is not None or way.depth:
-                shared = place
-                break
     asked = best is not None and best.asked
-    told = motion.read_motion(found[at : shared or end], verb, kind, mover, asked=asked, arrow=arrow)
-    told = motion.with_front(told, found[start:at] if best else found, found)
+    told = motion.read_motion(found[at:end], verb, kind, mover, asked=asked)
+    told = motion.with_front(told, found[start:at] if best else found)
     elsewhere = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
     speeds = {place: said for place, said in elsewhere if isinstance(said.speed, Quantity)}
+    others = dict[ObjectPhrase, OtherWords]()
+    for each in beside:
+        if each.subject is not None:
+            others.setdefault(each.subject, _other_motion(found, each, each.subject))
     told = replace(
         told,
         quantities=(*told.quantities, *speeds.values()),
         read=told.read.union(speeds),
-        others=_other_motions(found, best, beside, shared, end),
+        others=tuple(others.values()),
     )
     return range(start if best else at, end), told
 
@@ -219,37 +212,12 @@ def _movers_beside(
     ]  # fmt: skip
 
 
-def _other_motions(
-    found: Sequence[Item],
-    best: MotionCandidate | None,
-    beside: Sequence[MotionCandidate],
-    shared: int | None,
-    end: int,
-) -> tuple[OtherWords, ...]:
-    """What else moves at the same time, and how.
+def _other_motion(found: Sequence[Item], verb: MotionCandidate, thing: ObjectPhrase) -> OtherWords:
+    """How another thing moves at the same time.
 
     How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
     """
-    others: list[OtherWords] = []
-    if best is not None and shared is not None and (thing := found[shared + 1].phrase) is not None:
-        others.append(_other_motion(thing, best, found[shared + 1 : end]))
-    # "The ball and the mug both move to the right"; but "the ball between the cube and the mug rolls": one thing moves.
-    if best is not None and best.subject is not None and best.moves and not best.asked:
-        at = best.at - (key_at(found, best.at - 1) in _EACH_OF_TWO)
-        pair = key_at(found, at - 2) == "and" and phrase_at(found, at - 3) == best.subject
-        thing = found[at - 1].thing if pair and not lex.is_form(found[best.at].key, "s") else None
-        other = None if thing is None else _other_motion(thing, best, found[best.at : end])
-        long = any(item.quantity is not None and item.quantity.speed is None for item in found[best.at : end])
-        if other is not None and not other.motion.steps and not long:
-            read = other.motion.read.union(item.start for item in found[at : best.at])
-            others.append(replace(other, motion=replace(other.motion, read=read)))
-    for each in beside:
-        if each.subject is not None and all(each.subject != other.object for other in others):
-            others.append(_other_motion(each.subject, each, found[each.at : motion.clause_end(found, each.at)]))
-    return tuple(others)
-
-
-def _other_motion(thing: ObjectPhrase, verb: MotionCandidate, words: Sequence[Item]) -> OtherWords:
+    words = found[verb.at : motion.clause_end(found, verb.at)]
     told = motion.read_motion(words, verb.verb, verb.kind, thing)
     lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
     return OtherWords(thing, replace(told, read=frozenset() if told.steps else told.read - lengths))

@@ -1,13 +1,10 @@
-"""Puts a question into plain wording: without how to reply, without openings, and without typing errors."""
+"""Puts a question into plain wording: without how to reply, and without openings."""
 
 import re
-from collections.abc import Sequence
-from difflib import SequenceMatcher
-from functools import cache
 
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import listed_words, read_from
-from cow_service.readers.embedded.english.lexicon import Item, key_at
+from cow_service.readers.embedded.english.grammar import read_from
+from cow_service.readers.embedded.english.lexicon import key_at
 
 # Sentences of the text, and what those are about that say how to reply.
 _BETWEEN_SENTENCES = re.compile(r"((?<=[.?!])\s+|\n+)")
@@ -41,12 +38,15 @@ _SAID_AS = re.compile(rf"\b(?:{'|'.join(_LONGEST_FIRST)})\b", re.IGNORECASE)
 _TAG = re.compile(rf",\s*(?:{'|'.join(lex.SETS['tags'])})\s*\?(?=\s+\S)", re.IGNORECASE)  # and something else is asked
 
 
+_CLAIM = re.compile(r"(^|[.!]\s)\s*true or false\s*[:?,]?\s+([^.?!]+)[.?]?\s*$", re.IGNORECASE)  # the last sentence
+
+
 def without_openings(text: str) -> str:
     """The text without openings; what asks by a statement ("I wonder whether it ...") begins with "tell me" then.
 
     Words of informal English are put as the grammar has them ("gonna" as "going to").
     """
-    text = _TAG.sub(".", text)
+    text = _CLAIM.sub(r"\1\2?", _TAG.sub(".", text))
     text = _SAID_AS.sub(lambda found: lex.TABLES["said_as"][found[0].lower()], text.replace("’", "'"))
     found, kept, end = lex.tokens(text), list[str](), 0
     starts = [at for at in range(len(found)) if at == 0 or key_at(found, at - 1) in lex.ENDS]
@@ -58,57 +58,3 @@ def without_openings(text: str) -> str:
             kept += [text[end : found[at].start], asks]
             end = found[behind].start if behind < len(found) else len(text)
     return "".join([*kept, text[end:]])
-
-
-_SHORTEST = 5  # letters of a word that is looked at
-_BEFORE_NOUN = lex.DETERMINERS | lex.COLOURS.keys() | lex.CONDITIONALS | lex.AUXILIARIES | lex.PUNCTUATION | {"of"}
-_BEHIND_NOUN = lex.PUNCTUATION | lex.CLOSED | lex.VERBS.keys() | lex.PLACES
-_ONE_EDIT = ([("replace", 1, 1)], [("insert", 0, 1)], [("delete", 1, 0)])
-_ENDINGS = ("", "s", "es", "d", "ed", "r", "er")  # a listed word with one of these is no typing error
-
-
-def without_typing_errors(text: str) -> tuple[str, tuple[tuple[str, str], ...]]:
-    """The corrected text, and each error with the word that it was read as: one that is one letter off.
-
-    Any word may be a noun, so where a noun may stand only a few are corrected, such as names of directions.
-    """
-    found, errors, end, kept = lex.tokens(text), dict[str, str](), 0, list[str]()
-    for at, item in enumerate(found):
-        meant = _meant(found, at)
-        if meant is not None:
-            errors[text[item.start : item.end]] = meant
-            kept += [text[end : item.start], meant]
-            end = item.end
-    return "".join([*kept, text[end:]]), tuple(errors.items())
-
-
-def _meant(found: Sequence[Item], at: int) -> str | None:
-    key, before = found[at].key, key_at(found, at - 1)
-    if len(key) < _SHORTEST or not key.isalpha() or key in lex.SETS["no_errors"]:
-        return None
-    among = _vocabulary().get(key[0], frozenset())
-    if not among.isdisjoint(key.removesuffix(ending) for ending in _ENDINGS):
-        return None
-    near = [word for word in among if abs(len(word) - len(key)) < 2 and _is_one_edit(key, word)]
-    # A noun may stand behind a determiner, say, and with no noun behind it.
-    noun = key_at(found, at + 1) in _BEHIND_NOUN and (before in _BEFORE_NOUN or lex.is_modifier(before))
-    return near[0] if len(near) == 1 and (not noun or near[0] in lex.SETS["misspelt_nouns"]) else None
-
-
-def _is_one_edit(one: str, other: str) -> bool:
-    """Whether two words differ by one letter, or by two neighbours that have changed places."""
-    pairs = [(a, b) for a, b in zip(one, other, strict=False) if a != b]
-    if len(one) == len(other) and len(pairs) == 2 and pairs[0] == pairs[1][::-1]:
-        return "".join(pair[0] for pair in pairs) in one
-    if len(set(one) ^ set(other)) > 2:
-        return False
-    codes = SequenceMatcher(None, one, other, autojunk=False).get_opcodes()
-    return [(tag, b - a, d - c) for tag, a, b, c, d in codes if tag != "equal"] in _ONE_EDIT
-
-
-@cache
-def _vocabulary() -> dict[str, frozenset[str]]:
-    """The words of the closed lists and of the grammar by their first letters."""
-    words = lex.CLOSED | lex.COLOURS.keys() | lex.VERBS.keys() | listed_words()
-    words = words.union(*lex.SETS.values()) - lex.SETS["no_errors"] | {f"{noun}s" for noun in lex.SETS["nouns"]}
-    return {letter: frozenset(word for word in words if word[0] == letter) for letter in {word[0] for word in words}}

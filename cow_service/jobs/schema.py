@@ -1,0 +1,166 @@
+"""Our tables in the job database, and which versions of COW can serve on them at the same time.
+
+Results, references and finished stages belong to a job, and are deleted with its row.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import sqlalchemy as sa
+
+from cow_service.errors import StorageUnavailable
+
+SCHEMA = 2  # of our tables; 1 is that without `cow_schema`
+# The oldest version of COW, by its own `SCHEMA`, that can serve on these tables. It stays where a version only adds
+# tables, and columns that may be null: such a change is made while older servers run.
+OLDEST_SERVING = 1
+BEFORE_SCHEMA_1 = "cow_holds"  # a table of the versions that kept jobs elsewhere
+ALIVE_SECONDS = 10.0  # since a process last told of itself
+
+METADATA = sa.MetaData()
+JOBS = sa.Table(
+    "cow_jobs",
+    METADATA,
+    sa.Column("id", sa.String(64), primary_key=True),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("owner", sa.Text),  # the name of a key; null where the server has none
+    sa.Column("status", sa.String(16), nullable=False),  # a `JobStatus`: queued until work on it begins
+    sa.Column("created_at", sa.String(32), nullable=False),  # RFC 3339 in UTC, to the millisecond: sorts as text
+    sa.Column("ended", sa.Float),  # Unix time, s
+    sa.Column("version", sa.String(16), nullable=False),  # of the workflow that computes it
+    sa.Column("queue", sa.String(64), nullable=False),
+    sa.Column("priority", sa.String(16), nullable=False),
+    sa.Column("turn", sa.Integer, nullable=False),  # among the jobs of its queue: the lowest is taken first
+    sa.Column("executor", sa.String(64)),  # the process that has taken it; null while it waits in its queue
+    sa.Column("run", sa.String(64)),  # names this attempt: an earlier one can change nothing any more
+    sa.Column("starts", sa.Integer, nullable=False),  # how often it was taken
+    sa.Column("generator", sa.Text, nullable=False),
+    sa.Column("question", sa.Text, nullable=False),
+    sa.Column("image", sa.String(64), nullable=False),
+    sa.Column("webhook", sa.Text),
+    sa.Column("spec", sa.LargeBinary, nullable=False),  # a `JobSpec` as JSON, deflated
+    sa.Column("format", sa.Integer),  # of the result: `FORMAT` when it was stored
+    sa.Column("result", sa.LargeBinary),  # JSON, deflated, without the trajectory where `trajectory_key` names one
+    sa.Column("trajectory_key", sa.String(64)),
+    sa.Column("error", sa.Text),  # JSON
+    sa.Index("cow_jobs_of_time", "created_at"),
+    sa.Index("cow_jobs_of_status", "status", "created_at"),
+    sa.Index("cow_jobs_of_owner", "owner", "created_at"),
+    sa.Index("cow_jobs_ended", "ended"),
+)
+
+
+def _of_job(**options: Any) -> sa.Column[str]:
+    return sa.Column("job_id", sa.String(64), sa.ForeignKey(JOBS.c.id, ondelete="CASCADE"), **options)
+
+
+# Results of stages by their cache keys.
+RESULTS = sa.Table(
+    "cow_results",
+    METADATA,
+    sa.Column("key", sa.String(64), primary_key=True),
+    _of_job(nullable=False, index=True),
+    sa.Column("stage", sa.String(32), nullable=False),
+    sa.Column("result", sa.LargeBinary, nullable=False),  # JSON, deflated; without its value where that is a trajectory
+    sa.Column("created_at", sa.Float, nullable=False),
+)
+# A trajectory is most of a result: it is stored once for its stage and its job, under the key of the stage.
+TRAJECTORIES = sa.Table(
+    "cow_trajectories_of_jobs",
+    METADATA,
+    _of_job(primary_key=True),
+    sa.Column("key", sa.String(64), primary_key=True),
+    sa.Column("trajectory", sa.LargeBinary, nullable=False),  # JSON, deflated
+)
+# Which job needs which artifact: one without a reference may be removed.
+REFERENCES = sa.Table(
+    "cow_references",
+    METADATA,
+    sa.Column("sha256", sa.String(64), primary_key=True),
+    _of_job(primary_key=True, index=True),
+)
+# The stages of each job that are done, whoever computed their results.
+STAGES = sa.Table(
+    "cow_stages_of_jobs",
+    METADATA,
+    _of_job(primary_key=True),
+    sa.Column("stage", sa.String(32), primary_key=True),
+)
+# Where the artifacts of all jobs are: one row, once a server has started.
+STORES = sa.Table(
+    "cow_artifact_store",
+    METADATA,
+    sa.Column("id", sa.Integer, primary_key=True),  # always 1
+    sa.Column("address", sa.Text, nullable=False),
+)
+# When a process last began a kind of maintenance, of which each is one process's work at a time.
+MAINTENANCE = sa.Table(
+    "cow_maintenance",
+    METADATA,
+    sa.Column("task", sa.String(16), primary_key=True),
+    sa.Column("begun", sa.Float, nullable=False),  # Unix time, s
+)
+# Which versions of COW can serve on these tables: one row.
+SCHEMAS = sa.Table(
+    "cow_schema",
+    METADATA,
+    sa.Column("id", sa.Integer, primary_key=True),  # always 1
+    sa.Column("version", sa.Integer, nullable=False),  # `SCHEMA` of the COW that last changed the tables
+    sa.Column("oldest_serving", sa.Integer, nullable=False),
+)
+# One row for each process that runs an engine.
+PROCESSES = sa.Table(
+    "cow_executors",
+    METADATA,
+    sa.Column("executor", sa.String(64), primary_key=True),
+    sa.Column("seen", sa.Float, nullable=False),  # Unix time of the database, s
+    sa.Column("info", sa.Text, nullable=False),  # a `ProcessInfo` as JSON
+)
+
+
+def schema_of(connection: sa.Connection) -> int:
+    """That of the tables; 0 where there are none. Raises `StorageUnavailable` where this version cannot use it."""
+    there = set(sa.inspect(connection).get_table_names())
+    if SCHEMAS.name in there:
+        found = connection.execute(sa.select(SCHEMAS)).one_or_none()
+        if found is not None and found.oldest_serving > SCHEMA:
+            raise StorageUnavailable(
+                f"The job database is of a later version of COW (schema {found.version}), on whose tables this one "
+                f"(schema {SCHEMA}) cannot serve: update it."
+            )
+        if found is not None:  # else a restore has left the row out, and it is written anew
+            return found.version
+    if BEFORE_SCHEMA_1 in there and JOBS.name not in there:
+        raise StorageUnavailable(
+            "The job database is of a version of COW whose jobs this one cannot take over: let that version end them, "
+            "and give this one an empty database (COW_DATABASE_URL)."
+        )
+    return int(JOBS.name in there)
+
+
+def update_tables(connection: sa.Connection, now: sa.ColumnElement[float]) -> None:
+    """Makes our tables, or adds what those of an earlier version lack; those of a later one stay as they are.
+
+    Raises `StorageUnavailable` where this version cannot use them, or would change them in a way that processes which
+    run do not bear.
+    """
+    found = schema_of(connection)
+    if found > SCHEMA:
+        return
+    if 0 < found < OLDEST_SERVING:
+        alive = sa.select(PROCESSES.c.executor).where(PROCESSES.c.seen > now - ALIVE_SECONDS)
+        if connection.execute(alive).first() is not None:
+            raise StorageUnavailable(
+                f"The tables of the job database change (schema {found} to {SCHEMA}) in a way that the servers and "
+                "workers on it do not bear: stop all of them first."
+            )
+    METADATA.create_all(connection)
+    for table in METADATA.sorted_tables:
+        there = {column["name"] for column in sa.inspect(connection).get_columns(table.name)}
+        for column in table.columns:
+            if column.name not in there:
+                added = sa.schema.CreateColumn(column).compile(dialect=connection.dialect)
+                connection.execute(sa.text(f"ALTER TABLE {table.name} ADD COLUMN {added}"))
+    connection.execute(sa.delete(SCHEMAS))
+    connection.execute(sa.insert(SCHEMAS).values(id=1, version=SCHEMA, oldest_serving=OLDEST_SERVING))
