@@ -97,8 +97,8 @@ print(json.dumps(told), file=sys.__stdout__)
 
 
 def refusals(out: Path, asked: list[list[str]]) -> list[tuple[int, str]]:
-    """Exit code and standard error of `cow eval` with each of the arguments."""
-    commands = [["eval", str(EXAMPLES), "--out", str(out), *arguments] for arguments in asked]
+    """Exit code and standard error of `cow eval` with each of the arguments, into a folder of its own."""
+    commands = [["eval", str(EXAMPLES), "--out", f"{out}-{n}", *arguments] for n, arguments in enumerate(asked)]
     done = subprocess.run(
         [sys.executable, "-c", ASK_ALL, json.dumps(commands)],
         cwd=out.parent, env=environment(), capture_output=True, text=True, check=True, timeout=300,
@@ -287,7 +287,7 @@ def test_what_cannot_be_asked_is_refused_before_the_first_call(tmp_path: Path, m
         assert code == 1, told
         assert message in told
     assert not mllm.asked
-    assert not (tmp_path / "run" / "run.json").exists(), "the folder stays free"
+    assert not list(tmp_path.glob("run-*/run.json")), "the folder stays free"
 
 
 def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_what_was_not_found_is_drawn(server: Server, windows: Windows) -> None:
     drag_in_picture(page, (40, 120), (90, 170))
     expect(notice).to_contain_text("direction")
     page.get_by_role("button", name="Another object", exact=True).click()
-    drag_in_picture(page, (200, 95), (270, 171))
+    drag_in_picture(page, (150, 90), (230, 175))
     page.get_by_label("What is in the box?").fill("wooden crate")
     page.keyboard.press("Enter")
     expect(page.get_by_label("What wooden crate is")).to_have_value("target")

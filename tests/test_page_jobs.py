@@ -152,7 +152,7 @@ def test_a_server_with_keys(tmp_path: Path, windows: Windows) -> None:
         ask(page, QUESTION)
         result(page)
         assert said(page) == "Yes"
-        assert shown_pictures(page, ".filmstrip img") >= 3
+        assert shown_pictures(page, ".filmstrip img") >= 2
         film = page.locator(".scene video")
         assert eventually(lambda: film.evaluate("film => film.videoWidth")) == 240
         assert key not in page.content()

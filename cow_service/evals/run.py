@@ -159,13 +159,12 @@ def evaluate(wanted: plan.Plan, tell: Callable[[str], None]) -> runs.EvalRun:
     logs = wanted.out / runs.LOGS
     again = wanted.retry_failed and logs.is_dir() and runs.forget_failures(logs) > 0
     info = plan.merged(runs.read_info(wanted.out), begun, again=again)
-    runs.write_run(wanted.out, info, items)
     _ask(wanted, info, items, model, settings)
     return runs.read_run(wanted.out)
 
 
 def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, settings: dict[str, Any]) -> None:
-    """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin."""
+    """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin: the folder stays free."""
     logs = wanted.out / runs.LOGS
     logs.mkdir(exist_ok=True)
     progress = EvalProgress(len(items) * info.repeats * len(info.arms))
@@ -173,11 +172,13 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
         if not (wanted.retry_failed and each.failure):
             progress.add(each.arm, None if each.failure else each, earlier=True)
     if progress.done == progress.total:
+        runs.write_run(wanted.out, info, items)
         return
     keys = f"{info.token} {info.rounds}", info.token
     console = rich.get_console()
     with session(wanted.out, wanted.url, info.settings["requests"], *keys, **settings) as shared, ExitStack() as stack:
         _check_server(shared.url, wanted)
+        runs.write_run(wanted.out, info, items)
         stack.callback(setattr, console, "quiet", console.quiet)
         console.quiet = True  # Inspect says nothing of its own on standard output
         with progress_shown(progress, True) as show:
