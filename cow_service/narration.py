@@ -192,11 +192,28 @@ COVERED = 0.3  # share of what is hidden, from which it counts as hidden
 MAX_MET = 2  # encounters that are told one by one
 SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the side
 _KINDS: dict[str, records.EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
-_NOT_MET = {"touches": "does not touch {}", "covers": "does not hide {}", "covered": "is not hidden by {}"}
 _NOTHING_MET = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
-_BECOMES = {
+OF_TARGET: tuple[records.AskedRelation, ...] = ("tips", "moves")  # what is asked about does these
+# What the subject of each other relation does, and that it does not.
+EVENTS: dict[records.AskedRelation, tuple[str, str]] = {
+    "touches": ("touches", "does not touch"),
+    "covers": ("hides", "does not hide"),
+    "covered": ("is hidden by", "is not hidden by"),
+    "inside": ("ends up in", "does not end up in"),
     "tips": ("is knocked over", "is not knocked over"),
     "moves": ("is set in motion", "is not set in motion"),
+    "leaves": ("leaves the image", "does not leave the image"),
+    "lands": ("lands on the floor", "does not land on the floor"),
+}
+DOUBTS: dict[records.Doubt, str] = {  # what an outcome depends on
+    "speed": "how fast it moves",
+    "heading": "which way it heads in depth",
+    "camera": "how the camera stands",
+    "size": "how large things are",
+    "place": "where things are in depth",
+    "friction": "how much the floor brakes",
+    "identity": "whether the things are those that the question names",
+    "faint": "whether something stands in the way that is too faint to tell",
 }
 
 
@@ -426,7 +443,7 @@ class _Facts:
             return [f"hides a part of {name}" if relation == "covers" else f"is partly hidden by {name}"]
         if not meant:
             return [_NOTHING_MET[relation]]
-        return [_NOT_MET[relation].format(" or ".join(named(each, "the") for each in meant))]
+        return [f"{EVENTS[relation][1]} {' or '.join(named(each, 'the') for each in meant)}"]
 
     def _end(self, body: int, path: Path | None) -> list[str]:
         """How it ends, where the clip shows it."""
@@ -445,9 +462,9 @@ class _Facts:
     def _became(self) -> str:
         """What becomes of the body whose fall or motion is asked about."""
         outcome = self._outcome
-        if outcome is None or outcome.asked.relation not in _BECOMES or (outcome.asked.target and not outcome.object):
+        if outcome is None or outcome.asked.relation not in OF_TARGET or (outcome.asked.target and not outcome.object):
             return ""
-        does, does_not = _BECOMES[outcome.asked.relation]
+        does, does_not = EVENTS[outcome.asked.relation]
         tips = outcome.asked.relation == "tips"
         times = (
             (path.tipped_at if tips else path.moved_at, self._names[path.body]) for path in self._trajectory.paths[1:]

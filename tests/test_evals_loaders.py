@@ -206,7 +206,7 @@ FAULTS: dict[str, tuple[str, str]] = {
         r"asks the same as questions.jsonl, line 1 with another answer, \(B\)",
     ),
     "no options": (json.dumps({**ROW, "id": "q2", "image": "1.png", "question": "What?"}), "lists no options"),
-    "half a line": (json.dumps({**ROW, "image": "1.png"})[:30], "line 2: no JSON .* was the file written to its end"),
+    "half a line": (json.dumps({**ROW, "image": "1.png"})[:30], "line 2: no whole JSON .* was the file written"),
     "no object": ("[1]", "line 2: must be an object, got list"),
 }
 

@@ -64,7 +64,7 @@ def test_the_outcome_is_told_as_a_hypothesis() -> None:
     lines = text.splitlines()
     assert "> The ball bounces once and meets the white cube after 1.1 s." in lines
     assert "> In 93% of 200 computed worlds: the ball touches the white cube." in lines
-    assert "> It depends most on the speed, the heading in depth." in lines
+    assert "> It depends most on how fast it moves, which way it heads in depth." in lines
     assert "blue mug" not in text
     assert "a computed hypothesis about the first image" in text
     assert "It can be wrong" in text

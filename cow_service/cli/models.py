@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from cow_service.weights.manifests import Manifest, Source
-    from cow_service.weights.repositories import Download, DownloadProgress, ProgressCallback
+    from cow_service.weights.repositories import Download
 
 
 app = typer.Typer(rich_markup_mode=None, help="List readers and generators; pull and check weights.")
@@ -69,8 +67,7 @@ def pull(
     count, size = sum(len(each.files) for each in downloads), sum(each.size for each in downloads)
     pending, needed = sum(len(each.pending) for each in downloads), sum(each.pending_size for each in downloads)
     console.print(f"{name}: {count} files, {decimal(size)}; to download: {pending} files, {decimal(needed)}.")
-    with _shown(console, needed) as show:
-        download(downloads, weights_dir, show)
+    download(downloads, weights_dir, lambda repo, file: console.print(f"{repo}: {file.path}, {decimal(file.size)}"))
     for each in downloads:
         folder = folder_of(weights_dir, each.lock.repository)
         console.print(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
@@ -163,26 +160,6 @@ def _downloads(manifest: Manifest, weights_dir: Path, revisions: dict[str, str])
         if part in revisions and chosen.setdefault(source.repository, revisions[part]) != revisions[part]:
             raise InvalidRequest(f"Parts of '{source.repository}' share its folder: give them one --revision.")
     return [resolve(source, weights_dir, chosen.get(name)) for name, source in sources.items()]
-
-
-@contextmanager
-def _shown(console: Console, size: int) -> Generator[ProgressCallback]:
-    """A line for each file, and in a terminal a bar for all bytes."""
-    from rich.filesize import decimal  # noqa: PLC0415
-    from rich.progress import DownloadColumn, Progress, TransferSpeedColumn  # noqa: PLC0415
-
-    columns = *Progress.get_default_columns(), DownloadColumn(), TransferSpeedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        overall = bar.add_task("all files", total=size)
-        done: dict[tuple[str, str], int] = {}
-
-        def show(step: DownloadProgress) -> None:
-            if step.state == "downloading" and step.done == 0:
-                console.print(f"{step.repository}: {step.file}, {decimal(step.size)}")
-            done[step.repository, step.file] = step.done
-            bar.update(overall, completed=sum(done.values()))
-
-        yield show
 
 
 tracks = typer.Typer(

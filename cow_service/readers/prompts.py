@@ -15,28 +15,23 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from cow_service.weights.manifests import PROMPTS
 
-FIELDS = {"version": int, "inputs": list}
-
 # No autoescape: prompts are plain text for a model, and HTML entities would change the words it reads.
 _ENVIRONMENT = ImmutableSandboxedEnvironment(autoescape=False, undefined=StrictUndefined, trim_blocks=True)
 
 
 @dataclass(frozen=True)
 class Prompt:
-    """A prompt with its declared inputs. It does not call a model."""
+    """A prompt and its inputs, which are the names that its body uses. It does not call a model."""
 
     name: str
     version: int
-    inputs: tuple[str, ...]
+    inputs: frozenset[str]
     body: str
 
     def render(self, /, **inputs: object) -> str:
-        """The prompt with its inputs put in. Raises `TypeError`, naming inputs that are missing or not declared."""
-        missing = [name for name in self.inputs if name not in inputs]
-        unknown = [name for name in inputs if name not in self.inputs]
-        if missing or unknown:
-            faults = {"missing": missing, "not declared": unknown}
-            problems = [f"{what}: {', '.join(names)}" for what, names in faults.items() if names]
+        """The prompt with its inputs put in. Raises `TypeError`, naming inputs that are missing or not used."""
+        faults = {"missing": self.inputs - inputs.keys(), "not used": inputs.keys() - self.inputs}
+        if problems := [f"{what}: {', '.join(sorted(names))}" for what, names in faults.items() if names]:
             raise TypeError(f"Prompt {self.name!r}, inputs {'; '.join(problems)}.")
         return self.template.render(**inputs).strip()
 
@@ -54,18 +49,10 @@ def load_prompt(name: str) -> Prompt:
 
 def parse_prompt(name: str, text: str) -> Prompt:
     """A prompt from its file's text. Raises `ValueError`, naming the prompt and what is wrong with it."""
-    parts = re.split(r"^[ \t]*---[ \t]*$", text, maxsplit=2, flags=re.MULTILINE)
-    if len(parts) < 3 or parts[0]:
-        raise ValueError(f"Prompt {name!r} does not begin with front matter between two lines of '---'.")
-    head: Any = yaml.safe_load(parts[1])
-    if not isinstance(head, dict) or set(head) != set(FIELDS):
-        raise ValueError(f"Prompt {name!r} needs exactly these fields in its front matter: {', '.join(FIELDS)}.")
-    for field, kind in FIELDS.items():
-        if not isinstance(head[field], kind) or isinstance(head[field], bool):
-            raise ValueError(f"Prompt {name!r}: {field} must be of type {kind.__name__}, not {head[field]!r}.")
-    body = parts[2].strip()
-    inputs = tuple(str(item) for item in head["inputs"])
-    undeclared = find_undeclared_variables(_ENVIRONMENT.parse(body)) - set(inputs)
-    if undeclared:
-        raise ValueError(f"Prompt {name!r} uses inputs that it does not declare: {', '.join(sorted(undeclared))}.")
+    before, *parts = re.split(r"^[ \t]*---[ \t]*$", text, maxsplit=2, flags=re.MULTILINE)
+    head: Any = yaml.safe_load(parts[0]) if len(parts) == 2 and not before else None
+    if not isinstance(head, dict) or set(head) != {"version"} or type(head["version"]) is not int:
+        raise ValueError(f"Prompt {name!r} does not begin with `version: <number>` between two lines of '---'.")
+    body = parts[1].strip()
+    inputs = frozenset(find_undeclared_variables(_ENVIRONMENT.parse(body)))
     return Prompt(name, head["version"], inputs, body)

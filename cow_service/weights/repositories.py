@@ -9,7 +9,7 @@ with its API (HF_ENDPOINT), and changes nothing here; `download` carries it out.
 `WeightsUnavailable` here and nowhere else.
 
 huggingface_hub's `verify_repo_checksums` asks the hub for the digests and so needs a network; `snapshot_download` lists
-the repository at each call and reports one bar for all files: both are not used.
+the repository at each call: both are not used.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
-from uuid import uuid4
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from filelock import FileLock, Timeout
 from pydantic import AfterValidator, Field, ValidationError
@@ -197,15 +196,12 @@ def read_lock(weights_dir: Path, repository: str) -> Lock | None:
 def write_lock(weights_dir: Path, lock: Lock) -> None:
     """Writes the record; a reader sees the old one or the new one. Raises `OSError`."""
     path = folder_of(weights_dir, lock.repository) / LOCK_NAME
-    temporary = path.with_name(f"{LOCK_NAME}.{uuid4().hex}")
-    try:
-        with temporary.open("x", encoding="utf-8") as file:
-            file.write(lock.model_dump_json(indent=2) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    partial = path.with_name(f"{LOCK_NAME}.partial")  # `download` lets one pull at a time come here
+    with partial.open("w", encoding="utf-8") as file:
+        file.write(lock.model_dump_json(indent=2) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
 
 
 def chosen(lock: Lock, patterns: Sequence[str]) -> tuple[LockedFile, ...]:
@@ -257,20 +253,6 @@ def disk_errors(repository: str) -> Generator[None]:
 
 
 @dataclass(frozen=True)
-class DownloadProgress:
-    """How far one file has come. `done` and `size` are bytes; a file in the state `done` has the recorded digest."""
-
-    repository: str
-    file: str
-    state: Literal["downloading", "checking", "done"]
-    done: int
-    size: int
-
-
-ProgressCallback = Callable[[DownloadProgress], None]
-
-
-@dataclass(frozen=True)
 class Download:
     """What is to be downloaded: the record to write, the files of the source, and those that are not here yet."""
 
@@ -307,11 +289,14 @@ def resolve(source: Source, weights_dir: Path, revision: str | None = None, *, e
 def download(
     downloads: Sequence[Download],
     weights_dir: Path,
-    progress: ProgressCallback = lambda progress: None,
+    tell: Callable[[str, LockedFile], None] = lambda repository, file: None,
     *,
     endpoint: str | None = None,
 ) -> None:
-    """Downloads from different repositories. Raises `WeightsUnavailable`, before the first byte if disks are full."""
+    """Downloads from different repositories; `tell` is called before each file, and a terminal shows the hub's bars.
+
+    Raises `WeightsUnavailable`, before the first byte if disks are full.
+    """
     recorded = {each.lock.repository: read_lock(weights_dir, each.lock.repository) for each in downloads}
     downloads = [each for each in downloads if each.pending or each.lock != recorded[each.lock.repository]]
     if not downloads:
@@ -349,33 +334,21 @@ def download(
             with disk_errors(lock.repository):
                 write_lock(weights_dir, lock)
             for file in each.pending:
-                _download_file(hub, each.lock, file, weights_dir, progress)
+                tell(lock.repository, file)
+                _download_file(hub, each.lock, file, weights_dir)
 
 
-def _download_file(hub: HfApi, lock: Lock, file: LockedFile, weights_dir: Path, progress: ProgressCallback) -> None:
+def _download_file(hub: HfApi, lock: Lock, file: LockedFile, weights_dir: Path) -> None:
     folder = folder_of(weights_dir, lock.repository)
-
-    def report(state: Literal["downloading", "checking", "done"], done: int) -> None:
-        progress(DownloadProgress(lock.repository, file.path, state, done, file.size))
-
-    report("downloading", 0)
     with _hub_errors(lock.repository, lock.revision):
         # The library trusts an existing file by its modification time; this one has a wrong digest.
         (folder / file.path).unlink(missing_ok=True)
-        hub.hf_hub_download(
-            lock.repository,
-            file.path,
-            revision=lock.revision,
-            local_dir=folder,
-            tqdm_class=cast(Any, _progress_bar(lambda done: report("downloading", done))),
-        )
-    report("checking", file.size)
+        hub.hf_hub_download(lock.repository, file.path, revision=lock.revision, local_dir=folder)
     for finding in examine(lock, (file,), weights_dir):
         with disk_errors(lock.repository):
             (folder / file.path).unlink(missing_ok=True)
         why = f"what came is not what the hub lists: {finding.message}"
         raise _unavailable(lock.repository, why, "The file was deleted: run it again")
-    report("done", file.size)
 
 
 def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoint: str | None) -> Lock:
@@ -418,29 +391,6 @@ def _hub(endpoint: str | None) -> HfApi:
         why = 'Downloading weights needs huggingface_hub, which is not installed: pip install "cow-service[wan]".'
         raise WeightsUnavailable(why) from error
     return HfApi(endpoint=endpoint, library_name="cow-service", library_version=__version__)
-
-
-def _progress_bar(report: Callable[[int], None]) -> type:
-    """A stand-in for tqdm that passes the bytes so far to `report`, and shows nothing."""
-
-    class Bar:
-        def __init__(self, *args: Any, initial: int = 0, total: int | None = None, **options: Any) -> None:
-            self.n, self.total = initial, total
-
-        def __enter__(self) -> Bar:
-            return self
-
-        def update(self, count: float = 1) -> None:
-            self.n += int(count)
-            report(self.n)
-
-        def _ignore(self, *args: Any, **options: Any) -> None:
-            pass
-
-        # Having `update_transfer`, it gets one bar per file, and not a second one for bytes on the network.
-        update_transfer = set_transfer_postfix_str = set_postfix_str = refresh = close = __exit__ = _ignore
-
-    return Bar
 
 
 @contextmanager

@@ -43,8 +43,6 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
             f"(*/meta.json with image.jpg), a file ({', '.join(formats.READERS)}), or the name of a data set, such as "
             f"{CAUSALSPATIAL}."
         )
-    if found.broken:
-        raise InvalidRequest("\n".join(found.broken[:MAX_SHOWN]) + ".")
     absent = [subset for subset in subsets if published and not formats.subset_shards(path, [subset])]
     if absent:
         raise InvalidRequest(f"'{data}' has no subset '{absent[0]}': a folder of that name with Parquet files.")

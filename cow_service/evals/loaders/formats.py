@@ -13,17 +13,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from cow_service.errors import InvalidRequest
 from cow_service.evals.items import LETTERS, REAL, Pictures
-from cow_service.evals.loaders.rows import Collected, FileFault, Row, RowFault, Unread, collect
+from cow_service.evals.loaders.rows import Collected, Row, RowFault, Unread, collect
 
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
-
-
-Numbered = tuple[str, dict[str, Any]] | RowFault  # where a row stands, and its fields; or why it has none
+# Where a row stands, and what reads its fields, which raises `RowFault`.
+Numbered = tuple[str, Callable[[], dict[str, Any]]]
 
 
 def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
-    """The rows of a file that is shown by this name; last a `FileFault` where it is none, or is not whole."""
+    """The rows of a file that is shown by this name. Raises `InvalidRequest` where it is none, or is not whole."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
@@ -31,12 +31,14 @@ def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
         with pq.ParquetFile(path) as file:
             rows = (row for batch in file.iter_batches(batch_size=_AT_ONCE) for row in batch.to_pylist())
             for number, row in enumerate(rows):
-                yield f"{name}, row {number}", row
+                yield f"{name}, row {number}", partial(dict, row)
     except (pa.ArrowException, OSError) as error:
-        yield FileFault(f"{name}: no whole Parquet file ({str(error).splitlines()[0]}); get it again")
+        reason = str(error).splitlines()[0]
+        raise InvalidRequest(f"{name}: no whole Parquet file ({reason}); get it again.") from error
 
 
 META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
+SCENE_TEXTS = ("question", "answer", "task", "level")
 
 
 def scene_folders(folder: Path) -> list[Path]:
@@ -51,23 +53,17 @@ def scene_rows(folder: Path) -> Iterator[Unread]:
 
 
 def _scene_row(scene: Path) -> Row:
-    try:
-        meta: Any = json.loads((scene / META).read_bytes())
-    except ValueError as error:
-        raise RowFault(f"no whole JSON ({error}); was it written to its end?") from error
-    if not isinstance(meta, dict) or not isinstance(meta.get("question"), str):
-        raise RowFault("must be an object with `question`, `answer`")
-    image = scene / IMAGE
+    meta = _json_object((scene / META).read_bytes())
+    _require(meta, ("question", "answer"))
+    texts: dict[str, Any] = {name: str(meta[name]) for name in SCENE_TEXTS if meta.get(name) not in (None, "")}
+    named, image = str(meta.get("id") or scene.name), scene / IMAGE
     return Row(
-        id=str(meta.get("id") or scene.name),
-        source_id=str(meta.get("id") or scene.name),
+        id=named,
+        source_id=named,
         image=image.read_bytes() if image.is_file() else None,
-        question=meta["question"],
-        answer=str(meta.get("answer") or ""),
-        task=str(meta.get("task") or ""),
-        level=str(meta["level"]) if meta.get("level") is not None else None,
         scene=scene.name,
         oracle=oracle_frames(scene),
+        **texts,
     )
 
 
@@ -97,26 +93,17 @@ _LONGEST_PATH = 1024  # characters; what is longer is base64
 
 def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Unread]:
     """The rows of a file of one's own. Columns that mean nothing are faults, unless they are ignored."""
-    told: set[str] = set()
-    for numbered in READERS[path.suffix.lower()](path):
-        if isinstance(numbered, RowFault):
-            yield numbered
-            continue
-        place, fields = numbered
-        known = (*_NAMES, *IGNORED, *LETTERS)
-        unknown = [] if ignore_columns else [name for name in fields if name not in known]
-        for name in unknown:
-            if name not in told:
-                close = difflib.get_close_matches(name, _NAMES, 1)
-                columns = f"known are {', '.join(COLUMNS)}, and A, B, C... for options."
-                hint = f"did you mean `{close[0]}`?" if close else columns
-                yield RowFault(f"{place}: unknown column `{name}`: {hint}")
-        told.update(unknown)
-        if not unknown:
-            yield place, partial(_table_row, place, fields, path.parent)
+    for place, read in READERS[path.suffix.lower()](path):
+        yield place, partial(_table_row, place, read, path.parent, ignore_columns)
 
 
-def _table_row(place: str, fields: dict[str, Any], folder: Path) -> Row:
+def _table_row(place: str, read: Callable[[], dict[str, Any]], folder: Path, ignore_columns: bool) -> Row:
+    fields = read()
+    unknown = [name for name in fields if name not in (*_NAMES, *IGNORED, *LETTERS)]
+    if unknown and not ignore_columns:
+        close = difflib.get_close_matches(unknown[0], _NAMES, 1)
+        known = f"known are {', '.join(COLUMNS)}, and A, B, C... for options"
+        raise RowFault(f"unknown column `{unknown[0]}`: {f'did you mean `{close[0]}`?' if close else known}")
     values = {_NAMES[name]: value for name, value in fields.items() if name in _NAMES and value not in (None, "")}
     _require(values, REQUIRED)
     image = _image(values.pop("image"), folder)
@@ -174,18 +161,18 @@ def _image(given: Any, folder: Path) -> bytes:
 
 def _json_lines(path: Path) -> Iterator[Numbered]:
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        if not line.strip():
-            continue
-        place = f"{path.name}, line {number}"
-        try:
-            fields = json.loads(line)
-        except ValueError as error:
-            yield RowFault(f"{place}: no JSON ({error}); was the file written to its end?")
-            continue
-        if isinstance(fields, dict):
-            yield place, fields
-        else:
-            yield RowFault(f"{place}: must be an object, got {type(fields).__name__}")
+        if line.strip():
+            yield f"{path.name}, line {number}", partial(_json_object, line)
+
+
+def _json_object(text: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except ValueError as error:
+        raise RowFault(f"no whole JSON ({error}); was the file written to its end?") from error
+    if not isinstance(found, dict):
+        raise RowFault(f"must be an object, got {type(found).__name__}")
+    return found
 
 
 def _separated(path: Path, delimiter: str) -> Iterator[Numbered]:
@@ -195,17 +182,18 @@ def _separated(path: Path, delimiter: str) -> Iterator[Numbered]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             for number, cells in enumerate(csv.reader(file, delimiter=delimiter, strict=True), 1):
-                place = f"{path.name}, row {number}"
                 if not names:
                     names = [name.strip() for name in cells]
-                elif cells and len(cells) != len(names):
-                    yield RowFault(
-                        f"{place}: has {len(cells)} cells for {len(names)} columns; was the file written to its end?"
-                    )
                 elif cells:
-                    yield place, dict(zip(names, cells, strict=True))
+                    yield f"{path.name}, row {number}", partial(_named_cells, names, cells)
     except (csv.Error, UnicodeDecodeError) as error:
-        yield FileFault(f"{path.name}, row {number + 1}: {error}; was the file written to its end?")
+        raise InvalidRequest(f"{path.name}, row {number + 1}: {error}; was the file written to its end?") from error
+
+
+def _named_cells(names: list[str], cells: list[str]) -> dict[str, Any]:
+    if len(cells) != len(names):
+        raise RowFault(f"has {len(cells)} cells for {len(names)} columns; was the file written to its end?")
+    return dict(zip(names, cells, strict=True))
 
 
 READERS: dict[str, Callable[[Path], Iterator[Numbered]]] = {
@@ -259,20 +247,18 @@ def _published_rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, 
     for subset, shards in subset_shards(folder, subsets).items():
         for shard, path in enumerate(shards):
             rows = parquet_rows(path, path.relative_to(folder).as_posix())
-            for number, numbered in enumerate(rows):
-                if isinstance(numbered, RowFault):
-                    yield numbered
-                    continue
-                place, fields = numbered
-                unique = f"{subset}/{shard}/{number}"
-                if fields.get("not_sure"):
-                    abstaining[unique] = str(fields["not_sure"]).strip("() .").upper()[:1]
-                yield place, partial(_published_row, folder, subset, unique, fields)
+            for number, (place, read) in enumerate(rows):
+                yield place, partial(_published_row, folder, subset, f"{subset}/{shard}/{number}", read, abstaining)
 
 
-def _published_row(folder: Path, subset: str, unique: str, fields: dict[str, Any]) -> Row:
+def _published_row(
+    folder: Path, subset: str, unique: str, read: Callable[[], dict[str, Any]], abstaining: dict[str, str]
+) -> Row:
     """A row. One that lacks what the others have is a fault."""
+    fields = read()
     _require(fields, ("id", "question", "answer", "image"))
+    if fields.get("not_sure"):
+        abstaining[unique] = str(fields["not_sure"]).strip("() .").upper()[:1]
     source = str(fields["id"])
     level = _LEVEL.search(source)
     real = subset == "realworld"

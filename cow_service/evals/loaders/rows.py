@@ -21,10 +21,6 @@ class RowFault(ValueError):
     """Why a row cannot be asked; its text says what is wrong with which value."""
 
 
-class FileFault(RowFault):
-    """Why a file cannot be read to its end: rows are missing, and nobody knows how many."""
-
-
 @dataclass(frozen=True)
 class Row:
     """What a data set says of one question, before it is checked."""
@@ -32,8 +28,8 @@ class Row:
     id: str
     source_id: str
     image: bytes | None
-    question: str | None
-    answer: str | None
+    question: str
+    answer: str
     options: Sequence[str] | None = None  # beside the question; None: it lists them itself
     task: str | None = None
     level: str | None = None
@@ -41,13 +37,12 @@ class Row:
     oracle: Sequence[bytes] = ()
 
 
-# Where a row stands (file and row, for people), and what reads it, which raises `RowFault`; or why it cannot be read.
-Unread = tuple[str, Callable[[], Row]] | RowFault
+Unread = tuple[str, Callable[[], Row]]  # where a row stands (for people), and what reads it, which raises `RowFault`
 
 
 def item_of(place: str, row: Row, pictures: Pictures) -> Item:
     """The item of a row; its pictures are kept. Raises `RowFault`."""
-    if not row.question or not row.question.strip():
+    if not row.question.strip():
         raise RowFault("`question` is empty")
     if row.options is None:
         wording = items.listed_wording(row.question)
@@ -91,9 +86,9 @@ def task_of(name: str | None) -> Task:
     return "other"
 
 
-def _answer(given: str | None, options: Sequence[AnswerOption]) -> str:
+def _answer(given: str, options: Sequence[AnswerOption]) -> str:
     """The letter of the right option: given as a letter, as its text, or both."""
-    if not given or not given.strip():
+    if not given.strip():
         raise RowFault("`answer` is empty")
     said = option_named(options, given)
     if said is None:
@@ -117,7 +112,6 @@ class Collected:
 
     items: list[Item] = field(default_factory=list[Item])
     faults: list[str] = field(default_factory=list)  # a row each, with its place: what is left out
-    broken: list[str] = field(default_factory=list)  # files that cannot be read to their end
     notes: list[str] = field(default_factory=list)  # what was found and worked around
 
 
@@ -126,11 +120,7 @@ def collect(rows: Iterable[Unread], pictures: Pictures, *, repeated_rows: bool =
     found = Collected()
     asked: dict[tuple[str, str], Item] = {}
     by_id: dict[str, Item] = {}
-    for row in rows:
-        if isinstance(row, RowFault):
-            (found.broken if isinstance(row, FileFault) else found.faults).append(str(row))
-            continue
-        place, read = row
+    for place, read in rows:
         try:
             item = item_of(place, read(), pictures)
         except RowFault as fault:

@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
+from cow_service.narration import DOUBTS
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.asked import Unread
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import may_name, parse_noun_phrase
 from cow_service.readers.options import not_sure_option, plain, says_not_sure
-from cow_service.records import AnswerOption, Asked, Doubt, Outcome
+from cow_service.records import AnswerOption, Asked, Outcome
 
 _YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECASE)
 # "No contact" says something of the event, "No, it stops" of what is asked.
@@ -191,17 +192,6 @@ NOT_IDENTIFIED = (
 TOO_FAINT = "Not sure, because something may stand in the way that is too faint to tell; the warnings say where."
 TOO_CLOSE = "Not sure: the probability of {what} is {probability:.2f}{depends}."
 
-_DOUBTS: dict[Doubt, str] = {
-    "speed": "how fast it moves",
-    "heading": "which way it heads in depth",
-    "camera": "how the camera stands",
-    "size": "how large things are",
-    "place": "where things are in depth",
-    "friction": "how much the floor brakes",
-    "identity": "whether the things are those that the question names",
-    "faint": "whether something stands in the way that is too faint to tell",
-}
-
 
 def answer_from(
     options: Sequence[AnswerOption],
@@ -253,7 +243,7 @@ def why_not_sure(outcome: Outcome) -> str:
     if "faint" in outcome.depends_on:
         return TOO_FAINT
     what = "what is asked" if outcome.asked.form == "whether" else f"the likeliest answer, '{_in_words(outcome)}',"
-    depends = f"; it depends most on {_DOUBTS[outcome.depends_on[0]]}" if outcome.depends_on else ""
+    depends = f"; it depends most on {DOUBTS[outcome.depends_on[0]]}" if outcome.depends_on else ""
     return TOO_CLOSE.format(what=what, probability=outcome.probability, depends=depends)
 
 

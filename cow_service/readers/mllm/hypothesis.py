@@ -4,34 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.media.overlay import named_strip
-from cow_service.narration import bare_name, state_words
+from cow_service.narration import DOUBTS, EVENTS, OF_TARGET, bare_name, state_words
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.replies import text_of
-from cow_service.records import MEETINGS, AskedRelation, Doubt, Outcome, Simulation
+from cow_service.records import MEETINGS, AskedRelation, Outcome, Simulation
 
 AS_IT_IS = "As it is"  # the name of the frames with nothing changed
-EVENTS: dict[AskedRelation, tuple[str, str]] = {
-    "touches": ("touches", "touch"),
-    "covers": ("hides", "hide"),
-    "covered": ("is hidden by", ""),
-    "inside": ("ends up in", "end up in"),
-    "tips": ("is knocked over", ""),
-    "moves": ("is set in motion", ""),
-    "leaves": ("leaves the image", "leave the image"),
-    "lands": ("lands on the floor", "land on the floor"),
-}  # what the subject does, and what follows "does not"
-OF_TARGET: tuple[AskedRelation, ...] = ("tips", "moves")  # what is asked about does these
 OF_ITSELF: tuple[AskedRelation, ...] = ("leaves", "lands")  # nothing else is part of these
-DOUBTS: dict[Doubt, str] = {
-    "speed": "the speed",
-    "heading": "the heading in depth",
-    "camera": "the camera",
-    "size": "the sizes",
-    "place": "how far away and how high things are",
-    "friction": "the friction",
-    "identity": "whether the things are those that the question names",
-    "faint": "whether something stands in the way that is too faint to tell",
-}
 
 
 def pictures(imagined: Imagined) -> tuple[NDArray[np.uint8], ...]:
@@ -92,8 +71,7 @@ def _changed(simulation: Simulation) -> str:
 def _event(outcome: Outcome, mover: str) -> str:
     """What `Outcome.probability` is that of."""
     asked = outcome.asked
-    does, do = EVENTS[asked.relation]
-    does_not = does.replace("is ", "is not ", 1) if does.startswith("is ") else f"does not {do}"
+    does, does_not = EVENTS[asked.relation]
     doing = does_not if asked.negated else does
     subject = f"the {bare_name(outcome.subject or mover)}"
     thing = text_of(outcome.object or asked.target or ("anything" if asked.negated else "something"))
