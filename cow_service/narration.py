@@ -167,6 +167,12 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
         f"Something may stand at ({(left + right) / 2:.0f}, {bottom:.0f}) that is too faint to tell: no world has it."
         for left, _, right, bottom in trajectory.faint
     ]
+    if trajectory.outcome is not None and "outline" in trajectory.outcome.depends_on:
+        found += [
+            f"'{body.object}' was not seen clearly: give its box for an answer that may rest on it."
+            for body in trajectory.bodies
+            if not body.is_clear
+        ]
     found += [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
     found += [
         f"'{each.object}', put {each.place}, was put there by the way in which that moves, not as the camera sees it."
@@ -212,6 +218,7 @@ DOUBTS: dict[records.Doubt, str] = {  # what an outcome depends on
     "size": "how large things are",
     "place": "where things are in depth",
     "friction": "how much the floor brakes",
+    "outline": "where the outlines of things run",
     "identity": "whether the things are those that the question names",
     "faint": "whether something stands in the way that is too faint to tell",
 }

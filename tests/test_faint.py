@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 from cow_service.vision.scene import Scene
 
+DATA = Path(__file__).parent / "data"
 CONE = (273, 178, 367, 308)
 QUESTION = "If the red ball moves to the right, will it hit the blue cube? (A) Yes (B) No (C) Not sure"
 
@@ -51,3 +54,24 @@ def test_an_answer_is_not_sure_where_the_way_leads_over_something_faint(
     assert ("faint" in trajectory.outcome.depends_on) is in_way
     assert answer.not_sure is in_way
     assert any("may stand at (3" in each for each in answer.simulation.warnings)
+
+
+def test_an_answer_is_not_sure_of_a_thing_that_two_ways_of_cutting_out_do_not_agree_on(service: Service) -> None:
+    info = service.keep_image(
+        (DATA / "half_vase.jpg").read_bytes()
+    )  # the lower half of the vase is as grey as the floor
+    question = "If the purple ball is thrown opposite to the direction of the arrow, will it hit the white vase?"
+    asked = {"image": {"artifact": info.sha256}, "question": question}
+    answer = service.answer(AnswerRequest.model_validate(asked))
+    assert answer.simulation is not None
+    assert answer.not_sure
+    outcome = answer.simulation.trajectory.outcome
+    assert outcome is not None
+    assert outcome.depends_on[0] == "outline"
+    assert "'white vase' was not seen clearly" in " ".join(answer.warnings)
+    whole = {"object": "white vase", "bbox": [263, 152, 359, 333]}
+    answer = service.answer(AnswerRequest.model_validate(asked | {"objects": [whole]}))
+    assert answer.simulation is not None
+    outcome = answer.simulation.trajectory.outcome
+    assert outcome is not None
+    assert "outline" not in outcome.depends_on

@@ -239,9 +239,10 @@ MEETINGS: dict[EncounterKind, str] = {
     "occluded-by": "passes behind",
 }  # what the mover does with the other object, in words
 BAND_PERCENTILES = (10, 90)  # of the points over the ensemble, across and down apart: what `Path.band` lies between
-Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "faint"]
+Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "outline", "faint"]
 """What a world is uncertain of: `place` is how far from the camera and how high bodies are, `identity` whether things
-are what they are called, `faint` whether what is too faint to tell is a thing."""
+are what they are called, `outline` where their outlines run, `faint` whether what is too faint to tell is a thing."""
+CLEAR = 0.77  # confidence of a body below which no outcome that rests on it is sure
 CameraSource = Literal["shadow", "edges", "request", "prior"]
 
 
@@ -280,7 +281,17 @@ class Body(Record):
         "somewhere before the motion.",
     )
     source: Literal["embedded", "mllm", "request"] = Field(description="Who says that it is there.")
-    confidence: float = Field(ge=0, le=1, description="How sure it is that this is one separate thing.")
+    confidence: float = Field(
+        ge=0,
+        le=1,
+        description="How sure it is that this is one separate thing with this outline; where that is in doubt, how "
+        f"well two ways of cutting it out agree (IoU). Below {CLEAR} no outcome that rests on it is sure.",
+    )
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether an outcome that rests on it can be sure."""
+        return self.confidence >= CLEAR
 
 
 _MINIMAL = "; not in minimal results"  # `Prefer: return=minimal`

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from cow_service.narration import facts_of, facts_of_both, warnings_of
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
-from cow_service.records import BBox, Doubt, Grounding, Motion, Outcome, Trajectory
+from cow_service.records import CLEAR, BBox, Doubt, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, removed_of
 from cow_service.stages.keys import StageResult
@@ -12,6 +12,8 @@ from cow_service.stages.paths import record_trajectory
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
 from cow_service.vision.masks import iou
+
+FEW_WORLDS = 0.1  # share of the worlds
 
 
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
@@ -79,7 +81,8 @@ def add_facts(situation: Situation, trajectories: Sequence[Trajectory]) -> list[
 def judge(grounding: Grounding, result: EnsembleResult) -> Outcome | None:
     """What the worlds say to what is asked, if anything is; without a probability where they cannot tell.
 
-    However the worlds agree, nothing is sure of a thing that may be another one than the question means.
+    However the worlds agree, nothing is sure of a thing that may be another one than the question means, nor where a
+    thing that matters was not seen clearly.
     """
     asked = grounding.asked
     if asked is None:
@@ -96,7 +99,19 @@ def judge(grounding: Grounding, result: EnsembleResult) -> Outcome | None:
         return outcome
     first = None if result.decided.first is None else names[result.decided.first]
     decided = vars(result.decided) | {"first": first}
+    doubts: list[Doubt] = []
     if any(thing.is_doubtful for thing in (grounding, *others_of(grounding), *removed_of(grounding))):
-        doubts: tuple[Doubt, ...] = ("identity", *result.decided.depends_on)
-        decided |= {"sure": False, "robust": False, "depends_on": doubts}
+        doubts.append("identity")
+    if any(result.world.bodies[body].confidence < CLEAR for body in bodies_that_matter(result)):
+        doubts.append("outline")
+    if doubts:
+        decided |= {"sure": False, "robust": False, "depends_on": (*doubts, *result.decided.depends_on)}
     return outcome.model_copy(update=decided)
+
+
+def bodies_that_matter(result: EnsembleResult) -> list[int]:
+    """The mover, what is asked about, and what the mover touches in more than a few worlds."""
+    query, count = result.query, len(result.world.bodies)
+    meant = {0} if query is None else {0, query.subject, query.target}
+    events = None if result.ensemble is None else result.ensemble.events.of[0]
+    return [i for i in range(count) if i in meant or (events is not None and events.share("touches", i) > FEW_WORLDS)]

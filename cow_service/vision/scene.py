@@ -29,6 +29,7 @@ SHARP_SIDE = 2 * WORKING_SIDE  # px: in a larger image the outlines of regions a
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
 REACH = 1.5  # sizes of an object: an arrow further away is not its own
 RIVAL = 0.6  # of a rival's distance: what is nearer than that is clearly the nearest
+CLEAR_CUT = 0.9  # confidence of a region from which its outline leaves no doubt
 DOUBTFUL = 0.75  # confidence below which the same holds of a small region that touches another obstacle
 
 
@@ -43,7 +44,11 @@ class Obstacle:
 
 
 def find_obstacles(
-    regions: Sequence[Region], silhouette: Callable[[BBox], Mask], mover: BBox, named: Sequence[LocatedObject]
+    regions: Sequence[Region],
+    silhouette: Callable[[BBox], Mask],
+    confidence_of: Callable[[BBox], float],
+    mover: BBox,
+    named: Sequence[LocatedObject],
 ) -> tuple[Obstacle, ...]:
     """Everything but the mover: first what the question names, by that name, then other regions, by their colour.
 
@@ -58,9 +63,7 @@ def find_obstacles(
         if not is_same_object(other.bbox, mover):
             region = None if other.mask is not None else region_of(regions, other.bbox)
             mask = CroppedMask.of(silhouette(other.bbox)) if region is None else region.mask
-            found = region is not None and region.bbox == other.bbox  # here, not by the request or another reader
-            confidence = region.confidence if region is not None and found else 1.0
-            obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
+            obstacles.append(Obstacle(other.object, other.bbox, mask, confidence_of(other.bbox)))
     for region in regions:
         area = region.mask.area
         if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
@@ -72,7 +75,8 @@ def find_obstacles(
         larger = [other.mask for other in obstacles if area < OWN_SHARE * other.mask.area]
         if region.confidence < DOUBTFUL and any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger):
             continue
-        obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
+        name, confidence = f"{region.colour} object", confidence_of(region.bbox)
+        obstacles.append(Obstacle(name, region.bbox, region.mask, confidence))
     return tuple(obstacles)
 
 
@@ -250,6 +254,25 @@ class Scene:
         """The region that a box [x0, y0, x1, y1] is about, if there is one."""
         return region_of(self.regions, bbox)
 
+    def confidence_of(self, bbox: BBox) -> float:
+        """How sure it is (0..1) that what is in a box is one separate thing with its outline; 1 for what is given.
+
+        Where the outline of a region leaves a doubt, the thing is cut out again by its box alone: the confidence is
+        the share (IoU) of both cuts that is in both.
+        """
+        region = self.region_of(bbox)
+        if region is None or region.bbox != bbox:  # the request, or another reader, says where it is
+            return 1.0
+        if region.is_disc or region.confidence >= CLEAR_CUT:
+            return region.confidence
+        mask = region.mask.full()
+
+        def agreement() -> float:
+            again = mask_from_bbox(self.clean, bbox)
+            return float(np.count_nonzero(mask & again) / np.count_nonzero(mask | again))
+
+        return self.once(("confidence", bbox), agreement)
+
     def silhouette(self, bbox: BBox) -> Mask:
         """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
 
@@ -284,7 +307,7 @@ class Scene:
 
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
         """The objects beside the mover in a box, `named` ones by their name; found once for the same arguments."""
-        find = partial(find_obstacles, self.regions, self.silhouette, mover, named)
+        find = partial(find_obstacles, self.regions, self.silhouette, self.confidence_of, mover, named)
         return self.once(("obstacles", mover, tuple(named)), find)
 
     def locate(self, point: tuple[float, float]) -> Cutout:

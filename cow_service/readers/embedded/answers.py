@@ -16,7 +16,7 @@ from cow_service.readers.embedded.english.asked import Unread
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import may_name, parse_noun_phrase
 from cow_service.readers.options import not_sure_option, plain, says_not_sure
-from cow_service.records import AnswerOption, Asked, Outcome
+from cow_service.records import AnswerOption, Asked, Doubt, Outcome
 
 _YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECASE)
 # "No contact" says something of the event, "No, it stops" of what is asked.
@@ -189,6 +189,7 @@ NOT_AMONG = "Not sure, because what is met first, '{said}', is not one of what t
 NOT_IDENTIFIED = (
     "Not sure, because something that the question names looks like another kind of thing; the warnings say which."
 )
+NOT_CLEAR = "Not sure, because a thing that matters was not seen clearly; the warnings say which."
 TOO_FAINT = "Not sure, because something may stand in the way that is too faint to tell; the warnings say where."
 TOO_CLOSE = "Not sure: the probability of {what} is {probability:.2f}{depends}."
 
@@ -238,10 +239,10 @@ def why_not_sure(outcome: Outcome) -> str:
         return NOT_TOLD
     if outcome.sure:
         return ""
-    if "identity" in outcome.depends_on:
-        return NOT_IDENTIFIED
-    if "faint" in outcome.depends_on:
-        return TOO_FAINT
+    unseen: dict[Doubt, str] = {"identity": NOT_IDENTIFIED, "outline": NOT_CLEAR, "faint": TOO_FAINT}
+    told = next((why for doubt, why in unseen.items() if doubt in outcome.depends_on), None)
+    if told is not None:
+        return told
     what = "what is asked" if outcome.asked.form == "whether" else f"the likeliest answer, '{_in_words(outcome)}',"
     depends = f"; it depends most on {DOUBTS[outcome.depends_on[0]]}" if outcome.depends_on else ""
     return TOO_CLOSE.format(what=what, probability=outcome.probability, depends=depends)
