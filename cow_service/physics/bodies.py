@@ -142,6 +142,22 @@ class SeenBody:
         return self.prior is not None and self.prior.stands_on == "air"
 
 
+TOUCHING = 6  # px: so far apart are shapes of a drawing that touch
+HANGS = -1  # in the place of a support: it is drawn above nothing
+
+
+def supports_in_side_view(bodies: Sequence[SeenBody], level: float) -> list[int | None]:
+    """As `supports_of`, for shapes of a drawing whose floor is at a height in the image (px); `HANGS` without any."""
+    found: list[int | None] = []
+    for body in bodies:
+        lower = np.roll(body.mask.full(), TOUCHING, axis=0)
+        shared = [0 if other is body else other.mask.shared_with(lower) for other in bodies]
+        under = int(np.argmax(shared))
+        floor = None if body.bbox[3] > level - TOUCHING else HANGS
+        found.append(under if shared[under] else floor)
+    return found
+
+
 def supports_of(bodies: Sequence[SeenBody]) -> list[int | None]:
     """For each body the one that it stands on, by what is said of it or by where its foot is; None: the floor."""
     found: list[int | None] = []

@@ -144,6 +144,11 @@ def prior(roll: float = 0.0) -> CameraFit:
     return CameraFit(mean, np.diag(sigma**2), roll, ROLL_SIGMA, "prior")
 
 
+# Of a drawing that has no depth: seen level, from so far away that all depths look the same.
+_FAR = np.array([0.0, math.log(20.0), math.log(HEIGHT_RADII), *SLANT])
+SIDE_VIEW = CameraFit(_FAR, 1e-12 * np.eye(5), roll=0.0, roll_sigma=0.0, source="side-view")
+
+
 @dataclass(frozen=True)
 class Standing:
     """What one thing that stands on the floor shows of the camera."""

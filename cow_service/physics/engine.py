@@ -59,6 +59,8 @@ class RigidShape:
     middle: float | None = None  # height of a solid body's centre of mass, of its height; None: as of one stuff
     base: float = 1.0  # width on which a cylinder stands, of its width
     waist: float = 0.0  # height up to which it is that narrow, of its height
+    fixed: bool = False  # nothing moves it
+    pieces: tuple[Floats, ...] = ()  # corners [N, 2] of its convex parts, m right of its centre and above it
     follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
 
     @property
@@ -230,9 +232,9 @@ class _Engine:
     def add(self, k: int, i: int, body: RigidShape) -> rapier.RigidBodyHandle:
         """Adds a body; what neither moves nor is touched costs nothing."""
         x, y, z = (np.array(body.position) * self.scale + self.origin[k]).tolist()
-        builder = (
-            rapier.RigidBody.kinematic_position_based() if body.follows is not None else rapier.RigidBody.dynamic()
-        )
+        builder = rapier.RigidBody.fixed() if body.fixed else rapier.RigidBody.dynamic()
+        if body.follows is not None:
+            builder = rapier.RigidBody.kinematic_position_based()
         lift = GAP if body.falls and not body.ghost else 0.0
         rotation = (0.0, body.yaw, 0.0)  # axis times angle, radians
         if body.turn is not None:
@@ -397,6 +399,10 @@ def _mass_properties(body: RigidShape, scale: float) -> rapier.MassProperties:
 def _colliders(body: RigidShape, scale: float) -> list[rapier.ColliderBuilder]:
     """Of one solid piece, or a container's floor and the convex segments of the wall that stands on it."""
     width, height, hollow = body.half_width * scale, body.half_height * scale, body.hollow
+    if body.pieces:
+        ends = np.array([-1.0, 1.0]) * body.half_depth
+        solids = [[(x, y, z) for x, y in corners.tolist() for z in ends] for corners in body.pieces]
+        return [rapier.Collider.convex_hull(np.array(each) * scale).density(body.density) for each in solids]
     if hollow is None:
         if body.shape == "sphere":
             solid = rapier.Collider.ball(width)

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.bodies import HANGS, SeenBody, supports_in_side_view, supports_of
 from cow_service.physics.camera import FLAT, HORIZON, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN, quantiles
 from cow_service.records import FALLING_KINDS, BBox, Cue, Motion, Shape
@@ -224,14 +224,25 @@ def lay_out(
     size: tuple[int, int],
     draws: Floats,
     others: Mapping[int, Motion] = MappingProxyType({}),
+    level: float | None = None,
 ) -> Layout:
     """Places bodies seen in an image of a size (width, height), px.
 
-    `others` are motions of other bodies, by their places among `bodies`.
+    `others` are motions of other bodies, by their places among `bodies`; `level` is the height in the image (px) of
+    the floor of a drawing that is seen from the side.
     """
     cameras, parameters = Cameras.drawn(fit, size, draws)
-    picture = _Picture(bodies, supports_of(bodies), motion, draws)
-    cameras, placed = picture.placed(cameras, parameters, fit)
+    if level is None:
+        picture = _Picture(bodies, supports_of(bodies), motion, draws)
+        cameras, placed = picture.placed(cameras, parameters, fit)
+        supports = picture.supports
+    else:
+        depth = cameras.focal * motion.metres_per_pixel.value
+        cameras = cameras.at_height((level - size[1] / 2) * depth / cameras.focal)
+        supports = supports_in_side_view(bodies, level)
+        stands = [not flies(bodies[0], motion), *(on != HANGS for on in supports[1:])]
+        placed = [in_the_air(cameras, body.bbox, body.shape, depth) for body in bodies]
+        placed = [replace(body, stands=each) for body, each in zip(placed, stands, strict=True)]
     if motion.rises:
         placed[0] = replace(placed[0], stands=False)
     places = {body.bbox: each for body, each in zip(bodies, placed, strict=True)}
@@ -239,6 +250,8 @@ def lay_out(
     def velocity_of(body: int, motion: Motion, speed_name: str = "speed") -> Floats:
         goal = None if motion.towards is None else places.get(motion.towards.bbox)
         others = [each for index, each in enumerate(placed) if index != body]
+        if level is not None:
+            return _in_side_view(placed[body], motion, draws, goal, speed_name)
         return _velocity(placed[body], motion, cameras, draws, goal, others, speed_name)
 
     velocity = velocity_of(0, motion)
@@ -246,8 +259,8 @@ def lay_out(
     legs = [motion.model_copy(update=turned | {"direction": s.direction, "depth": s.depth}) for s in motion.steps]
     further = tuple(velocity_of(0, leg) for leg in legs)
     also = {i: velocity_of(i, each, "other_speed") for i, each in others.items()}
-    placed = _apart(placed)
-    resting = tuple(on if body.stands else None for on, body in zip(picture.supports, placed, strict=True))
+    placed = placed if level is not None else _apart(placed)
+    resting = tuple(on if each.stands and on != HANGS else None for on, each in zip(supports, placed, strict=True))
     return Layout(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
 
 
@@ -386,6 +399,16 @@ def _velocity(
     else:
         way = _out_of_image(motion, cameras, direction)
     return way * speed[:, None]
+
+
+def _in_side_view(mover: LiftedBody, motion: Motion, draws: Floats, goal: LiftedBody | None, speed_name: str) -> Floats:
+    """[K, 3] m/s of what moves in a drawing that has no depth: along the floor where it stands."""
+    dx, dy = motion.direction or (0.0, 0.0)
+    direction = np.array([dx, -dy, 0.0]) if goal is None else goal.centre[0] - mover.centre[0]
+    if mover.stands and motion.kind == "linear" and not motion.rises:
+        direction = direction * np.array([1.0, 0.0, 0.0])
+    speed = motion.speed * motion.metres_per_pixel.value * speed_factors(motion, draws, speed_name)
+    return direction / max(float(np.linalg.norm(direction)), 1e-9) * speed[:, None]
 
 
 def speed_factors(motion: Motion, draws: Floats, name: str = "speed") -> Floats:

@@ -26,6 +26,7 @@ from cow_service.physics.placement import (
     settle,
 )
 from cow_service.records import FALLING_KINDS, Motion, Shape
+from cow_service.vision.side_view import pieces_of
 from cow_service.vision.types import Floats, Mask
 
 FRICTION, FRICTION_SIGMA = 0.5, 0.5  # of a body; one standard deviation of the logarithm
@@ -71,6 +72,7 @@ class WorldInput:
     turns_wanted: bool = False  # how bodies turn is recorded of an ensemble, too
     placement: PlacementGoal | None = None  # the mover is carried somewhere and released
     placed_before: tuple[PlacementGoal, ...] = ()  # what is put somewhere before anything moves, in this order
+    level: float | None = None  # px: height in the image of the floor of a drawing that is seen from the side
 
     @property
     def horizon(self) -> float:
@@ -132,7 +134,7 @@ def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     if len(draws) == 1:
         fps, frames = given.fps, given.frames
     bodies, goals = (*given.bodies, *given.removed), given.placed_before
-    layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.others)
+    layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.others, given.level)
     layout = layout.first(len(given.bodies))
     if goals:
         layout = layout.rearranged(new_supports(goals, layout.supports))
@@ -189,21 +191,23 @@ class _Draw:
             if not seen.is_form_known:  # it shows its width, which nothing says is that of something round
                 shape, side, turn = "box", half, math.atan2(x, z)
                 deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
-            bodies.append(
-                RigidShape(
-                    shape=shape,
-                    half_width=side,
-                    half_depth=deep,
-                    half_height=tall,
-                    position=(x, y, z),
-                    yaw=turn,
-                    density=seen.fullness if shape == "cylinder" else 1.0,
-                    friction=friction,
-                    restitution=restitution,
-                    falls=body.stands,
-                    **self.balance(seen, shape, tall, (x, y, z)),
-                )
+            rigid = RigidShape(
+                shape=shape,
+                half_width=side,
+                half_depth=deep,
+                half_height=tall,
+                position=(x, y, z),
+                yaw=turn,
+                density=seen.fullness if shape == "cylinder" else 1.0,
+                friction=friction,
+                restitution=restitution,
+                falls=body.stands,
+                **self.balance(seen, shape, tall, (x, y, z)),
             )
+            if given.level is not None:  # all are as deep, and what hangs, or is cut off by the border, stays
+                fixed = bool(bodies) and (not body.stands or self.is_cut(seen))
+                rigid = replace(rigid, half_depth=unit, yaw=0.0, middle=None, pieces=self.pieces(seen), fixed=fixed)
+            bodies.append(rigid)
         weight = math.exp(WEIGHT_SIGMA * float(row[COLUMN["weight"]]))
         bodies[0] = replace(bodies[0], density=bodies[0].density * weight)
         velocities = [legs[k] for legs in (layout.velocity, *layout.further)]
@@ -214,6 +218,19 @@ class _Draw:
             if i < len(bodies):  # else it is taken away
                 bodies[i] = self.set_going(i, bodies[i], motion, [layout.others[i][k]], "other_speed")
         return tuple(bodies)
+
+    def pieces(self, seen: SeenBody) -> tuple[Floats, ...]:
+        """A body of a drawing as convex pieces: corners [N, 2] each, m right of its middle and above it."""
+        x0, y0, x1, y1 = seen.bbox
+        unit = self.given.motion.metres_per_pixel.value * np.array([1.0, -1.0])
+        if seen.shape == "sphere":
+            return ()
+        return tuple((corners - np.array([(x0 + x1) / 2, (y0 + y1) / 2])) * unit for corners in pieces_of(seen.mask))
+
+    def is_cut(self, seen: SeenBody) -> bool:
+        """Whether the border of the image cuts a body off."""
+        x0, y0, x1, y1 = seen.bbox
+        return x0 <= 0 or y0 <= 0 or x1 >= self.given.size[0] or y1 >= self.given.size[1]
 
     def balance(self, seen: SeenBody, shape: Shape, tall: float, centre: tuple[float, float, float]) -> dict[str, Any]:
         """On what a body stands and where its centre of mass is: fields of its shape; none of what cannot tip."""
@@ -246,7 +263,8 @@ class _Draw:
                 factor = float(speed_factors(motion, self.draws[self.k : self.k + 1], speed)[0])
                 changes["course"] = course_of(motion, velocities, motion.speed * factor)
         fast = float(np.hypot(velocity[0], velocity[2]))
-        if seen.elongated and fast > 0:  # a vehicle is longer along its heading than across, as wide as it is seen
+        # A vehicle is longer along its heading than across, as wide as it is seen.
+        if seen.elongated and fast > 0 and given.level is None:
             placed, k = self.layout.bodies[index], self.k
             sight = placed.centre[k, [0, 2]] / np.linalg.norm(placed.centre[k, [0, 2]])
             along = abs(float(velocity[[0, 2]] @ sight)) / fast

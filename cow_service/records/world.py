@@ -243,7 +243,7 @@ Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "iden
 """What a world is uncertain of: `place` is how far from the camera and how high bodies are, `identity` whether things
 are what they are called, `outline` where their outlines run, `faint` whether what is too faint to tell is a thing."""
 CLEAR = 0.77  # confidence of a body below which no outcome that rests on it is sure
-CameraSource = Literal["shadow", "edges", "request", "prior"]
+CameraSource = Literal["shadow", "edges", "request", "side-view", "prior"]
 
 
 class CameraDeviations(Record):

@@ -12,8 +12,8 @@ import numpy as np
 from cow_service.errors import CannotGround
 from cow_service.narration import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
-from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import FOCAL_WIDTHS, CameraFit, Standing, fit_shadow, narrowed, prior
+from cow_service.physics.bodies import SeenBody, supports_in_side_view, supports_of
+from cow_service.physics.camera import FOCAL_WIDTHS, SIDE_VIEW, CameraFit, Standing, fit_shadow, narrowed, prior
 from cow_service.physics.ensemble import BY_EVENTS, Query
 from cow_service.physics.layout import flies
 from cow_service.physics.placement import PlacementGoal
@@ -25,6 +25,7 @@ from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Obstacle, Scene
 from cow_service.vision.shadows import Shadow, find_shadow
+from cow_service.vision.side_view import SideView
 
 PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
@@ -65,6 +66,11 @@ class Situation:
     def follows_path(self) -> bool:
         """Whether the mover follows a path that no contact changes: one that is given, or has the ballistic law."""
         return self.request.trajectory is not None or (self.motion.law == "ballistic" and self.motion.kind != "place")
+
+    @property
+    def side_view(self) -> SideView | None:
+        """The drawing without depth that the image is, unless its mover follows a path through space."""
+        return None if self.follows_path else self.scene.side_view
 
     @cached_property
     def located(self) -> tuple[LocatedObject, ...]:
@@ -116,6 +122,9 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         standing=standing_things(bodies, motion),
         radii=_height_in_radii(bodies[0], motion),
     )
+    level = None if situation.side_view is None else situation.side_view.level
+    if level is not None:
+        fit = SIDE_VIEW
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
@@ -142,6 +151,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         turns_wanted=query is not None and query.asked.relation == "tips",
         placement=carried,
         placed_before=before,
+        level=level,
     )
     if not situation.follows_path:
         return world, query, None
@@ -181,6 +191,8 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
         )
         if said is not None and said.shape is not None:
             body = replace(body, shape=said.shape)
+        elif situation.side_view is not None:
+            body = replace(body, shape="sphere" if body.shape == "sphere" else "box")
         elif body.shape != "sphere":
             body = replace(body, is_form_known=False)
         if said is not None and not bodies:
@@ -217,7 +229,9 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], carried: Placemen
     # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.
     subject = bodies[query.subject]
     in_air = subject.is_flying if query.subject else flies(subject, situation.motion)
-    stands_on_floor = not in_air and supports_of(bodies)[query.subject] is None
+    view = situation.side_view
+    supports = supports_of(bodies) if view is None else supports_in_side_view(bodies, view.level)
+    stands_on_floor = not in_air and supports[query.subject] is None
     is_present = situation.is_separated and query.subject <= len(situation.obstacles)
     is_seen = asked.relation in BY_EVENTS and not (stands_on_floor and asked.relation == "lands")
     return replace(query, is_decidable=is_present and is_seen)

@@ -103,6 +103,13 @@ def outer_contour(mask: Mask) -> NDArray[np.int32]:
     return np.asarray(max(contours, key=cv2.contourArea), np.int32)
 
 
+def roundness_of(mask: Mask) -> float:
+    """The share (0..1) of the smallest circle around a mask [h, w] that its outer contour encloses."""
+    outline = outer_contour(mask)
+    _, radius = cv2.minEnclosingCircle(outline)
+    return float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
+
+
 def hull(mask: Mask) -> Mask:
     """The convex hull [H, W] of a mask."""
     filled = np.zeros(mask.shape, np.uint8)

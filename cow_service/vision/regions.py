@@ -62,6 +62,7 @@ TOP_AREA = 0.3  # of a region: a larger one above it is another object, not what
 DARK = 28.0  # lightness below which a part may be the underside of another
 SAME_TOP = 0.6  # of a smaller region, taken up by what stands on another: it is no object of its own
 
+DISC = 0.93  # roundness from which a drawn shape is a disc
 SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
 SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
 
@@ -106,10 +107,7 @@ class _Found:
         if near is not None:
             soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
         mask = masks.enlarged(soft, size)
-        outline = masks.outer_contour(mask.patch)
-        _, radius = cv2.minEnclosingCircle(outline)
-        roundness = float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
-        return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc)
+        return Region(mask, *_names(self.lab), masks.roundness_of(mask.patch), self.confidence, self.is_disc)
 
 
 def measure(image: Image) -> View:
@@ -224,6 +222,13 @@ def disc_region(image: Image, disc: Mask) -> Region:
     """A ball of an RGB image [H, W, 3] whose mask [H, W] is known."""
     names = _names(masks.lab_of(image[disc][None])[0])
     return Region(CroppedMask.of(disc), *names, roundness=1.0, confidence=1.0, is_disc=True)
+
+
+def drawn_region(image: Image, shape: CroppedMask) -> Region:
+    """A shape of a drawing, an RGB image [H, W, 3]."""
+    roundness = masks.roundness_of(shape.patch)
+    names = _names(masks.lab_of(image[shape.rows, shape.columns][shape.patch][None])[0])
+    return Region(shape, *names, roundness, confidence=1.0, is_disc=roundness > DISC)
 
 
 def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:

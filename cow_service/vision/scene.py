@@ -18,8 +18,9 @@ from cow_service.vision.contrast import View
 from cow_service.vision.faint import find_faint
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, dilated, is_among, is_same_object, without_holes
-from cow_service.vision.regions import WORKING_SIDE, Region, disc_region, find_regions, measure, region_of
+from cow_service.vision.regions import WORKING_SIDE, Region, disc_region, drawn_region, find_regions, measure, region_of
 from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
+from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
@@ -92,7 +93,8 @@ class Cutout:
 Found = TypeVar("Found")
 Measured = dict[str, Any]
 """Cached properties of a `Scene` by their names."""
-OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "_all_trails")  # neither mover nor words decide them
+# Neither mover nor words decide them.
+OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "side_view", "_all_trails")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,8 +155,13 @@ class Scene:
         return erase_drawing(self.image, self.cues)
 
     @cached_property
+    def side_view(self) -> SideView | None:
+        """The drawing seen from the side that the image is; None for a picture that has depth."""
+        return find_side_view(self._undrawn)
+
+    @cached_property
     def _all_trails(self) -> tuple[Trail, ...]:
-        return find_trails(self._undrawn)
+        return () if self.side_view else find_trails(self._undrawn)
 
     @cached_property
     def trails(self) -> tuple[Trail, ...]:
@@ -184,6 +191,9 @@ class Scene:
     @cached_property
     def regions(self) -> tuple[Region, ...]:
         """Objects of the image, largest first; empty where it is too cluttered to tell."""
+        if self.side_view is not None:
+            drawn = (drawn_region(self.clean, shape) for shape in self.side_view.shapes)
+            return tuple(sorted(drawn, key=lambda region: -region.mask.area))
         found = find_regions(self.clean, self._view)
         for trail in self.trails:
             if region_of(found, trail.present.bbox) is None:
@@ -193,7 +203,7 @@ class Scene:
     @cached_property
     def faint(self) -> tuple[BBox, ...]:
         """Boxes [x0, y0, x1, y1] of what may be things of the image, too faint to tell."""
-        return find_faint(self._view, (self.width, self.height), self.regions)
+        return () if self.side_view else find_faint(self._view, (self.width, self.height), self.regions)
 
     def with_mover(self, bbox: BBox) -> Scene:
         """This scene where its trails end as they are, else the scene in which the one in a box ends there."""
@@ -293,7 +303,7 @@ class Scene:
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
         other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
-        names = ("cues", "arrows", "boxes", "regions", "faint")
+        names = ("cues", "arrows", "boxes", "side_view", "regions", "faint")
         other.__dict__.update(
             {name: getattr(self, name) for name in names}, clean=clean
         )  # where cached properties are kept

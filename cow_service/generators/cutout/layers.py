@@ -19,6 +19,7 @@ from cow_service.vision.types import Image, Mask
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 HOLE_GROWTH = 0.03  # of the object's size: the rim, mixed with the background, is inpainted too
+DRAWN_RIM = 9  # px: twice the width of the blur around what is drawn
 SHADED_RIM = 3  # px: so much more of it where a contact shadow was taken out, which is not known right at the object
 AROUND = 1.5  # of its half width: what is lower than that far from a container's middle may be in it
 DEEPER = 0.02  # of the container's height: so far below the rim something is in it
@@ -86,9 +87,15 @@ def take_apart(given: GeneratorInput) -> Layers:
     eye = 0.0 if ground is None else ground.camera.height
     moving = moving_bodies(given, size, ground)
     still = still_bodies(given, moving, size, ground)
-    unshaded = take_shadows(given, image, moving, still, ground, factor)
-    cues = resized_mask(scene.cues, size) if clean else None
-    background = without_bodies(unshaded, moving, still, eye, cues)
+    if scene.side_view is None:
+        unshaded = take_shadows(given, image, moving, still, ground, factor)
+        cues = resized_mask(scene.cues, size) if clean else None
+        background = without_bodies(unshaded, moving, still, eye, cues)
+    else:  # a drawing has no shadows, and what is behind its things is known
+        unshaded, background = UnshadedScene(image, {}, ()), image.copy()
+        holes = np.logical_or.reduce([_dilated(body.mask, DRAWN_RIM) for body in moving])
+        holes &= ~np.logical_or.reduce([np.zeros_like(holes), *(body.mask for body in still)])
+        background[holes] = fit_within(scene.side_view.empty, MAX_SIDE)[holes]
     sprites: list[Sprite] = []
     for body in moving:
         # What nearer bodies hide of it at the first frame: of a sphere's disc; of the hull of what is seen, else.

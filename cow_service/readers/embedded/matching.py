@@ -260,6 +260,15 @@ def inside_drawn_box(scene: Scene, phrase: ObjectPhrase, remedy: str) -> BBox:
     return max(held, key=lambda region: region.mask.area).bbox if held else scene.boxes[0].bbox
 
 
+TABLE = 0.6  # of its box: a drawn table fills less, with the space between its legs
+
+
+def table_among(regions: Sequence[Region]) -> Region | None:
+    """The one region of a drawing seen from the side that has legs; None where none or several have."""
+    found = [each for each in regions if not each.is_disc and each.mask.area < TABLE * each.mask.patch.size]
+    return found[0] if len(found) == 1 else None
+
+
 def describe(regions: Sequence[Region]) -> str:
     """What was seen, in words, for an error message."""
     if not regions:

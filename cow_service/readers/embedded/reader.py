@@ -114,6 +114,12 @@ class EmbeddedReader:
                 and not matching.is_kind_asked(each, question)
                 and changes.given_as(each, given.known) is None
             ]
+            asked, table = read_asked(question), None
+            if scene.side_view is not None and (phrase := noun_phrases.table_landed_on(question.items)) is not None:
+                # Seen from the side, a table is a thing, and the floor is another.
+                table = matching.table_among([each for each in regions if each.bbox != bbox])
+                asked = None if table is None else records.Asked(relation="touches", target=phrase.text)
+                located += () if table is None else (LocatedObject(object=phrase.text, bbox=table.bbox),)
             boxes |= {mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (mover, *question.others) if each.text in boxes]
             doubts, doubtful = matching.noun_doubts(scene, things)
@@ -125,7 +131,7 @@ class EmbeddedReader:
             others=tuple(each.model_copy(update={"is_doubtful": each.bbox in doubtful}) for each in located),
             warnings=(*assumed, *missing, *doubts),
             interventions=(*removed, *placed),
-            asked=read_asked(question),
+            asked=asked,
             is_doubtful=bbox in doubtful,
         )
 
@@ -233,6 +239,13 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         )
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
+    if scene.side_view is not None and words.direction == (0.0, 1.0) and kind == "linear":
+        return MotionReading("fall", None, "gravity")  # down a slope, or over an edge, by its weight
+    if scene.side_view is not None and words.depth:
+        raise CannotReadDirection(
+            "The image is a drawing seen from the side: nothing in it moves towards the viewer, or away. "
+            f"{GIVE_DIRECTION}"
+        )
     said = _as_said(scene, words, kind, grounding)
     if said is not None:
         return said

@@ -241,13 +241,23 @@ _PLACE = lex.words(
 
 
 def with_tables(found: Sequence[Item]) -> list[Item]:
-    """The items; "the table" is a thing where it is not behind a preposition that makes it a place."""
+    """The items; "the table" is a thing where no preposition makes it a place, and a wall where it has a colour."""
     kept = list(found)
     for at, item in enumerate(found):
         before, in_front = key_at(found, at - 1), key_at(found, at - 1) == "of" and key_at(found, at - 2) == "front"
-        if item.phrase is not None and item.phrase.head in TABLES and (before not in _PLACE or in_front):
+        if item.phrase is None:
+            continue
+        is_table = item.phrase.head in TABLES and (before not in _PLACE or in_front)
+        if is_table or (item.phrase.head == "wall" and item.phrase.colour is not None):
             kept[at] = replace(item, phrase=replace(item.phrase, as_thing=True))
     return kept
+
+
+def table_landed_on(found: Sequence[Item]) -> ObjectPhrase | None:
+    """The table of "will it land on the table", where a question ends so."""
+    ends = [item for item in found if item.phrase is not None][-1:]
+    on = key_at(found, found.index(ends[0]) - 1) if ends else ""
+    return ends[0].phrase if on in {"on", "onto", "upon"} and ends[0].phrase and ends[0].phrase.head in TABLES else None
 
 
 def with_nouns(found: Sequence[Item]) -> list[Item]:

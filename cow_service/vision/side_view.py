@@ -1,0 +1,152 @@
+"""Tells a drawing that is seen from the side: flat shapes on a level ground, before a flat background.
+
+In such a picture there is no depth: the ground is a line, and what is drawn above it is that far above it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.vision import masks
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.types import Floats32, Image, Mask
+
+SAME = 6  # levels: pixels that differ less from a colour have it
+APART = 24  # levels between two colours of a drawing, at least
+FLAT = 0.9  # share of the pixels of a drawing that have one of its colours: edges are blurred
+MOST_COLOURS = 12
+LEAST_COLOUR = 0.0005  # of the pixels
+GROUND = 0.45  # of the image's width, at least, is ground
+LEVEL = 0.006  # of the image's height: so even is the upper edge of a ground
+NO_GAP = 0.01  # of the image's width: what is open of its ground is no gap
+LINE = 0.15  # of the image's width: a shorter piece of a line is no ground
+THIN = 0.007  # of the larger side: half the width of an outline, at most
+LEAST_SHAPE = 0.0003  # of the image
+HIGHEST_GROUND = 0.55  # of the image's height, from the top
+
+
+@dataclass(frozen=True)
+class SideView:
+    """What a drawing shows."""
+
+    shapes: tuple[CroppedMask, ...]  # things, and pieces of ground between which there is a gap
+    level: float  # px: height in the image of the floor; of a ground with a gap the image's lower border
+    empty: Image  # [H, W, 3] without the things
+
+
+def find_side_view(image: Image) -> SideView | None:
+    """The side view that an RGB image [H, W, 3] is; None for a picture that has depth, or no level ground."""
+    height = image.shape[0]
+    if _flat_colours(image[::4, ::4]) is None:  # most pictures end here
+        return None
+    colours = _flat_colours(image)
+    if colours is None:
+        return None
+    labels = np.stack([np.abs(image - colour).sum(axis=2) for colour in colours]).argmin(axis=0)
+    background = int(np.bincount(labels[: max(2, height // 50)].ravel()).argmax())
+    ground, level = _ground(labels, background)
+    if ground is None:
+        return None
+    rest = (labels != background) & ~masks.dilated(ground, 5)  # its edge is blurred
+    open_ground = (labels[level : level + 2] == background).all(axis=0) & ~ground.any(axis=0)
+    whole = bool(open_ground.mean() < NO_GAP)
+    shapes = [CroppedMask.of(each) for each in _shapes(labels, rest)]
+    if not whole:
+        count, pieces = cv2.connectedComponents(ground.astype(np.uint8))
+        shapes += [CroppedMask.of(pieces == i) for i in range(1, count)]
+    # What reaches below the ground's edge stands before it: the picture has depth after all.
+    elif any(each.bbox[3] > level + 2 + LEVEL * height for each in shapes):
+        return None
+    empty = np.full_like(image, image[labels == background].mean(axis=0).round())
+    empty[ground] = image[ground]
+    return SideView(tuple(shapes), float(level if whole else height), empty)
+
+
+def _flat_colours(image: Image) -> list[NDArray[np.int16]] | None:
+    """The few colours [3] of a drawing; None for a photograph."""
+    counts = np.bincount(((image >> 2).astype(np.int64) @ np.array([4096, 64, 1])).ravel(), minlength=1 << 18)
+    order = np.argsort(-counts)[:256]
+    pixels = image.astype(np.int16)
+    found, has_one = list[NDArray[np.int16]](), np.zeros(image.shape[:2], bool)
+    for at in order.tolist():
+        colour = np.array([at >> 12, at >> 6 & 63, at & 63], np.int16) * 4 + 2
+        if counts[at] < LEAST_COLOUR * has_one.size or len(found) == MOST_COLOURS:
+            break
+        if all(np.abs(colour - other).max() >= APART for other in found):
+            found.append(colour)
+            has_one |= np.abs(pixels - colour).max(axis=2) <= SAME
+    return found if len(found) > 1 and has_one.mean() > FLAT else None
+
+
+def _ground(labels: NDArray[np.int64], background: int) -> tuple[Mask | None, int]:
+    """The ground [H, W] of one colour, and the height in the image of its upper edge; None where there is none."""
+    height, width = labels.shape
+    kernel = np.ones((1, round(LINE * width)), np.uint8)
+    best, level = None, 0
+    for colour in np.unique(labels[labels != background]):
+        wide = cv2.morphologyEx((labels == colour).astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(wide.astype(np.uint8))
+        sides = [i for i in range(1, count) if stats[i][0] == 0 or stats[i][0] + stats[i][2] == width]
+        sides = [i for i in sides if stats[i][1] > (1 - HIGHEST_GROUND) * height]
+        if not sides:
+            continue
+        top = min(stats[i][1] for i in sides)
+        level_ones = [i for i in range(1, count) if abs(stats[i][1] - top) <= 1 + LEVEL * height]
+        ground = np.isin(parts, level_ones)
+        if ground.any(axis=0).mean() > GROUND and (best is None or top < level):
+            best, level = ground, int(top)
+    return best, level
+
+
+def _shapes(labels: NDArray[np.int64], rest: Mask) -> list[Mask]:
+    """The things among what is neither background nor ground [H, W]: of one colour each, with their outlines."""
+    thin = max(3.0, THIN * max(rest.shape))
+    bodies, lines = list[Mask](), list[Mask]()
+    for colour in np.unique(labels[rest]):
+        count, parts, stats, _ = cv2.connectedComponentsWithStats((rest & (labels == colour)).astype(np.uint8))
+        for i in range(1, count):
+            if stats[i][4] < 8:
+                continue
+            part = parts == i
+            reach = float(cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
+            (lines if reach <= thin else bodies).append(part)
+    for line in lines:  # an outline belongs to the shape that it runs along
+        near = masks.dilated(line, 5)
+        shared = [int(np.count_nonzero(near & body)) for body in bodies]
+        if shared and max(shared) > 0:
+            bodies[int(np.argmax(shared))] |= line
+    return [masks.without_holes(body) if _is_ring(body) else body for body in bodies if body.mean() > LEAST_SHAPE]
+
+
+def _is_ring(body: Mask) -> bool:
+    """Whether the holes of a shape are small: patterns on it."""
+    return float(np.count_nonzero(body)) > 0.8 * np.count_nonzero(masks.without_holes(body))
+
+
+def pieces_of(shape: CroppedMask) -> list[Floats32]:
+    """A shape as convex pieces: corners [N, 2] each, px of the image; of what is not convex its rows, in slabs."""
+    x0, y0, _, _ = shape.bbox
+    patch = shape.patch
+    outline = masks.outer_contour(patch).reshape(-1, 2).astype(np.float32)
+    hull = cv2.convexHull(outline).reshape(-1, 2)
+    if shape.area > 0.94 * cv2.contourArea(hull):
+        corners = cv2.approxPolyDP(hull, 0.75, True).reshape(-1, 2)
+        return [(corners + np.array([x0, y0])).astype(np.float32)]
+    slabs = list[tuple[int, int, int, int]]()  # left, top, right, bottom
+    open_ones: dict[tuple[int, int], int] = {}
+    even = max(2, patch.shape[1] // 30)
+    for row in range(len(patch) + 1):
+        edges = np.diff(np.pad(patch[row].astype(np.int8), 1)) if row < len(patch) else np.zeros(1, np.int8)
+        runs = list(zip(np.nonzero(edges == 1)[0].tolist(), np.nonzero(edges == -1)[0].tolist(), strict=True))
+        going: dict[tuple[int, int], int] = {}
+        for left, right in runs:
+            same = [run for run in open_ones if abs(run[0] - left) <= even and abs(run[1] - right) <= even]
+            going[same[0] if same else (left, right)] = open_ones.pop(same[0]) if same else row
+        slabs += [(left, top, right, row) for (left, right), top in open_ones.items()]
+        open_ones = going
+    corners = [[(left, top), (right, top), (right, low), (left, low)] for left, top, right, low in slabs]
+    return [np.array(each, np.float32) + np.array([x0, y0], np.float32) for each in corners]

@@ -1,0 +1,143 @@
+"""Drawings seen from the side are a world without depth: the ground is a line, and things rest on what is beneath."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from drawn import Image, floor, jpeg, png_bytes
+from drawn import ball as shaded_ball
+
+from cow_service.requests import AnswerRequest
+from cow_service.service import Service
+from cow_service.vision.side_view import find_side_view, pieces_of
+
+WIDTH, HEIGHT, LEVEL = 640, 400, 330
+RED, BLUE, GREEN, ORANGE, BROWN, BLACK = (
+    (220, 40, 40), (40, 80, 220), (40, 160, 60), (240, 140, 30), (139, 90, 43), (20, 20, 20)
+)  # fmt: skip
+Colour = tuple[int, int, int]
+Paint = Callable[[Image], Any]
+
+
+def drawing(*things: Paint, sky: Colour = (255, 255, 255), ground: Colour | None = None, gap: int = 0) -> Image:
+    """Things on a line, or on a filled ground with a gap of a width in its middle."""
+    image = np.full((HEIGHT, WIDTH, 3), sky, np.uint8)
+    ends = [0, (WIDTH - gap) // 2, (WIDTH + gap) // 2, WIDTH] if gap else [0, WIDTH]
+    for left, right in list(pairwise(ends))[::2]:
+        low = LEVEL if ground is None else HEIGHT
+        cv2.rectangle(image, (left, LEVEL), (right, low), ground or BLACK, cv2.FILLED if ground else 3)
+    for paint in things:
+        paint(image)
+    return image
+
+
+def ball(x: int, radius: int, colour: Colour, bottom: int = LEVEL - 2, outline: bool = False) -> Paint:
+    def paint(image: Image) -> None:
+        cv2.circle(image, (x, bottom - radius), radius, colour, cv2.FILLED, cv2.LINE_AA)
+        if outline:
+            cv2.circle(image, (x, bottom - radius), radius, BLACK, 3, cv2.LINE_AA)
+
+    return paint
+
+
+def box(x: int, wide: int, high: int, colour: Colour, bottom: int = LEVEL - 2) -> Paint:
+    return lambda image: cv2.rectangle(image, (x - wide // 2, bottom - high), (x + wide // 2, bottom), colour, -1)
+
+
+def table(x: int, wide: int, high: int, colour: Colour) -> Paint:
+    def paint(image: Image) -> None:
+        box(x, wide, 16, colour, LEVEL - 2 - high + 16)(image)
+        for leg in (x - wide // 2 + 20, x + wide // 2 - 20):
+            box(leg, 14, high, colour)(image)
+
+    return paint
+
+
+def slope(left: int, right: int, high: int, colour: Colour) -> Paint:
+    corners = np.array([(left, LEVEL - 2), (right, LEVEL - 2), (left, LEVEL - 2 - high)])
+    return lambda image: cv2.fillPoly(image, [corners], colour, cv2.LINE_AA)
+
+
+ON_TABLE = LEVEL - 2 - 120
+CASES = {
+    "rolls into a box": (
+        drawing(ball(120, 30, RED), box(450, 80, 80, BLUE)),
+        "If the red ball rolls to the right, will it hit the blue box?", "Yes",
+    ),
+    "is stopped on its way": (
+        drawing(ball(100, 24, RED), box(300, 50, 110, BLACK), box(500, 60, 60, GREEN)),
+        "If the red ball rolls to the right, will it hit the green box?", "No",
+    ),
+    "falls onto a table": (
+        drawing(table(400, 260, 120, BROWN), ball(400, 22, RED, 92)),
+        "If the red ball falls, will it land on the table?", "Yes",
+    ),
+    "falls beside a table": (
+        drawing(table(420, 220, 120, BROWN), ball(120, 22, RED, 92), ground=GREEN),
+        "If the red ball falls, will it land on the table?", "No",
+    ),
+    "rolls over the edge of a table onto a box": (
+        drawing(table(200, 240, 120, BROWN), ball(250, 20, RED, ON_TABLE), box(420, 90, 40, BLUE)),
+        "If the red ball rolls to the right, will it hit the blue box?", "Yes",
+    ),
+    "stays on a table and passes over a box beneath": (
+        drawing(table(320, 600, 120, BROWN), ball(80, 20, RED, ON_TABLE), box(320, 60, 60, BLUE)),
+        "If the red ball rolls to the right, will it hit the blue box?", "No",
+    ),
+    "rolls down a slope": (
+        drawing(slope(60, 330, 150, GREEN), ball(95, 18, RED, LEVEL - 133), box(500, 70, 80, BLUE)),
+        "If the red ball is released, will it hit the blue box?", "Yes",
+    ),
+    "falls into a gap": (
+        drawing(ball(120, 22, RED), box(520, 60, 70, BLUE), ground=GREEN, gap=160),
+        "If the red ball rolls slowly to the right, will it hit the blue box?", "No",
+    ),
+    "is thrown in front of a wall": (
+        drawing(ball(400, 22, RED, 220), box(560, 40, 200, BLUE), sky=(200, 225, 255), ground=GREEN),
+        "If the red ball is thrown to the left, will it hit the blue box?", "No",
+    ),
+    "has an outline": (
+        drawing(ball(520, 30, ORANGE, outline=True), box(160, 70, 100, BLUE)),
+        "If the orange ball rolls towards the blue box, will it hit it?", "Yes",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("image", "question", "expected"), CASES.values(), ids=CASES)
+@pytest.mark.parametrize("compressed", [False, True])
+def test_what_happens_in_a_drawing(
+    service: Service, image: Image, question: str, expected: str, compressed: bool
+) -> None:
+    info = service.keep_image(png_bytes(jpeg(image) if compressed else image))
+    answer = service.answer(AnswerRequest.model_validate({"image": {"artifact": info.sha256}, "question": question}))
+    assert answer.simulation is not None, answer.warnings
+    camera = answer.simulation.trajectory.camera
+    assert camera is not None
+    assert camera.source == "side-view"
+    assert answer.answer == expected, answer.reasoning
+
+
+def test_a_table_that_is_not_seen_is_not_the_floor(service: Service) -> None:
+    info = service.keep_image(png_bytes(drawing(ball(120, 22, RED, 92), box(420, 120, 90, BLUE))))
+    question = "If the red ball falls, will it land on the table?"
+    answer = service.answer(AnswerRequest.model_validate({"image": {"artifact": info.sha256}, "question": question}))
+    assert answer.not_sure
+
+
+def test_a_picture_with_depth_is_no_side_view() -> None:
+    assert find_side_view(shaded_ball(floor(), (300, 180), 45, RED)) is None
+    before_the_line = drawing(ball(120, 30, RED), box(450, 80, 80, BLUE, LEVEL + 40))
+    assert find_side_view(before_the_line) is None
+
+
+def test_the_pieces_of_a_table_leave_the_room_beneath_it() -> None:
+    view = find_side_view(drawing(table(320, 240, 120, BROWN)))
+    assert view is not None
+    pieces = pieces_of(view.shapes[0])
+    assert len(pieces) == 3
+    assert not any(cv2.pointPolygonTest(each.reshape(-1, 1, 2), (320, LEVEL - 40), False) > 0 for each in pieces)
