@@ -22,7 +22,7 @@ from cow_service.stages.motion import read_motion
 from cow_service.vision.circles import Edges
 from cow_service.vision.scene import Scene
 from cow_service.vision.trail_removal import without_earlier_shadows
-from cow_service.vision.trails import Position, Trail, TrailEnd, find_trails, trail_of
+from cow_service.vision.trails import Position, Trail, find_trails, trail_of
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RENDERED = Path(__file__).parent / "data" / "rendered_trail.jpg"  # four positions of one ball
@@ -58,12 +58,9 @@ def test_the_opaque_end_of_a_faded_trail_is_the_present_position() -> None:
 def test_a_multiple_exposure_leaves_the_end_to_the_words() -> None:
     (found,) = find_trails(OPAQUE)
     assert not found.end_known
-    for end in (
-        TrailEnd(near=(460, 230, 530, 300)),
-        TrailEnd(side=(1.0, 0.0)),
-    ):
-        assert math.dist(found.ending(end).present.centre, PLACES[-1]) < 1.5
-    assert math.dist(found.ending(TrailEnd(side=(-1.0, 0.0))).present.centre, PLACES[0]) < 1.5
+    for ended in (found.ending(near=(460, 230, 530, 300)), found.ending(side=(1.0, 0.0))):
+        assert math.dist(ended.present.centre, PLACES[-1]) < 1.5
+    assert math.dist(found.ending(side=(-1.0, 0.0)).present.centre, PLACES[0]) < 1.5
 
 
 def test_what_is_no_trail() -> None:

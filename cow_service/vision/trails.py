@@ -103,26 +103,21 @@ class Trail:
         c, b, a = (position.centre for position in self.positions[-1:-4:-1])
         return (3 * c[0] - 4 * b[0] + a[0]) / 2, (3 * c[1] - 4 * b[1] + a[1]) / 2
 
-    def ending(self, end: TrailEnd) -> Trail:
-        """The same positions with the present one at an end."""
+    def ending(self, near: BBox | None = None, side: Vector | None = None) -> Trail:
+        """The same positions with the present one at the end nearest to a box, or farthest to a side, else as it shows.
+
+        A side is a direction in the image: (-1, 0) for the leftmost.
+        """
         ends = self.positions[0], self.positions[-1]
-        if end.near is not None:
-            x0, y0, x1, y1 = end.near
+        if near is not None:
+            x0, y0, x1, y1 = near
             gaps = [math.dist(position.centre, ((x0 + x1) / 2, (y0 + y1) / 2)) for position in ends]
-        elif end.side is not None:
-            gaps = [-position.x * end.side[0] - position.y * end.side[1] for position in ends]
+        elif side is not None:
+            gaps = [-position.x * side[0] - position.y * side[1] for position in ends]
         else:
             return self
         is_last = gaps[1] <= gaps[0]
         return Trail(self.positions if is_last else self.positions[::-1], self.evident, True)
-
-
-@dataclass(frozen=True)
-class TrailEnd:
-    """Which end of a trail is the present position: that nearest to a box, or farthest to a side, else as it shows."""
-
-    near: BBox | None = None  # of another object
-    side: Vector | None = None  # in the image: (-1, 0) for the leftmost
 
 
 def trail_of(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
