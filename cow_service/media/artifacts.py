@@ -54,6 +54,7 @@ class ListedArtifact:
 # Does what writes an artifact, and repeats it while the store is away. Raises `StorageUnavailable` after the last try,
 # and `Canceled`.
 RetryPolicy: TypeAlias = Callable[[Callable[[], Artifact]], Artifact]
+Put: TypeAlias = Callable[[bytes, str], Artifact]  # `ArtifactStore.put`
 
 
 def try_once(work: Callable[[], Artifact]) -> Artifact:
@@ -61,11 +62,15 @@ def try_once(work: Callable[[], Artifact]) -> Artifact:
     return work()
 
 
-class ArtifactWriter(ABC):
-    """Stores bytes under their digests. Every method raises `StorageUnavailable` where the store cannot be written."""
+class ArtifactStore(ABC):
+    """Stores, reads, lists and deletes bytes. Every method raises `StorageUnavailable` where that cannot be done.
+
+    Threads may share it.
+    """
 
     def __init__(self, scratch_folder: Path) -> None:
         self.scratch_folder = scratch_folder  # that of the store, or beside the jobs where the store has no folder
+        self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
     @abstractmethod
     def put(self, data: bytes, media_type: str) -> Artifact:
@@ -74,16 +79,9 @@ class ArtifactWriter(ABC):
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
 
-    def put_file(self, path: Path, media_type: str) -> Artifact:
-        """Moves in a finished file of `scratch`; afterwards `path` no longer exists. Raises as `put` does."""
-        with disk_errors():
-            artifact = self.put(path.read_bytes(), media_type)
-            path.unlink()
-        return artifact
-
     @contextmanager
     def scratch(self) -> Generator[Path]:
-        """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
+        """A path on this machine for a temporary file, which is deleted afterwards."""
         with disk_errors():
             self.scratch_folder.mkdir(parents=True, exist_ok=True)
         path = self.scratch_folder / f".{uuid4().hex}{TEMPORARY_SUFFIX}"
@@ -91,14 +89,6 @@ class ArtifactWriter(ABC):
             yield path
         finally:
             path.unlink(missing_ok=True)
-
-
-class ArtifactStore(ArtifactWriter):
-    """As a writer; reads, lists and deletes, too, and raises `StorageUnavailable` likewise. Threads may share it."""
-
-    def __init__(self, scratch_folder: Path) -> None:
-        super().__init__(scratch_folder)
-        self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
     @property
     @abstractmethod
@@ -134,13 +124,13 @@ class ArtifactStore(ArtifactWriter):
         """All artifacts, in no particular order."""
 
     @contextmanager
-    def batch(self, retry: RetryPolicy = try_once) -> Generator[ArtifactWriter]:
-        """A writer several of whose puts may run at the same time; all are done when its block ends.
+    def batch(self, retry: RetryPolicy = try_once) -> Generator[Put]:
+        """A `put` that may go on while its caller does; all that was put is there when the block ends.
 
         `retry` does each of them: what is written took long to make, and is not made again for an outage. The end of
         the block raises what any of them raises. Here they run one after another: a disk is no faster for many threads.
         """
-        yield _RetryingWriter(self, retry)
+        yield lambda data, media_type: retry(lambda: self.put(data, media_type))
 
     @abstractmethod
     def check(self) -> None:
@@ -295,17 +285,6 @@ class DiskArtifacts(ArtifactStore):
     def _mark_used(self, path: Path) -> None:
         os.utime(path)  # maintenance deletes by this time
         self._note_verified(path.stem, _version(path))
-
-
-class _RetryingWriter(ArtifactWriter):
-    """Waits while the disk is full or away."""
-
-    def __init__(self, store: ArtifactStore, retry: RetryPolicy) -> None:
-        super().__init__(store.scratch_folder)
-        self._store, self._retry = store, retry
-
-    def put(self, data: bytes, media_type: str) -> Artifact:
-        return self._retry(lambda: self._store.put(data, media_type))
 
 
 def _artifact_at(path: Path) -> Artifact:

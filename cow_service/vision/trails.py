@@ -184,12 +184,12 @@ class _Search:
             chain = self.between(near, a, b, inner)
             if chain is None:
                 continue
-            chain = self.beyond(self.beyond(chain)[::-1])
+            chain = self.extended(self.extended(chain)[::-1])
             if len(chain) > max(2, len(best)) and _is_path(chain) and self.are_alike(chain) and self.is_outlined(chain):
                 best = chain
         if not best:
             return None
-        chain = self.prolonged(self.prolonged(best)[::-1])[::-1]
+        chain = self.extended(self.extended(best, compared=False)[::-1], compared=False)[::-1]
         shares = self.opacities(chain, compared=False)
         if shares is None:
             return None
@@ -223,8 +223,12 @@ class _Search:
                 return whole
         return None
 
-    def beyond(self, chain: Chain) -> Chain:
-        """A chain with what goes on after its last circle."""
+    def extended(self, chain: Chain, compared: bool = True) -> Chain:
+        """A chain with what goes on after its last circle.
+
+        Where it is not compared with the others, for it may be too pale or too much overlaid, it must lie exactly where
+        the path of three or more leads.
+        """
         while len(chain) < MAX_POSITIONS:
             last, before = chain[-1], chain[-2]
             dx, dy = last.x - before.x, last.y - before.y
@@ -234,28 +238,17 @@ class _Search:
             else:
                 turns = [(math.cos(angle), math.sin(angle)) for angle in (-0.35, 0.35, -0.7, 0.7)]
                 seeds += [(last.x + dx * c - dy * s, last.y + dx * s + dy * c) for c, s in turns]
-            for x, y in seeds:
-                found = _fit_near(self.edges, x, y, last.radius**2 / before.radius)
-                if found is None or any(found.is_same(other) for other in chain):
+            for x, y in seeds if compared else seeds[:1]:
+                found = _fit_near(self.edges, x, y, last.radius**2 / before.radius if compared else last.radius)
+                if found is None or any(found.is_same(other) for other in chain) or not _is_path((*chain, found)):
                     continue
-                if _is_path((*chain, found)) and self.are_alike((*chain, found)):
+                is_predicted = math.dist(found.centre, (x, y)) < PREDICTED * found.radius
+                is_seen = found.support >= PALE_SUPPORT and self.contrast(found) >= LEAST_CONTRAST / 2
+                if self.are_alike((*chain, found)) if compared else is_predicted and is_seen:
                     chain = (*chain, found)
                     break
             else:
                 break
-        return chain
-
-    def prolonged(self, chain: Chain) -> Chain:
-        """A chain with circles that its path leads on to, though too pale, or too much overlaid, to be compared."""
-        while len(chain) < MAX_POSITIONS:
-            x, y = (3 * getattr(chain[-1], at) - 3 * getattr(chain[-2], at) + getattr(chain[-3], at) for at in "xy")
-            found = _fit_near(self.edges, x, y, chain[-1].radius)
-            if found is None or found.support < PALE_SUPPORT or any(found.is_same(other) for other in chain):
-                break
-            near = math.dist(found.centre, (x, y)) < PREDICTED * found.radius
-            if not near or not _is_path((*chain, found)) or self.contrast(found) < LEAST_CONTRAST / 2:
-                break
-            chain = (*chain, found)
         return chain
 
     def is_outlined(self, chain: Chain) -> bool:
@@ -350,8 +343,7 @@ def _is_free(chain: Chain, i: int, offsets: Floats, factor: float) -> Mask:
 def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
     """The circle with most edges on it within half a radius of a place."""
     near: list[Circle] = []
-    places = np.array([x, y]) + radius * AROUND
-    for column, row in places[edges.may_fit(places, radius)].tolist():
+    for column, row in (np.array([x, y]) + radius * AROUND).tolist():
         found = edges.fit(column, row, radius)
         if found is None or not 1 / SIZES < found.radius / radius < SIZES:
             continue
