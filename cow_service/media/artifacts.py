@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import TypeAlias
 from uuid import uuid4
 
 from filelock import FileLock
@@ -169,10 +169,7 @@ class DiskArtifacts(ArtifactStore):
             self._folder.mkdir(parents=True, exist_ok=True)
             with FileLock(self._folder / "name.lock"):
                 if not name.exists():
-                    with self.scratch() as temporary:
-                        with temporary.open("x") as file:
-                            file.write(uuid4().hex)
-                            _sync(file)
+                    with self._written(uuid4().hex.encode()) as temporary:
                         _move(temporary, name)
                 return f"folder:{name.read_text()}"
 
@@ -184,18 +181,14 @@ class DiskArtifacts(ArtifactStore):
             if known := self._find_intact(sha256):
                 self._mark_used(known)
                 return _artifact_at(known)
-            with self.scratch() as temporary:
-                with temporary.open("xb") as file:
-                    file.write(data)
-                    _sync(file)
-                # Two threads may store the same bytes under two media types: the first one decides.
-                with self._commit_lock:
-                    stored = self._find_intact(sha256)
-                    if stored is None:
-                        stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
-                        stored.parent.mkdir(parents=True, exist_ok=True)
-                        _move(temporary, stored)
-                        self._note_verified(sha256, _version(stored))
+            # Two threads may store the same bytes under two media types: the first one decides.
+            with self._written(data) as temporary, self._commit_lock:
+                stored = self._find_intact(sha256)
+                if stored is None:
+                    stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
+                    stored.parent.mkdir(parents=True, exist_ok=True)
+                    _move(temporary, stored)
+                    self._note_verified(sha256, _version(stored))
             return _artifact_at(stored)
 
     def get(self, sha256: str) -> Artifact:
@@ -246,9 +239,18 @@ class DiskArtifacts(ArtifactStore):
 
     def check(self) -> None:
         """Writes, syncs and removes a small file."""
-        with disk_errors(), self.scratch() as temporary, temporary.open("xb") as file:
-            file.write(b"\0")
-            _sync(file)
+        with disk_errors(), self._written(b"\0"):
+            pass
+
+    @contextmanager
+    def _written(self, data: bytes) -> Generator[Path]:
+        """A temporary file of these bytes, which are on the disk."""
+        with self.scratch() as path:
+            with path.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            yield path
 
     def _find(self, sha256: str) -> Path | None:
         for extension in MEDIA_TYPES.values():
@@ -296,11 +298,6 @@ def _version(path: Path) -> tuple[int, ...]:
     """What changes with the bytes of a file, unless the disk itself damages them."""
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def _sync(file: IO[Any]) -> None:
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def _move(temporary: Path, stored: Path) -> None:

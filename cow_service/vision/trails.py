@@ -18,7 +18,7 @@ import numpy as np
 from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
 from cow_service.vision.masks import iou
-from cow_service.vision.types import Floats, Image, Mask
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08
@@ -306,9 +306,14 @@ class _Search:
 
     def colours(self, circle: Circle, offsets: Floats) -> Floats:
         """Colours [N, 3] at offsets [N, 2] (radii) from a circle's centre."""
-        xs = np.clip(circle.x + circle.radius * offsets[:, 0], 0, self.image.shape[1] - 1).astype(int)
-        ys = np.clip(circle.y + circle.radius * offsets[:, 1], 0, self.image.shape[0] - 1).astype(int)
-        return self.image[ys, xs].astype(np.float64)
+        return sampled(self.image, circle, offsets[:, 0], offsets[:, 1]).astype(np.float64)
+
+
+def sampled(image: Image, of: Circle | Position, u: Floats | Floats32, v: Floats | Floats32) -> Image:
+    """Colours [..., 3] at offsets [...] (radii) right and down from a centre, or next to them in the image."""
+    xs = np.clip(of.x + of.radius * u, 0, image.shape[1] - 1).astype(int)
+    ys = np.clip(of.y + of.radius * v, 0, image.shape[0] - 1).astype(int)
+    return image[ys, xs]
 
 
 def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
