@@ -85,11 +85,6 @@ def test_a_hollow_arrow_is_measured(
     assert np.abs(scene.clean.astype(int) - floor())[scene.cues].mean() < 12
 
 
-def test_head_style_is_told() -> None:
-    arrows = [DrawnArrow((200, 200), 0.3, 120, 5, COLOURS["red"], style) for style in ("filled", "open")]
-    assert [Scene(jpeg(arrow.on(floor()))).arrows[0].filled for arrow in arrows] == [True, False]
-
-
 def test_large_images_are_measured_in_their_own_pixels() -> None:
     arrow = DrawnArrow((900, 700), 2.2, 500, 16, COLOURS["red"], "filled")
     found = Scene(arrow.on(floor(2000, 1500))).arrows

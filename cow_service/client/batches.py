@@ -14,6 +14,7 @@ from cow_service.client import errors
 from cow_service.client.journal import Journal, Question, QuestionLike, questions
 from cow_service.client.options import CONCURRENCY
 from cow_service.client.progress import BatchProgress, progress_shown
+from cow_service.client.protocol import RETRYABLE
 from cow_service.client.request import JobRequest, job_request
 from cow_service.records import JobKind
 
@@ -21,15 +22,7 @@ MAX_OUTAGE_SECONDS = 300.0  # without any response, after which a batch ends; it
 RETRY_SECONDS = 2.0  # before a question is sent again that the server could not accept
 # Every other question would meet these, too.
 _FATAL = (errors.Unauthorized, errors.OriginNotAllowed, errors.MethodNotAllowed, errors.NotFound)
-TRANSIENT = (
-    errors.ServerUnreachable,
-    errors.ShuttingDown,
-    errors.QueueFull,
-    errors.RateLimited,
-    errors.NotReady,
-    errors.StorageUnavailable,
-    errors.BodyTooSlow,
-)
+TRANSIENT = (*RETRYABLE, errors.ServerUnreachable, errors.StorageUnavailable)
 
 R_co = TypeVar("R_co", bound=records.Simulation | records.Answer, covariant=True)
 

@@ -91,7 +91,8 @@ def endpoint_of(base_url: str | None, api_key: str | None, timeout: float | http
 MAX_RETRY_AFTER_SECONDS = 60.0  # a server that asks for more is asked again after this time
 FIRST_BACKOFF_SECONDS, BACKOFF_GROWTH, MAX_BACKOFF_SECONDS = 0.5, 2.0, 8.0  # without a Retry-After
 # Refusals before a job is made. What a job has failed with is final: the same key would return it again.
-RETRYABLE_CODES = frozenset({"queue-full", "rate-limited", "shutting-down", "not-ready", "body-too-slow"})
+RETRYABLE = (errors.QueueFull, errors.RateLimited, errors.ShuttingDown, errors.NotReady, errors.BodyTooSlow)
+RETRYABLE_CODES = frozenset(kind.code for kind in RETRYABLE)
 RETRYABLE_STATUS = frozenset({408, 425, 429, 502, 503, 504})  # of a proxy in front of the server
 _BROKEN_CONNECTION = (httpx.NetworkError, httpx.TimeoutException, httpx.RemoteProtocolError)
 

@@ -20,7 +20,13 @@ from cow_service.errors import CowError
 Q = TypeVar("Q")
 R = TypeVar("R")
 END_SECONDS = 0.5  # that threads are given to end before their connections are closed
-_thread = threading.local()  # `stop`: the event that ends what a thread of `map_concurrently` does
+
+
+class _Thread(threading.local):
+    stop: threading.Event | None = None  # ends what a thread of `map_concurrently` does
+
+
+_thread = _Thread()
 
 
 class Stopped(BaseException):
@@ -76,8 +82,7 @@ class BlockingIO:
 
     async def request(self, method: str, url: str, **arguments: Any) -> httpx.Response:
         """The response to a request. Raises `Stopped` in a thread whose batch has ended."""
-        stop = _stop()
-        if stop is not None and stop.is_set():
+        if _thread.stop is not None and _thread.stop.is_set():
             raise Stopped
         return self.http.request(method, url, **arguments)
 
@@ -98,10 +103,9 @@ class BlockingIO:
 
     async def sleep(self, seconds: float) -> None:
         """Waits. Raises `Stopped`."""
-        stop = _stop()
-        if stop is None:
+        if _thread.stop is None:
             time.sleep(seconds)
-        elif stop.wait(seconds):
+        elif _thread.stop.wait(seconds):
             raise Stopped
 
     async def call_blocking(self, function: Callable[[], R]) -> R:
@@ -110,7 +114,7 @@ class BlockingIO:
 
     async def shield(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Does work to its end even in a thread that was stopped."""
-        stop, _thread.stop = _stop(), None
+        stop, _thread.stop = _thread.stop, None
         try:
             await work()
         finally:
@@ -165,8 +169,3 @@ class BlockingIO:
             until = time.monotonic() + END_SECONDS
             for thread in threads:
                 thread.join(max(0.0, until - time.monotonic()))
-
-
-def _stop() -> threading.Event | None:
-    """What ends the work of this thread, where it works for a batch."""
-    return getattr(_thread, "stop", None)

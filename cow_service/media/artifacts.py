@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import TypeAlias
 from uuid import uuid4
 
 from filelock import FileLock
@@ -54,6 +54,7 @@ class ListedArtifact:
 # Does what writes an artifact, and repeats it while the store is away. Raises `StorageUnavailable` after the last try,
 # and `Canceled`.
 RetryPolicy: TypeAlias = Callable[[Callable[[], Artifact]], Artifact]
+Put: TypeAlias = Callable[[bytes, str], Artifact]  # `ArtifactStore.put`
 
 
 def try_once(work: Callable[[], Artifact]) -> Artifact:
@@ -61,11 +62,15 @@ def try_once(work: Callable[[], Artifact]) -> Artifact:
     return work()
 
 
-class ArtifactWriter(ABC):
-    """Stores bytes under their digests. Every method raises `StorageUnavailable` where the store cannot be written."""
+class ArtifactStore(ABC):
+    """Stores, reads, lists and deletes bytes. Every method raises `StorageUnavailable` where that cannot be done.
+
+    Threads may share it.
+    """
 
     def __init__(self, scratch_folder: Path) -> None:
         self.scratch_folder = scratch_folder  # that of the store, or beside the jobs where the store has no folder
+        self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
     @abstractmethod
     def put(self, data: bytes, media_type: str) -> Artifact:
@@ -74,16 +79,9 @@ class ArtifactWriter(ABC):
         Raises `ValueError` if the media type is not in `MEDIA_TYPES`.
         """
 
-    def put_file(self, path: Path, media_type: str) -> Artifact:
-        """Moves in a finished file of `scratch`; afterwards `path` no longer exists. Raises as `put` does."""
-        with disk_errors():
-            artifact = self.put(path.read_bytes(), media_type)
-            path.unlink()
-        return artifact
-
     @contextmanager
     def scratch(self) -> Generator[Path]:
-        """A path on this machine for a temporary file; deleted afterwards unless `put_file` moved it."""
+        """A path on this machine for a temporary file, which is deleted afterwards."""
         with disk_errors():
             self.scratch_folder.mkdir(parents=True, exist_ok=True)
         path = self.scratch_folder / f".{uuid4().hex}{TEMPORARY_SUFFIX}"
@@ -91,14 +89,6 @@ class ArtifactWriter(ABC):
             yield path
         finally:
             path.unlink(missing_ok=True)
-
-
-class ArtifactStore(ArtifactWriter):
-    """As a writer; reads, lists and deletes, too, and raises `StorageUnavailable` likewise. Threads may share it."""
-
-    def __init__(self, scratch_folder: Path) -> None:
-        super().__init__(scratch_folder)
-        self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
     @property
     @abstractmethod
@@ -134,13 +124,13 @@ class ArtifactStore(ArtifactWriter):
         """All artifacts, in no particular order."""
 
     @contextmanager
-    def batch(self, retry: RetryPolicy = try_once) -> Generator[ArtifactWriter]:
-        """A writer several of whose puts may run at the same time; all are done when its block ends.
+    def batch(self, retry: RetryPolicy = try_once) -> Generator[Put]:
+        """A `put` that may go on while its caller does; all that was put is there when the block ends.
 
         `retry` does each of them: what is written took long to make, and is not made again for an outage. The end of
         the block raises what any of them raises. Here they run one after another: a disk is no faster for many threads.
         """
-        yield _RetryingWriter(self, retry)
+        yield lambda data, media_type: retry(lambda: self.put(data, media_type))
 
     @abstractmethod
     def check(self) -> None:
@@ -179,10 +169,7 @@ class DiskArtifacts(ArtifactStore):
             self._folder.mkdir(parents=True, exist_ok=True)
             with FileLock(self._folder / "name.lock"):
                 if not name.exists():
-                    with self.scratch() as temporary:
-                        with temporary.open("x") as file:
-                            file.write(uuid4().hex)
-                            _sync(file)
+                    with self._written(uuid4().hex.encode()) as temporary:
                         _move(temporary, name)
                 return f"folder:{name.read_text()}"
 
@@ -194,18 +181,14 @@ class DiskArtifacts(ArtifactStore):
             if known := self._find_intact(sha256):
                 self._mark_used(known)
                 return _artifact_at(known)
-            with self.scratch() as temporary:
-                with temporary.open("xb") as file:
-                    file.write(data)
-                    _sync(file)
-                # Two threads may store the same bytes under two media types: the first one decides.
-                with self._commit_lock:
-                    stored = self._find_intact(sha256)
-                    if stored is None:
-                        stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
-                        stored.parent.mkdir(parents=True, exist_ok=True)
-                        _move(temporary, stored)
-                        self._note_verified(sha256, _version(stored))
+            # Two threads may store the same bytes under two media types: the first one decides.
+            with self._written(data) as temporary, self._commit_lock:
+                stored = self._find_intact(sha256)
+                if stored is None:
+                    stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
+                    stored.parent.mkdir(parents=True, exist_ok=True)
+                    _move(temporary, stored)
+                    self._note_verified(sha256, _version(stored))
             return _artifact_at(stored)
 
     def get(self, sha256: str) -> Artifact:
@@ -256,9 +239,18 @@ class DiskArtifacts(ArtifactStore):
 
     def check(self) -> None:
         """Writes, syncs and removes a small file."""
-        with disk_errors(), self.scratch() as temporary, temporary.open("xb") as file:
-            file.write(b"\0")
-            _sync(file)
+        with disk_errors(), self._written(b"\0"):
+            pass
+
+    @contextmanager
+    def _written(self, data: bytes) -> Generator[Path]:
+        """A temporary file of these bytes, which are on the disk."""
+        with self.scratch() as path:
+            with path.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            yield path
 
     def _find(self, sha256: str) -> Path | None:
         for extension in MEDIA_TYPES.values():
@@ -297,17 +289,6 @@ class DiskArtifacts(ArtifactStore):
         self._note_verified(path.stem, _version(path))
 
 
-class _RetryingWriter(ArtifactWriter):
-    """Waits while the disk is full or away."""
-
-    def __init__(self, store: ArtifactStore, retry: RetryPolicy) -> None:
-        super().__init__(store.scratch_folder)
-        self._store, self._retry = store, retry
-
-    def put(self, data: bytes, media_type: str) -> Artifact:
-        return self._retry(lambda: self._store.put(data, media_type))
-
-
 def _artifact_at(path: Path) -> Artifact:
     media_type = next(name for name, extension in MEDIA_TYPES.items() if path.suffix == f".{extension}")
     return artifact_of(path.stem, media_type, path.stat().st_size)
@@ -317,11 +298,6 @@ def _version(path: Path) -> tuple[int, ...]:
     """What changes with the bytes of a file, unless the disk itself damages them."""
     status = path.stat()
     return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def _sync(file: IO[Any]) -> None:
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def _move(temporary: Path, stored: Path) -> None:

@@ -65,20 +65,21 @@ _TRANSPOSE_TO_UPRIGHT = {  # by EXIF orientation
     8: Image.Transpose.ROTATE_90,
 }
 
-_FOREIGN_SIGNATURES = (
-    (b"GIF8", "a GIF file"),
-    (b"BM", "a BMP file"),
-    (b"II*\0", "a TIFF file"),
-    (b"MM\0*", "a TIFF file"),
-    (b"%PDF", "a PDF file"),
-    (b"8BPS", "a Photoshop file"),
-    (b"PK\3\4", "a ZIP archive"),
-    (b"data:", "a data URL"),
-    (b"iVBORw0KGgo", "base64 text, not decoded"),
-    (b"/9j/", "base64 text, not decoded"),
-    (b"UklGR", "base64 text, not decoded"),
-)
-_ISO_BRANDS = {b"avif": "an AVIF file", b"avis": "an AVIF file", b"heic": "a HEIC file", b"mif1": "a HEIF file"}
+_FOREIGN = {  # by what their first bytes match
+    rb"GIF8": "a GIF file",
+    rb"BM": "a BMP file",
+    rb"II\*\0|MM\0\*": "a TIFF file",
+    rb"%PDF": "a PDF file",
+    rb"8BPS": "a Photoshop file",
+    rb"PK\x03\x04": "a ZIP archive",
+    rb"data:": "a data URL",
+    rb"iVBORw0KGgo|/9j/|UklGR": "base64 text, not decoded",
+    rb".{4}ftypavi[fs]": "an AVIF file",
+    rb".{4}ftyp(heic|mif1)": "a HEIC file",
+    rb".{4}ftyp": "an MP4 or other ISO media file",
+    rb"(?i:(\xef\xbb\xbf)?\s*(<svg|(<\?xml|<!--|<!doctype svg).*<svg))": "an SVG file",
+    rb"(?i:(\xef\xbb\xbf)?\s*(<!doctype html|<html))": "an HTML page",
+}
 _SNIFFED_BYTES = 1024
 
 
@@ -226,16 +227,9 @@ def tiled(frames: Sequence[NDArray[np.uint8]], columns: int, gap: int, grey: int
 
 def _describe_foreign(data: bytes) -> str:
     head = data[:_SNIFFED_BYTES]
-    for signature, name in _FOREIGN_SIGNATURES:
-        if head.startswith(signature):
+    for pattern, name in _FOREIGN.items():
+        if re.match(pattern, head, re.DOTALL):
             return name
-    if head[4:8] == b"ftyp":
-        return _ISO_BRANDS.get(head[8:12], "an MP4 or other ISO media file")
-    markup = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
-    if markup.startswith(b"<svg") or (markup.startswith((b"<?xml", b"<!--", b"<!doctype svg")) and b"<svg" in markup):
-        return "an SVG file"
-    if markup.startswith((b"<!doctype html", b"<html")):
-        return "an HTML page"
     try:
         # An incremental decoder waits for the rest of a character that the end of the sample cut in two.
         text = codecs.getincrementaldecoder("utf-8")().decode(head)

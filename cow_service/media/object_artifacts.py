@@ -141,12 +141,18 @@ class ObjectArtifacts(artifacts.ArtifactStore):
                         yield artifacts.ListedArtifact(one["path"], one["size"], one["last_modified"].timestamp())
 
     @contextmanager
-    def batch(self, retry: artifacts.RetryPolicy = artifacts.try_once) -> Generator[artifacts.ArtifactWriter]:
-        """Sends in threads."""
+    def batch(self, retry: artifacts.RetryPolicy = artifacts.try_once) -> Generator[artifacts.Put]:
+        """Sends in threads. The `put` belongs to one thread."""
+        sent: list[Future[Artifact]] = []
         with ThreadPoolExecutor(MAX_PARALLEL, thread_name_prefix="cow-artifacts") as pool:
-            writer = _ParallelWriter(self, retry, pool)
-            yield writer
-            for each in writer.sent:
+
+            def put(data: bytes, media_type: str) -> Artifact:
+                artifacts.extension_of(media_type)
+                sent.append(pool.submit(retry, partial(self.put, data, media_type)))
+                return artifacts.artifact_of(hashlib.sha256(data).hexdigest(), media_type, len(data))
+
+            yield put
+            for each in sent:
                 each.result()
 
     def check(self) -> None:
@@ -187,20 +193,6 @@ class ObjectArtifacts(artifacts.ArtifactStore):
 
     def _is_verified(self, found: _Object) -> bool:
         return found.e_tag is not None and self._verified.get(found.artifact.sha256) == found.e_tag
-
-
-class _ParallelWriter(artifacts.ArtifactWriter):
-    """Hands the bytes to other threads. It belongs to one thread."""
-
-    def __init__(self, store: ObjectArtifacts, retry: artifacts.RetryPolicy, threads: ThreadPoolExecutor) -> None:
-        super().__init__(store.scratch_folder)
-        self._store, self._retry, self._threads = store, retry, threads
-        self.sent: list[Future[Artifact]] = []
-
-    def put(self, data: bytes, media_type: str) -> Artifact:
-        artifacts.extension_of(media_type)
-        self.sent.append(self._threads.submit(self._retry, partial(self._store.put, data, media_type)))
-        return artifacts.artifact_of(hashlib.sha256(data).hexdigest(), media_type, len(data))
 
 
 def _object(sha256: str, result: "obstore.GetResult") -> _Object:

@@ -11,7 +11,7 @@ import numpy as np
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.interventions import with_put, without_removed
-from cow_service.media.artifacts import ArtifactWriter
+from cow_service.media.artifacts import Put, disk_errors
 from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import DARK, LIGHT, Label, Replaced, draw_labels, draw_overlay
 from cow_service.records import Clip, Frame, GeneratorInfo, Grounding, Motion, Trajectory, Video
@@ -41,9 +41,9 @@ class EncodedFrame:
         return EncodedFrame(index, index / fps, width, height, encoder.submit(encode_png, picture))
 
 
-def stored(frames: Sequence[EncodedFrame], artifacts: ArtifactWriter) -> tuple[Frame, ...]:
+def stored(frames: Sequence[EncodedFrame], put: Put) -> tuple[Frame, ...]:
     """Waits for the PNGs and stores them."""
-    kept = [artifacts.put(frame.png.result(), "image/png") for frame in frames]
+    kept = [put(frame.png.result(), "image/png") for frame in frames]
     return tuple(
         Frame(
             index=frame.index,
@@ -109,12 +109,12 @@ def generate(
 
     Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.
     """
-    with run.backends.artifacts.batch(run.retry_policy) as artifacts, ThreadPoolExecutor(1) as encoder:
+    with run.backends.artifacts.batch(run.retry_policy) as put, ThreadPoolExecutor(1) as encoder:
         with run.cpu():
             given, as_it_is = _inputs(run, grounding, motion, trajectory)
         made_by = run.generator.describe(given)
         with run.device():
-            frames, video = _render(run, given, made_by, artifacts, encoder)
+            frames, video = _render(run, given, made_by, put, encoder)
             factual: list[EncodedFrame] = []
             # Those of the scene as it is cost as much as the clip: on a device, made only where they are asked for.
             wanted, is_cheap = run.request.frames, run.generator.concurrency is None
@@ -128,10 +128,10 @@ def generate(
         with run.cpu():
             overlay = _draw_overlay(run.image.pixels, given, as_it_is or given)
         clip = Clip(
-            frames=stored(frames, artifacts),
-            factual_frames=stored(factual, artifacts),
+            frames=stored(frames, put),
+            factual_frames=stored(factual, put),
             video=video,
-            overlay=artifacts.put(overlay, "image/jpeg"),
+            overlay=put(overlay, "image/jpeg"),
             generator=made_by,
         )
     named = (*clip.frames, *clip.factual_frames, *([] if video is None else [video]), clip.overlay)
@@ -183,11 +183,7 @@ def _draw_overlay(image: Image, given: GeneratorInput, as_it_is: GeneratorInput)
 
 
 def _render(
-    run: Run[SimulateRequest],
-    given: GeneratorInput,
-    made_by: GeneratorInfo,
-    artifacts: ArtifactWriter,
-    encoder: Executor,
+    run: Run[SimulateRequest], given: GeneratorInput, made_by: GeneratorInfo, put: Put, encoder: Executor
 ) -> tuple[list[EncodedFrame], Video | None]:
     """The chosen frames, and the video of all of them. Only those that are needed are rendered."""
     generator, request, trajectory = run.generator, run.request, given.trajectory
@@ -210,9 +206,11 @@ def _render(
     from cow_service.media.video import write_mp4  # noqa: PLC0415 # FFmpeg's bindings take long to import
 
     width, height = generator.size(given.scene.width, given.scene.height)
-    with artifacts.scratch() as path:
+    with run.backends.artifacts.scratch() as path:
         count = write_mp4(clip(), path, fps=trajectory.fps, width=width, height=height)
-        artifact = artifacts.put_file(path, "video/mp4")
+        with disk_errors():
+            data = path.read_bytes()
+        artifact = put(data, "video/mp4")
     return frames, Video(
         url=artifact.url,
         sha256=artifact.sha256,

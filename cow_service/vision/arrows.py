@@ -5,6 +5,8 @@ is that of a shaft followed by a head that tapers to a tip, and if an ideal arro
 Objects of a scene (bottles, cones, pencils) fail one of the two.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Iterable
@@ -30,8 +32,6 @@ class Arrow:
 
     tail: Point
     tip: Point
-    colour: tuple[int, int, int]  # RGB
-    filled: bool
     mask: Mask  # [H, W]: the drawing with its outline and its fringe
     fit: float  # intersection over union with the ideal arrow, 0..1
 
@@ -52,19 +52,19 @@ class Arrow:
 
 def find_arrows(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[Arrow, ...]:
     """Drawn arrows among the strokes of an image; overlapping findings are one."""
-    found: list[tuple[_Shape, Stroke]] = []
+    found: list[tuple[float, _Profile, Stroke]] = []
     for stroke in strokes:
         corners = np.array([stroke.x, stroke.y, *stroke.patch.shape])  # drawings can be found twice
-        known = [other for shape, other in found if shape.fit > CERTAIN_FIT]
+        known = [other for fit, _, other in found if fit > CERTAIN_FIT]
         if any((np.abs(corners - [other.x, other.y, *other.patch.shape]) <= 3).all() for other in known):
             continue
-        shape = fit_arrow(stroke.patch, stroke.hollow)
-        if shape is not None:
-            found.append((shape, stroke))
-    found.sort(key=lambda item: -item[0].fit * np.linalg.norm(item[0].tip - item[0].tail) ** 0.25)
+        fitted = fit_arrow(stroke.patch, stroke.hollow)
+        if fitted is not None:
+            found.append((*fitted, stroke))
+    found.sort(key=lambda item: -item[0] * np.linalg.norm(item[1].tip - item[1].tail) ** 0.25)
     arrows: list[Arrow] = []
     taken = np.zeros(image.pixels.shape[:2], bool)
-    for shape, stroke in found:
+    for fit, shape, stroke in found:
         h, w = stroke.patch.shape
         if (taken[stroke.y : stroke.y + h, stroke.x : stroke.x + w] & stroke.patch).sum() > 0.2 * stroke.patch.sum():
             continue
@@ -72,20 +72,12 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[Arrow, 
         taken |= mask
         offset = np.array([stroke.x, stroke.y])
         tail, tip = (((point + offset + 0.5) / image.scale - 0.5).tolist() for point in (shape.tail, shape.tip))
-        arrows.append(Arrow(tuple(tail), tuple(tip), stroke.colour, shape.filled, image.full(mask), shape.fit))
+        arrows.append(Arrow(tuple(tail), tuple(tip), image.full(mask), fit))
     return tuple(arrows)
 
 
-@dataclass(frozen=True)
-class _Shape:
-    tail: Floats
-    tip: Floats
-    filled: bool
-    fit: float
-
-
-def fit_arrow(patch: Mask, hollow: bool = False) -> _Shape | None:
-    """The arrow that a patch [h, w] is, or None. Coordinates are those of the patch.
+def fit_arrow(patch: Mask, hollow: bool) -> tuple[float, _Profile] | None:
+    """How well a patch [h, w] fits the arrow that it is, and that arrow in the patch's coordinates; None for no arrow.
 
     A `hollow` drawing has two flat colours, which no object of a scene has: its head need not be much wider than its
     shaft. Shaft and head are read off the width profile along an axis from tail to tip, which is refined on the shaft.
@@ -99,7 +91,7 @@ def fit_arrow(patch: Mask, hollow: bool = False) -> _Shape | None:
     gaps = hull[:, None] - hull[None]
     i, j = np.unravel_index(int((gaps**2).sum(axis=2).argmax()), (len(hull), len(hull)))
     diameter = (hull[i] - hull[j]).astype(np.float64)
-    best: _Shape | None = None
+    best: tuple[float, _Profile] | None = None
     for axis, sign in itertools.product((vectors[:, 1], diameter / np.linalg.norm(diameter)), (1.0, -1.0)):
         profile = _profile(points, centre, sign * axis, least_head)
         for _ in range(2):
@@ -107,10 +99,9 @@ def fit_arrow(patch: Mask, hollow: bool = False) -> _Shape | None:
                 profile = _profile(points, profile.centre, profile.axis, least_head)
         if profile is None or not profile.is_arrow_like():
             continue
-        for filled in (True, False):
-            fit = profile.overlap(patch, filled)
-            if fit >= least_fit and (best is None or fit > best.fit):
-                best = _Shape(profile.tail, profile.tip, filled, fit)
+        fit = max(profile.overlap(patch, filled) for filled in (True, False))
+        if fit >= least_fit and (best is None or fit > best[0]):
+            best = fit, profile
     return best
 
 
@@ -222,7 +213,6 @@ class DrawnBox:
     """A rectangle drawn over the image to mark something. It does not say what."""
 
     bbox: BBox  # x0, y0, x1, y1, px: inside the line
-    colour: tuple[int, int, int]  # RGB
     mask: Mask  # [H, W]: the line with its fringe
 
 
@@ -250,6 +240,5 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox
         inner = (stroke.x + line, stroke.y + line, stroke.x + w - line, stroke.y + h - line)
         x0, y0, x1, y1 = (value / image.scale for value in inner)
         if all(np.abs(np.array(box.bbox) - (x0, y0, x1, y1)).max() >= 8 / image.scale for box in boxes):
-            mask = image.full(drawing_mask(image.pixels, stroke))
-            boxes.append(DrawnBox((x0, y0, x1, y1), stroke.colour, mask))
+            boxes.append(DrawnBox((x0, y0, x1, y1), image.full(drawing_mask(image.pixels, stroke))))
     return tuple(sorted(boxes, key=lambda box: -(box.bbox[2] - box.bbox[0]) * (box.bbox[3] - box.bbox[1])))

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cow_service.records import BBox, Point
 from cow_service.vision.contrast import lab_gradients
@@ -150,15 +149,6 @@ class Edges:
         fx, fy = self.stretch
         return self._fitted(x / fx - 0.5, y / fy - 0.5, 2 * radius / (fx + fy))
 
-    def may_fit(self, places: Floats, radius: float) -> Mask:
-        """Which of circles of the image around `places` [K, 2] (px) have enough edges near them for `fit`."""
-        fx, fy = self.stretch
-        x, y, radius = places[:, :1] / fx - 0.5, places[:, 1:] / fy - 0.5, 2 * radius / (fx + fy)
-        near = self._near(x.min(), y.min(), x.max(), y.max(), radius)
-        reach = max(2.0, FIRST_REACH * radius)
-        on, _, _ = _on_circle(self.points[near], self.normals[near], x, y, radius, reach)
-        return np.count_nonzero(on, axis=1) >= LEAST_ON
-
     def notch(self, a: Circle, b: Circle) -> float | None:
         """How deep the outline is notched where two circles overlap: 1 as theirs is, 0 as straight as a bottle's side.
 
@@ -187,7 +177,10 @@ class Edges:
 
     def _fitted(self, x: float, y: float, radius: float) -> Circle | None:
         """The circle by least squares over the edges near one of the working size, twice; None where few lie on it."""
-        near = self._near(x, y, x, y, radius)
+        reach = 1.6 * radius
+        first, last = np.searchsorted(self.points[:, 1], (y - reach, y + reach))
+        columns = self.points[first:last, 0]
+        near = first + np.nonzero((columns > x - reach) & (columns < x + reach))[0]
         points, normals = self.points[near], self.normals[near]
         for share in (FIRST_REACH, SECOND_REACH):
             on, across, down = _on_circle(points, normals, x, y, radius, max(2.0, share * radius))
@@ -204,13 +197,6 @@ class Edges:
             return None
         fx, fy = self.stretch
         return Circle(float((x + 0.5) * fx), float((y + 0.5) * fy), radius * (fx + fy) / 2, bins)
-
-    def _near(self, left: float, top: float, right: float, bottom: float, radius: float) -> NDArray[np.intp]:
-        """Indices of the edges that circles around the places of a box may lie on."""
-        reach = 1.6 * radius
-        first, last = np.searchsorted(self.points[:, 1], (top - reach, bottom + reach))
-        columns = self.points[first:last, 0]
-        return first + np.nonzero((columns > left - reach) & (columns < right + reach))[0]
 
 
 def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:
@@ -229,12 +215,9 @@ def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:
 
 
 def _on_circle(
-    points: Floats, normals: Floats, x: Floats | float, y: Floats | float, radius: float, reach: float
+    points: Floats, normals: Floats, x: float, y: float, radius: float, reach: float
 ) -> tuple[Mask, Floats, Floats]:
-    """Which edges [N] lie within `reach` px of a circle and face it, and how far right and below its centre all are.
-
-    Of several circles of one radius, `x` and `y` are [K, 1], and what is found [K, N].
-    """
+    """Which edges [N] lie within `reach` px of a circle and face it, and how far right and below its centre all are."""
     across, down = points[:, 0] - x, points[:, 1] - y
     distance = np.sqrt(across * across + down * down)
     facing = np.abs(across * normals[:, 0] + down * normals[:, 1]) > FACING * distance

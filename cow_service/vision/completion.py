@@ -246,40 +246,12 @@ HANGS = 0.7  # of a side's width that lies below the top
 SHARP_TOP = 0.7  # of a top's outline that lies on edges: with less it is a shine on the floor
 SHADE, SAME_CHROMA = 0.8, 4.0  # of the surroundings' light, and Lab units from their hue: a shadow
 STRONG_EDGE = 3.0  # Lab units per px: no soft shadow ends in so strong an edge
-LIT_BLACK, SAME_LIGHT = (
-    0.85,
-    0.05,
-)  # of the surroundings' light: the lit face of something black; shadows differ by less
+LIT_BLACK = 0.85  # of the surroundings' light: the lit face of something black
 LEAST_TOUCHED = 1.0  # of the side of a patch: so much of something black lies next to it
 TEXTURE_EDGE = 0.4  # of the surroundings' spread in lightness: weaker edges are texture
 WEAK_EDGES = (0.45, 1.8)  # as `EDGE_THRESHOLDS`: the sides of something surely white stand out by as little
 
 _Box = tuple[int, int, int, int]  # x, y, width, height
-
-
-class _Tops:
-    """Bright patches, by their label."""
-
-    def __init__(self, view: View, white: Mask) -> None:
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
-        self.labels = np.asarray(labels, np.int32)
-        self.boxes: list[_Box] = [(int(x), int(y), int(w), int(h)) for x, y, w, h in stats[:, :4]]
-        self.areas = [int(area) for area in stats[:, 4]]
-        self._near_edges = dilated(view.edges > view.edge_threshold, 5)
-
-    def is_sharp(self, top: int) -> bool:
-        """Whether its outline lies on edges."""
-        x, y, w, h = self.boxes[top]
-        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        return float(np.mean(self._near_edges[around][outline_of(self.labels[around] == top)])) > SHARP_TOP
-
-    def has_side(self, top: int, side: _Box, area: int, lit: bool) -> bool:
-        """Whether a side is that of a top: small beside it, and lit or right below it."""
-        x, y, w, _ = side
-        tx, ty, tw, _ = self.boxes[top]
-        overlap = min(x + w, tx + tw + 3) - max(x, tx - 3)
-        hangs = overlap > HANGS * w and y >= ty
-        return self.areas[top] >= LEAST_TOP and area < MAX_RATIO * self.areas[top] and (lit or hangs)
 
 
 def white_sides(view: View, core: Mask) -> Mask:
@@ -289,18 +261,30 @@ def white_sides(view: View, core: Mask) -> Mask:
     """
     neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
     white = core & (view.bright > BRIGHT_STEP) & neutral
-    tops = _Tops(view, white)
+    _, labels, tops, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
+    near_edges = dilated(view.edges > view.edge_threshold, 5)
     lit_too = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | white
     sides, surely_white = np.zeros(white.shape, bool), set[int]()
-    for top, ((x, y, w, h), area) in enumerate(zip(tops.boxes, tops.areas, strict=True)):
-        if top == 0 or area < LEAST_TOP or not tops.is_sharp(top):
+    for top, (x, y, w, h, area) in enumerate(tops.tolist()):
+        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
+        if top == 0 or area < LEAST_TOP:
+            continue
+        if float(np.mean(near_edges[around][outline_of(labels[around] == top)])) <= SHARP_TOP:
             continue
         if 0.2 * w < h < 0.8 * w:  # slightly lit pixels joined to it, right below and no further down than it is wide
             window = slice(y, y + h + w), slice(x, x + w)
-            sides[window] |= _joined(lit_too[window], tops.labels[window] == top, 4)
-        own = tops.labels[y : y + h, x : x + w] == top
+            sides[window] |= _joined(lit_too[window], labels[window] == top, 4)
+        own = labels[y : y + h, x : x + w] == top
         if area >= LEAST_WHITE and float(np.median(view.chroma[y : y + h, x : x + w][own])) < CHROMA_STEP:
             surely_white.add(top)
+
+    def has_side(top: int, side: _Box, area: int, lit: bool) -> bool:
+        """Whether a side is that of a top: small beside it, and lit or right below it."""
+        x, y, w, _ = side
+        tx, ty, tw, _, top_area = tops[top].tolist()
+        hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > HANGS * w and y >= ty
+        return top_area >= LEAST_TOP and area < MAX_RATIO * top_area and (lit or hangs)
+
     for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if surely_white else [])):
         weak = thresholds == WEAK_EDGES
         for near, patch, box in enclosed(view, *thresholds):
@@ -309,10 +293,10 @@ def white_sides(view: View, core: Mask) -> Mask:
             )
             if is_shade or (weak and float(np.median(view.chroma[near][patch])) > CHROMA_STEP):
                 continue
-            touched = set(np.unique(tops.labels[near][dilated(patch, times=4)]).tolist()) - {0}
+            touched = set(np.unique(labels[near][dilated(patch, times=4)]).tolist()) - {0}
             lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > BRIGHT_REACH
             area = int(np.count_nonzero(patch))
-            if any(tops.has_side(top, box, area, lit) for top in (touched & surely_white if weak else touched)):
+            if any(has_side(top, box, area, lit) for top in (touched & surely_white if weak else touched)):
                 sides[near] |= dilated(patch, times=2)
     return sides
 

@@ -252,17 +252,10 @@ def _best_offset(coarse: Floats32, todo: Mask, barred: Mask, y: int, x: int) -> 
     # A place may be used where the tile itself would take no barred pixel.
     tile_y, tile_x = _around(y, TILE // 2, coarse.shape[0]), _around(x, TILE // 2, coarse.shape[1])
     top, left = tile_y.start - window[0].start, tile_x.start - window[1].start
-    counts = cv2.integral(barred.astype(np.uint8))
-    rows, columns = error.shape
-    y0, y1 = top, top + tile_y.stop - tile_y.start
-    x0, x1 = left, left + tile_x.stop - tile_x.start
-    taken = (
-        counts[y1 : y1 + rows, x1 : x1 + columns]
-        - counts[y0 : y0 + rows, x1 : x1 + columns]
-        - counts[y1 : y1 + rows, x0 : x0 + columns]
-        + counts[y0 : y0 + rows, x0 : x0 + columns]
-    )
-    error[(taken > 0) | ~np.isfinite(error)] = np.inf
+    size = tile_x.stop - tile_x.start, tile_y.stop - tile_y.start
+    taken = cv2.boxFilter(barred.astype(np.float32), -1, size, anchor=(0, 0), normalize=False)
+    taken = taken[top : top + error.shape[0], left : left + error.shape[1]]
+    error[(taken > 0.5) | ~np.isfinite(error)] = np.inf
     best = np.unravel_index(int(error.argmin()), error.shape)
     if not np.isfinite(error[best]):
         return None

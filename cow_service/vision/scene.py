@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -42,43 +42,6 @@ class Obstacle:
     bbox: BBox
     mask: CroppedMask
     confidence: float = 1.0  # 0..1: how sure it is that it is there as one thing with this mask; 1 for what is given
-
-
-def find_obstacles(
-    regions: Sequence[Region],
-    silhouette: Callable[[BBox], Mask],
-    confidence_of: Callable[[BBox], float],
-    mover: BBox,
-    named: Sequence[LocatedObject],
-) -> tuple[Obstacle, ...]:
-    """Everything but the mover: first what the question names, by that name, then other regions, by their colour.
-
-    `silhouette` gives the mask [H, W] of the object in a box; of known regions their own mask, which is cheaper, is
-    taken, unless a mask was given.
-    """
-    body = silhouette(mover)
-    body_area, whole = np.count_nonzero(body), without_holes(body)
-    near = dilated(body, 7)
-    obstacles: list[Obstacle] = []
-    for other in named:
-        if not is_same_object(other.bbox, mover):
-            region = None if other.mask is not None else region_of(regions, other.bbox)
-            mask = CroppedMask.of(silhouette(other.bbox)) if region is None else region.mask
-            obstacles.append(Obstacle(other.object, other.bbox, mask, confidence_of(other.bbox)))
-    for region in regions:
-        area = region.mask.area
-        if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
-            continue
-        if area < OWN_SHARE * body_area and region.mask.shared_with(near):
-            continue
-        if is_among(region.bbox, (other.bbox for other in obstacles)):
-            continue
-        larger = [other.mask for other in obstacles if area < OWN_SHARE * other.mask.area]
-        if region.confidence < DOUBTFUL and any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger):
-            continue
-        name, confidence = f"{region.colour} object", confidence_of(region.bbox)
-        obstacles.append(Obstacle(name, region.bbox, region.mask, confidence))
-    return tuple(obstacles)
 
 
 @dataclass(frozen=True)
@@ -304,9 +267,8 @@ class Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
         other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
         names = ("cues", "arrows", "boxes", "side_view", "regions", "faint")
-        other.__dict__.update(
-            {name: getattr(self, name) for name in names}, clean=clean
-        )  # where cached properties are kept
+        # Where cached properties are kept.
+        other.__dict__.update({name: getattr(self, name) for name in names}, clean=clean)
         return other
 
     def with_mask(self, bbox: BBox, mask: Mask) -> Scene:
@@ -316,8 +278,37 @@ class Scene:
         return other
 
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
-        """The objects beside the mover in a box, `named` ones by their name; found once for the same arguments."""
-        find = partial(find_obstacles, self.regions, self.silhouette, self.confidence_of, mover, named)
+        """The objects beside the mover in a box: first what the question names, by that name, then others, by colour.
+
+        Found once for the same arguments. Of known regions their own mask is taken, which is cheaper than another
+        silhouette, unless a mask was given.
+        """
+
+        def find() -> tuple[Obstacle, ...]:
+            body = self.silhouette(mover)
+            body_area, whole, near = np.count_nonzero(body), without_holes(body), dilated(body, 7)
+            obstacles: list[Obstacle] = []
+            for other in named:
+                if not is_same_object(other.bbox, mover):
+                    region = None if other.mask is not None else self.region_of(other.bbox)
+                    mask = CroppedMask.of(self.silhouette(other.bbox)) if region is None else region.mask
+                    obstacles.append(Obstacle(other.object, other.bbox, mask, self.confidence_of(other.bbox)))
+            for region in self.regions:
+                area = region.mask.area
+                if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
+                    continue
+                if area < OWN_SHARE * body_area and region.mask.shared_with(near):
+                    continue
+                if is_among(region.bbox, (other.bbox for other in obstacles)):
+                    continue
+                doubtful = region.confidence < DOUBTFUL
+                larger = [other.mask for other in obstacles if doubtful and area < OWN_SHARE * other.mask.area]
+                if any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger):
+                    continue
+                name, confidence = f"{region.colour} object", self.confidence_of(region.bbox)
+                obstacles.append(Obstacle(name, region.bbox, region.mask, confidence))
+            return tuple(obstacles)
+
         return self.once(("obstacles", mover, tuple(named)), find)
 
     def locate(self, point: tuple[float, float]) -> Cutout:

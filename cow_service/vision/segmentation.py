@@ -208,12 +208,9 @@ def _tidy(cut: Mask, box: Floats) -> Mask:
     window = slice(max(0, int(y0) - 1), int(np.ceil(y1)) + 1), slice(max(0, int(x0) - 1), int(np.ceil(x1)) + 1)
     kept[window] = cut[window]
     kept = cv2.morphologyEx(kept, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    contours, _ = cv2.findContours(kept, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    if not contours:
+    if not kept.any():
         return kept.astype(bool)
-    biggest = max(contours, key=cv2.contourArea)
-    whole = np.zeros(cut.shape, np.uint8)
-    cv2.drawContours(whole, [biggest], -1, 1, -1)
+    whole = cv2.drawContours(np.zeros(cut.shape, np.uint8), [outer_contour(kept > 0)], -1, 1, cv2.FILLED)
     holes = (whole > 0) & (kept == 0)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8), connectivity=4)
     for i, area in enumerate(stats[:, 4]):

@@ -16,6 +16,7 @@ from cow_service.records import BBox
 from cow_service.vision.inpainting import quadratic_terms
 from cow_service.vision.masks import lab_of, resized_mask, scaled
 from cow_service.vision.scene import Scene
+from cow_service.vision.trail_removal import LEAST_SHADE, MOST_SHADE, NEAREST, SLANT, floor_means
 from cow_service.vision.types import Floats, Floats32, Mask
 
 WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
@@ -23,9 +24,6 @@ LEAST_WIDTH = 14.0  # px in the image: a smaller shadow is lost in the floor's t
 LIKELY_WIDTH = 0.95  # of the object's width: shadows looked for; the fit settles the rest
 FLATNESS = (0.25, 0.36, 0.5, 0.66)  # of their own width: their heights, on a floor seen at a slant
 RING = (1.15, 1.5)  # of the ellipse: the floor about it that it is compared with
-SLANT = 1.1  # px sideways per px down: light indoors falls steeper
-NEAREST = 0.25  # of the object's width, from its foot down to the shadow's middle: nearer, it may touch the floor
-LEAST_SHADE, MOST_SHADE = 0.025, 0.6  # of the floor's lightness that a shadow takes away; more is an object
 MAX_TRIES, MAX_CANDIDATES = 40, 3  # the darkest patches are looked at, and so many that stand alone measured
 RIVAL_SHADE = 0.6  # of the darkest patch's shade: another one as dark leaves it open which is the shadow
 EXPLAINED = 0.5  # of what a smooth floor leaves unexplained around the patch, by a soft ellipse in it
@@ -124,17 +122,9 @@ class _Floor:
         ry, rx = int(np.ceil(RING[1] * b)), int(np.ceil(RING[1] * a))
         ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]
         radius = np.sqrt((xs / a) ** 2 + (ys / b) ** 2)
-        inner, ring = (radius <= 0.9).astype(np.float32), ((radius >= RING[0]) & (radius <= RING[1])).astype(np.float32)
-        weight = self.free.astype(np.float32)
-        light = self.lab[..., 0] * weight
-        inside, about = (
-            [cv2.filter2D(values, cv2.CV_32F, kernel / kernel.sum(), borderType=cv2.BORDER_CONSTANT)
-             for values in (light, weight)]
-            for kernel in (inner, ring)
-        )  # fmt: skip
-        whole = (inside[1] > 0.97) & (about[1] > 0.7)
-        dark = 1 - (inside[0] / np.maximum(inside[1], 1e-3)) / np.maximum(about[0] / np.maximum(about[1], 1e-3), 1.0)
-        return np.where(whole, dark, 0).astype(np.float32)
+        rings, weight = (radius <= 0.9, (radius >= RING[0]) & (radius <= RING[1])), self.free.astype(np.float32)
+        (inside, whole), (about, free) = (floor_means(self.lab[..., 0], weight, mask) for mask in rings)
+        return np.where((whole > 0.97) & (free > 0.7), 1 - inside / np.maximum(about, 1.0), 0).astype(np.float32)
 
     def fit_ellipse(self, seen: Ellipse) -> Shadow | None:
         """A soft tilted ellipse on a smooth floor, fitted to the lightness around what was seen."""

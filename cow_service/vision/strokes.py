@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import eroded, outer_contour, scaled
+from cow_service.vision.masks import eroded, scaled, without_holes
 from cow_service.vision.types import Image, Mask
 
 WORKING_SIDE = 896  # px: longer images are searched at this size
@@ -87,23 +87,19 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
     around = cv2.medianBlur(half, THIN // 2 | 1)
     narrow = (cv2.absdiff(half, around).max(axis=2) > STANDS_OUT).astype(np.uint8) * 255
     narrow = cv2.resize(cv2.dilate(narrow, _SQUARE), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-    for (bx, by, bw, bh), thin in (
-        (patch.box, patch.mask) for patch in _patches(np.asarray(narrow, np.uint8), most=1.0)
-    ):
+    for (bx, by, bw, bh), _, _, thin in _patches(np.asarray(narrow, np.uint8), most=1.0):
         window = image[by : by + bh, bx : bx + bw]
         allowed = thin.astype(np.uint8) * np.uint8(255)
         known: dict[Box, int] = {}
         for colour, tolerance in itertools.product(_flat_colours(window[thin]), TOLERANCES):
             same = np.asarray(cv2.bitwise_and(_alike(window, colour, tolerance), allowed), np.uint8)
-            for patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, FLAT)):
-                before = known.get(patch.box)
-                if before is not None and abs(patch.area - before) <= ALIKE * before:
+            for box, area, flat, patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, FLAT)):
+                before = known.get(box)
+                if before is not None and abs(area - before) <= ALIKE * before:
                     continue
-                known[patch.box] = patch.area
-                if 2 * patch.flat < patch.area:
-                    continue
-                stroke = Stroke(bx + patch.box[0], by + patch.box[1], patch.mask, colour)
-                if _is_drawn(image, stroke):
+                known[box] = area
+                stroke = Stroke(bx + box[0], by + box[1], patch, colour)
+                if 2 * flat >= area and _is_drawn(image, stroke):
                     yield stroke
                     yield from _hollow(image, stroke)
 
@@ -149,7 +145,7 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
 
 def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
     """The hollow drawing of which a stroke may be the rim, and that of which it may be the inside."""
-    whole = _outlined(stroke.patch)
+    whole = without_holes(stroke.patch)
     if np.count_nonzero(whole & ~stroke.patch) > LEAST_INSIDE * np.count_nonzero(whole):
         inside = eroded(whole & ~stroke.patch, beyond=0)
         pixels = image[stroke.surroundings(image, 0)[0]][inside].astype(np.int16)
@@ -172,14 +168,7 @@ def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
         count, labels = cv2.connectedComponents(((patch > 0) | is_rim).astype(np.uint8), connectivity=4)
         kept = labels == np.bincount(labels[patch > 0], minlength=count).argmax()
         colour = int(rim[0]), int(rim[1]), int(rim[2])
-        yield Stroke(window[1].start, window[0].start, _outlined(kept), colour, hollow=True)
-
-
-def _outlined(patch: Mask) -> Mask:
-    """The area [h, w] within the outer outline of a patch."""
-    whole = np.zeros(patch.shape, np.uint8)
-    cv2.drawContours(whole, [outer_contour(patch)], -1, 1, -1)
-    return whole > 0
+        yield Stroke(window[1].start, window[0].start, without_holes(kept), colour, hollow=True)
 
 
 def _flat_colours(pixels: NDArray[np.uint8]) -> list[Colour]:
@@ -207,30 +196,17 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[Colour]:
     return colours
 
 
-@dataclass(frozen=True)
-class _Patch:
-    """A connected patch of a mask."""
-
-    box: Box
-    area: int  # px
-    flat: int  # of them, those that have the patch's colour itself
-    labels: NDArray[np.int32]  # [h, w] of the box
-    label: int
-
-    @property
-    def mask(self) -> Mask:
-        """[h, w] of the box."""
-        return self.labels == self.label
-
-
-def _patches(same: NDArray[np.uint8], most: float, flat: Callable[[], NDArray[np.uint8]] | None = None) -> list[_Patch]:
+def _patches(
+    same: NDArray[np.uint8], most: float, flat: Callable[[], NDArray[np.uint8]] | None = None
+) -> Iterator[tuple[Box, int, int, Mask]]:
     """Connected patches that are long enough for an arrow; `most` bounds area / diagonal^2.
 
-    `flat` tells where [h, w] pixels have the patches' colour itself.
+    Of each its box, its area, how many of its pixels have its colour itself, and its mask [h, w] in the box. `flat`
+    tells where [h, w] pixels have that colour.
     """
     left, top, width, height = cv2.boundingRect(same)
     if not width:
-        return []
+        return
     window = slice(top, top + height), slice(left, left + width)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(same[window], connectivity=8)
     squared = stats[:, 2].astype(np.int64) ** 2 + stats[:, 3].astype(np.int64) ** 2
@@ -239,9 +215,6 @@ def _patches(same: NDArray[np.uint8], most: float, flat: Callable[[], NDArray[np
     flats = np.zeros(len(stats), np.int64)
     if flat is not None and fitting.any():
         flats = np.bincount(labels[flat()[window] > 0], minlength=len(stats))
-    patches: list[_Patch] = []
     for i in np.nonzero(fitting)[0].tolist():
         x, y, w, h, area = stats[i].tolist()
-        own = np.asarray(labels[y : y + h, x : x + w], np.int32)
-        patches.append(_Patch((left + x, top + y, w, h), area, int(flats[i]), own, i))
-    return patches
+        yield (left + x, top + y, w, h), area, int(flats[i]), labels[y : y + h, x : x + w] == i

@@ -11,7 +11,7 @@ import numpy as np
 
 from cow_service.vision.inpainting import fill_hole
 from cow_service.vision.masks import dilated, lab_of, scaled, window_of
-from cow_service.vision.trails import FADED, Position, Trail
+from cow_service.vision.trails import FADED, Position, Trail, sampled
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 RIM, LEAST_RIM = 0.06, 2.0  # of the radius, px: around a position, mixed with the background
@@ -51,12 +51,12 @@ def _completed(image: Image, trail: Trail, window: tuple[slice, slice]) -> tuple
     # On the very rim a pixel shows the background as well: taken from just inside.
     inward = np.minimum(1, (1 - 1.2 / present.radius) / np.maximum(away, 1e-6))
     u, v = u * inward, v * inward
-    best, colours = _freedom(present, solid, u, v), _sampled(image, present, u, v)
+    best, colours = _freedom(present, solid, u, v), sampled(image, present, u, v).astype(np.float32)
     own = best > APART
     for donor in solid:
         margin = _freedom(donor, [present, *(position for position in solid if position is not donor)], u, v)
         better = ~own & (margin > best)
-        colours = np.where(better[..., None], _sampled(image, donor, u, v), colours)
+        colours = np.where(better[..., None], sampled(image, donor, u, v), colours)
         best = np.where(better, margin, best)
     return share[..., None], colours
 
@@ -68,13 +68,6 @@ def _freedom(of: Position, others: Sequence[Position], u: Floats32, v: Floats32)
     return np.min([np.full_like(x, 9.0), *away], axis=0) - np.float32(1)
 
 
-def _sampled(image: Image, of: Position, u: Floats32, v: Floats32) -> Floats32:
-    """Colours [h, w, 3] at offsets (radii) from a position."""
-    columns = np.clip((of.x + of.radius * u).astype(int), 0, image.shape[1] - 1)
-    rows = np.clip((of.y + of.radius * v).astype(int), 0, image.shape[0] - 1)
-    return image[rows, columns].astype(np.float32)
-
-
 WORKING_WIDTH = 16.0  # px: the image is searched at the size at which the ball is so wide
 LEAST_WIDTH = 16.0  # px of the ball in the image
 WIDTHS = (0.7, 0.85, 1.0, 1.15, 1.3)  # of the ball's
@@ -82,7 +75,7 @@ FLATNESS = (0.28, 0.38, 0.5)  # of their own width: their heights
 DRIFTS = (-1.2, -0.8, -0.4, 0.0, 0.4, 0.8, 1.2)  # down the image from the first shadow to the last, in the ball's width
 RING = 1.45  # of the ellipses: the floor about them that they are compared with
 SLANT = 1.1  # px sideways per px down: light indoors falls steeper
-NEAREST = 0.25  # of the ball's width below it: nearer, the shadow touches it
+NEAREST = 0.25  # of the ball's width, from its foot down to the shadow's middle: nearer, the ball may touch the floor
 LEAST_SHADE, MOST_SHADE = 0.025, 0.6  # of the floor's lightness that shadows take away; more is an object
 SAME_HUE = 7.0  # Lab units in the a*b* plane, by which a shade may differ from the floor about it
 STANDS_OUT = 0.55  # of the shade inside: by so much it must exceed that about it
@@ -111,6 +104,17 @@ def without_earlier_shadows(image: Image, trail: Trail, objects: Mask) -> Image:
     rim = dilated(objects, 5)
     hole = earlier & ~(away[-1] <= OWN**2) & ~rim
     return fill_hole(image, hole, ((away[-1] <= GROWN**2) | rim) & ~hole)
+
+
+def floor_means(values: Floats32, weight: Floats32, mask: Mask) -> tuple[Floats32, Floats32]:
+    """Mean value [h, w] of what may be floor in a mask about each pixel, and the share of the mask that may be.
+
+    `weight` [h, w] is 1 where there may be floor, else 0.
+    """
+    kernel = mask.astype(np.float32) / np.float32(max(1, np.count_nonzero(mask)))
+    total, share = (np.asarray(cv2.filter2D(layer, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT), np.float32)
+                    for layer in (values * weight, weight))  # fmt: skip
+    return np.asarray(total / np.maximum(share, 1e-3), np.float32), share
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +177,8 @@ class _Floor:
         away = np.stack([np.hypot((xs - dx) / half[0], (ys - dy) / half[1]) for dx, dy in offsets])
         nearest = away.min(axis=0)
         inside = nearest <= 0.95
-        (dark, whole), (rim, free) = (self.means(m) for m in (inside, (nearest >= 1.12) & (nearest <= RING)))
+        rings = inside, (nearest >= 1.12) & (nearest <= RING)
+        (dark, whole), (rim, free) = (floor_means(self.shade, self.weight, mask) for mask in rings)
         score = np.where(allowed & (whole > 0.6) & (free > 0.5) & (dark > LEAST_SHADE), dark - rim, 0)
         y, x = (int(v) for v in np.unravel_index(int(score.argmax()), score.shape))
         if score[y, x] <= STANDS_OUT * dark[y, x] or score[y, x] <= 0:
@@ -188,13 +193,6 @@ class _Floor:
                 return 0.0, x, y
         # A larger row of the same shade is the better one: part of a shadow is as dark as the whole.
         return float(score[y, x]) * float(np.sqrt(np.count_nonzero(inside))), x, y
-
-    def means(self, mask: Mask) -> tuple[Floats32, Floats32]:
-        """Mean shade [h, w] of what may be floor in a mask about each pixel, and the share of it that may be."""
-        kernel = mask.astype(np.float32) / np.float32(max(1, np.count_nonzero(mask)))
-        total, share = (np.asarray(cv2.filter2D(values, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT), np.float32)
-                        for values in (self.shade * self.weight, self.weight))  # fmt: skip
-        return np.asarray(total / np.maximum(share, 1e-3), np.float32), share
 
     def fitted(self, start: Floats) -> tuple[Floats, Half]:
         """Centres [N, 2] and half axes (px of the image) of the row whose even shade explains most of that around it.

@@ -18,7 +18,7 @@ import numpy as np
 from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
 from cow_service.vision.masks import iou
-from cow_service.vision.types import Floats, Image, Mask
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08
@@ -103,26 +103,21 @@ class Trail:
         c, b, a = (position.centre for position in self.positions[-1:-4:-1])
         return (3 * c[0] - 4 * b[0] + a[0]) / 2, (3 * c[1] - 4 * b[1] + a[1]) / 2
 
-    def ending(self, end: TrailEnd) -> Trail:
-        """The same positions with the present one at an end."""
+    def ending(self, near: BBox | None = None, side: Vector | None = None) -> Trail:
+        """The same positions with the present one at the end nearest to a box, or farthest to a side, else as it shows.
+
+        A side is a direction in the image: (-1, 0) for the leftmost.
+        """
         ends = self.positions[0], self.positions[-1]
-        if end.near is not None:
-            x0, y0, x1, y1 = end.near
+        if near is not None:
+            x0, y0, x1, y1 = near
             gaps = [math.dist(position.centre, ((x0 + x1) / 2, (y0 + y1) / 2)) for position in ends]
-        elif end.side is not None:
-            gaps = [-position.x * end.side[0] - position.y * end.side[1] for position in ends]
+        elif side is not None:
+            gaps = [-position.x * side[0] - position.y * side[1] for position in ends]
         else:
             return self
         is_last = gaps[1] <= gaps[0]
         return Trail(self.positions if is_last else self.positions[::-1], self.evident, True)
-
-
-@dataclass(frozen=True)
-class TrailEnd:
-    """Which end of a trail is the present position: that nearest to a box, or farthest to a side, else as it shows."""
-
-    near: BBox | None = None  # of another object
-    side: Vector | None = None  # in the image: (-1, 0) for the leftmost
 
 
 def trail_of(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
@@ -189,12 +184,12 @@ class _Search:
             chain = self.between(near, a, b, inner)
             if chain is None:
                 continue
-            chain = self.beyond(self.beyond(chain)[::-1])
+            chain = self.extended(self.extended(chain)[::-1])
             if len(chain) > max(2, len(best)) and _is_path(chain) and self.are_alike(chain) and self.is_outlined(chain):
                 best = chain
         if not best:
             return None
-        chain = self.prolonged(self.prolonged(best)[::-1])[::-1]
+        chain = self.extended(self.extended(best, compared=False)[::-1], compared=False)[::-1]
         shares = self.opacities(chain, compared=False)
         if shares is None:
             return None
@@ -228,8 +223,12 @@ class _Search:
                 return whole
         return None
 
-    def beyond(self, chain: Chain) -> Chain:
-        """A chain with what goes on after its last circle."""
+    def extended(self, chain: Chain, compared: bool = True) -> Chain:
+        """A chain with what goes on after its last circle.
+
+        Where it is not compared with the others, for it may be too pale or too much overlaid, it must lie exactly where
+        the path of three or more leads.
+        """
         while len(chain) < MAX_POSITIONS:
             last, before = chain[-1], chain[-2]
             dx, dy = last.x - before.x, last.y - before.y
@@ -239,28 +238,17 @@ class _Search:
             else:
                 turns = [(math.cos(angle), math.sin(angle)) for angle in (-0.35, 0.35, -0.7, 0.7)]
                 seeds += [(last.x + dx * c - dy * s, last.y + dx * s + dy * c) for c, s in turns]
-            for x, y in seeds:
-                found = _fit_near(self.edges, x, y, last.radius**2 / before.radius)
-                if found is None or any(found.is_same(other) for other in chain):
+            for x, y in seeds if compared else seeds[:1]:
+                found = _fit_near(self.edges, x, y, last.radius**2 / before.radius if compared else last.radius)
+                if found is None or any(found.is_same(other) for other in chain) or not _is_path((*chain, found)):
                     continue
-                if _is_path((*chain, found)) and self.are_alike((*chain, found)):
+                is_predicted = math.dist(found.centre, (x, y)) < PREDICTED * found.radius
+                is_seen = found.support >= PALE_SUPPORT and self.contrast(found) >= LEAST_CONTRAST / 2
+                if self.are_alike((*chain, found)) if compared else is_predicted and is_seen:
                     chain = (*chain, found)
                     break
             else:
                 break
-        return chain
-
-    def prolonged(self, chain: Chain) -> Chain:
-        """A chain with circles that its path leads on to, though too pale, or too much overlaid, to be compared."""
-        while len(chain) < MAX_POSITIONS:
-            x, y = (3 * getattr(chain[-1], at) - 3 * getattr(chain[-2], at) + getattr(chain[-3], at) for at in "xy")
-            found = _fit_near(self.edges, x, y, chain[-1].radius)
-            if found is None or found.support < PALE_SUPPORT or any(found.is_same(other) for other in chain):
-                break
-            near = math.dist(found.centre, (x, y)) < PREDICTED * found.radius
-            if not near or not _is_path((*chain, found)) or self.contrast(found) < LEAST_CONTRAST / 2:
-                break
-            chain = (*chain, found)
         return chain
 
     def is_outlined(self, chain: Chain) -> bool:
@@ -318,9 +306,14 @@ class _Search:
 
     def colours(self, circle: Circle, offsets: Floats) -> Floats:
         """Colours [N, 3] at offsets [N, 2] (radii) from a circle's centre."""
-        xs = np.clip(circle.x + circle.radius * offsets[:, 0], 0, self.image.shape[1] - 1).astype(int)
-        ys = np.clip(circle.y + circle.radius * offsets[:, 1], 0, self.image.shape[0] - 1).astype(int)
-        return self.image[ys, xs].astype(np.float64)
+        return sampled(self.image, circle, offsets[:, 0], offsets[:, 1]).astype(np.float64)
+
+
+def sampled(image: Image, of: Circle | Position, u: Floats | Floats32, v: Floats | Floats32) -> Image:
+    """Colours [..., 3] at offsets [...] (radii) right and down from a centre, or next to them in the image."""
+    xs = np.clip(of.x + of.radius * u, 0, image.shape[1] - 1).astype(int)
+    ys = np.clip(of.y + of.radius * v, 0, image.shape[0] - 1).astype(int)
+    return image[ys, xs]
 
 
 def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
@@ -355,8 +348,7 @@ def _is_free(chain: Chain, i: int, offsets: Floats, factor: float) -> Mask:
 def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
     """The circle with most edges on it within half a radius of a place."""
     near: list[Circle] = []
-    places = np.array([x, y]) + radius * AROUND
-    for column, row in places[edges.may_fit(places, radius)].tolist():
+    for column, row in (np.array([x, y]) + radius * AROUND).tolist():
         found = edges.fit(column, row, radius)
         if found is None or not 1 / SIZES < found.radius / radius < SIZES:
             continue

@@ -61,18 +61,20 @@ def compose(layers: Layers, index: int) -> Image:
         return layers.image.copy()
     frame = layers.background.copy()
     for shadow in layers.shadows:
-        for shade in shadow.at(index, (frame.shape[1], frame.shape[0])):
-            # Where the surface is seen: the floor between still bodies, or the top of one.
-            others = [other for other in layers.still if shade.surface in (None, other.index)]
-            others = [other for other in others if _overlap(shade.window, other)]
-            if not others and shade.surface is not None:
-                continue
-            seen = np.ones(shade.dark.shape[:2], np.float32)
-            for other in others:
-                _hide(seen, shade.window, other)
-            share = three_channels(seen if shade.surface is None else 1 - seen) if others else 1.0
-            window = frame[shade.window]
-            window[:] = cv2.multiply(window, 1 - shade.dark * share, dtype=cv2.CV_8U)
+        shade = shadow(index, (frame.shape[1], frame.shape[0]))
+        if shade is None:
+            continue
+        # Where the surface is seen: the floor between still bodies, or the top of one.
+        others = [other for other in layers.still if shade.surface in (None, other.index)]
+        others = [other for other in others if _overlap(shade.window, other)]
+        if not others and shade.surface is not None:
+            continue
+        seen = np.ones(shade.dark.shape[:2], np.float32)
+        for other in others:
+            _hide(seen, shade.window, other)
+        share = three_channels(seen if shade.surface is None else 1 - seen) if others else 1.0
+        window = frame[shade.window]
+        window[:] = cv2.multiply(window, 1 - shade.dark * share, dtype=cv2.CV_8U)
     for body, sprite in _far_to_near(layers, index):
         _draw(layers, frame, body, sprite, index)
         for container in layers.containers:

@@ -5,9 +5,9 @@ light. And what comes down onto a surface takes that surface's light from the sk
 distance d from the centre of a sphere of radius r, at a height h above a plane, loses h r^2 / d^3 of it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
 
 import cv2
 import numpy as np
@@ -41,125 +41,99 @@ class ShadePatch:
     surface: int | None  # of `Trajectory.bodies`; None for the floor
 
 
-class MovingShadow(Protocol):
-    """A shadow of a moving body."""
-
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
-        """As it is at a clip frame, inside frames of a size (width, height)."""
-        ...
+MovingShadow = Callable[[int, tuple[int, int]], ShadePatch | None]
+"""A shadow of a moving body: as it is at a clip frame, inside frames of a size (width, height), where it is seen."""
 
 
-@dataclass(frozen=True)
-class AttachedShadow:
-    """Of a standing thing where no camera is known: it moves and grows as the thing does."""
+def _attached_shadow(
+    shade: Shade, path: Path, start: Floats, factor: float, frame: int, size: tuple[int, int]
+) -> ShadePatch | None:
+    """Of a standing thing where no camera is known: it moves and grows as the thing does.
 
-    shade: Shade
-    path: Path
-    start: Floats  # [2] px of the clip
-    factor: float  # clip px per image px
-
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
-        """One shadow, on the floor."""
-        matrix = np.eye(2) * self.path.scale[frame]
-        to = self.factor * np.array(self.path.points[frame])
-        yield from _patch(self.shade, matrix, to, self.start, size, None)
+    `start` [2] is in px of the clip, `factor` clip px per image px.
+    """
+    to = factor * np.array(path.points[frame])
+    return _patch(shade, np.eye(2) * path.scale[frame], to, start, size, None)
 
 
-@dataclass(frozen=True)
-class ContactShadow:
-    """Of a thing that stands at the first frame."""
+def _contact_shadow(
+    ground: Ground, path: Path, shade: Shade, support: int | None, frame: int, size: tuple[int, int]
+) -> ShadePatch | None:
+    """Of a thing that stands at the first frame, on what lies beneath it; none once it has risen.
 
-    ground: Ground
-    path: Path
-    shade: Shade
-    support: int | None  # what it stands on, of `Trajectory.bodies`; None for the floor
-
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
-        """On what lies beneath the thing; none once it has risen."""
-        ground, body = self.ground, self.ground.bodies[self.path.body]
-        first, there = (np.array(self.path.states[index][:3]) for index in (0, frame))
-        # Heights of its lower end above the floor, first and now.
-        lower = 0.0 if body.support == "floor" else ground.height(np.array(body.position)) - body.size[1] / 2
-        bottom = lower + ground.height(there) - ground.height(first)
-        surface = ground.surface_below(there, bottom, body.size[1])
-        if surface.body == self.support:
-            surface = Surface(lower, self.support)
-        strength = 1 - max(0.0, bottom - surface.height) / (FADED * body.size[1])
-        if strength <= NO_SHADE:
-            return
-        start, foot = ground.foot(first, lower), ground.foot(there, surface.height)
-        matrix = np.eye(2) * (ground.depth(start) / ground.depth(foot))
-        ends = ground.project(foot), ground.project(start)
-        yield from _patch(self.shade, matrix, *ends, size, surface.body, min(1.0, strength))
+    `support` is what it stands on, of `Trajectory.bodies`; None for the floor.
+    """
+    body = ground.bodies[path.body]
+    first, there = (np.array(path.states[index][:3]) for index in (0, frame))
+    # Heights of its lower end above the floor, first and now.
+    lower = 0.0 if body.support == "floor" else ground.height(np.array(body.position)) - body.size[1] / 2
+    bottom = lower + ground.height(there) - ground.height(first)
+    surface = ground.surface_below(there, bottom, body.size[1])
+    if surface.body == support:
+        surface = Surface(lower, support)
+    strength = 1 - max(0.0, bottom - surface.height) / (FADED * body.size[1])
+    if strength <= NO_SHADE:
+        return None
+    start, foot = ground.foot(first, lower), ground.foot(there, surface.height)
+    matrix = np.eye(2) * (ground.depth(start) / ground.depth(foot))
+    ends = ground.project(foot), ground.project(start)
+    return _patch(shade, matrix, *ends, size, surface.body, min(1.0, strength))
 
 
-@dataclass(frozen=True)
-class CastShadow:
-    """Of a thing in the air at the first frame: where the light through it meets the floor."""
+def _cast_shadow(
+    ground: Ground, path: Path, shade: Shade, light: Vector, frame: int, size: tuple[int, int]
+) -> ShadePatch | None:
+    """Of a thing in the air at the first frame: where the light through it meets the floor or the top of a still body.
 
-    ground: Ground
-    path: Path
-    shade: Shade
-    light: Vector  # m right and ahead per m of height
-
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
-        """On the floor, or on the top of a still body."""
-        ground = self.ground
-        first, there = (np.array(self.path.states[index][:3]) for index in (0, frame))
-        start = cast_onto(ground, first, self.light, 0.0)
-        surface, length = Surface(0.0, None), ground.bodies[self.path.body].size[1]
-        for index in ground.still:  # whose top the light through it meets before the floor
-            top = ground.height(np.array(ground.bodies[index].position)) + ground.bodies[index].size[1] / 2
-            reached = cast_onto(ground, there, self.light, top)
-            below = ground.surface_below(reached, ground.height(there) - length / 2, length)
-            if below.body == index:
-                surface = below
-                break
-        to = cast_onto(ground, there, self.light, surface.height)
-        if to[2] <= 0:
-            return
-        matrix = ground.shape_on_floor(to) @ np.linalg.inv(ground.shape_on_floor(start))
-        yield from _patch(self.shade, matrix, ground.project(to), ground.project(start), size, surface.body)
+    `light` is in m right and ahead per m of height.
+    """
+    first, there = (np.array(path.states[index][:3]) for index in (0, frame))
+    start = cast_onto(ground, first, light, 0.0)
+    surface, length = Surface(0.0, None), ground.bodies[path.body].size[1]
+    for index in ground.still:  # whose top the light through it meets before the floor
+        top = ground.height(np.array(ground.bodies[index].position)) + ground.bodies[index].size[1] / 2
+        reached = cast_onto(ground, there, light, top)
+        below = ground.surface_below(reached, ground.height(there) - length / 2, length)
+        if below.body == index:
+            surface = below
+            break
+    to = cast_onto(ground, there, light, surface.height)
+    if to[2] <= 0:
+        return None
+    matrix = ground.shape_on_floor(to) @ np.linalg.inv(ground.shape_on_floor(start))
+    return _patch(shade, matrix, ground.project(to), ground.project(start), size, surface.body)
 
 
-@dataclass(frozen=True)
-class SkyShadow:
-    """Of a thing in the air at the first frame that comes near to a surface: computed as of a sphere."""
-
-    ground: Ground
-    path: Path
-
-    def at(self, frame: int, size: tuple[int, int]) -> Iterator[ShadePatch]:
-        """On the surface beneath; nothing from some height on."""
-        ground, body = self.ground, self.ground.bodies[self.path.body]
-        there = np.array(self.path.states[frame][:3])
-        radius, height = body.size[1] / 2, ground.height(there)
-        surface = ground.surface_below(there, height - radius, body.size[1])
-        above = max(radius, height - surface.height)
-        if SKY * (radius / above) ** (2 * SHARPNESS) <= NO_SHADE:
-            return
-        foot = ground.foot(there, surface.height)
-        across = np.abs(ground.shape_on_floor(foot)).sum(axis=1) * EXTENT * radius
-        centre = ground.project(foot)
-        window = clipped(centre - across, centre + across, size)
-        if window is None or foot[2] <= 0:
-            return
-        # The share of the sky's light that a sphere takes from the plane through `foot`, fading out at `EXTENT`.
-        rows, columns = window
-        high, wide = rows.stop - rows.start, columns.stop - columns.start
-        scale = min(1.0, CELLS / max(wide, high))
-        cells_x, cells_y = max(1, round(wide * scale)), max(1, round(high * scale))
-        xs = columns.start + (np.arange(cells_x) + 0.5) * wide / cells_x
-        ys = rows.start + (np.arange(cells_y) + 0.5) * high / cells_y
-        rays = ground.camera.rays(np.stack(np.meshgrid(xs, ys), axis=2).reshape(-1, 2) / ground.factor)
-        sink = -rays @ ground.camera.up
-        length = (ground.camera.height - ground.height(foot)) / np.where(sink > 1e-6, sink, 1.0)
-        gap = ((rays * length[:, None] - foot) ** 2).sum(axis=1)
-        taken = np.where(sink > 1e-6, above * radius**2 / (gap + above**2) ** 1.5, 0.0) ** SHARPNESS
-        edge = (above * radius**2 / ((EXTENT * radius) ** 2 + above**2) ** 1.5) ** SHARPNESS
-        cells = np.clip(SKY * (taken - edge), 0, MOST_TAKEN).reshape(cells_y, cells_x).astype(np.float32)
-        dark = np.asarray(cv2.resize(cells, (wide, high), interpolation=cv2.INTER_LINEAR), np.float32)
-        yield ShadePatch(window, three_channels(dark), surface.body)
+def _sky_shadow(ground: Ground, path: Path, frame: int, size: tuple[int, int]) -> ShadePatch | None:
+    """Of a thing in the air at the first frame, on the surface that it comes near to: computed as of a sphere."""
+    body, there = ground.bodies[path.body], np.array(path.states[frame][:3])
+    radius, height = body.size[1] / 2, ground.height(there)
+    surface = ground.surface_below(there, height - radius, body.size[1])
+    above = max(radius, height - surface.height)
+    if SKY * (radius / above) ** (2 * SHARPNESS) <= NO_SHADE:
+        return None
+    foot = ground.foot(there, surface.height)
+    across = np.abs(ground.shape_on_floor(foot)).sum(axis=1) * EXTENT * radius
+    centre = ground.project(foot)
+    window = clipped(centre - across, centre + across, size)
+    if window is None or foot[2] <= 0:
+        return None
+    # The share of the sky's light that a sphere takes from the plane through `foot`, fading out at `EXTENT`.
+    rows, columns = window
+    high, wide = rows.stop - rows.start, columns.stop - columns.start
+    scale = min(1.0, CELLS / max(wide, high))
+    cells_x, cells_y = max(1, round(wide * scale)), max(1, round(high * scale))
+    xs = columns.start + (np.arange(cells_x) + 0.5) * wide / cells_x
+    ys = rows.start + (np.arange(cells_y) + 0.5) * high / cells_y
+    rays = ground.camera.rays(np.stack(np.meshgrid(xs, ys), axis=2).reshape(-1, 2) / ground.factor)
+    sink = -rays @ ground.camera.up
+    length = (ground.camera.height - ground.height(foot)) / np.where(sink > 1e-6, sink, 1.0)
+    gap = ((rays * length[:, None] - foot) ** 2).sum(axis=1)
+    taken = np.where(sink > 1e-6, above * radius**2 / (gap + above**2) ** 1.5, 0.0) ** SHARPNESS
+    edge = (above * radius**2 / ((EXTENT * radius) ** 2 + above**2) ** 1.5) ** SHARPNESS
+    cells = np.clip(SKY * (taken - edge), 0, MOST_TAKEN).reshape(cells_y, cells_x).astype(np.float32)
+    dark = np.asarray(cv2.resize(cells, (wide, high), interpolation=cv2.INTER_LINEAR), np.float32)
+    return ShadePatch(window, three_channels(dark), surface.body)
 
 
 def cast_onto(ground: Ground, position: Floats, light: Vector, height: float) -> Floats:
@@ -177,10 +151,11 @@ def _patch(
     size: tuple[int, int],
     surface: int | None,
     strength: float = 1.0,
-) -> Iterator[ShadePatch]:
+) -> ShadePatch | None:
     window = clipped(*shade.corners(matrix, to, start), size)
-    if window is not None:
-        yield ShadePatch(window, np.float32(strength) * shade.darkness(window, matrix, to, start), surface)
+    if window is None:
+        return None
+    return ShadePatch(window, np.float32(strength) * shade.darkness(window, matrix, to, start), surface)
 
 
 @dataclass(frozen=True)
@@ -208,11 +183,12 @@ def take_shadows(
         if np.abs(points - points[0]).max() <= 1 and np.ptp(body.path.scale) <= 0.01:  # it stays where it is
             continue
         if ground is not None and ground.bodies[index].support == "air":
-            shadows.append(SkyShadow(ground, body.path))
-            cast = _cast_shadow(given, image, body, ground, floor)
-            if cast is not None:
-                shadows.append(cast)
-                image, _ = _without_shade(image, cast.shade, ~objects)
+            shadows.append(partial(_sky_shadow, ground, body.path))
+            light = _light_through(given, body, ground)
+            shade = None if light is None else _shade_in_light(image, body, ground, light, floor)
+            if light is not None and shade is not None:
+                shadows.append(partial(_cast_shadow, ground, body.path, shade, light))
+                image, _ = _without_shade(image, shade, ~objects)
             continue
         masks = [other.mask for other in still if other.index == body.support]
         beside = eroded(masks[0], 2 * RIM + 1) if masks else floor
@@ -220,28 +196,28 @@ def take_shadows(
         if shade is None:
             continue
         if ground is None:
-            shadows.append(AttachedShadow(shade, body.path, factor * body.start, factor))
+            shadows.append(partial(_attached_shadow, shade, body.path, factor * body.start, factor))
         else:
-            shadows.append(ContactShadow(ground, body.path, shade, body.support))
+            shadows.append(partial(_contact_shadow, ground, body.path, shade, body.support))
         image, noisy[index] = _without_shade(image, shade, masks[0] if masks else ~objects)
     return UnshadedScene(image, noisy, tuple(shadows))
 
 
-def _cast_shadow(
-    given: GeneratorInput, image: Image, body: MovingBody, ground: Ground, floor: Mask
-) -> CastShadow | None:
-    """The shadow of a thing in the air: where the light says, or else where one is found below the mover."""
-    first = np.array(body.path.states[0][:3])
-    light = given.trajectory.light
+def _light_through(given: GeneratorInput, body: MovingBody, ground: Ground) -> Vector | None:
+    """The light (m right and ahead per m of height): as it is known, or as a shadow is found below the mover."""
+    first, light = np.array(body.path.states[0][:3]), given.trajectory.light
     if light is None and body.path.body == 0:
         found, high = find_shadow(given.scene, given.grounding.bbox), ground.height(first)
         there = None if found is None else ground.camera.floor_points(np.array([found.centre]))
         if there is not None and np.isfinite(there).all() and high > 0:
             gap = ground.camera.to_floor(there)[0] - ground.camera.to_floor(first[None])[0]
             light = float(gap[0]) / high, float(gap[2]) / high
-    if light is None:
-        return None
-    middle = cast_onto(ground, first, light, 0.0)
+    return light
+
+
+def _shade_in_light(image: Image, body: MovingBody, ground: Ground, light: Vector, floor: Mask) -> Shade | None:
+    """The shadow on the floor of a thing in the air, at the first frame."""
+    middle = cast_onto(ground, np.array(body.path.states[0][:3]), light, 0.0)
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)[:, None]
     ring = np.cos(angles) * ground.camera.right + np.sin(angles) * ground.camera.ahead
     outline = ground.bodies[body.path.body].size[0] / 2 * STRETCH * ring
@@ -254,8 +230,7 @@ def _cast_shadow(
     inner = 0.7 * points + 0.3 * points.mean(axis=0)
     cv2.fillConvexPoly(ellipse, np.rint(inner).astype(np.int32), 1)
     seed = (ellipse > 0) & floor
-    shade = cast_shade(image, seed, (float(x0), float(y0), float(x1), float(y1)), floor)
-    return None if shade is None else CastShadow(ground, body.path, shade, light)
+    return cast_shade(image, seed, (float(x0), float(y0), float(x1), float(y1)), floor)
 
 
 def _without_shade(image: Image, shade: Shade, where: Mask) -> tuple[Image, Mask]:

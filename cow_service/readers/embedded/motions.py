@@ -14,7 +14,7 @@ from cow_service.readers.embedded.matching import best_matches, describe, match_
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, Until, Vector
 from cow_service.vision.scene import Scene
-from cow_service.vision.trails import TrailEnd, trail_of
+from cow_service.vision.trails import trail_of
 
 _T = TypeVar("_T")
 
@@ -123,14 +123,14 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
                 f"The question tells the end of the trail by '{words.near.text}', which was not found, or not for "
                 f"certain. Seen: {describe(scene.regions)}. {GIVE_PLACE}"
             )
-        trail = trail.ending(TrailEnd(None if near is None else near.bbox, words.side))
+        trail = trail.ending(None if near is None else near.bbox, words.side)
     if not trail.end_known:
         # What may lie ahead: the first thing that is asked about, else the middle of the image.
         asked = ((each.text, match_one(beside, each)) for each in question.others)
         x, y = scene.width / 2, scene.height / 2
         ahead = ((name, region.bbox) for name, region in asked if region is not None)
         name, bbox = next(ahead, ("middle of the image", (x, y, x, y)))
-        trail = trail.ending(TrailEnd(bbox))
+        trail = trail.ending(bbox)
         warnings = (
             f"The image shows the {phrase.text} in {len(trail.positions)} places one after another, and neither they "
             f"nor the question tell which is the last: the one nearest to the {name} was taken for it. Say otherwise "
