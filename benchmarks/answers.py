@@ -1,10 +1,12 @@
 """Measures answers: those of the embedded reader against scenes with known truth, and what asking an MLLM adds.
 
-    python benchmarks/answers.py DIR [--runs N] [--json FILE]
+    python benchmarks/answers.py DIR ... [--runs N] [--json FILE] [--diagram FILE]
 
-DIR holds one folder per scene with image.jpg and meta.json, as `examples/` does. Each scene is asked as a caller would,
-by image and question alone; right, wrong and not sure are counted. Then one scene is answered through a server on
-loopback that replies at once: what is left is our own time (prompts, images, HTTP, reading the replies, simulation).
+Each DIR holds one folder per scene with image.jpg and meta.json, as `examples/` does. Each scene is asked as a caller
+would, by image and question alone; right, wrong and not sure are counted, and what is told with a probability is scored
+(Brier) and drawn against what is so, as a reliability diagram with a curve for each DIR. Then one scene is answered
+through a server on loopback that replies at once: what is left is our own time (prompts, images, HTTP, reading the
+replies, simulation).
 """
 
 from __future__ import annotations
@@ -24,9 +26,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from cow_service.evals.report.figures import draw_curves
+from cow_service.evals.statistics import Calibration, calibration_of
 from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
+
+YES = "A"  # the option that says that it happens, in the scenes' questions
 
 
 class Instant(BaseHTTPRequestHandler):
@@ -70,19 +76,22 @@ def measure_scenes(service: Service, folders: list[Path]) -> tuple[list[dict[str
         meta = json.loads((folder / "meta.json").read_text())
         started = time.perf_counter()
         answer = service.answer(request_of(service, folder))
-        outcome = "not sure" if answer.not_sure else "right" if answer.answer == meta["answer"] else "wrong"
+        told = None if answer.simulation is None else answer.simulation.trajectory.outcome
         rows.append(
             {
                 "scene": folder.name,
-                "task": meta["task"],
                 "truth": meta["answer"],
                 "answer": answer.answer,
-                "outcome": outcome,
+                "probability": None if told is None or told.asked.form != "whether" else told.probability,
+                "outcome": "not sure" if answer.not_sure else "right" if answer.answer == meta["answer"] else "wrong",
                 "ms": round(1000 * (time.perf_counter() - started), 1),
             }
         )
     counts = Counter(row["outcome"] for row in rows)
-    summary = {name: counts[name] for name in ("right", "wrong", "not sure")}
+    summary: dict[str, Any] = {name: counts[name] for name in ("right", "wrong", "not sure")}
+    told = [(row["probability"], row["truth"] == YES) for row in rows if row["probability"] is not None]
+    if told:
+        summary["calibration"] = calibration_of(told).model_dump(mode="json")
     return rows, summary | {"p50_ms": round(statistics.median(row["ms"] for row in rows), 1)}
 
 
@@ -121,27 +130,46 @@ def measure_overhead(folder: Path, runs: int) -> dict[str, float]:
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--runs", type=int, default=10)
-    parser.add_argument("--json", type=Path, default=None, help="write rows and summary here")
+    parser.add_argument("--json", type=Path, default=None, help="write rows and summaries here")
+    parser.add_argument("--diagram", type=Path, default=None, help="draw the reliability diagram here (PNG or SVG)")
     arguments = parser.parse_args()
-    folders = sorted(path.parent for path in arguments.folder.glob("*/meta.json"))
-    if not folders:
-        print(f"No scenes in {arguments.folder}: it needs folders with image.jpg and meta.json.", file=sys.stderr)
-        return 2
+    scenes = {each.name: sorted(path.parent for path in each.glob("*/meta.json")) for each in arguments.folders}
+    for name, folders in scenes.items():
+        if not folders:
+            print(f"No scenes in {name}: it needs folders with image.jpg and meta.json.", file=sys.stderr)
+            return 2
+    rows: dict[str, list[dict[str, Any]]] = {}
+    summaries: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as data, Service(Settings(data_dir=Path(data), reader="embedded")) as service:
-        rows, summary = measure_scenes(service, folders)
-    table = Table(box=None, pad_edge=False)
-    for name in rows[0]:
-        table.add_column(name)
-    for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
-    Console(width=120).print(table)
-    summary = summary | measure_overhead(folders[0], arguments.runs)
-    for name, value in summary.items():
+        for name, folders in scenes.items():
+            rows[name], summaries[name] = measure_scenes(service, folders)
+    for name, found in rows.items():
+        table = Table(box=None, pad_edge=False, title=name)
+        for column in found[0]:
+            table.add_column(column)
+        for row in found:
+            table.add_row(*(str(value) for value in row.values()))
+        Console(width=120).print(table)
+    for name, found in summaries.items():
+        brier = f"; Brier score {found['calibration']['brier']:.3f}" if "calibration" in found else ""
+        counted = ", ".join(f"{found[outcome]} {outcome}" for outcome in ("right", "wrong", "not sure"))
+        print(f"{name}: {counted}{brier}; p50 {found['p50_ms']} ms")
+    overhead = measure_overhead(next(iter(scenes.values()))[0], arguments.runs)
+    for name, value in overhead.items():
         print(f"{name}: {value}")
+    if arguments.diagram is not None:
+        curves = [
+            ([name], Calibration.model_validate(found["calibration"]))
+            for name, found in summaries.items()
+            if "calibration" in found
+        ]
+        draw_curves(curves).savefig(arguments.diagram, dpi=120)
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"summary": summary, "scenes": rows}, indent=2) + "\n")
+        arguments.json.write_text(
+            json.dumps({"summaries": summaries, "overhead": overhead, "scenes": rows}, indent=2) + "\n"
+        )
     return 0
 
 

@@ -214,9 +214,12 @@ def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibrat
         for each in observations
         if each.probability is not None and each.happens is not None
     }
-    if not told:
-        return None
-    table = np.array(list(told.values()), dtype=np.float64)
+    return calibration_of(list(told.values()), bins) if told else None
+
+
+def calibration_of(told: Sequence[tuple[float, bool]], bins: int = 10) -> Calibration:
+    """Of probabilities and whether what they are about happened: one or more."""
+    table = np.array(told, dtype=np.float64)
     base = table[:, 1].mean()
     places = np.minimum((table[:, 0] * bins).astype(int), bins - 1)
     found: list[Bin] = []

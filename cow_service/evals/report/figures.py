@@ -251,8 +251,11 @@ def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
             same.append(each.name)
         elif each.calibration is not None:
             curves.append(([each.name], each.calibration))
-    if not curves:
-        return None
+    return draw_curves(curves) if curves else None
+
+
+def draw_curves(curves: Sequence[tuple[list[str], Calibration]]) -> Figure:
+    """A reliability diagram with a curve for each calibration, whose names it has."""
     figure = Figure(figsize=(SQUARE + 0.6, SQUARE + 0.5 + 0.42 * len(curves)), layout="constrained")
     axes = figure.add_subplot()
     (diagonal,) = axes.plot([0, 100], [0, 100], color=DIM, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
