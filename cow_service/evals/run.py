@@ -139,10 +139,12 @@ def evaluate(wanted: plan.Plan, tell: Callable[[str], None]) -> runs.EvalRun:
     """
     plan.check_plan(wanted)
     try:
-        pictures = Pictures(wanted.out / runs.PICTURES)
+        wanted.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageUnavailable(f"'{wanted.out}' cannot be written: {error.strerror or error}.") from error
-    found = load(wanted.data, pictures, subsets=wanted.subsets, skip_faulty=wanted.skip_faulty)
+    found = load(
+        wanted.data, Pictures(wanted.out / runs.PICTURES), subsets=wanted.subsets, skip_faulty=wanted.skip_faulty
+    )
     items = found.items[: wanted.limit]
     arms = check_arms(wanted.arms, wanted.ask, items)
     for told in (*found.notes, *found.faults):
@@ -159,7 +161,6 @@ def evaluate(wanted: plan.Plan, tell: Callable[[str], None]) -> runs.EvalRun:
     logs = wanted.out / runs.LOGS
     again = wanted.retry_failed and logs.is_dir() and runs.forget_failures(logs) > 0
     info = plan.merged(runs.read_info(wanted.out), begun, again=again)
-    runs.write_run(wanted.out, info, items)
     _ask(wanted, info, items, model, settings)
     return runs.read_run(wanted.out)
 
@@ -178,6 +179,7 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
     console = rich.get_console()
     with session(wanted.out, wanted.url, info.settings["requests"], *keys, **settings) as shared, ExitStack() as stack:
         _check_server(shared.url, wanted)
+        runs.write_run(wanted.out, info, items)
         stack.callback(setattr, console, "quiet", console.quiet)
         console.quiet = True  # Inspect says nothing of its own on standard output
         with progress_shown(progress, True) as show:
