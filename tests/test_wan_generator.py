@@ -413,7 +413,8 @@ def test_the_size_of_a_clip(toys: Service, size: tuple[int, int], wanted: tuple[
 
     generator = toys.generators.get("tiny-ati")
     assert isinstance(generator, WanGenerator)
-    full = replace(generator, max_area=480 * 832)
+    defaults = {**generator.manifest.defaults, "max_area": 480 * 832}
+    full = replace(generator, manifest=generator.manifest.model_copy(update={"defaults": defaults}))
     assert full.size(*size) == wanted
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from cow_service import __version__, records
@@ -84,21 +84,11 @@ def run_request(
 
 @contextmanager
 def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], None]]:
-    """Progress bars for the stages; yields the function that updates them."""
+    """A progress bar with the stage beside it; yields the function that updates it."""
     columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
     with Progress(*columns, console=console, transient=True) as bars:
-        tasks: dict[Stage, TaskID] = {}
-        loading = bars.add_task("loading", total=None)  # a model takes its time before the first stage
-
-        def show(stage: Stage | None, done: float) -> None:
-            if stage is None:
-                return
-            bars.update(loading, visible=False)
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=done)
-
-        yield show
+        bar = bars.add_task("loading", total=1.0)  # a model takes its time before the first stage
+        yield lambda stage, done: bars.update(bar, description=stage or "loading", completed=done)
 
 
 def print_stages(console: Console, simulation: Simulation) -> None:
@@ -150,12 +140,16 @@ def print_models(models: records.Models, *, as_json: bool) -> None:
     table = Table("role", "name", "ready", "what it is", box=None, pad_edge=False)
     for role, backends in (("reader", models.readers), ("generator", models.generators)):
         for backend in backends:
-            words = escape(display.readiness_words(backend))
-            ready = words if backend.ready is None else f"[{'green' if backend.ready else 'yellow'}]{words}[/]"
-            table.add_row(role, backend.name + (" (default)" if backend.default else ""), ready, backend.summary)
+            name = backend.name + (" (default)" if backend.default else "")
+            table.add_row(role, name, _readiness(backend), backend.summary)
     console = Console()
     console.print(table)
     console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)
+
+
+def _readiness(backend: records.BackendInfo) -> str:
+    words = escape(display.readiness_words(backend))
+    return words if backend.ready is None else f"[{'green' if backend.ready else 'yellow'}]{words}[/]"
 
 
 def answer_table(answer: Answer) -> Table:
@@ -179,28 +173,16 @@ def answer_table(answer: Answer) -> Table:
 
 
 def _verdict(verdict: Verdict) -> str:
-    if verdict.answer is None:
-        return "[yellow]not sure[/]"
-    text = verdict.answer if verdict.option is None else f"({verdict.answer}) {verdict.option}"
-    return f"[yellow]{escape(text)}[/]" if verdict.not_sure else f"[green]{escape(text)}[/]"
+    colour = "yellow" if verdict.not_sure or verdict.answer is None else "green"
+    return f"[{colour}]{escape(display.describe_answer(verdict))}[/]"
 
 
 # `cow doctor`
 
 PACKAGES = (
-    "fastapi",
-    "uvicorn",
-    "pydantic",
-    "numpy",
-    "opencv-python-headless",
-    "pillow",
-    "av",
-    "torch",
-    "diffusers",
-    "transformers",
-    "pydantic-ai-slim",
-    "llguidance",
-)
+    "fastapi", "uvicorn", "pydantic", "numpy", "opencv-python-headless", "pillow", "av", "torch", "diffusers",
+    "transformers", "pydantic-ai-slim", "llguidance",
+)  # fmt: skip
 
 
 class Report(BaseModel):
@@ -266,12 +248,9 @@ def print_report(report: Report, *, as_json: bool) -> None:
     console.print(f"cow {report.cow}, Python {report.python}, {report.platform}", highlight=False)
     folder = f"data folder: {report.data_folder} ({report.free_disk_gb:.1f} GB free)"
     console.print(folder, highlight=False, soft_wrap=True)
-    table = Table("backend", "ready", "missing", "get it with", box=None, pad_edge=False)
+    table = Table("backend", "ready", "get it with", box=None, pad_edge=False)
     for backend in report.backends:
-        ready = {True: "[green]yes[/]", False: "[yellow]no[/]", None: "unknown"}[backend.ready]
-        table.add_row(
-            backend.name, ready, ", ".join(backend.missing) or "-", escape(backend.install or backend.pull or "-")
-        )
+        table.add_row(backend.name, _readiness(backend), escape(backend.install or backend.pull or "-"))
     console.print(table)
     installed = ", ".join(f"{name} {found}" for name, found in report.packages.items() if found)
     console.print(f"installed: {installed}", highlight=False)

@@ -7,12 +7,11 @@ from typing import Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
+from cow_service.cli.batch import EXIT_INTERRUPTED, EXIT_SOME_FAILED
 from cow_service.cli.options import Texts, argument, option, printable
 from cow_service.errors import CowError
 
 INSTALL = 'pip install "cow-service[evals]"'
-EXIT_SOME_FAILED = 3
-EXIT_INTERRUPTED = 130
 _OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair", "pydantic_ai", "tenacity")
 
 

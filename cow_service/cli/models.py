@@ -64,9 +64,10 @@ def pull(
     console = Console(highlight=False, soft_wrap=True, markup=False)
     console.print("Comparing the repository with the files that are here ...")
     downloads = _downloads(manifest, weights_dir, revisions)
-    count, size = sum(len(each.files) for each in downloads), sum(each.size for each in downloads)
-    pending, needed = sum(len(each.pending) for each in downloads), sum(each.pending_size for each in downloads)
-    console.print(f"{name}: {count} files, {decimal(size)}; to download: {pending} files, {decimal(needed)}.")
+    files = [file for each in downloads for file in each.files]
+    pending = [file for each in downloads for file in each.pending]
+    size, missing = (decimal(sum(file.size for file in some)) for some in (files, pending))
+    console.print(f"{name}: {len(files)} files, {size}; to download: {len(pending)} files, {missing}.")
     download(downloads, weights_dir, lambda repo, file: console.print(f"{repo}: {file.path}, {decimal(file.size)}"))
     for each in downloads:
         folder = folder_of(weights_dir, each.lock.repository)
@@ -218,11 +219,7 @@ def import_tracks(
     if not read.visible.any():
         raise InvalidRequest(f"{file.name} has {read.points.shape[1]} tracks, and none of them is ever visible.")
     held = read.held()
-    moves = (
-        np.abs(held.points - held.points[:1]).max(axis=(0, 2)) > ANCHOR_MAX_MOVE_PX
-        if held.points.size
-        else np.zeros(0, bool)
-    )
+    moves = np.abs(held.points - held.points[:1]).max(axis=(0, 2)) > ANCHOR_MAX_MOVE_PX
     if not moves.any():
         raise InvalidRequest(
             f"{file.name} has {moves.size} tracks, and none of them moves by more than {ANCHOR_MAX_MOVE_PX:g} px."

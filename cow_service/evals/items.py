@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from cow_service.media.artifacts import extension_of, media_type_of
+from cow_service.errors import ArtifactNotFound
+from cow_service.media.artifacts import DiskArtifacts, media_type_of
 from cow_service.media.images import decode
 from cow_service.readers.options import split_options
 from cow_service.records import AnswerOption, Record
@@ -75,37 +76,25 @@ def appended_wording(question: str, options: Sequence[str]) -> Wording:
     return parts, tuple(AnswerOption(letter=letter, text=text) for letter, text in zip(letters, options, strict=True))
 
 
-class Pictures:
-    """A folder of pictures. The same bytes are kept once."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
-        self._known = {path.stem: path for path in folder.iterdir() if not path.name.startswith(".")}
+class Pictures(DiskArtifacts):
+    """A folder of pictures, by their digests. The same bytes are kept once."""
 
     def add(self, data: bytes) -> str:
         """Keeps a picture; returns its digest. Raises what `decode` raises for what is none."""
-        if hashlib.sha256(data).hexdigest() not in self._known:
+        try:
+            self.get(hashlib.sha256(data).hexdigest())
+        except ArtifactNotFound:
             decode(data)
         return self.add_made(data)
 
     def add_made(self, data: bytes) -> str:
         """The same for a picture that the service made."""
-        digest = hashlib.sha256(data).hexdigest()
-        if digest not in self._known:
-            path = self.folder / f"{digest}.{extension_of(media_type_of(data) or 'image/png')}"
-            partial = path.with_name(f".{digest}.partial")
-            partial.write_bytes(data)
-            self._known[digest] = partial.replace(path)
-        return digest
+        return self.put(data, media_type_of(data) or "image/png").sha256
 
     def path(self, digest: str) -> Path:
-        """The file of a picture. Raises `KeyError` for one that was not added."""
-        return self._known[digest]
-
-    def read(self, digest: str) -> bytes:
-        """What a picture holds. Raises `KeyError` for one that was not added."""
-        return self.path(digest).read_bytes()
+        """The file of a picture. Raises `ArtifactNotFound`."""
+        with self.local_file(digest) as path:
+            return path
 
 
 Ask = Literal["prompt", "answer"]

@@ -139,10 +139,12 @@ def evaluate(wanted: plan.Plan, tell: Callable[[str], None]) -> runs.EvalRun:
     """
     plan.check_plan(wanted)
     try:
-        pictures = Pictures(wanted.out / runs.PICTURES)
+        wanted.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageUnavailable(f"'{wanted.out}' cannot be written: {error.strerror or error}.") from error
-    found = load(wanted.data, pictures, subsets=wanted.subsets, skip_faulty=wanted.skip_faulty)
+    found = load(
+        wanted.data, Pictures(wanted.out / runs.PICTURES), subsets=wanted.subsets, skip_faulty=wanted.skip_faulty
+    )
     items = found.items[: wanted.limit]
     arms = check_arms(wanted.arms, wanted.ask, items)
     for told in (*found.notes, *found.faults):

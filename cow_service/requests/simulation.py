@@ -8,25 +8,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
+from cow_service import records
 from cow_service.errors import shortened
-from cow_service.records import (
-    DIRECTED_KINDS,
-    AnswerOption,
-    Asked,
-    BBox,
-    Estimate,
-    FramePolicy,
-    InterventionKind,
-    Law,
-    MotionKind,
-    ObjectPrior,
-    ObjectRole,
-    PlaceRelation,
-    Record,
-    Shape,
-    Until,
-    Vector,
-)
+from cow_service.records import Record
 from cow_service.requests.values import (
     Finite,
     Flag,
@@ -58,17 +42,17 @@ class PlaceRequest(Record):
     mask: MaskRef | None = Field(
         default=None, description="PNG of the upright image's size, white where the object is and black elsewhere."
     )
-    shape: Shape | None = None
+    shape: records.Shape | None = None
     size: Annotated[Finite, Field(ge=1e-4, le=1000)] | None = Field(default=None, description="Its longest side, m.")
     stands_on: ObjectWords | None = Field(default=None, description="`floor`, `air`, or an object in words.")
 
     @property
-    def prior(self) -> ObjectPrior | None:
+    def prior(self) -> records.ObjectPrior | None:
         """What it says of the object beside its place, taken as exact."""
         if self.shape is None and self.size is None and self.stands_on is None:
             return None
-        size = None if self.size is None else Estimate(value=self.size, deviation=0.0)
-        return ObjectPrior(shape=self.shape, size=size, stands_on=self.stands_on)
+        size = None if self.size is None else records.Estimate(value=self.size, deviation=0.0)
+        return records.ObjectPrior(shape=self.shape, size=size, stands_on=self.stands_on)
 
     @model_validator(mode="after")
     def _one_place(self) -> PlaceRequest:
@@ -78,7 +62,7 @@ class PlaceRequest(Record):
 
     @field_validator("bbox")
     @classmethod
-    def _has_area(cls, bbox: BBox | None) -> BBox | None:
+    def _has_area(cls, bbox: records.BBox | None) -> records.BBox | None:
         if bbox is not None and (bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2):
             raise ValueError(f"[x0, y0, x1, y1] must span at least 2 px each way, got {list(bbox)}")
         return bbox
@@ -94,10 +78,12 @@ class ObjectRequest(PlaceRequest):
     """Another object of the image, by its box, its mask, or a point on it."""
 
     object: ObjectWords
-    role: ObjectRole = Field(default="target", description="target: the question asks about it; obstacle: it is there.")
+    role: records.ObjectRole = Field(
+        default="target", description="target: the question asks about it; obstacle: it is there."
+    )
 
 
-class AskedRequest(Asked):
+class AskedRequest(records.Asked):
     """What the question wants to know. Objects are named as in `objects`, or as the question names them."""
 
     subject: ObjectWords | None = Field(default=None, description="Who does it; null: the object that moves.")
@@ -113,9 +99,11 @@ class AskedRequest(Asked):
 class InterventionRequest(Record):
     """A change of the scene before anything moves. Its objects are named as in `objects`, or in words to look for."""
 
-    kind: InterventionKind
+    kind: records.InterventionKind
     object: ObjectWords
-    relation: PlaceRelation | None = Field(default=None, description="Of `place`: how it is put to the `targets`.")
+    relation: records.PlaceRelation | None = Field(
+        default=None, description="Of `place`: how it is put to the `targets`."
+    )
     targets: tuple[ObjectWords, ...] = Field(
         default=(), max_length=2, description="Of `place`: what it is put into, onto or beside; two for `between`."
     )
@@ -139,7 +127,7 @@ MAX_STEPS = 16
 _OF_A_LINE = ("distance", "duration", "until", "steps")
 
 
-def _has_length(direction: Vector) -> Vector:
+def _has_length(direction: records.Vector) -> records.Vector:
     if not 1e-9 < math.hypot(*direction) < 1e12:
         raise ValueError(f"[dx, dy] must have a length, got {list(direction)}")
     return direction
@@ -172,7 +160,7 @@ class OtherMotionRequest(Record):
     speed: Speed | None = Field(default=None, description="px/s; by default as for the mover.")
 
     @property
-    def stated_kind(self) -> MotionKind:
+    def stated_kind(self) -> records.MotionKind:
         """The kind of motion."""
         return self.kind or "linear"
 
@@ -187,12 +175,12 @@ class OtherMotionRequest(Record):
 class MotionRequest(Record):
     """Skips stage 2: how the object moves. Without `kind` and `direction` these are read from the question."""
 
-    kind: MotionKind | None = Field(
+    kind: records.MotionKind | None = Field(
         default=None,
         description="linear: straight on; projectile: thrown; fall: dropped; static: it stays; place: it is put "
         "somewhere. By default linear where there is a `direction`, else read from the question.",
     )
-    law: Law = Field(
+    law: records.Law = Field(
         default="contact",
         description="contact: it bounces, pushes, rolls, comes to rest; ballistic: straight through everything.",
     )
@@ -214,7 +202,9 @@ class MotionRequest(Record):
         default=None, description="px at the depth of the first frame, after which it is stopped."
     )
     duration: Seconds | None = Field(default=None, description="s, after which it is stopped.")
-    until: Until | None = Field(default=None, description="contact: it is stopped where it first meets something.")
+    until: records.Until | None = Field(
+        default=None, description="contact: it is stopped where it first meets something."
+    )
     steps: tuple[MotionStepRequest, ...] = Field(
         default=(), max_length=MAX_STEPS, description="Further legs, after this one."
     )
@@ -234,7 +224,7 @@ class MotionRequest(Record):
     )
 
     @property
-    def stated_kind(self) -> MotionKind | None:
+    def stated_kind(self) -> records.MotionKind | None:
         """The kind of motion; None where the motion is left to the reader."""
         return self.kind or ("linear" if self.direction is not None else None)
 
@@ -243,10 +233,10 @@ class MotionRequest(Record):
         kind = self.stated_kind
         if kind is None and (self.depth or self.depth_deviation is not None):
             raise ValueError("`depth` and `depth_deviation` need a `direction` [dx, dy]")
-        if kind in DIRECTED_KINDS and self.direction is None:
+        if kind in records.DIRECTED_KINDS and self.direction is None:
             raise ValueError(f"a {kind} motion needs a `direction` [dx, dy]")
         speeds = self.direction is not None or self.speed is not None or self.speed_deviation is not None
-        if kind not in (None, *DIRECTED_KINDS) and (speeds or self.depth or self.depth_deviation is not None):
+        if kind not in (None, *records.DIRECTED_KINDS) and (speeds or self.depth or self.depth_deviation is not None):
             raise ValueError(f"a {kind} motion takes no `direction`, `speed` or `depth`; a throw is a `projectile`")
         lengths = [name for name in _OF_A_LINE if getattr(self, name) not in (None, ())]
         if kind not in (None, "linear") and lengths:
@@ -321,7 +311,7 @@ MAX_OPTIONS = 26
 MAX_OPTION_LEVELS = 8
 
 
-class OptionRequest(AnswerOption):
+class OptionRequest(records.AnswerOption):
     """An answer to choose from, with its letter."""
 
     text: Words = Field(min_length=1, max_length=400)
@@ -345,7 +335,7 @@ Options = Annotated[
 class FramesRequest(Record):
     """Which frames of the clip to return as pictures, and how large."""
 
-    policy: FramePolicy = Field(
+    policy: records.FramePolicy = Field(
         default="events",
         description="events: before, at and after what matters, and the end; uniform: evenly over the clip; "
         "initial: frames 1, 3, 5, ..., as in the paper.",
@@ -447,7 +437,7 @@ class SimulateRequest(Record):
         return self.seed or 0
 
     @property
-    def law(self) -> Law:
+    def law(self) -> records.Law:
         """The law of the motion, whoever reads it."""
         return MotionRequest().law if self.motion is None else self.motion.law
 

@@ -260,16 +260,6 @@ class Download:
     files: tuple[LockedFile, ...]
     pending: tuple[LockedFile, ...]
 
-    @property
-    def size(self) -> int:
-        """Bytes of all files."""
-        return sum(file.size for file in self.files)
-
-    @property
-    def pending_size(self) -> int:
-        """Bytes to download."""
-        return sum(file.size for file in self.pending)
-
 
 def resolve(source: Source, weights_dir: Path, revision: str | None = None, *, endpoint: str | None = None) -> Download:
     """What is missing of a source. The hub is asked only for what is not recorded. Raises `WeightsUnavailable`.
@@ -320,7 +310,7 @@ def download(
             with disk_errors(each.lock.repository):
                 folder = folder_of(weights_dir, each.lock.repository)  # which may be a link to another disk
                 disk, free = folder.stat().st_dev, shutil.disk_usage(folder).free
-            needed[disk] += each.pending_size
+            needed[disk] += sum(file.size for file in each.pending)
             if needed[disk] > free:
                 why = f"its disk has {free / 1e9:.1f} GB free, and {needed[disk] / 1e9:.1f} GB are needed"
                 raise _unavailable(each.lock.repository, why, "Free some space, or set COW_MODELS_DIR to a larger disk")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from pydantic import ValidationError
 
-from cow_service.errors import CowError
+from cow_service.errors import CowError, StorageUnavailable
 from cow_service.evals import items
 from cow_service.evals.items import Item, Pictures, Task
 from cow_service.readers.options import not_sure_option, option_named
@@ -102,6 +102,8 @@ def _picture(data: bytes | None, name: str, pictures: Pictures) -> str:
         raise RowFault(f"the {name} is missing")
     try:
         return pictures.add(data)
+    except StorageUnavailable:
+        raise
     except CowError as error:
         raise RowFault(f"the {name} cannot be used: {error.detail}") from error
 

@@ -106,7 +106,7 @@ def _addresses(folder: Path, runs: Sequence[EvalRun], digests: Sequence[str]) ->
     """Where the pictures of these digests are; None for a file that is not there."""
     known: dict[str, Path] = {}
     for run in reversed(runs):
-        known |= {path.stem: path for path in (run.folder / PICTURES).glob("*")}
+        known |= {path.stem: path for path in (run.folder / PICTURES).rglob("*.*")}
     found = (known.get(digest) for digest in digests)
     return [None if path is None else _address(folder, path) for path in found]
 

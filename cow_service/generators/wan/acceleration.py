@@ -128,7 +128,7 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -
     `steps`: denoising steps of the coming clip, which dbcache counts. `branches`: passes of each step here.
     Run every pass in `transformer.cache_context("cond")` or `("uncond")`, one after the other: each has its own state.
     """
-    if "cache_dit" in sys.modules and _has_dbcache(transformer):
+    if "cache_dit" in sys.modules and getattr(transformer, "_is_cached", False):  # by dbcache
         import cache_dit  # noqa: PLC0415
 
         changed = cache_dit.DBCacheConfig().reset(
@@ -141,10 +141,6 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -
             transformer._context_manager.set_context(name)
         return
     transformer._reset_stateful_cache()  # removed and added anew, the hooks would be in another order
-
-
-def _has_dbcache(transformer: Any) -> bool:
-    return getattr(transformer, "_is_cached", False)
 
 
 def pin(module: nn.Module) -> None:

@@ -29,6 +29,7 @@ from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, Wa
 from cow_service.generators.wan.ranks import RankGroup
 from cow_service.generators.wan.tracks import tracks_of
 from cow_service.records import GeneratorInfo
+from cow_service.settings import Settings
 from cow_service.vision.types import Image
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import Manifest
@@ -64,27 +65,27 @@ class WanGenerator(WanLimits):
     fingerprint: str = field(init=False)  # SHA-256 of everything that decides a clip besides its input
 
     manifest: Manifest
-    repository: str | None  # of the transformer, or the name of the user's own checkpoint
-    revision: str | None
-    revisions: dict[str, str]  # of the other parts that were pulled
+    settings: Settings
+    revisions: dict[str, str]  # of the parts that were pulled
     weights_identity: str  # as `weights_identity`, taken before the weights were loaded
     pipeline: WanTrackPipeline
     group: RankGroup | None  # of processes that denoise with this one
     device: torch.device
-    profile_name: str
-    profile: Profile
+    profile: Profile  # that of the settings, with the attention backend that was chosen
     conditioning: TrackConditioning
-    max_area: int  # px per frame
 
     def __post_init__(self) -> None:
+        own, source = self.settings.checkpoints.get(self.manifest.name), self.manifest.sources.get("transformer")
+        self._repository = own.name if own is not None else None if source is None else source.repository
+        self._max_area = int(self.manifest.defaults["max_area"])  # px per frame
         self._embeddings = EmbeddingCache(self.pipeline)
         self._negative_prompt = str(self.manifest.defaults.get("negative_prompt", ""))
         threads = self.manifest.defaults.get("threads")
         self.threads = None if threads is None else int(threads)  # of the CPU; None keeps PyTorch's own number
         parts = (
-            *(self.manifest.name, self.repository, self.revision, sorted(self.revisions.items())),
-            *(self.weights_identity, self.device.type, self.profile_name, self.profile.model_dump_json()),
-            *(self.max_area, self._negative_prompt),
+            *(self.manifest.name, self._repository, sorted(self.revisions.items()), self.weights_identity),
+            *(self.device.type, self.settings.profile, self.profile.model_dump_json()),
+            *(self._max_area, self._negative_prompt),
         )
         self.fingerprint = sha256(repr(parts).encode()).hexdigest()
 
@@ -95,7 +96,7 @@ class WanGenerator(WanLimits):
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Of a clip, at the image's aspect ratio, in multiples of 16 px. Raises `InvalidRequest` if too narrow."""
-        clip_width, clip_height = clip_size(self.max_area, width, height)
+        clip_width, clip_height = clip_size(self._max_area, width, height)
         if max(clip_width, clip_height) > MAX_SIDE:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
             raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))
@@ -131,13 +132,13 @@ class WanGenerator(WanLimits):
         changed = self.profile.acceleration.model_dump(exclude_defaults=True, mode="json").items()
         return GeneratorInfo(
             name=self.manifest.name,
-            model=self.repository,
-            revision=self.revision,
+            model=self._repository,
+            revision=self.revisions.get("transformer"),
             seed=given.seed,
             steps=sampling.steps,
             is_toy=not self.manifest.sources,
             options={
-                "profile": self.profile_name,
+                "profile": self.settings.profile,
                 "solver": sampling.solver,
                 "shift": sampling.shift,
                 "guidance_scale": sampling.guidance_scale,
@@ -148,7 +149,7 @@ class WanGenerator(WanLimits):
                 "negative_prompt": negative or "",
                 "clean_cues": options.clean_cues,
             }
-            | {f"{part}_revision": revision for part, revision in self.revisions.items()}
+            | {f"{part}_revision": revision for part, revision in self.revisions.items() if part != "transformer"}
             | {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in changed},
         )
 

@@ -48,35 +48,21 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)
     device = choose_device(settings.device, GeneratorUnavailable)
-    own = settings.checkpoints.get(name)
-    if own is not None:
-        checkpoints.checkpoint_files(own)
+    if name in settings.checkpoints:
+        checkpoints.checkpoint_files(settings.checkpoints[name])
     weights = Weights(manifest, profile, settings)
     folders = {part: weights.folder(part) for part in manifest.sources}
     check_machine(manifest, settings.profile, folders, device)
     acceleration.check_device(profile.acceleration, device)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
-    max_area = int(manifest.defaults["max_area"])
+    size = clip_size(int(manifest.defaults["max_area"]), *USUAL_SIDES)
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
         kept = settings.data_dir / "attention.json"
-        profile = with_attention(profile, manifest.architecture, *clip_size(max_area, *USUAL_SIDES), device, kept)
+        profile = with_attention(profile, manifest.architecture, *size, device, kept)
         weights = replace(weights, profile=profile)
         pipeline, group = weights.load_pipeline(device)
-    revisions = weights.revisions()
-    repository = manifest.sources["transformer"].repository if manifest.sources else None
     generator = WanGenerator(
-        manifest=manifest,
-        repository=repository if own is None else own.name,
-        revision=revisions.pop("transformer", None),
-        revisions=revisions,
-        weights_identity=identity,
-        pipeline=pipeline,
-        group=group,
-        device=device,
-        profile_name=settings.profile,
-        profile=profile,
-        conditioning=track_conditioning,
-        max_area=max_area,
+        manifest, settings, weights.revisions(), identity, pipeline, group, device, profile, track_conditioning
     )
     if settings.warmup:
         try:

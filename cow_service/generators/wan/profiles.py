@@ -153,6 +153,4 @@ class WanLimits:
 
     options_model = WanOptions
 
-    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
-        """4n + 1 frames, 5 to 81."""
-        return nearest_lengths(num_frames)
+    nearest_lengths = staticmethod(nearest_lengths)

@@ -231,11 +231,10 @@ class BatchGenerator:
         self._model.eval().requires_grad_(False)
         self._processor: Any = processor
         self._tokenizer: transformers.PreTrainedTokenizerFast = self._processor.tokenizer
-        advice = model.generation_config or transformers.GenerationConfig()
-        given = {name: getattr(advice, name) for name in ("temperature", "top_p", "top_k")}
-        known: dict[str, Any] = {"temperature": 1.0}
-        known |= {name: value for name, value in given.items() if value is not None}
-        self.default_sampling = TokenSampling(**known) if advice.do_sample else TokenSampling()
+        advice: Any = model.generation_config or transformers.GenerationConfig()
+        self.default_sampling = TokenSampling()
+        if advice.do_sample:
+            self.default_sampling = TokenSampling(advice.temperature or 1.0, advice.top_p or 1.0, advice.top_k or 0)
         ends: Any = self._tokenizer.eos_token_id if advice.eos_token_id is None else advice.eos_token_id
         self._ends: tuple[int, ...] = (ends,) if isinstance(ends, int) else tuple(ends)
         # Else the checkpoint's advice on sampling would be mixed into every call, after ours.

@@ -108,7 +108,6 @@ PROFILE = ModelProfile(
     # A grammar holds the reply to the schema but tells the model nothing: what it may write stands in its prompt.
     native_output_requires_schema_in_instructions=True,
 )
-_UNPREPARED = ("retry-feedback", "retry-prompt")
 
 
 class LocalModel(Model[None]):
@@ -123,7 +122,7 @@ class LocalModel(Model[None]):
     unsupported_settings = frozenset(
         {
             "extra_body", "extra_headers", "frequency_penalty", "logit_bias", "max_retries", "parallel_tool_calls",
-            "presence_penalty", "service_tier", "stop_sequences",
+            "presence_penalty", "service_tier", "stop_sequences", "timeout",
         }
     )  # fmt: skip
 
@@ -163,25 +162,15 @@ class LocalModel(Model[None]):
     ) -> ModelResponse:
         """The reply. Its finish reason is `length` where it was cut off, as the caller's limit or the model's wants it.
 
-        Raises `MllmUnavailable` where memory runs out or the setting `timeout` (seconds) is over, `ImageUnreadable` and
-        the other errors of `images.decode` for images, and `UserError` for tools, files that are no images, schemas
-        that replies cannot be held to, and settings out of range.
+        Raises `MllmUnavailable` where memory runs out, `ImageUnreadable` and the other errors of `images.decode` for
+        images, and `UserError` for tools, files that are no images, schemas that replies cannot be held to, and
+        settings out of range.
         """
         settings, parameters = self.prepare_request(model_settings, model_request_parameters)
-        settings = settings or ModelSettings()
         # Decoding images takes long enough to hold up an event loop.
-        pending = await asyncio.to_thread(self._pending, messages, settings, parameters)
-        timeout = settings.get("timeout")
-        seconds = timeout if isinstance(timeout, int | float) else None
-        try:
-            # Giving up cancels the future, and so takes the call out of the queue or ends its reply.
-            async with asyncio.timeout(seconds):
-                reply = await asyncio.wrap_future(self._worker.submit(pending))
-        except TimeoutError as error:
-            raise MllmUnavailable(
-                f"'{self._name}' gave no reply in {seconds:g} s. Allow it more (COW_MLLM_TIMEOUT), send fewer requests "
-                f"at a time, or set COW_MLLM to a smaller model."
-            ) from error
+        pending = await asyncio.to_thread(self._pending, messages, settings or ModelSettings(), parameters)
+        # Giving up cancels the future, and so takes the call out of the queue or ends its reply.
+        reply = await asyncio.wrap_future(self._worker.submit(pending))
         return replace(reply, model_name=self._name, provider_name=self.system)
 
     def _pending(
@@ -189,8 +178,6 @@ class LocalModel(Model[None]):
     ) -> PendingGeneration:
         if parameters.function_tools:
             raise UserError("A model in this process takes no tools.")
-        if any(part.part_kind in _UNPREPARED for message in messages for part in message.parts):
-            messages = self.prepare_messages(messages, parameters)  # as agents do before they ask
         default = self._generator.default_sampling
         sampling = generation.TokenSampling(
             temperature=settings.get("temperature", default.temperature),

@@ -45,14 +45,12 @@ def load_local(settings: Settings) -> LocalModel:
     `CheckpointInvalid`.
     """
     manifests, name = mllm_manifests(), settings.mllm
-    usable = ", ".join(each.name for each in manifests.values() if each.sources or each.architecture)
-    if name is None:
-        raise ReaderUnavailable(f"No multimodal LLM is chosen: set COW_MLLM to one of {usable}.")
-    manifest, own = manifests.get(name), settings.checkpoints.get(name)
+    manifest, own = manifests.get(name or ""), settings.checkpoints.get(name or "")
     if manifest is None or not (own or manifest.sources or manifest.architecture):
+        usable = ", ".join(each.name for each in manifests.values() if each.sources or each.architecture)
+        fault = f"'{name}' has no weights that run in this process" if name else "No multimodal LLM is chosen"
         raise ReaderUnavailable(
-            f"'{name}' has no weights that run in this process. If it is served by others, take the reader 'mllm', or "
-            f"set COW_MLLM to one of {usable}."
+            f"{fault}. Take the reader 'mllm' for one that is served by others, or set COW_MLLM to one of {usable}."
         )
     options = LocalOptions.model_validate(manifest.local)
     places = device_map(settings.device)

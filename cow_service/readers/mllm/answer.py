@@ -66,7 +66,8 @@ def answer_schema(options: Sequence[AnswerOption], reasoning_length: int) -> rep
 def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
     """The answer that a reply gives. Raises `ReplyError` where it gives none of the options, or more than one."""
     said = replies.without_thinking(reply)
-    objects = [fields for value in replies.values_in(said) for fields in _objects(value)]
+    parts = (part for value in replies.values_in(said) for part in replies.listed(value))
+    objects = [replies.fields_of(part) for part in parts if isinstance(part, dict)]
     if any(key in fields for fields in objects for key in _KEYS):
         readings = [reading for fields in objects for reading in _read_fields(fields, options)]
     else:
@@ -76,14 +77,6 @@ def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
     if len({(reading.answer, reading.not_sure) for reading in readings}) > 1:
         raise ReplyError(f"several answers are given; {_remedy(options)}")
     return readings[-1]
-
-
-def _objects(value: object) -> Iterator[dict[str, Any]]:
-    if isinstance(value, list):
-        for part in replies.listed(value):
-            yield from _objects(part)
-    elif isinstance(value, dict):
-        yield replies.fields_of(value)
 
 
 def _read_fields(fields: dict[str, Any], options: Sequence[AnswerOption]) -> Iterator[AnswerReading]:

@@ -134,15 +134,13 @@ class MllmClient:
         return await asyncio.wrap_future(self._thread.submit(self._chat(body)))
 
     async def _chat(self, body: dict[str, Any]) -> ChatTurn:
-        model = self.model.model
-        chat = prepare_chat(body, model)
+        chat = prepare_chat(body, self.model.model)
         settings = self._supported(chat.settings | ModelSettings(timeout=self._timeout, max_retries=0))
+        once = RetryingModel(self.model.model, self._slots, self._timeout, budget=0, schema=None)
         try:
-            async with self._slots:
-                with anyio.fail_after(self._timeout):
-                    response = await model_request(
-                        model, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
-                    )
+            response = await model_request(
+                once, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
+            )
         except errors.UserError as error:
             raise InvalidRequest(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}") from error
         except errors.ModelHTTPError as error:
@@ -150,14 +148,10 @@ class MllmClient:
             told = {"message": message, "type": "upstream_error", "param": None, "code": str(error.status_code)}
             retry = {} if error.retry_after is None else {"Retry-After": f"{error.retry_after:.0f}"}
             return ChatTurn({"error": told}, error.status_code, chat.warnings, retry)
-        except TimeoutError as error:
-            raise MllmUnavailable(
-                f"{self._name} gave no reply within {self._timeout:g} s (COW_MLLM_TIMEOUT)."
-            ) from error
         except errors.ModelAPIError as error:
             raise MllmUnavailable(f"{self._name} could not be asked: {reason_of(error)}.") from error
-        except errors.AgentRunError as error:
-            raise MllmBadReply(f"{self._name} gave a reply that could not be read.") from error
+        except errors.ContentFilterError as error:
+            raise MllmBadReply(f"{self._name} refused to answer: its content filter held the reply back.") from error
         return ChatTurn(completion_of(response, self.model.name), warnings=chat.warnings)
 
     async def _complete(self, call: PromptCall[T], given: ReaderInput) -> T | CowError:
@@ -264,7 +258,7 @@ _MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
 
 
 class RetryingModel(WrapperModel):
-    """A model that repeats a failed request while that may help and `budget` seconds are not over.
+    """A model that repeats a failed request while that may help and `budget` seconds are not over; with 0, never.
 
     Each attempt waits for one of `slots`, then takes `timeout` seconds at most. `calls` counts the attempts, `failures`
     keeps the errors of those that failed.
@@ -274,10 +268,7 @@ class RetryingModel(WrapperModel):
         self, wrapped: Model, slots: asyncio.Semaphore, timeout: float, budget: float, schema: Schema | None
     ) -> None:
         super().__init__(wrapped)
-        self._slots = slots
-        self._timeout = timeout
-        self._budget = budget
-        self._schema = schema
+        self._slots, self._timeout, self._budget, self._schema = slots, timeout, budget, schema
         self.calls = 0
         self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InternalError, InvalidRequest
-from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number, number
+from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number, listed, number
 from cow_service.records import BBox, Point
 from cow_service.weights.manifests import Coordinates, Family, ImageSize
 
@@ -108,11 +108,11 @@ class CoordinateFrame:
 
     def point(self, written: object) -> Point:
         """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""
-        return self._inside(*self._pairs(written, 1, "a point")[0])
+        return self._inside(*self._pairs(written, 1, "a point is 2 numbers")[0])
 
     def bbox(self, written: object) -> BBox:
         """A box [x0, y0, x1, y1] in pixels, its corners sorted. Raises `ReplyError` for one outside or without area."""
-        (ax, ay), (bx, by) = (self._inside(*pair) for pair in self._pairs(written, 2, "a box"))
+        (ax, ay), (bx, by) = (self._inside(*pair) for pair in self._pairs(written, 2, "a box is 4 numbers"))
         x0, y0, x1, y1 = min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
         if x1 - x0 < LEAST_SIDE or y1 - y0 < LEAST_SIDE:
             raise ReplyError(f"the box {_shown(written)} has no area; give two opposite corners of the object")
@@ -120,7 +120,7 @@ class CoordinateFrame:
 
     def ends(self, written: object) -> tuple[Point, Point]:
         """Where a line begins and ends, in pixels. Raises `ReplyError` for one outside or without length."""
-        start, end = (self._inside(*pair) for pair in self._pairs(written, 2, "a direction"))
+        start, end = (self._inside(*pair) for pair in self._pairs(written, 2, "a direction is 4 numbers"))
         if math.dist(start, end) < LEAST_LENGTH:
             raise ReplyError(f"the direction {_shown(written)} has no length; give two different points")
         return start, end
@@ -143,17 +143,18 @@ class CoordinateFrame:
         width, height = self._full
         return min(max(x, 0.0), width) / width * self.width, min(max(y, 0.0), height) / height * self.height
 
-    def _pairs(self, written: object, count: int, what: str) -> list[tuple[float, float]]:
-        """(x, y) pairs in the family's units."""
-        # The two points of an object such as {"start": ..., "end": ...}; anything else as it is.
-        fields = fields_of(written) if count == 2 else {}
+    def _pairs(self, written: object, count: int, wanted: str) -> list[tuple[float, float]]:
+        """So many (x, y) pairs in the family's units, also from points in a list or by name. Raises `ReplyError`."""
+        fields = fields_of(written)
         ends = next(([fields[a], fields[b]] for a, b in _CORNERS if a in fields and b in fields), written)
-        named = _by_name(ends, count)
-        numbers = _numbers(ends) if named is None else named
+        if count == 2 and len(listed(ends)) == 2:
+            return [pair for end in listed(ends) for pair in self._pairs(end, 1, wanted)]
+        named = _by_name(fields, count)
+        numbers = named or _numbers(written)
         if len(numbers) != 2 * count:
-            raise ReplyError(f"{what} is {2 * count} numbers, not {_shown(written)}")
+            raise ReplyError(f"{wanted}, not {_shown(written)}")
         pairs = list(zip(numbers[::2], numbers[1::2], strict=True))
-        return pairs if named is not None or self.coordinates.axes == "xy" else [(x, y) for y, x in pairs]
+        return pairs if named or self.coordinates.axes == "xy" else [(x, y) for y, x in pairs]
 
 
 @dataclass(frozen=True)
@@ -191,20 +192,15 @@ def _numbers(written: object) -> list[float]:
     return [number for part in parts for number in part] if all(parts) else []
 
 
-def _by_name(written: object, count: int) -> list[float] | None:
-    """The numbers of an object such as {"x0": ..., "y0": ...}, x first; None where it is none."""
-    if isinstance(written, list) and len(cast("list[object]", written)) == count:
-        parts = [_by_name(part, 1) for part in cast("list[object]", written)]
-        return None if None in parts else [number for part in parts if part is not None for number in part]
-    held = fields_of(written)
+def _by_name(fields: Mapping[str, Any], count: int) -> list[float]:
+    """The numbers of an object such as {"x0": ..., "y0": ...}, x first; none where its fields have other names."""
     for x, y, width, height in _SIZED if count == 2 else ():
-        if {x, y, width, height} <= set(held):
-            left, top, wide, high = ((_numbers(held[name]) or [math.nan])[0] for name in (x, y, width, height))
+        if {x, y, width, height} <= fields.keys():
+            left, top, wide, high = ((_numbers(fields[name]) or [math.nan])[0] for name in (x, y, width, height))
             return [left, top, left + wide, top + high]
-    for names in (("x", "y"),) if count == 1 else _NAMED:
-        if set(names) <= set(held):
-            return [number for name in names for number in _numbers(held[name])]
-    return None
+    known = _NAMED if count == 2 else (("x", "y"),)
+    names = next((names for names in known if fields.keys() >= set(names)), ())
+    return [number for name in names for number in _numbers(fields[name])]
 
 
 def covers_image(width: int, height: int, bbox: BBox) -> bool:

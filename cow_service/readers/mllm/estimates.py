@@ -108,7 +108,7 @@ def estimate(expected: str, schema: Schema, read: Callable[[object, ValidationIn
     return PlainValidator(validated), WithJsonSchema(schema)
 
 
-def _word(known: Mapping[str, Any]) -> tuple[Any, Any]:
+def word(known: Mapping[str, Any]) -> tuple[Any, Any]:
     """The annotations of one of some words; the values of `known` are the words, its keys their synonyms, too."""
     words_known = tuple(dict.fromkeys(known.values()))
     return estimate(
@@ -160,8 +160,8 @@ Support = Annotated[
         ),
     ),
 ]
-KnownShape = Annotated[Shape | None, *_word(SHAPES)]
-KnownSpeed = Annotated[SpeedWord | None, *_word(SPEEDS)]
+KnownShape = Annotated[Shape | None, *word(SHAPES)]
+KnownSpeed = Annotated[SpeedWord | None, *word(SPEEDS)]
 DepthDegrees = Annotated[
     float | None,
     *estimate("an angle from -90 (towards the camera) to 90 (away)", number(-90, 90, "integer"), _depth_degrees),

@@ -401,20 +401,9 @@ class Scale(Reply):
 
     other_names: ClassVar = {"metres": ("meters", "length")}
     reference: Annotated[str | None, BeforeValidator(replies.name_of)]
-    metres: Annotated[float | None, WithJsonSchema(replies.nullable(replies.number(*estimates.SIZES)))]
+    metres: Annotated[estimates.Size, WithJsonSchema(replies.nullable(replies.number(*estimates.SIZES)))]
     ends: Annotated[Ends | None, _COORDINATES]
-    down: Annotated[Vector, WithJsonSchema(replies.nullable(replies.one_of(*DOWN)))]
-
-    @field_validator("metres", mode="before")
-    @classmethod
-    def _read_metres(cls, written: object) -> float | None:
-        if replies.is_none(written):
-            return None
-        metres = estimates.metres_of(written)
-        if metres is None or not estimates.SIZES[0] <= metres <= estimates.SIZES[1]:
-            shown = str(written)[:40]
-            raise ReplyError(f"`metres` is {shown}; give the length in metres as a number from 0.001 to 1000")
-        return metres
+    down: Annotated[str | None, *estimates.word(_SIDES), WithJsonSchema(replies.nullable(replies.one_of(*DOWN)))]
 
     @field_validator("ends", mode="before")
     @classmethod
@@ -426,16 +415,6 @@ class Scale(Reply):
             raise ReplyError("`ends` are too close to measure by; take a longer thing")
         return ends
 
-    @field_validator("down", mode="before")
-    @classmethod
-    def _read_down(cls, written: object) -> Vector:
-        said = replies.text_of(written).lower().removesuffix(" side")
-        side = "bottom" if replies.is_none(written) else _SIDES.get(said)
-        if side is None:
-            sides = ", ".join(DOWN)
-            raise ReplyError(f"`down` is {written!r}; give the side of the image to which things fall: {sides}")
-        return DOWN[side]
-
     @property
     def metres_per_pixel(self) -> records.MetresPerPixel | None:
         """Null where nothing was known of any size."""
@@ -444,6 +423,11 @@ class Scale(Reply):
         span = math.dist(*self.ends)
         note = f"{self.reference or 'an object of known size'}: {self.metres:g} m over {span:.0f} px"
         return records.MetresPerPixel(value=self.metres / span, source="reference", note=note)
+
+    @property
+    def way_down(self) -> Vector:
+        """A unit vector in the image."""
+        return DOWN[self.down or "bottom"]
 
 
 def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scale]:
@@ -462,4 +446,8 @@ def read_scale(reply: str, frame: CoordinateFrame) -> Scale:
         raise ReplyError("`ends` and `metres` are missing; give both, or null for both")
     if len(objects) > 1:
         raise ReplyError("several references are given; give one")
-    return Scale.model_validate(objects[0], context=estimates.ReadingContext(frame))
+    context = estimates.ReadingContext(frame)
+    scale = Scale.model_validate(objects[0], context=context)
+    if context.warnings:
+        raise ReplyError(" ".join(context.warnings).rstrip("."))
+    return scale

@@ -218,7 +218,7 @@ class MllmReader:
         if identified is not None:
             hints |= identified.hints
         if isinstance(scaled, Scale):
-            hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.down}
+            hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.way_down}
         elif isinstance(scaled, CowError):
             hints["scale_error"] = scaled.code
         return located, MotionHints(**hints)
