@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import replace
-from queue import Empty, SimpleQueue
 from uuid import uuid4
 
 from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, SetWorkflowID
@@ -54,9 +53,9 @@ class Runner:
         computer: Computer,
         hooks: Webhooks,
         notifications: Notifications,
-        on_end: Callable[[TakenJob, str | CowError | None], None],
+        on_end: Callable[[TakenJob, bool], None],
     ) -> None:
-        """`on_end` is called when an attempt is over, with the outcome of the job where it has one."""
+        """`on_end` is called when an attempt is over, with whether the job has ended by it."""
         self._parts, self._jobs, self._active, self._computer = parts, parts.jobs, parts.active, computer
         self._hooks, self._notifications, self._on_end = hooks, notifications, on_end
         self._starting: dict[str, TakenJob] = {}  # by the ids of their workflows
@@ -71,21 +70,21 @@ class Runner:
         except (SQLAlchemyError, dbos_error.DBOSException) as error:
             log.warning("job %s could not be started: %s", job.id, type(error).__name__)
             del self._starting[workflow_id]
-            self._on_end(job, None)  # maintenance will find that nobody works on it, and give it back
+            self._on_end(job, False)  # maintenance will find that nobody works on it, and give it back
 
     def compute(self, workflow_id: str) -> None:
         """Computes a job, and stores its outcome."""
         job = self._starting.pop(workflow_id)
-        outcome: str | CowError | None = None
+        ended = False
         try:
             with (
                 context.bound(request=job.spec.request_id, job=job.id),
                 tracing.span(f"job {job.spec.kind}", parent=job.spec.traceparent, job_id=job.id),
                 self._active.running(job.id, job.spec.kind, job.run) as running,
             ):
-                outcome = self._outcome(job, running)
+                ended = self._compute(job, running)
         finally:
-            self._on_end(job, outcome)
+            self._on_end(job, ended)
 
     def call_webhook(self, job_id: str, url: str, attempt: int) -> None:
         """Makes an attempt to call a webhook, and sees to another one where that failed."""
@@ -107,8 +106,8 @@ class Runner:
         if wait is not None:
             patient.wait_through(enqueue)
 
-    def _outcome(self, job: TakenJob, running: ActiveJob) -> str | CowError | None:
-        """The result or the error of a job, once it is stored; None where it has none, as it was canceled."""
+    def _compute(self, job: TakenJob, running: ActiveJob) -> bool:
+        """Whether the result or the error of a job is stored; not where it was canceled."""
         metrics, begun = self._parts.service.metrics, False
 
         def progress(stage: Stage | None, done: float) -> None:
@@ -133,25 +132,24 @@ class Runner:
             except Exception as error:
                 if isinstance(error, CowError):
                     log.info("job %s failed: %s", job.id, error.code)  # its detail may hold what was asked
-                    outcome = error
+                    failure = error
                 else:
                     log.exception("job %s failed", job.id)
-                    outcome = unforeseen()
-                stored = patient.wait_through(lambda: self._jobs.fail(job, outcome))
+                    failure = unforeseen()
+                status, stored = "failed", patient.wait_through(lambda: self._jobs.fail(job, failure))
             else:
                 for stage, seconds in computed.timings.items():
                     metrics.stage_seconds.labels(stage).observe(seconds)
-                outcome = computed.result
-                kept = job, computed.kept, computed.trajectory_key, computed.stages
-                stored = patient.wait_through(lambda: self._jobs.succeed(*kept))
+                given = job, computed.result, computed.trajectory_key, computed.stages
+                status, stored = "succeeded", patient.wait_through(lambda: self._jobs.succeed(*given))
             if not stored:
                 raise Canceled("The job is another process's, or has lost a stage.")
         except Canceled:
             with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
                 self._jobs.release(job.id, job.run)  # where it was interrupted; one that was canceled stays so
-            return None
-        metrics.jobs.labels(job.spec.kind, "succeeded" if isinstance(outcome, str) else "failed").inc()
-        return outcome
+            return False
+        metrics.jobs.labels(job.spec.kind, status).inc()
+        return True
 
 
 _runner: Runner | None = None
@@ -246,12 +244,11 @@ class Dispatcher(BackgroundThread):
         self._parts, self._capacity, self._start = parts, capacity, start
         self._places = threading.Lock()
         self._held: Counter[str] = Counter()  # the places of each queue that are held
-        self._handed: SimpleQueue[TakenJob] = SimpleQueue()
         self._woken = threading.Event()
         self._look = True  # at the queues: there may be jobs that wait
 
     def drain(self) -> None:
-        """Takes no more jobs. Those that were handed over are started."""
+        """Takes no more jobs."""
         self._stop.set()
         self._woken.set()
 
@@ -265,8 +262,12 @@ class Dispatcher(BackgroundThread):
         self._look = True
         self._woken.set()
 
+    def has_place(self, queue: str) -> bool:
+        """Whether a job of a queue could be taken now."""
+        return self._held[queue] < self._capacity(queue)
+
     def hold_place(self, queue: str) -> bool:
-        """Holds a place for a job that is about to be handed over; False where none is free."""
+        """Holds a place for a job that is about to be taken; False where none is free."""
         capacity = self._capacity(queue)
         with self._places:
             if self._stop.is_set() or self._held[queue] >= capacity:
@@ -280,18 +281,12 @@ class Dispatcher(BackgroundThread):
             self._held[queue] -= 1
         self.wake()
 
-    def hand_over(self, job: TakenJob) -> None:
-        """Has a job started that holds a place already."""
-        self._handed.put(job)
-        self._woken.set()
-
     def run(self) -> None:
-        """Starts what was handed over, and what waits in the queues."""
+        """Starts what waits in the queues."""
         while not self._stop.is_set():
             self._woken.clear()
             look, self._look = self._look, False
             try:
-                self._start_handed()
                 for queue in self._parts.jobs.waiting_queues() if look else ():
                     self._fill(queue)
             except CowError as error:
@@ -300,12 +295,6 @@ class Dispatcher(BackgroundThread):
                 log.exception("no jobs were taken")
             if not self._woken.wait(POLL_SECONDS):
                 self._look = True
-        self._start_handed()
-
-    def _start_handed(self) -> None:
-        with suppress(Empty):
-            while True:
-                self._start(self._handed.get_nowait())
 
     def _fill(self, queue: str) -> None:
         places = 0
@@ -320,5 +309,4 @@ class Dispatcher(BackgroundThread):
             with self._places:
                 self._held[queue] -= places - len(taken)
         for job in taken:
-            self._start_handed()  # these wait for nothing but this thread
             self._start(job)
