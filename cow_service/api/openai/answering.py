@@ -1,17 +1,19 @@
 """Chats with a model without an MLLM: the last user message becomes an `AnswerRequest`, and its answer the reply."""
 
 import json
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import Iterator
 from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any
 
 from anyio import to_thread
 from pydantic import ValidationError
+from sse_starlette import ServerSentEvent
 
 from cow_service.api.openai import chats
+from cow_service.api.openai.forwarding import Events
 from cow_service.api.openai.records import Answerer
-from cow_service.api.openai.stream import DONE, chunk_of, event_of, follow_job, job_head, progress_chunk
+from cow_service.api.openai.stream import LAST_EVENT, chunk_of, event_of, follow_job, job_head, progress_chunk
 from cow_service.api.problems import invalid
 from cow_service.api.submission import Submission, Submitter
 from cow_service.errors import FieldError, InvalidRequest
@@ -160,7 +162,7 @@ def completion_of(chat: ParsedChat, result: str) -> dict[str, Any]:
 
 async def answer_events(
     submitter: Submitter, submission: Submission, chat: ParsedChat, created_at: str | None
-) -> AsyncGenerator[bytes]:
+) -> Events:
     """The chunks of an answer job: progress first. Raises what the job fails with."""
     head: dict[str, Any] = {}
     async with aclosing(follow_job(submitter, submission, created_at)) as updates:
@@ -173,10 +175,10 @@ async def answer_events(
             else:
                 head = job_head(update.id, update.created_at, chat.model) | {"usage": None}
                 yield progress_chunk(update, head, {"role": "assistant", "content": ""})
-    yield DONE
+    yield LAST_EVENT
 
 
-def _last_events(chat: ParsedChat, result: str, head: dict[str, Any]) -> list[bytes]:
+def _last_events(chat: ParsedChat, result: str, head: dict[str, Any]) -> list[ServerSentEvent]:
     """The message, its end, and its tokens where they were asked for. CPU work: not for the event loop."""
     completion = completion_of(chat, result)
     message = completion["choices"][0]["message"]

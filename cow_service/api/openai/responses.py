@@ -2,12 +2,15 @@
 
 import time
 import uuid
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import Iterator
 from contextlib import aclosing
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
+from sse_starlette import ServerSentEvent
+
 from cow_service.api.openai.chats import EXTENSION, wrong
+from cow_service.api.openai.forwarding import Events
 from cow_service.api.openai.stream import Streamed, chunks_of, data_of, event_of
 from cow_service.api.problems import openai_error
 from cow_service.errors import CowError
@@ -176,7 +179,7 @@ def as_response(streamed: Streamed, request: dict[str, Any], model: str) -> Stre
     """A chat's stream as that of a response."""
     response = ResponseEvents(request, model)
 
-    async def events() -> AsyncGenerator[bytes]:
+    async def events() -> Events:
         for event in response.begin():
             yield event
         try:
@@ -237,12 +240,12 @@ class ResponseEvents:
         self._open: _Item | None = None
         self._finish_reason: Any = None
 
-    def begin(self) -> Iterator[bytes]:
+    def begin(self) -> Iterator[ServerSentEvent]:
         """The first two."""
         yield self._event("response.created", response=self.response)
         yield self._event("response.in_progress", response=self.response)
 
-    def add(self, chunk: dict[str, Any]) -> Iterator[bytes]:
+    def add(self, chunk: dict[str, Any]) -> Iterator[ServerSentEvent]:
         """The events for a chunk; of several choices the first is taken."""
         cow = chunk.get(EXTENSION)
         if isinstance(cow, dict) and "progress" not in cow:
@@ -253,7 +256,7 @@ class ResponseEvents:
             if choice.get("index", 0) == 0:
                 yield from self._add_choice(choice)
 
-    def end(self) -> Iterator[bytes]:
+    def end(self) -> Iterator[ServerSentEvent]:
         """The end of the last item, and the whole response."""
         if not {"message", "function_call"} & {item.kind for item in self._items.values()}:
             yield from self._switch_to("message", "message")
@@ -267,12 +270,12 @@ class ResponseEvents:
         }
         yield self._event(f"response.{status}", response=self.response)
 
-    def fail(self, error: dict[str, Any]) -> bytes:
+    def fail(self, error: dict[str, Any]) -> ServerSentEvent:
         """The last event of a response that breaks off; `error` is OpenAI's."""
         flat = {name: error.get(name) for name in ("code", "message", "param")}
         return self._event("error", **flat, error=error)
 
-    def _add_choice(self, choice: dict[str, Any]) -> Iterator[bytes]:
+    def _add_choice(self, choice: dict[str, Any]) -> Iterator[ServerSentEvent]:
         delta = cast("dict[str, Any]", choice.get("delta") or {})
         self._finish_reason = choice.get("finish_reason") or self._finish_reason
         if thought := delta.get("reasoning_content") or delta.get("reasoning"):
@@ -293,7 +296,7 @@ class ResponseEvents:
             if arguments := function.get("arguments"):
                 yield self._add_text("response.function_call_arguments.delta", arguments)
 
-    def _switch_to(self, key: str, kind: str, **call: Any) -> Iterator[bytes]:
+    def _switch_to(self, key: str, kind: str, **call: Any) -> Iterator[ServerSentEvent]:
         """Goes on with an item; the one before it is closed, a new one is opened."""
         if self._open is not None and self._items.get(key) is self._open:
             return
@@ -306,12 +309,12 @@ class ResponseEvents:
             part = {"type": "output_text", "text": "", "annotations": [], "logprobs": []}
             yield self._item_event("response.content_part.added", item, content_index=0, part=part)
 
-    def _add_text(self, event: str, text: str, **others: Any) -> bytes:
+    def _add_text(self, event: str, text: str, **others: Any) -> ServerSentEvent:
         assert self._open is not None
         self._open.text += text
         return self._item_event(event, self._open, delta=text, **others)
 
-    def _close(self) -> Iterator[bytes]:
+    def _close(self) -> Iterator[ServerSentEvent]:
         item, self._open = self._open, None
         if item is None:
             return
@@ -327,10 +330,10 @@ class ResponseEvents:
             yield self._item_event("response.function_call_arguments.done", item, **arguments)
         yield self._event("response.output_item.done", output_index=item.index, item=whole)
 
-    def _item_event(self, kind: str, item: _Item, **others: Any) -> bytes:
+    def _item_event(self, kind: str, item: _Item, **others: Any) -> ServerSentEvent:
         return self._event(kind, item_id=item.id, output_index=item.index, **others)
 
-    def _event(self, kind: str, **others: Any) -> bytes:
+    def _event(self, kind: str, **others: Any) -> ServerSentEvent:
         self._number += 1
         return event_of({"type": kind, "sequence_number": self._number, **others}, kind)
 
