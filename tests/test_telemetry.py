@@ -219,7 +219,7 @@ def test_stages_jobs_and_queues(caplog: pytest.LogCaptureFixture) -> None:
     metrics.jobs.labels("simulate", "failed").inc()
     metrics.stage_cache("generation", hit=True)
     metrics.stage_cache("generation", hit=False)
-    metrics.queue_depth = lambda: {("light", "ati", "queued"): 3, ("light", "ati", "running"): 1}
+    metrics.gauges["cow_queue_depth"] = lambda: [(("light", "ati", "queued"), 3), (("light", "ati", "running"), 1)]
     seen = samples(metrics)
     assert seen["cow_stage_seconds_sum", ("grounding",)] == pytest.approx(0.2)
     assert seen["cow_jobs_total", ("simulate", "failed")] == 1
@@ -227,10 +227,10 @@ def test_stages_jobs_and_queues(caplog: pytest.LogCaptureFixture) -> None:
     assert seen["cow_stage_cache_total", ("miss", "generation")] == 1
     assert seen["cow_queue_depth", ("ati", "light", "queued")] == 3
 
-    def fail() -> dict[tuple[str, str, str], int]:
+    def fail() -> None:
         raise OSError("the database is gone")
 
-    metrics.queue_depth = fail
+    metrics.gauges["cow_queue_depth"] = fail
     assert ("cow_jobs_total", ("simulate", "failed")) in samples(metrics)
     assert "the database is gone" in caplog.text
 

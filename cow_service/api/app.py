@@ -12,7 +12,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Scope
 
 from cow_service import __version__
-from cow_service.api.middleware.access import PAGE_FILES, PAGES, PROBES, Callers, Guard, KeyRing, Origins, is_loopback
+from cow_service.api.middleware.access import PAGE_FILES, PAGES, PROBES, Callers, Guard, Origins, is_loopback
 from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
@@ -115,10 +115,9 @@ class LayeredApp(FastAPI):
 
 def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> None:
     """Puts the middleware around the routes of an app, the innermost first."""
-    keys = KeyRing(settings.api_keys)
     limits = {"megabytes": settings.max_body_mb, "seconds": settings.body_timeout}
     app.add_middleware(BodyLimit, **limits, megabytes_at_once=settings.max_bodies_mb)
-    app.add_middleware(Guard, refuse=Callers(keys, settings).refuse)
+    app.add_middleware(Guard, refuse=Callers(settings).refuse)
 
     def surround(stack: ASGIApp) -> ASGIApp:
         if settings.cors_origins:
@@ -129,7 +128,7 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
                 allow_headers=REQUEST_HEADERS,
                 expose_headers=RESPONSE_HEADERS,
             )
-        origins = Origins(settings.cors_origins, only_local=not keys and is_loopback(settings.host))
+        origins = Origins(settings.cors_origins, only_local=not settings.api_keys and is_loopback(settings.host))
         stack = Guard(stack, origins.refuse)
         return AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"])
 

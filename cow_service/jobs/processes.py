@@ -87,13 +87,17 @@ class Processes(BackgroundThread):
         self._draining = False
         metrics, overview = self._parts.service.metrics, self.overview
         metrics.workers = self.workers
-        metrics.queue_depth = lambda: _sums(
-            ((one.queue, one.generator, one.state), one.jobs) for one in overview.counts()
-        )
-        metrics.queue_oldest = lambda: {one.name: one.oldest_seconds or 0.0 for one in overview.workers().queues}
-        metrics.queue_unserved = lambda: _sums(
-            ((one.queue, one.reason), one.jobs) for one in overview.workers().unserved
-        )
+        metrics.gauges |= {
+            "cow_queue_depth": lambda: _sums(
+                ((one.queue, one.generator, one.state), one.jobs) for one in overview.counts()
+            ).items(),
+            "cow_queue_oldest_seconds": lambda: [
+                ((one.name,), one.oldest_seconds or 0.0) for one in overview.workers().queues
+            ],
+            "cow_queue_unserved": lambda: _sums(
+                ((one.queue, one.reason), one.jobs) for one in overview.workers().unserved
+            ).items(),
+        }
         super().start()
 
     def drain(self) -> None:
