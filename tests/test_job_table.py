@@ -16,6 +16,7 @@ from engines import running_engine
 from job_rows import add_job, take_new_job
 from postgres import postgres_server
 from pydantic import SecretStr
+from servers import eventually
 
 from cow_service.errors import InternalError, InvalidRequest
 from cow_service.jobs import webhooks, workflows
@@ -165,15 +166,27 @@ def test_pages_show_each_job_once(database: Database) -> None:
 
 
 @pytest.mark.parametrize("capacity", [0, 3])
-def test_no_more_places_are_held_than_there_are(capacity: int) -> None:
-    parts: Any = SimpleNamespace()
-    dispatcher = Dispatcher(parts, lambda queue: capacity, lambda job, image: None)
-    assert [dispatcher.hold_place("light") for _ in range(4)] == [place < capacity for place in range(4)]
+def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
+    waiting, started = list("abcdefgh"), []
+
+    def take(queue: str, executor: str, number: int, limit: int | None) -> list[str]:
+        taken = waiting[:number]
+        del waiting[:number]
+        return taken
+
+    jobs = SimpleNamespace(waiting_queues=lambda: ["light"], take=take)
+    settings = SimpleNamespace(running_limit_per_key=None)
+    parts: Any = SimpleNamespace(executor="me", jobs=jobs, service=SimpleNamespace(settings=settings))
+    dispatcher = Dispatcher(parts, lambda queue: capacity, started.append)
+    dispatcher.start()
+    eventually(lambda: len(started) == capacity)
     if capacity:
-        dispatcher.free_place("light")
-        assert dispatcher.hold_place("light")
-    dispatcher.drain()
-    assert not dispatcher.hold_place("other")
+        assert dispatcher.free_places("light") == 0
+        dispatcher.give_place_back("light")
+        eventually(lambda: len(started) == capacity + 1)
+    dispatcher.stop()
+    assert dispatcher.free_places("light") == dispatcher.free_places("other") == 0
+    assert len(waiting) + len(started) == 8
 
 
 def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:

@@ -12,7 +12,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Scope
 
 from cow_service import __version__
-from cow_service.api.middleware.access import PAGE_FILES, PAGES, PROBES, Callers, Guard, Origins, is_loopback
+from cow_service.api.middleware.access import PROBES, Callers, Guard, Origins, is_loopback, is_open
 from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
@@ -88,19 +88,17 @@ def create_app(
     # Else a few GIFs would take the threads of all operations.
     app.state.downloads = CapacityLimiter(MAX_CONCURRENT_DOWNLOADS)
     install_problem_handlers(app)
+
+    def refuse_until_started(scope: Scope) -> NotReady | None:
+        return None if engine.is_running or is_open(scope["path"]) else NotReady(NOT_STARTED)
+
     if not starting:
-        app.add_middleware(Guard, refuse=lambda scope: refuse_until_started(scope, engine))
+        app.add_middleware(Guard, refuse=refuse_until_started)
     install_layers(app, service.settings, service.metrics)
     for module in (simulate, chats, jobs, artifacts, health, page):
         app.include_router(module.router)
     app.openapi = lambda: contract(app)
     return app
-
-
-def refuse_until_started(scope: Scope, engine: JobEngine) -> NotReady | None:
-    """Why a request is refused while the engine waits for its database, if it is."""
-    is_open = scope["path"] in PROBES | PAGES or scope["path"].startswith(PAGE_FILES)
-    return None if engine.is_running or is_open else NotReady(NOT_STARTED)
 
 
 class LayeredApp(FastAPI):

@@ -120,23 +120,17 @@ class StoredStep:
             found = self.outages.wait_through(
                 lambda: next((each for key in (digest, *also) if (each := self._find(stage, key)) is not None), None)
             )
-            if found is not None:
-                result, reused = found
-                self.looked_for(stage, reused)
-                if reused:
-                    self.outages.wait_through(lambda: self.database.reuse_result(self.job_id, stage, result.artifacts))
-                self.stages.add(stage)
-                return result, reused
-            self.looked_for(stage, False)
-            result = self.outages.wait_through(compute)
-            self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
-            text, trajectory = result.model_dump_json(exclude={"value"} if stage == "trajectory" else None), None
-            if stage == "trajectory":
-                trajectory, self.trajectory_key = result.value.model_dump_json(), digest
-            stored = digest, self.job_id, stage, text, result.artifacts, trajectory
-            self.outages.wait_through(lambda: self.database.store_result(*stored))
+            self.looked_for(stage, found is not None and found[1])
+            if found is None:
+                found = result, _ = self.outages.wait_through(compute), False
+                self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
+                text, trajectory = result.model_dump_json(exclude={"value"} if stage == "trajectory" else None), None
+                if stage == "trajectory":
+                    trajectory, self.trajectory_key = result.value.model_dump_json(), digest
+                stored = digest, self.job_id, stage, text, result.artifacts, trajectory
+                self.outages.wait_through(lambda: self.database.store_result(*stored))
             self.stages.add(stage)
-            return result, False
+            return found
 
     def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
         """A stored result all of whose artifacts are there, and whether it is another job's."""
@@ -146,8 +140,8 @@ class StoredStep:
         job_id, values = row
         try:
             result = RESULT_TYPES[stage].model_validate_json(to_json(values))
-            if result.artifacts and job_id != self.job_id:  # before they are looked for: nobody removes them meanwhile
-                self.database.add_references(self.job_id, result.artifacts)
+            if job_id != self.job_id:  # before its artifacts are looked for: nobody removes them meanwhile
+                self.database.reuse_result(self.job_id, stage, result.artifacts)
             self.artifacts.touch(*result.artifacts)
         except (ArtifactNotFound, ValidationError):  # lost, or of another version
             return None
@@ -186,7 +180,7 @@ class JobOutcome:
 
 
 class Computer:
-    """Computes jobs, some at the same time."""
+    """Computes jobs, some at the same time: this one none, which is for worker processes on the same job database."""
 
     def start(self) -> None:
         """Makes ready for jobs. Returns at once."""
@@ -205,10 +199,6 @@ class Computer:
     def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
         """What computes the jobs, of which `active` says how far they are."""
         return ()
-
-
-class Elsewhere(Computer):
-    """Computes no jobs: worker processes that share the job database take them from its queues."""
 
 
 class InProcess(Computer):

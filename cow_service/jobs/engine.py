@@ -205,7 +205,7 @@ class JobEngine:
             is_new = self.jobs.insert(job_id, spec, owner, queue, step)
         if is_new:
             self._dispatcher.wake()
-            if not self._dispatcher.has_place(queue):
+            if self._dispatcher.free_places(queue) <= 0:
                 self._notifications.send(Notification("queued", job_id))
         return is_new
 
@@ -260,7 +260,7 @@ class JobEngine:
 
     def _attempt_ended(self, job: TakenJob, has_ended: bool) -> None:
         """This process works no more on a job. Where that has ended, callers are told."""
-        self._dispatcher.free_place(job.queue)
+        self._dispatcher.give_place_back(job.queue)
         if has_ended:
             self.active.notify_ended(job.id)
             self._notifications.send(Notification("ended", job.id))

@@ -63,10 +63,8 @@ class Readiness:
     def check(self) -> None:
         """Raises `NotReady` while loading, `StorageUnavailable`, `ReaderUnavailable`, `GeneratorUnavailable`."""
         fault = self._fault()
-        if self._started and not self._done.is_set():
+        if fault is not None or (self._started and not self._done.is_set()):
             raise NotReady(fault or "The default reader and generator are being loaded. Ask again in a while.")
-        if fault is not None:
-            raise NotReady(fault)
         self._service.artifacts.check()
         self._load_backends()
         free = shutil.disk_usage(self._service.settings.data_dir).free

@@ -239,11 +239,11 @@ class Dispatcher(BackgroundThread):
     """The places of this process, and the thread that fills them. Safe to use from every thread."""
 
     def __init__(self, parts: EngineParts, capacity: Callable[[str], int], start: Callable[[TakenJob], None]) -> None:
-        """`capacity`: of a queue by its name; `start` begins the work on a job that has a place."""
+        """`capacity`: of a queue by its name; `start` begins the work on a job that was taken."""
         super().__init__("cow-dispatcher", STOP_SECONDS)
         self._parts, self._capacity, self._start = parts, capacity, start
         self._places = threading.Lock()
-        self._held: Counter[str] = Counter()  # the places of each queue that are held
+        self._held: Counter[str] = Counter()  # the places of each queue that are held; only the thread takes more
         self._woken = threading.Event()
         self._look = True  # at the queues: there may be jobs that wait
 
@@ -262,20 +262,11 @@ class Dispatcher(BackgroundThread):
         self._look = True
         self._woken.set()
 
-    def has_place(self, queue: str) -> bool:
-        """Whether a job of a queue could be taken now."""
-        return self._held[queue] < self._capacity(queue)
+    def free_places(self, queue: str) -> int:
+        """How many jobs of a queue could be taken now."""
+        return 0 if self._stop.is_set() else self._capacity(queue) - self._held[queue]
 
-    def hold_place(self, queue: str) -> bool:
-        """Holds a place for a job that is about to be taken; False where none is free."""
-        capacity = self._capacity(queue)
-        with self._places:
-            if self._stop.is_set() or self._held[queue] >= capacity:
-                return False
-            self._held[queue] += 1
-            return True
-
-    def free_place(self, queue: str) -> None:
+    def give_place_back(self, queue: str) -> None:
         """The holder of a place needs it no more."""
         with self._places:
             self._held[queue] -= 1
@@ -297,16 +288,11 @@ class Dispatcher(BackgroundThread):
                 self._look = True
 
     def _fill(self, queue: str) -> None:
-        places = 0
-        while self.hold_place(queue):
-            places += 1
-        taken: list[TakenJob] = []
-        try:
-            if places:
-                limit = self._parts.service.settings.running_limit_per_key
-                taken = self._parts.jobs.take(queue, self._parts.executor, places, limit)
-        finally:
-            with self._places:
-                self._held[queue] -= places - len(taken)
+        if (places := self.free_places(queue)) <= 0:
+            return
+        limit = self._parts.service.settings.running_limit_per_key
+        taken = self._parts.jobs.take(queue, self._parts.executor, places, limit)
+        with self._places:
+            self._held[queue] += len(taken)
         for job in taken:
             self._start(job)

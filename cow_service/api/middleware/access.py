@@ -45,11 +45,16 @@ def key_owner(key: str, hashes: Mapping[str, str]) -> str | None:
     return owner
 
 
-PROBES = frozenset({"/livez", "/readyz"})
-PAGES = frozenset({"/", "/docs"})
+PROBES = ("/livez", "/readyz")
+PAGES = ("/", "/docs")
 PAGE_FILES = ("/docs/", "/web/")
 MAX_CALLERS = 10_000  # remembered; beyond that the one that has been idle longest gets a full bucket
 MAX_FAILURES = 30  # per minute from one address, before it has to wait
+
+
+def is_open(path: str) -> bool:
+    """Whether everybody may ask for it: probes, and pages with their files."""
+    return path in (*PROBES, *PAGES) or path.startswith(PAGE_FILES)
 
 
 class Guard:
@@ -94,10 +99,8 @@ class Callers:
         """Why a request is refused, if it is."""
         state = scope.setdefault("state", {})
         owner = state["owner"] = None
-        if scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
-            path = scope["path"]
-            if path in PROBES or path in PAGES or path.startswith(PAGE_FILES):
-                return None
+        if scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and is_open(scope["path"]):
+            return None
         if self._keys:
             sent = Headers(scope=scope).getlist("authorization")
             scheme, _, rest = sent[0].strip().partition(" ") if len(sent) == 1 else ("", "", "")
