@@ -42,18 +42,25 @@ def chat_fields(body: dict[str, Any]) -> dict[str, Any]:
     given = body.get("input")
     asked = [{"role": "user", "content": given}] if isinstance(given, str) else _messages(given)
     chat["messages"] = [*system, *asked]
-    text, reasoning = _object(body, "text"), _object(body, "reasoning")
+    text, reasoning = (
+        _as_object({} if body.get(name) is None else body[name], f"/{name}") for name in ("text", "reasoning")
+    )
     form = text.get("format")
     if isinstance(form, dict) and form.get("type") == "json_schema":
         form = {"type": "json_schema", "json_schema": _without_type(form)}
-    tools = [_tool(tool, f"/tools/{place}/type") for place, tool in enumerate(_array(body, "tools"))]
+    tools: list[dict[str, Any]] = []
+    for place, tool in enumerate(_array(body.get("tools"), "/tools")):
+        if (kind := _as_object(tool, f"/tools/{place}").get("type")) != "function":
+            shown = f"{str(kind)[:40]!r} is a tool of OpenAI's own servers"
+            raise wrong(f"/tools/{place}/type", f"{shown}: only `function` can be sent on")
+        tools.append({"type": "function", "function": _without_type(tool)})
     choice = body.get("tool_choice")
     if isinstance(choice, dict):
         named = cast("dict[str, Any]", choice)
         if named.get("type") != "function":
             raise wrong("/tool_choice/type", "only `function` can be chosen by name")
         choice = {"type": "function", "function": {"name": named.get("name")}}
-    include = _array(body, "include")
+    include = _array(body.get("include"), "/include")
     if unknown := [str(each)[:60] for each in include if each not in INCLUDED]:
         raise wrong("/include", f"only {', '.join(INCLUDED)} can be included, not {', '.join(unknown)}")
     if body.get("truncation") not in (None, "disabled"):
@@ -83,7 +90,7 @@ def _messages(given: Any) -> Iterator[dict[str, Any]]:
             case "message":
                 content = item.get("content")
                 if not isinstance(content, str):
-                    content = _parts(_array(item, "content", pointer), f"{pointer}/content")
+                    content = [*_parts(_array(content, f"{pointer}/content"), f"{pointer}/content")]
                 message = {"role": item.get("role", "user"), "content": content}
             case "function_call":
                 function = {"name": item.get("name"), "arguments": item.get("arguments")}
@@ -95,7 +102,7 @@ def _messages(given: Any) -> Iterator[dict[str, Any]]:
             case "function_call_output":
                 output = item.get("output")
                 if isinstance(output, list):
-                    output = _parts(cast("list[Any]", output), f"{pointer}/output")
+                    output = [*_parts(cast("list[Any]", output), f"{pointer}/output")]
                 message = {"role": "tool", "tool_call_id": item.get("call_id"), "content": output}
             case "reasoning":
                 continue
@@ -107,52 +114,40 @@ def _messages(given: Any) -> Iterator[dict[str, Any]]:
         before = message
 
 
-def _parts(parts: list[Any], pointer: str) -> list[dict[str, Any]]:
-    return [_part(_as_object(part, f"{pointer}/{place}"), f"{pointer}/{place}") for place, part in enumerate(parts)]
+def _parts(parts: list[Any], above: str) -> Iterator[dict[str, Any]]:
+    """The parts of a message, or of what a function returned, as chats have them."""
+    for place, each in enumerate(parts):
+        pointer = f"{above}/{place}"
+        match _as_object(each, pointer):
+            case {"type": "input_text" | "output_text" | "text", **part}:
+                yield {"type": "text", "text": part.get("text", "")}
+            case {"type": "refusal", **part}:
+                yield {"type": "refusal", "refusal": part.get("refusal", "")}
+            case {"type": "input_image", "image_url": str(url), **part}:
+                detail = {} if part.get("detail") is None else {"detail": part["detail"]}
+                yield {"type": "image_url", "image_url": {"url": url, **detail}}
+            case {"type": "input_image" | "input_file", "file_id": file} if file is not None:
+                raise wrong(f"{pointer}/file_id", f"{STATELESS}, and so no files: send the image itself as `image_url`")
+            case part:
+                kind = str(part.get("type"))[:40]
+                raise wrong(f"{pointer}/type", f"parts of the type {kind!r} cannot be sent on as a chat")
 
 
-def _part(part: dict[str, Any], pointer: str) -> dict[str, Any]:
-    match part:
-        case {"type": "input_text" | "output_text" | "text"}:
-            return {"type": "text", "text": part.get("text", "")}
-        case {"type": "refusal"}:
-            return {"type": "refusal", "refusal": part.get("refusal", "")}
-        case {"type": "input_image", "image_url": str(url)}:
-            detail = {} if part.get("detail") is None else {"detail": part["detail"]}
-            return {"type": "image_url", "image_url": {"url": url, **detail}}
-        case {"type": "input_image" | "input_file", "file_id": file} if file is not None:
-            raise wrong(f"{pointer}/file_id", f"{STATELESS}, and so no files: send the image itself as `image_url`")
-        case _:
-            kind = str(part.get("type"))[:40]
-            raise wrong(f"{pointer}/type", f"parts of the type {kind!r} cannot be sent on as a chat")
-
-
-def _tool(tool: Any, pointer: str) -> dict[str, Any]:
-    kind = tool.get("type") if isinstance(tool, dict) else "none"
-    if kind != "function":
-        shown = str(kind)[:40]
-        raise wrong(pointer, f"{shown!r} is a tool of OpenAI's own servers: only `function` can be sent on")
-    return {"type": "function", "function": _without_type(tool)}
-
-
-def _without_type(value: Any) -> dict[str, Any]:
-    return {name: held for name, held in cast("dict[str, Any]", value).items() if name != "type"}
+def _without_type(value: dict[str, Any]) -> dict[str, Any]:
+    return {name: held for name, held in value.items() if name != "type"}
 
 
 def _as_object(value: Any, pointer: str) -> dict[str, Any]:
+    """An object of the request."""
     if not isinstance(value, dict):
         raise wrong(pointer, "is no object")
     return cast("dict[str, Any]", value)
 
 
-def _object(body: dict[str, Any], name: str) -> dict[str, Any]:
-    return {} if body.get(name) is None else _as_object(body[name], f"/{name}")
-
-
-def _array(body: dict[str, Any], name: str, above: str = "") -> list[Any]:
-    value = body.get(name)
+def _array(value: Any, pointer: str) -> list[Any]:
+    """An array of the request, empty where it is left out."""
     if value is not None and not isinstance(value, list):
-        raise wrong(f"{above}/{name}", "is no array")
+        raise wrong(pointer, "is no array")
     return value or []
 
 
