@@ -196,7 +196,7 @@ def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
         engine.webhooks.client,
         sa.Table("workflow_status", sa.MetaData(), autoload_with=engine.database.engine),
     )
-    left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, workflows.WORKFLOW)}
+    left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, "job")}
     with engine.database.transaction() as connection:
         for name, workflow in left.items():
             connection.execute(
@@ -209,5 +209,5 @@ def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
     webhook = DBOS.get_workflow_status(left[webhooks.WORKFLOW])
     assert webhook is not None
     assert (webhook.status, webhook.queue_name) == ("ENQUEUED", webhooks.QUEUE)
-    assert DBOS.get_workflow_status(left[workflows.WORKFLOW]) is None
+    assert DBOS.get_workflow_status(left["job"]) is None
     client.delete_workflows([left[webhooks.WORKFLOW]])

@@ -1,8 +1,8 @@
 """The job engine: accepts jobs, has them computed durably, and reports their state.
 
 A job is a row of the job database, in the database before its submission is acknowledged. It waits in the queue of its
-generator, from which any process on the same database may take it. Each attempt to compute it is a workflow of DBOS.
-One process has one engine, as DBOS is one per process.
+generator, from which any process on the same database may take it. DBOS keeps the calls of webhooks. A process has one
+engine, as DBOS is one per process.
 """
 
 import logging
@@ -129,9 +129,8 @@ class JobEngine:
         self._maintenance.stop()
         self._dispatcher.stop()
         self._notifications.stop()
-        # DBOS polls once a second whether the work is done.
-        wait = int(self.service.settings.shutdown_grace + HANDOVER_SECONDS) if self.active.runs() else 0
-        DBOS.destroy(workflow_completion_timeout_sec=wait)
+        self._runner.wait(self.service.settings.shutdown_grace + HANDOVER_SECONDS)
+        DBOS.destroy()
         if self._grace is not None:
             self._grace.cancel()
         self._interrupt()

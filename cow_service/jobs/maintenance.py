@@ -20,7 +20,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, StorageUnavailable
-from cow_service.jobs import webhooks, workflows
+from cow_service.jobs import workflows
 from cow_service.jobs.computing import EngineParts
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.webhooks import Webhooks
@@ -254,17 +254,15 @@ class Maintenance(BackgroundThread):
             raise
 
     def clean_up_jobs(self) -> None:
-        """Removes jobs past their retention, and what DBOS keeps of attempts that are over."""
+        """Removes jobs past their retention, and what DBOS keeps from before that."""
         before = time.time() - 3600.0 * self._parts.service.settings.job_retention_hours
         while not self._stop.is_set() and (jobs := self._parts.jobs.ended_before(before, MAX_REMOVED_JOBS)):
             self._remove(jobs, before)
-        # The records that DBOS keeps of attempts: those of jobs are of no use once they are over.
-        client, limit = self._hooks.client, MAX_REMOVED_JOBS
-        for name, until in ((workflows.WORKFLOW, time.time()), (webhooks.WORKFLOW, before)):
-            moment = datetime.fromtimestamp(until, UTC).isoformat()
-            ended = partial(client.list_workflows, name=name, completed_before=moment, limit=limit)
-            while not self._stop.is_set() and (records := ended(load_input=False, load_output=False)):
-                client.delete_workflows([record.workflow_id for record in records])
+        # The records that DBOS keeps of calls of webhooks.
+        moment, client = datetime.fromtimestamp(before, UTC).isoformat(), self._hooks.client
+        ended = partial(client.list_workflows, completed_before=moment, limit=MAX_REMOVED_JOBS)
+        while not self._stop.is_set() and (records := ended(load_input=False, load_output=False)):
+            client.delete_workflows([record.workflow_id for record in records])
         if not self._stop.is_set():
             self._parts.database.give_room_back(self._stop.is_set)
 

@@ -1,20 +1,20 @@
-"""The workflows that DBOS runs: an attempt to compute a job, and an attempt to call a webhook.
+"""Attempts: to compute a job, each in a thread, and to call a webhook, each a workflow of DBOS.
 
-The table of jobs (`job_table.py`) says who computes which job: each attempt is a workflow of its own, and where its
-process ends, another process makes the next one. A call of a webhook is kept by DBOS alone, which delays it, and runs
-it again.
+The table of jobs (`job_table.py`) says who computes which job: where its process ends, another process makes the next
+attempt. A call of a webhook is kept by DBOS alone, which delays it, and runs it again.
 """
 
 import logging
 import math
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import replace
 from uuid import uuid4
 
-from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, SetWorkflowID
+from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -33,7 +33,6 @@ from cow_service.observability import tracing
 from cow_service.requests import Stage
 from cow_service.settings import Settings
 
-WORKFLOW = "job"  # the name of an attempt's workflow
 POLL_SECONDS = 0.25  # between two looks at the queues, besides whenever it is woken: other processes add jobs, too
 STOP_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 
@@ -45,7 +44,7 @@ class Interrupted(BaseException):
 
 
 class Runner:
-    """Does the work of this process's workflows. Safe to use from every thread."""
+    """Does the work of this process: its jobs, and its workflows. Safe to use from every thread."""
 
     def __init__(
         self,
@@ -58,23 +57,27 @@ class Runner:
         """`on_end` is called when an attempt is over, with whether the job has ended by it."""
         self._parts, self._jobs, self._active, self._computer = parts, parts.jobs, parts.active, computer
         self._hooks, self._notifications, self._on_end = hooks, notifications, on_end
-        self._starting: dict[str, TakenJob] = {}  # by the ids of their workflows
+        self._threads: list[threading.Thread] = []
 
     def start(self, job: TakenJob) -> None:
         """Starts an attempt to compute a job in a thread."""
-        workflow_id = f"{job.id}.{job.run}"
-        self._starting[workflow_id] = job
+        thread = threading.Thread(target=self._run, args=(job,), name=f"job-{job.id}", daemon=True)
         try:
-            with SetWorkflowID(workflow_id):
-                DBOS.start_workflow(compute_job, workflow_id)
-        except (SQLAlchemyError, dbos_error.DBOSException) as error:
-            log.warning("job %s could not be started: %s", job.id, type(error).__name__)
-            del self._starting[workflow_id]
+            thread.start()
+        except RuntimeError as error:  # the system gives no more threads
+            log.warning("job %s could not be started: %s", job.id, error)
             self._on_end(job, False)  # maintenance will find that nobody works on it, and give it back
+        else:
+            self._threads = [*(each for each in self._threads if each.is_alive()), thread]
 
-    def compute(self, workflow_id: str) -> None:
+    def wait(self, seconds: float) -> None:
+        """Waits until no job is at work, at most so long."""
+        until = time.monotonic() + seconds
+        for thread in self._threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _run(self, job: TakenJob) -> None:
         """Computes a job, and stores its outcome."""
-        job = self._starting.pop(workflow_id)
         ended = False
         try:
             with (
@@ -83,6 +86,8 @@ class Runner:
                 self._active.running(job.id, job.spec.kind, job.run) as running,
             ):
                 ended = self._compute(job, running)
+        except Exception:
+            log.exception("the outcome of job %s could not be stored", job.id)
         finally:
             self._on_end(job, ended)
 
@@ -161,13 +166,6 @@ def set_runner(runner: Runner | None) -> None:
     _runner = runner
 
 
-@DBOS.workflow(name=WORKFLOW)
-def compute_job(workflow_id: str) -> None:
-    """An attempt to compute a job."""
-    assert _runner is not None, "workflows run only while an engine does"
-    _runner.compute(workflow_id)
-
-
 @DBOS.workflow(name=webhooks.WORKFLOW)
 def call_webhook(job_id: str, url: str, attempt: int) -> None:
     """An attempt to notify a webhook that a job has ended."""
@@ -214,7 +212,8 @@ def busy_executors(client: DBOSClient) -> set[str]:
 def recover(client: DBOSClient, jobs: JobTable, ended: list[str]) -> list[str]:
     """Has the work of processes that have ended done by others; returns the ids of their jobs.
 
-    Calls of webhooks go back to their queue. Attempts to compute a job are over: their records are deleted.
+    Calls of webhooks go back to their queue. An earlier version kept records of attempts to compute a job, too: these
+    are over, and are deleted.
     """
     recovered = jobs.recover(ended)
     pending = client.list_workflows(executor_id=ended, status="PENDING", load_input=False, load_output=False)
