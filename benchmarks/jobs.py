@@ -25,6 +25,7 @@ import sqlalchemy as sa
 
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobFilters, JobSpec
+from cow_service.jobs.maintenance import collect_artifacts
 from cow_service.media.images import encode_png
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -137,7 +138,11 @@ def measure(engine: JobEngine, counts: list[int]) -> list[dict[str, Any]]:
                 "one_ms": timed(lambda: engine.find(good, None)),
             }
         )
-        tidy = engine._maintenance.clean_up  # pyright: ignore[reportPrivateUsage]
+
+        def tidy() -> None:
+            engine._maintenance.clean_up_jobs()  # pyright: ignore[reportPrivateUsage]
+            collect_artifacts(engine.service, engine.database, lambda: False)
+
         tidy()  # the first round after such a change of the tables is not typical
         started = time.process_time()
         tidy()

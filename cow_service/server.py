@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from typing import ClassVar
@@ -17,7 +18,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cow_service.api.app import create_app
 from cow_service.errors import CowError, StorageUnavailable
-from cow_service.jobs.computing import Elsewhere
+from cow_service.jobs.computing import Computer
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness, warm_up
 from cow_service.service import Service
@@ -142,34 +143,29 @@ def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
     server, engine, readiness = _server(service, pool)
     readiness.start()
     readiness.wait(LOAD_SECONDS)
-    failures: list[CowError] = []
 
     def serve() -> None:
-        try:
-            engine.start()  # here and not in the caller's thread, whose event loop may be running
-            server.run()
-        except CowError as error:
-            failures.append(error)
+        engine.start()  # here and not in the caller's thread, whose event loop may be running
+        server.run()
 
-    thread = threading.Thread(target=serve, name="cow-server", daemon=True)
-    thread.start()
-    try:
-        while not server.started:
-            if not thread.is_alive():
-                told = "The server in this process ended before it had begun; its log says why."
-                raise failures[0] if failures else StorageUnavailable(told)
-            time.sleep(START_POLL_SECONDS)
-        yield server.address
-    finally:
-        server.should_exit = True
-        thread.join()
+    with ThreadPoolExecutor(1, "cow-server") as thread:
+        ended = thread.submit(serve)
+        try:
+            while not server.started:
+                if ended.done():
+                    ended.result()
+                    raise StorageUnavailable("The server in this process ended before it had begun; its log says why.")
+                time.sleep(START_POLL_SECONDS)
+            yield server.address
+        finally:
+            server.should_exit = True
 
 
 def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngine, Readiness]:
     """A server of its role that does not run yet, its engine, and what tells whether it is ready."""
     settings = service.settings
     if settings.role == "api":
-        engine, readiness = JobEngine(service, Elsewhere()), Readiness(service, lambda: None)
+        engine, readiness = JobEngine(service, Computer()), Readiness(service, lambda: None)
     elif pool is not None:
         engine, readiness = JobEngine(service, pool), Readiness(service, pool.load, fault=pool.fault)
     else:

@@ -14,13 +14,20 @@ from cow_service.stages.run import now
 STEP = 100
 
 
-def add_job(database: Database, job_id: str, owner: str | None = None, **more: Any) -> TakenJob | None:
-    """Adds a job, which belongs to a process where an `executor` is named; None where there is one of that id."""
-    executor, step, queue = more.pop("executor", None), more.pop("step", STEP), more.pop("queue", "light")
+def add_job(database: Database, job_id: str, owner: str | None = None, **more: Any) -> bool:
+    """Adds a job; False where there is one of that id."""
+    step, queue = more.pop("step", STEP), more.pop("queue", "light")
     request = {"image": {"artifact": "0" * 64}, "question": "?"}
     asked = {"kind": "simulate", "request": request, "reader": "embedded", "generator": "cutout"}
     spec = JobSpec(**({**asked, "created_at": now()} | more))
-    return JobTable(database).insert(job_id, spec, owner, queue, step, executor)
+    return JobTable(database).insert(job_id, spec, owner, queue, step)
+
+
+def take_new_job(database: Database, job_id: str, executor: str) -> TakenJob:
+    """Adds a job, and gives it to a process: no other one waits."""
+    assert add_job(database, job_id)
+    (job,) = JobTable(database).take("light", executor, 1, None)
+    return job
 
 
 def open_jobs(database: Database) -> list[str]:

@@ -218,7 +218,7 @@ def test_beyond_the_budget_the_oldest_go_first(settings, monkeypatch):
         kept = {name: store.put(name.encode() * 500, "image/png").sha256 for name in ("ab", "cd", "ef", "gh")}
         for name, sha256 in kept.items():
             add_job(database, f"job-{name}")
-            database.add_references(f"job-{name}", [sha256])
+            database.reuse_result(f"job-{name}", "generation", [sha256])
             if name != "ab":
                 JobTable(database).cancel(f"job-{name}")
         # An object store tells the times of its own clock, in whole seconds: here they are told.

@@ -22,10 +22,10 @@ from openai import AsyncOpenAI, OpenAI
 from random_mllm import RATE, USAGE, RandomMllm, cut, failing, paused, random_mllm, silent
 from servers import BODY, QUESTION, Served, data_url, picture, problem
 
-from cow_service.api.openai.forwarding import Forwarder, Whole
+from cow_service.api.openai.forwarding import Forwarder
 from cow_service.api.openai.records import ChatImagination
 from cow_service.errors import MllmUnavailable
-from cow_service.readers.chat import Upstream
+from cow_service.readers.chat import ChatTurn, Upstream
 from cow_service.settings import Settings
 
 pytestmark = pytest.mark.slow
@@ -464,7 +464,7 @@ def test_many_at_a_time_wait_for_a_place(mllm: RandomMllm) -> None:
         await forwarder.close()
         return found
 
-    refused, reply = sorted(asyncio.run(ask_twice()), key=lambda each: isinstance(each, Whole))
+    refused, reply = sorted(asyncio.run(ask_twice()), key=lambda each: isinstance(each, ChatTurn))
     assert reply.succeeded
     assert isinstance(refused, MllmUnavailable)
     assert "COW_MLLM_CONCURRENCY" in refused.detail

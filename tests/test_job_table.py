@@ -13,9 +13,10 @@ import pytest
 import sqlalchemy as sa
 from dbos import DBOS
 from engines import running_engine
-from job_rows import add_job
+from job_rows import add_job, take_new_job
 from postgres import postgres_server
 from pydantic import SecretStr
+from servers import eventually
 
 from cow_service.errors import InternalError, InvalidRequest
 from cow_service.jobs import webhooks, workflows
@@ -60,12 +61,7 @@ def test_jobs_are_taken_in_their_turns_and_once(database: Database) -> None:
     assert table.take("light", "me", 9, None) == []
     assert table.waiting_queues() == ["ati"]
     assert table.executors() == {"me", "other"}
-    assert table.load("alice", "ati").own == 3
-    assert (table.load(None, "ati").jobs, table.load(None, "ati").waiting, table.load(None, "light").waiting) == (
-        7,
-        1,
-        0,
-    )
+    assert (table.count_open("alice"), table.count_open(None)) == ((7, 3), (7, 1))
 
 
 def test_no_owner_has_more_taken_jobs_than_they_may_have(database: Database) -> None:
@@ -118,8 +114,7 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
 
 def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_without_it(database: Database) -> None:
     table = JobTable(database)
-    job = add_job(database, "job", executor="me")
-    assert job is not None
+    job = take_new_job(database, "job", "me")
     database.store_result("key", "job", "grounding", "{}", ["a" * 64])
     assert not table.succeed(job, "{}", None, ("grounding", "generation"))
     assert table.taken_by("me") == {"job": job.run}
@@ -129,12 +124,10 @@ def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_wit
 
 def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(database: Database) -> None:
     table = JobTable(database)
-    old = add_job(database, "job", executor="me")
-    assert old is not None
-    assert add_job(database, "job") is None, "the id is taken"
+    old = take_new_job(database, "job", "me")
+    assert not add_job(database, "job"), "the id is taken"
     table.delete(["job"])
-    new = add_job(database, "job", executor="me")
-    assert new is not None
+    new = take_new_job(database, "job", "me")
     assert not table.succeed(old, "{}", None, ())
     assert table.taken_by("me") == {"job": new.run}
 
@@ -173,15 +166,27 @@ def test_pages_show_each_job_once(database: Database) -> None:
 
 
 @pytest.mark.parametrize("capacity", [0, 3])
-def test_jobs_that_did_not_wait_take_places_of_those_that_do(capacity: int) -> None:
-    parts: Any = SimpleNamespace()
-    dispatcher = Dispatcher(parts, lambda queue: capacity, lambda job, image: None)
-    assert [dispatcher.hold_place("light") for _ in range(4)] == [place < capacity for place in range(4)]
+def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
+    waiting, started = list("abcdefgh"), []
+
+    def take(queue: str, executor: str, number: int, limit: int | None) -> list[str]:
+        taken = waiting[:number]
+        del waiting[:number]
+        return taken
+
+    jobs = SimpleNamespace(waiting_queues=lambda: ["light"], take=take)
+    settings = SimpleNamespace(running_limit_per_key=None)
+    parts: Any = SimpleNamespace(executor="me", jobs=jobs, service=SimpleNamespace(settings=settings))
+    dispatcher = Dispatcher(parts, lambda queue: capacity, started.append)
+    dispatcher.start()
+    eventually(lambda: len(started) == capacity)
     if capacity:
-        dispatcher.free_place("light")
-        assert dispatcher.hold_place("light")
-    dispatcher.drain()
-    assert not dispatcher.hold_place("other")
+        assert dispatcher.free_places("light") == 0
+        dispatcher.give_place_back("light")
+        eventually(lambda: len(started) == capacity + 1)
+    dispatcher.stop()
+    assert dispatcher.free_places("light") == dispatcher.free_places("other") == 0
+    assert len(waiting) + len(started) == 8
 
 
 def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
@@ -191,7 +196,7 @@ def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
         engine.webhooks.client,
         sa.Table("workflow_status", sa.MetaData(), autoload_with=engine.database.engine),
     )
-    left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, workflows.WORKFLOW)}
+    left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, "job")}
     with engine.database.transaction() as connection:
         for name, workflow in left.items():
             connection.execute(
@@ -204,5 +209,5 @@ def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
     webhook = DBOS.get_workflow_status(left[webhooks.WORKFLOW])
     assert webhook is not None
     assert (webhook.status, webhook.queue_name) == ("ENQUEUED", webhooks.QUEUE)
-    assert DBOS.get_workflow_status(left[workflows.WORKFLOW]) is None
+    assert DBOS.get_workflow_status(left["job"]) is None
     client.delete_workflows([left[webhooks.WORKFLOW]])

@@ -121,7 +121,7 @@ def test_nothing_is_stored_for_a_job_that_was_deleted_meanwhile(database: Databa
         store("motion", SHARED, lambda: result(1))
     assert database.find_result(SHARED.digest) is None
     with pytest.raises(Canceled, match="was deleted"):
-        database.add_references("one", ["0" * 64])
+        database.reuse_result("one", "grounding", ["0" * 64])
 
 
 def test_servers_of_one_database_have_one_place_for_artifacts(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.types import ASGIApp, Scope
 
 from cow_service import __version__
-from cow_service.api.middleware.access import PAGE_FILES, PAGES, PROBES, Callers, Guard, KeyRing, Origins, is_loopback
+from cow_service.api.middleware.access import PROBES, Callers, Guard, Origins, is_loopback, is_open
 from cow_service.api.middleware.access_log import AccessLog
 from cow_service.api.middleware.body_limit import BodyLimit
 from cow_service.api.openai import routes as chats
@@ -88,19 +88,17 @@ def create_app(
     # Else a few GIFs would take the threads of all operations.
     app.state.downloads = CapacityLimiter(MAX_CONCURRENT_DOWNLOADS)
     install_problem_handlers(app)
+
+    def refuse_until_started(scope: Scope) -> NotReady | None:
+        return None if engine.is_running or is_open(scope["path"]) else NotReady(NOT_STARTED)
+
     if not starting:
-        app.add_middleware(Guard, refuse=lambda scope: refuse_until_started(scope, engine))
+        app.add_middleware(Guard, refuse=refuse_until_started)
     install_layers(app, service.settings, service.metrics)
     for module in (simulate, chats, jobs, artifacts, health, page):
         app.include_router(module.router)
     app.openapi = lambda: contract(app)
     return app
-
-
-def refuse_until_started(scope: Scope, engine: JobEngine) -> NotReady | None:
-    """Why a request is refused while the engine waits for its database, if it is."""
-    is_open = scope["path"] in PROBES | PAGES or scope["path"].startswith(PAGE_FILES)
-    return None if engine.is_running or is_open else NotReady(NOT_STARTED)
 
 
 class LayeredApp(FastAPI):
@@ -115,10 +113,9 @@ class LayeredApp(FastAPI):
 
 def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> None:
     """Puts the middleware around the routes of an app, the innermost first."""
-    keys = KeyRing(settings.api_keys)
     limits = {"megabytes": settings.max_body_mb, "seconds": settings.body_timeout}
     app.add_middleware(BodyLimit, **limits, megabytes_at_once=settings.max_bodies_mb)
-    app.add_middleware(Guard, refuse=Callers(keys, settings).refuse)
+    app.add_middleware(Guard, refuse=Callers(settings).refuse)
 
     def surround(stack: ASGIApp) -> ASGIApp:
         if settings.cors_origins:
@@ -129,7 +126,7 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
                 allow_headers=REQUEST_HEADERS,
                 expose_headers=RESPONSE_HEADERS,
             )
-        origins = Origins(settings.cors_origins, only_local=not keys and is_loopback(settings.host))
+        origins = Origins(settings.cors_origins, only_local=not settings.api_keys and is_loopback(settings.host))
         stack = Guard(stack, origins.refuse)
         return AccessLog(stack, metrics, paths=lambda: app.openapi()["paths"])
 

@@ -266,18 +266,15 @@ class Submitter:
         while True:
             if look and (result := await to_thread.run_sync(self._result, submission, created_at)) is not None:
                 return result
+            if waiter.refusal is not None:
+                raise waiter.refusal
             rest = POLL_SECONDS if until is None else min(POLL_SECONDS, until - time.monotonic())
             if rest <= 0:
                 return None
             with suppress(TimeoutError):
                 await asyncio.wait_for(waiter.ended.wait(), rest)
+            waiter.ended.clear()
             look = True
-            if waiter.ended.is_set():
-                outcome, outcome_of = waiter.take()
-                if outcome is not None and outcome_of in (None, created_at):
-                    if isinstance(outcome, CowError):
-                        raise outcome
-                    return outcome
 
     async def leave(self, submission: Submission, created_at: str | None) -> None:
         """The caller has disconnected: cancels a new job that nobody can ask for."""

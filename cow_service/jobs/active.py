@@ -42,29 +42,20 @@ class Waiter:
     loop: asyncio.AbstractEventLoop
     changed: asyncio.Event = field(default_factory=asyncio.Event)  # progress, or the end
     ended: asyncio.Event = field(default_factory=asyncio.Event)  # the database has the answer
-    outcome: str | CowError | None = None  # the result as JSON, or the error, where this process has it at hand
-    outcome_of: str | None = None  # `created_at` of the job that it is of; None where it applies to any
+    refusal: CowError | None = None  # why nobody may wait here any longer
 
-    def notify(self, outcome: str | CowError | None, created_at: str | None) -> None:
+    def notify(self, refusal: CowError | None) -> None:
         """The job has ended, or is not waited for any more."""
-        if self.outcome_of is None or created_at is not None:
-            self.outcome, self.outcome_of = outcome, created_at
+        self.refusal = refusal or self.refusal
         self.ended.set()
         self.changed.set()
-
-    def take(self) -> tuple[str | CowError | None, str | None]:
-        """The outcome that was notified, and the creation time of its job; resets both, as another may follow."""
-        taken = self.outcome, self.outcome_of
-        self.outcome = self.outcome_of = None
-        self.ended.clear()
-        return taken
 
 
 class ActiveJobs:
     """The jobs that this process runs or waits for. Safe to use from every thread.
 
     An idempotency key that is used again after its job was deleted comes to the same id: a message about an id may be
-    about the earlier job. Outcomes therefore carry the time of their job.
+    about the earlier job. What became of a job is therefore read from the database alone.
     """
 
     def __init__(self) -> None:
@@ -165,11 +156,11 @@ class ActiveJobs:
         with self._lock:
             return list(self._waiters)
 
-    def notify_ended(self, job: str, outcome: str | CowError | None, created_at: str | None = None) -> None:
-        """Tells waiters that a job has ended. `outcome` where it is at hand, and of which job of that id it is."""
+    def notify_ended(self, job: str, refusal: CowError | None = None) -> None:
+        """Tells waiters that a job has ended, or why they may not wait for it here any longer."""
         self._elsewhere.pop(job, None)
         for waiter in self._waiters_of(job):
-            waiter.loop.call_soon_threadsafe(waiter.notify, outcome, created_at)
+            waiter.loop.call_soon_threadsafe(waiter.notify, refusal)
 
     def _wake(self, job: str) -> None:
         for waiter in self._waiters_of(job):

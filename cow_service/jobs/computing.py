@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 from weakref import WeakValueDictionary
 
 import psutil
@@ -28,7 +28,7 @@ from cow_service.records import Answer, WorkerInfo
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 from cow_service.service import Service
 from cow_service.stages.keys import RESULT_TYPES, StageKey, StageResult, digest_of
-from cow_service.stages.run import Progress
+from cow_service.stages.run import Progress, Run
 
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result checks whether it was canceled
 FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # seconds between two tries
@@ -120,23 +120,17 @@ class StoredStep:
             found = self.outages.wait_through(
                 lambda: next((each for key in (digest, *also) if (each := self._find(stage, key)) is not None), None)
             )
-            if found is not None:
-                result, reused = found
-                self.looked_for(stage, reused)
-                if reused:
-                    self.outages.wait_through(lambda: self.database.reuse_result(self.job_id, stage, result.artifacts))
-                self.stages.add(stage)
-                return result, reused
-            self.looked_for(stage, False)
-            result = self.outages.wait_through(compute)
-            self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
-            text, trajectory = result.model_dump_json(exclude={"value"} if stage == "trajectory" else None), None
-            if stage == "trajectory":
-                trajectory, self.trajectory_key = result.value.model_dump_json(), digest
-            stored = digest, self.job_id, stage, text, result.artifacts, trajectory
-            self.outages.wait_through(lambda: self.database.store_result(*stored))
+            self.looked_for(stage, found is not None and found[1])
+            if found is None:
+                found = result, _ = self.outages.wait_through(compute), False
+                self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
+                text, trajectory = result.model_dump_json(exclude={"value"} if stage == "trajectory" else None), None
+                if stage == "trajectory":
+                    trajectory, self.trajectory_key = result.value.model_dump_json(), digest
+                stored = digest, self.job_id, stage, text, result.artifacts, trajectory
+                self.outages.wait_through(lambda: self.database.store_result(*stored))
             self.stages.add(stage)
-            return result, False
+            return found
 
     def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
         """A stored result all of whose artifacts are there, and whether it is another job's."""
@@ -146,8 +140,8 @@ class StoredStep:
         job_id, values = row
         try:
             result = RESULT_TYPES[stage].model_validate_json(to_json(values))
-            if result.artifacts and job_id != self.job_id:  # before they are looked for: nobody removes them meanwhile
-                self.database.add_references(self.job_id, result.artifacts)
+            if job_id != self.job_id:  # before its artifacts are looked for: nobody removes them meanwhile
+                self.database.reuse_result(self.job_id, stage, result.artifacts)
             self.artifacts.touch(*result.artifacts)
         except (ArtifactNotFound, ValidationError):  # lost, or of another version
             return None
@@ -177,20 +171,16 @@ class Work:
 
 @dataclass(frozen=True)
 class JobOutcome:
-    """The result of a job, and the time of each stage that was computed for it, s.
+    """The result of a job, and the time of each stage that was computed for it, s."""
 
-    `kept` is what is stored of it: without the trajectory where that is stored under `trajectory_key`.
-    """
-
-    result: str  # JSON
-    kept: str  # JSON
+    result: str  # JSON, without the trajectory where that is stored under `trajectory_key`
     trajectory_key: str | None
     timings: dict[str, float]
     stages: set[str]  # those of the job, each of which is stored
 
 
 class Computer:
-    """Computes jobs, some at the same time."""
+    """Computes jobs, some at the same time: this one none, which is for worker processes on the same job database."""
 
     def start(self) -> None:
         """Makes ready for jobs. Returns at once."""
@@ -209,10 +199,6 @@ class Computer:
     def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
         """What computes the jobs, of which `active` says how far they are."""
         return ()
-
-
-class Elsewhere(Computer):
-    """Computes no jobs: worker processes that share the job database take them from its queues."""
 
 
 class InProcess(Computer):
@@ -255,17 +241,12 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
     given = work.progress, step, outages.wait_through, job.id, spec.created_at, spec.turn
     seen = None if spec.fresh else service.seen
-    if isinstance(request, AnswerRequest):
-        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
-            result = answer(run)
-    else:
-        with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
-            result = simulate(run)
+    with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
+        result = answer(cast("Run[AnswerRequest]", run)) if isinstance(request, AnswerRequest) else simulate(run)
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
-    text = result.model_dump_json()
     simulation = result.simulation if isinstance(result, Answer) else result
-    if step.trajectory_key is None or simulation is None:
-        return JobOutcome(text, text, None, computed, step.stages)
-    bare = simulation.model_copy(update={"trajectory": None})
-    bare = result.model_copy(update={"simulation": bare}) if isinstance(result, Answer) else bare
-    return JobOutcome(text, bare.model_dump_json(warnings=False), step.trajectory_key, computed, step.stages)
+    trajectory_key = None if simulation is None else step.trajectory_key
+    if trajectory_key is not None and simulation is not None:
+        bare = simulation.model_copy(update={"trajectory": None})
+        result = result.model_copy(update={"simulation": bare}) if isinstance(result, Answer) else bare
+    return JobOutcome(result.model_dump_json(warnings=False), trajectory_key, computed, step.stages)

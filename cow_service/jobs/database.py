@@ -258,11 +258,6 @@ class Database:
         """The stages of a job that are done."""
         return self._column(sa.select(STAGES.c.stage).where(STAGES.c.job_id == job))
 
-    def add_references(self, job: str, artifacts: Iterable[str]) -> None:
-        """Notes that a job needs some artifacts. Raises as `store_result` does."""
-        with self._cursor() as cursor:
-            self._add_references(cursor, job, artifacts)
-
     def referenced(self, artifacts: Iterable[str]) -> set[str]:
         """Those of some artifacts that a job needs."""
         found, all_of_them = set[str](), list(artifacts)

@@ -1,23 +1,20 @@
 """The job engine: accepts jobs, has them computed durably, and reports their state.
 
-A job is a row of the job database, in the database before its submission is acknowledged. Where this process has a
-place for it, it is started at once; else it waits in the queue of its generator, from which any process on the same
-database may take it. Each attempt to compute it is a workflow of DBOS. One process has one engine, as DBOS is one per
-process.
+A job is a row of the job database, in the database before its submission is acknowledged. It waits in the queue of its
+generator, from which any process on the same database may take it. DBOS keeps the calls of webhooks. A process has one
+engine, as DBOS is one per process.
 """
 
 import logging
 import threading
 import uuid
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
 from http import HTTPStatus
 
 from dbos import DBOS
 
 from cow_service.errors import (
     ArtifactNotFound,
-    CowError,
     IdempotencyKeyReused,
     JobNotFound,
     NotReady,
@@ -132,9 +129,8 @@ class JobEngine:
         self._maintenance.stop()
         self._dispatcher.stop()
         self._notifications.stop()
-        # DBOS polls once a second whether the work is done.
-        wait = int(self.service.settings.shutdown_grace + HANDOVER_SECONDS) if self.active.runs() else 0
-        DBOS.destroy(workflow_completion_timeout_sec=wait)
+        self._runner.wait(self.service.settings.shutdown_grace + HANDOVER_SECONDS)
+        DBOS.destroy()
         if self._grace is not None:
             self._grace.cancel()
         self._interrupt()
@@ -155,27 +151,19 @@ class JobEngine:
             raise NotReady(NOT_STARTED)
         self.processes.overview.check_served()
 
-    def check_capacity(self, owner: str | None, queue: str = "") -> int:
-        """Raises `QueueFull` where another job would be too many, `ShuttingDown` where none is accepted.
-
-        Returns the jobs that wait in the queue, or -1 where the owner has as many running jobs as they may have.
-        """
-        settings = self.service.settings
-        limit, own_limit, running_limit = settings.queue_limit, settings.own_queue_limit, settings.running_limit_per_key
+    def check_capacity(self, owner: str | None) -> None:
+        """Raises `QueueFull` where another job would be too many, `ShuttingDown` where none is accepted."""
+        limit, own_limit = self.service.settings.queue_limit, self.service.settings.own_queue_limit
         if self._stopping:
             raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
-        load = self.jobs.load(owner, queue)
-        if load.jobs >= limit:
+        jobs, own = self.jobs.count_open(owner)
+        if jobs >= limit:
+            raise QueueFull(f"{jobs} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later.")
+        if owner is not None and own_limit < limit and own >= own_limit:
             raise QueueFull(
-                f"{load.jobs} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later."
+                f"{own} jobs of your key wait or run, and COW_QUEUE_LIMIT_PER_KEY is {own_limit}. Send the request "
+                "again when some of them have ended."
             )
-        if owner is not None and own_limit < limit and load.own >= own_limit:
-            raise QueueFull(
-                f"{load.own} jobs of your key wait or run, and COW_QUEUE_LIMIT_PER_KEY is {own_limit}. Send the "
-                "request again when some of them have ended."
-            )
-        may_start = owner is None or running_limit is None or load.own < running_limit
-        return load.waiting if may_start else -1
 
     def submit(self, job_id: str, spec: JobSpec, owner: str | None, key: str | None, keep: Callable[[], None]) -> bool:
         """Accepts a job; returns whether it is new. It is in the database when this returns.
@@ -211,19 +199,14 @@ class JobEngine:
         settings = self.service.settings
         queue = queue_of(spec.reader, spec.generator, settings)
         step = step_of(settings.key_weights.get(owner or "", 1.0))
-        with ExitStack() as unless_started:
-            with self._submitting:  # the number of jobs must not change between the check and the insertion
-                starts = self.check_capacity(owner, queue) == 0 and self._dispatcher.hold_place(queue)
-                if starts:
-                    unless_started.callback(self._dispatcher.free_place, queue)
-                job = self.jobs.insert(job_id, spec, owner, queue, step, self._parts.executor if starts else None)
-            if job is not None and starts:
-                unless_started.pop_all()
-                self._dispatcher.hand_over(job)
-            elif job is not None:
-                self._dispatcher.wake()
+        with self._submitting:  # the number of jobs must not change between the check and the insertion
+            self.check_capacity(owner)
+            is_new = self.jobs.insert(job_id, spec, owner, queue, step)
+        if is_new:
+            self._dispatcher.wake()
+            if self._dispatcher.free_places(queue) <= 0:
                 self._notifications.send(Notification("queued", job_id))
-            return job is not None
+        return is_new
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
         """The state of a job. Raises `JobNotFound`, also for the job of another owner."""
@@ -250,7 +233,7 @@ class JobEngine:
         if self.jobs.cancel(job_id):
             self.active.request_cancel(job_id)
             self._notifications.send(Notification("canceled", job_id))
-            self.active.notify_ended(job_id, None)
+            self.active.notify_ended(job_id)
             self._dispatcher.wake()
             self.service.metrics.jobs.labels(kind, "canceled").inc()
         return self.find(job_id, owner)
@@ -274,12 +257,11 @@ class JobEngine:
         if owner is not None and not self.jobs.may_read(sha256, owner):
             raise ArtifactNotFound(f"No artifact of yours has the SHA-256 {sha256[:64]}.")
 
-    def _attempt_ended(self, job: TakenJob, outcome: str | CowError | None) -> None:
-        """This process works no more on a job. Where it has an outcome, callers are told."""
-        self._dispatcher.free_place(job.queue)
-        if outcome is not None:
-            # With its time: a job of the same id, of a key that was used again after a deletion, may not have ended.
-            self.active.notify_ended(job.id, outcome, job.spec.created_at)
+    def _attempt_ended(self, job: TakenJob, has_ended: bool) -> None:
+        """This process works no more on a job. Where that has ended, callers are told."""
+        self._dispatcher.give_place_back(job.queue)
+        if has_ended:
+            self.active.notify_ended(job.id)
             self._notifications.send(Notification("ended", job.id))
 
     def _receive(self, notification: Notification) -> None:
@@ -291,9 +273,9 @@ class JobEngine:
                 self.active.set_progress_elsewhere(job_id, stage, done)
             case Notification("canceled", job_id):
                 self.active.request_cancel(job_id)
-                self.active.notify_ended(job_id, None)
+                self.active.notify_ended(job_id)
             case Notification(job_id=job_id):
-                self.active.notify_ended(job_id, None)
+                self.active.notify_ended(job_id)
                 self._dispatcher.wake()  # its key may have another one
 
     def _interrupt(self) -> None:

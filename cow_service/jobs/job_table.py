@@ -143,34 +143,22 @@ class OpenCount:
         return max(0.0, time.time() - datetime.fromisoformat(self.oldest).timestamp())
 
 
-@dataclass(frozen=True)
-class QueueLoad:
-    """How many jobs are open: all, those of an owner, and those in a queue that no process has taken."""
-
-    jobs: int
-    own: int
-    waiting: int
-
-
 class JobTable:
     """The jobs of a database."""
 
     def __init__(self, database: Database, on_end: OnEnd = lambda connection, job_id, url: None) -> None:
         self._database, self._on_end = database, on_end
 
-    def load(self, owner: str | None, queue: str = "") -> QueueLoad:
-        """What a new job of an owner adds to."""
-        (row,) = self._database.read(_LOAD, {"owner": owner, "queue": queue})
-        return QueueLoad(*row)
+    def count_open(self, owner: str | None) -> tuple[int, int]:
+        """How many jobs are open: all, and those of an owner."""
+        ((jobs, own),) = self._database.read(_OPEN_JOBS, {"owner": owner})
+        return jobs, own
 
-    def insert(
-        self, job_id: str, spec: JobSpec, owner: str | None, queue: str, step: int, executor: str | None
-    ) -> TakenJob | None:
-        """Adds a job and what it needs; None where there is one of that id.
+    def insert(self, job_id: str, spec: JobSpec, owner: str | None, queue: str, step: int) -> bool:
+        """Adds a job and what it needs; False where there is one of that id.
 
-        Its turn comes `step` after that of its owner's last job. With an `executor` that process has taken it.
+        Its turn comes `step` after that of its owner's last job.
         """
-        run = uuid4().hex
         with self._database.transaction() as connection:
             given = {"owner": owner, "queue": queue}
             first: Sequence[Any] = connection.execute(_FIRST_TURN, given).all()
@@ -178,18 +166,17 @@ class JobTable:
             turn = next_turn([*first, *jobs], owner, spec.priority, step)
             spec = spec.model_copy(update={"turn": turn})
             row = spec.model_dump(include={"kind", "created_at", "priority", "turn", "generator", "webhook"})
-            row |= {"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION}
+            row |= {"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION, "starts": 0}
             row |= {"question": spec.request["question"], "image": spec.image, "spec": packed(spec.model_dump_json())}
-            row |= {"executor": executor, "run": None if executor is None else run, "starts": int(executor is not None)}
             added = self._database.insert(JOBS).on_conflict_do_nothing().returning(JOBS.c.id)
             if connection.execute(added, row).one_or_none() is None:
-                return None
+                return False
             needed = [{"sha256": sha256, "job_id": job_id} for sha256 in {spec.image, *spec.masks}]
             connection.execute(self._database.insert(REFERENCES).on_conflict_do_nothing(), needed)
             if behind := [job.id for job in jobs if moves(job, owner, spec.priority, turn)]:
                 waits = JOBS.c.id.in_(behind), JOBS.c.executor.is_(None)
                 connection.execute(sa.update(JOBS).where(*waits).values(turn=JOBS.c.turn + step))
-        return TakenJob(job_id, spec, owner, queue, run)
+        return True
 
     def waiting_queues(self) -> list[str]:
         """The queues in which jobs of this version wait."""
@@ -408,11 +395,7 @@ _ORDER = JOBS.c.turn, JOBS.c.created_at, JOBS.c.id
 _RELEASED = {"status": "queued", "executor": None, "run": None}
 _OF_OWNER = JOBS.c.owner.is_not_distinct_from(sa.bindparam("owner", type_=sa.Text))
 _OF_QUEUE = JOBS.c.queue == sa.bindparam("queue", type_=sa.Text)
-_LOAD = sa.select(
-    sa.func.count(),
-    sa.func.count(sa.case((_OF_OWNER, 1))),
-    sa.func.count(sa.case((sa.and_(_OF_QUEUE, JOBS.c.executor.is_(None)), 1))),
-).where(JOBS.c.status.in_(OPEN))
+_OPEN_JOBS = sa.select(sa.func.count(), sa.func.count(sa.case((_OF_OWNER, 1)))).where(JOBS.c.status.in_(OPEN))
 _TURNS = sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.priority).where(_OF_QUEUE, JOBS.c.status.in_(OPEN))
 _FIRST_TURN, _TURNS_OF_OWNER = _TURNS.order_by(JOBS.c.turn).limit(1), _TURNS.where(_OF_OWNER)
 _SHOWN = [

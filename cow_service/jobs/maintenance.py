@@ -20,7 +20,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, StorageUnavailable
-from cow_service.jobs import webhooks, workflows
+from cow_service.jobs import workflows
 from cow_service.jobs.computing import EngineParts
 from cow_service.jobs.database import Database, database_errors
 from cow_service.jobs.webhooks import Webhooks
@@ -136,10 +136,7 @@ class SessionLease(BackgroundThread):
     def release(self) -> None:
         """As that of a folder."""
         self.stop()
-        if self._session is not None:
-            with suppress(psycopg.Error):
-                self._session.close()
-            self._session = None
+        self._close()
 
     def run(self) -> None:
         """Keeps the session alive, and takes the lease again after an outage."""
@@ -152,10 +149,7 @@ class SessionLease(BackgroundThread):
                         self._ask(self._session, "SELECT 1")
                 except psycopg.Error:
                     log.warning("the lease of this process was lost: it is taken again when the database is back")
-                    if self._session is not None:
-                        with suppress(psycopg.Error):
-                            self._session.close()
-                    self._session = None
+                    self._close()
                     self._free_since = {}
 
     def _open(self) -> None:
@@ -163,6 +157,12 @@ class SessionLease(BackgroundThread):
         self._ask(session, "SELECT set_config('idle_session_timeout', %s, false)", f"{SILENCE_SECONDS:g}s")
         self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held by who looks at it, for a moment
         self._session = session
+
+    def _close(self) -> None:
+        session, self._session = self._session, None
+        with suppress(psycopg.Error):
+            if session is not None:
+                session.close()
 
     def _ask(self, session: psycopg.Connection[Any], statement: LiteralString, *values: object) -> object:
         """The value that a statement returns. Raises `psycopg.Error`, also where no answer comes."""
@@ -188,12 +188,6 @@ class Maintenance(BackgroundThread):
         super().__init__("cow-maintenance", JOIN_TIMEOUT_SECONDS)
         self._parts, self._hooks, self._lease, self._remove = parts, hooks, lease, remove
         self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
-
-    def clean_up(self) -> None:
-        """Removes jobs past their retention, and artifacts without references."""
-        self._clean_up_jobs()
-        if not self._stop.is_set():
-            collect_artifacts(self._parts.service, self._parts.database, self._stop.is_set)
 
     def run(self) -> None:
         """Does each kind of work when it is due. Errors are logged only: maintenance continues whatever happens."""
@@ -249,7 +243,7 @@ class Maintenance(BackgroundThread):
         """Does what no other process has done lately."""
         database, settings = self._parts.database, self._parts.service.settings
         if database.take_turn("jobs", TURN_SECONDS):
-            self._clean_up_jobs()
+            self.clean_up_jobs()
         seconds = LISTING_SECONDS if settings.artifacts_max_gb is None else TURN_SECONDS
         if self._stop.is_set() or not database.take_turn("artifacts", seconds):
             return
@@ -259,17 +253,16 @@ class Maintenance(BackgroundThread):
             database.give_turn_back("artifacts")  # an hour is long
             raise
 
-    def _clean_up_jobs(self) -> None:
+    def clean_up_jobs(self) -> None:
+        """Removes jobs past their retention, and what DBOS keeps from before that."""
         before = time.time() - 3600.0 * self._parts.service.settings.job_retention_hours
         while not self._stop.is_set() and (jobs := self._parts.jobs.ended_before(before, MAX_REMOVED_JOBS)):
             self._remove(jobs, before)
-        # The records that DBOS keeps of attempts: those of jobs are of no use once they are over.
-        client, limit = self._hooks.client, MAX_REMOVED_JOBS
-        for name, until in ((workflows.WORKFLOW, time.time()), (webhooks.WORKFLOW, before)):
-            moment = datetime.fromtimestamp(until, UTC).isoformat()
-            ended = partial(client.list_workflows, name=name, completed_before=moment, limit=limit)
-            while not self._stop.is_set() and (records := ended(load_input=False, load_output=False)):
-                client.delete_workflows([record.workflow_id for record in records])
+        # The records that DBOS keeps of calls of webhooks.
+        moment, client = datetime.fromtimestamp(before, UTC).isoformat(), self._hooks.client
+        ended = partial(client.list_workflows, completed_before=moment, limit=MAX_REMOVED_JOBS)
+        while not self._stop.is_set() and (records := ended(load_input=False, load_output=False)):
+            client.delete_workflows([record.workflow_id for record in records])
         if not self._stop.is_set():
             self._parts.database.give_room_back(self._stop.is_set)
 

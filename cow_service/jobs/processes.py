@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from functools import partial
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import sqlalchemy as sa
 
@@ -29,6 +29,10 @@ TELL_SECONDS = 2.0  # between two rows
 FORGOTTEN_SECONDS = 3600.0  # after which a row is deleted
 JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 MAX_AGE_SECONDS = 1.0  # of an overview that is given out again
+
+# What not every caller may know: where processes are, and the ids of others' jobs.
+_OF_WORKERS = {"__all__": {"pid": True, "jobs": {"__all__": {"id": True}}}}
+FOR_ADMINS: dict[str, Any] = {"processes": {"__all__": {"host": True, "pid": True, "workers": _OF_WORKERS}}}
 
 Key = TypeVar("Key")
 
@@ -87,13 +91,17 @@ class Processes(BackgroundThread):
         self._draining = False
         metrics, overview = self._parts.service.metrics, self.overview
         metrics.workers = self.workers
-        metrics.queue_depth = lambda: _sums(
-            ((one.queue, one.generator, one.state), one.jobs) for one in overview.counts()
-        )
-        metrics.queue_oldest = lambda: {one.name: one.oldest_seconds or 0.0 for one in overview.workers().queues}
-        metrics.queue_unserved = lambda: _sums(
-            ((one.queue, one.reason), one.jobs) for one in overview.workers().unserved
-        )
+        metrics.gauges |= {
+            "cow_queue_depth": lambda: _sums(
+                ((one.queue, one.generator, one.state), one.jobs) for one in overview.counts()
+            ).items(),
+            "cow_queue_oldest_seconds": lambda: [
+                ((one.name,), one.oldest_seconds or 0.0) for one in overview.workers().queues
+            ],
+            "cow_queue_unserved": lambda: _sums(
+                ((one.queue, one.reason), one.jobs) for one in overview.workers().unserved
+            ).items(),
+        }
         super().start()
 
     def drain(self) -> None:
@@ -150,7 +158,7 @@ class Overview:
     def workers(self, *, for_admin: bool = True) -> Workers:
         """What `GET /workers` returns. Raises `StorageUnavailable`."""
         found = self._latest()[0]
-        return found if for_admin else found.model_copy(update={"processes": tuple(map(_public, found.processes))})
+        return found if for_admin else Workers.model_validate(found.model_dump(exclude=FOR_ADMINS))
 
     def counts(self) -> list[OpenCount]:
         """The jobs that wait or run. Raises `StorageUnavailable`."""
@@ -246,14 +254,3 @@ def _queues(
         )
         for name in sorted(names, key=lambda name: (name != LIGHT, name))
     )
-
-
-def _public(process: ProcessInfo) -> ProcessInfo:
-    """What every caller may know of a process: not where it is, nor the ids of others' jobs."""
-    workers = tuple(
-        worker.model_copy(
-            update={"pid": None, "jobs": tuple(job.model_copy(update={"id": None}) for job in worker.jobs)}
-        )
-        for worker in process.workers
-    )
-    return process.model_copy(update={"host": None, "pid": None, "workers": workers})

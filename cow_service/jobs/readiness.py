@@ -11,15 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import cv2
-import numpy as np
-
 from cow_service.errors import CowError, NotReady, StorageUnavailable
 from cow_service.media.artifacts import ArtifactStore
-from cow_service.media.images import encode_png
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
+from cow_service.weights.manifests import EXAMPLES
 
 MAX_AGE_SECONDS = 2.0  # of what was found of the store
 MIN_FREE_BYTES = 200_000_000  # on the disk of the data folder
@@ -63,10 +60,8 @@ class Readiness:
     def check(self) -> None:
         """Raises `NotReady` while loading, `StorageUnavailable`, `ReaderUnavailable`, `GeneratorUnavailable`."""
         fault = self._fault()
-        if self._started and not self._done.is_set():
+        if fault is not None or (self._started and not self._done.is_set()):
             raise NotReady(fault or "The default reader and generator are being loaded. Ask again in a while.")
-        if fault is not None:
-            raise NotReady(fault)
         self._service.artifacts.check()
         self._load_backends()
         free = shutil.disk_usage(self._service.settings.data_dir).free
@@ -111,26 +106,18 @@ class StorageCheck:
                 raise StorageUnavailable(f"{self._fault} The job goes on when that is over.")
 
 
-WIDTH, HEIGHT = 320, 180  # px
-BALL, BOX = (80, 110), (220, 85, 260, 130)  # px
-QUESTION = "If the red ball moves in the direction of the arrow, will it hit the blue box?"
+QUESTION = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
 
 log = logging.getLogger("cow_service")
 
 
 def warm_up(settings: Settings) -> None:
     """Imagines with the backends that need no weights. Nothing of it is kept; a failure is logged."""
-    # A ball, an arrow on it and a box, on a floor.
-    picture = np.full((HEIGHT, WIDTH, 3), 190, np.uint8)
-    picture[: HEIGHT // 3] = 225
-    cv2.circle(picture, BALL, 22, (200, 40, 40), -1, cv2.LINE_AA)
-    cv2.rectangle(picture, BOX[:2], BOX[2:], (40, 70, 200), -1)
-    cv2.arrowedLine(picture, (105, 110), (165, 110), (240, 40, 40), 4, cv2.LINE_AA, 0, 0.3)
     try:
         with TemporaryDirectory(prefix="cow-warm-up-") as folder:
             alone = {"data_dir": Path(folder), "artifacts": None, "reader": "embedded", "generator": "cutout"}
             service = Service(settings.model_copy(update=alone))
-            artifact = service.keep_image(encode_png(picture))
+            artifact = service.keep_image(EXAMPLES["ball-and-mug"].file("image").read_bytes())
             request = SimulateRequest(image=ImageArtifact(artifact=artifact.sha256), question=QUESTION, num_frames=9)
             service.simulate(request).model_dump_json()
             service.close()

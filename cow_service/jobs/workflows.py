@@ -1,21 +1,20 @@
-"""The workflows that DBOS runs: an attempt to compute a job, and an attempt to call a webhook.
+"""Attempts: to compute a job, each in a thread, and to call a webhook, each a workflow of DBOS.
 
-The table of jobs (`job_table.py`) says who computes which job: each attempt is a workflow of its own, and where its
-process ends, another process makes the next one. A call of a webhook is kept by DBOS alone, which delays it, and runs
-it again.
+The table of jobs (`job_table.py`) says who computes which job: where its process ends, another process makes the next
+attempt. A call of a webhook is kept by DBOS alone, which delays it, and runs it again.
 """
 
 import logging
 import math
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import replace
-from queue import Empty, SimpleQueue
 from uuid import uuid4
 
-from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, SetWorkflowID
+from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer
 from dbos import error as dbos_error
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -34,7 +33,6 @@ from cow_service.observability import tracing
 from cow_service.requests import Stage
 from cow_service.settings import Settings
 
-WORKFLOW = "job"  # the name of an attempt's workflow
 POLL_SECONDS = 0.25  # between two looks at the queues, besides whenever it is woken: other processes add jobs, too
 STOP_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 
@@ -46,7 +44,7 @@ class Interrupted(BaseException):
 
 
 class Runner:
-    """Does the work of this process's workflows. Safe to use from every thread."""
+    """Does the work of this process: its jobs, and its workflows. Safe to use from every thread."""
 
     def __init__(
         self,
@@ -54,38 +52,44 @@ class Runner:
         computer: Computer,
         hooks: Webhooks,
         notifications: Notifications,
-        on_end: Callable[[TakenJob, str | CowError | None], None],
+        on_end: Callable[[TakenJob, bool], None],
     ) -> None:
-        """`on_end` is called when an attempt is over, with the outcome of the job where it has one."""
+        """`on_end` is called when an attempt is over, with whether the job has ended by it."""
         self._parts, self._jobs, self._active, self._computer = parts, parts.jobs, parts.active, computer
         self._hooks, self._notifications, self._on_end = hooks, notifications, on_end
-        self._starting: dict[str, TakenJob] = {}  # by the ids of their workflows
+        self._threads: list[threading.Thread] = []
 
     def start(self, job: TakenJob) -> None:
         """Starts an attempt to compute a job in a thread."""
-        workflow_id = f"{job.id}.{job.run}"
-        self._starting[workflow_id] = job
+        thread = threading.Thread(target=self._run, args=(job,), name=f"job-{job.id}", daemon=True)
         try:
-            with SetWorkflowID(workflow_id):
-                DBOS.start_workflow(compute_job, workflow_id)
-        except (SQLAlchemyError, dbos_error.DBOSException) as error:
-            log.warning("job %s could not be started: %s", job.id, type(error).__name__)
-            del self._starting[workflow_id]
-            self._on_end(job, None)  # maintenance will find that nobody works on it, and give it back
+            thread.start()
+        except RuntimeError as error:  # the system gives no more threads
+            log.warning("job %s could not be started: %s", job.id, error)
+            self._on_end(job, False)  # maintenance will find that nobody works on it, and give it back
+        else:
+            self._threads = [*(each for each in self._threads if each.is_alive()), thread]
 
-    def compute(self, workflow_id: str) -> None:
+    def wait(self, seconds: float) -> None:
+        """Waits until no job is at work, at most so long."""
+        until = time.monotonic() + seconds
+        for thread in self._threads:
+            thread.join(max(0.0, until - time.monotonic()))
+
+    def _run(self, job: TakenJob) -> None:
         """Computes a job, and stores its outcome."""
-        job = self._starting.pop(workflow_id)
-        outcome: str | CowError | None = None
+        ended = False
         try:
             with (
                 context.bound(request=job.spec.request_id, job=job.id),
                 tracing.span(f"job {job.spec.kind}", parent=job.spec.traceparent, job_id=job.id),
                 self._active.running(job.id, job.spec.kind, job.run) as running,
             ):
-                outcome = self._outcome(job, running)
+                ended = self._compute(job, running)
+        except Exception:
+            log.exception("the outcome of job %s could not be stored", job.id)
         finally:
-            self._on_end(job, outcome)
+            self._on_end(job, ended)
 
     def call_webhook(self, job_id: str, url: str, attempt: int) -> None:
         """Makes an attempt to call a webhook, and sees to another one where that failed."""
@@ -107,8 +111,8 @@ class Runner:
         if wait is not None:
             patient.wait_through(enqueue)
 
-    def _outcome(self, job: TakenJob, running: ActiveJob) -> str | CowError | None:
-        """The result or the error of a job, once it is stored; None where it has none, as it was canceled."""
+    def _compute(self, job: TakenJob, running: ActiveJob) -> bool:
+        """Whether the result or the error of a job is stored; not where it was canceled."""
         metrics, begun = self._parts.service.metrics, False
 
         def progress(stage: Stage | None, done: float) -> None:
@@ -133,25 +137,24 @@ class Runner:
             except Exception as error:
                 if isinstance(error, CowError):
                     log.info("job %s failed: %s", job.id, error.code)  # its detail may hold what was asked
-                    outcome = error
+                    failure = error
                 else:
                     log.exception("job %s failed", job.id)
-                    outcome = unforeseen()
-                stored = patient.wait_through(lambda: self._jobs.fail(job, outcome))
+                    failure = unforeseen()
+                status, stored = "failed", patient.wait_through(lambda: self._jobs.fail(job, failure))
             else:
                 for stage, seconds in computed.timings.items():
                     metrics.stage_seconds.labels(stage).observe(seconds)
-                outcome = computed.result
-                kept = job, computed.kept, computed.trajectory_key, computed.stages
-                stored = patient.wait_through(lambda: self._jobs.succeed(*kept))
+                given = job, computed.result, computed.trajectory_key, computed.stages
+                status, stored = "succeeded", patient.wait_through(lambda: self._jobs.succeed(*given))
             if not stored:
                 raise Canceled("The job is another process's, or has lost a stage.")
         except Canceled:
             with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
                 self._jobs.release(job.id, job.run)  # where it was interrupted; one that was canceled stays so
-            return None
-        metrics.jobs.labels(job.spec.kind, "succeeded" if isinstance(outcome, str) else "failed").inc()
-        return outcome
+            return False
+        metrics.jobs.labels(job.spec.kind, status).inc()
+        return True
 
 
 _runner: Runner | None = None
@@ -161,13 +164,6 @@ def set_runner(runner: Runner | None) -> None:
     """Sets who does the work: DBOS calls functions, and one process has one engine."""
     global _runner  # noqa: PLW0603
     _runner = runner
-
-
-@DBOS.workflow(name=WORKFLOW)
-def compute_job(workflow_id: str) -> None:
-    """An attempt to compute a job."""
-    assert _runner is not None, "workflows run only while an engine does"
-    _runner.compute(workflow_id)
 
 
 @DBOS.workflow(name=webhooks.WORKFLOW)
@@ -216,7 +212,8 @@ def busy_executors(client: DBOSClient) -> set[str]:
 def recover(client: DBOSClient, jobs: JobTable, ended: list[str]) -> list[str]:
     """Has the work of processes that have ended done by others; returns the ids of their jobs.
 
-    Calls of webhooks go back to their queue. Attempts to compute a job are over: their records are deleted.
+    Calls of webhooks go back to their queue. An earlier version kept records of attempts to compute a job, too: these
+    are over, and are deleted.
     """
     recovered = jobs.recover(ended)
     pending = client.list_workflows(executor_id=ended, status="PENDING", load_input=False, load_output=False)
@@ -241,17 +238,16 @@ class Dispatcher(BackgroundThread):
     """The places of this process, and the thread that fills them. Safe to use from every thread."""
 
     def __init__(self, parts: EngineParts, capacity: Callable[[str], int], start: Callable[[TakenJob], None]) -> None:
-        """`capacity`: of a queue by its name; `start` begins the work on a job that has a place."""
+        """`capacity`: of a queue by its name; `start` begins the work on a job that was taken."""
         super().__init__("cow-dispatcher", STOP_SECONDS)
         self._parts, self._capacity, self._start = parts, capacity, start
         self._places = threading.Lock()
-        self._held: Counter[str] = Counter()  # the places of each queue that are held
-        self._handed: SimpleQueue[TakenJob] = SimpleQueue()
+        self._held: Counter[str] = Counter()  # the places of each queue that are held; only the thread takes more
         self._woken = threading.Event()
         self._look = True  # at the queues: there may be jobs that wait
 
     def drain(self) -> None:
-        """Takes no more jobs. Those that were handed over are started."""
+        """Takes no more jobs."""
         self._stop.set()
         self._woken.set()
 
@@ -265,33 +261,22 @@ class Dispatcher(BackgroundThread):
         self._look = True
         self._woken.set()
 
-    def hold_place(self, queue: str) -> bool:
-        """Holds a place for a job that is about to be handed over; False where none is free."""
-        capacity = self._capacity(queue)
-        with self._places:
-            if self._stop.is_set() or self._held[queue] >= capacity:
-                return False
-            self._held[queue] += 1
-            return True
+    def free_places(self, queue: str) -> int:
+        """How many jobs of a queue could be taken now."""
+        return 0 if self._stop.is_set() else self._capacity(queue) - self._held[queue]
 
-    def free_place(self, queue: str) -> None:
+    def give_place_back(self, queue: str) -> None:
         """The holder of a place needs it no more."""
         with self._places:
             self._held[queue] -= 1
         self.wake()
 
-    def hand_over(self, job: TakenJob) -> None:
-        """Has a job started that holds a place already."""
-        self._handed.put(job)
-        self._woken.set()
-
     def run(self) -> None:
-        """Starts what was handed over, and what waits in the queues."""
+        """Starts what waits in the queues."""
         while not self._stop.is_set():
             self._woken.clear()
             look, self._look = self._look, False
             try:
-                self._start_handed()
                 for queue in self._parts.jobs.waiting_queues() if look else ():
                     self._fill(queue)
             except CowError as error:
@@ -300,25 +285,13 @@ class Dispatcher(BackgroundThread):
                 log.exception("no jobs were taken")
             if not self._woken.wait(POLL_SECONDS):
                 self._look = True
-        self._start_handed()
-
-    def _start_handed(self) -> None:
-        with suppress(Empty):
-            while True:
-                self._start(self._handed.get_nowait())
 
     def _fill(self, queue: str) -> None:
-        places = 0
-        while self.hold_place(queue):
-            places += 1
-        taken: list[TakenJob] = []
-        try:
-            if places:
-                limit = self._parts.service.settings.running_limit_per_key
-                taken = self._parts.jobs.take(queue, self._parts.executor, places, limit)
-        finally:
-            with self._places:
-                self._held[queue] -= places - len(taken)
+        if (places := self.free_places(queue)) <= 0:
+            return
+        limit = self._parts.service.settings.running_limit_per_key
+        taken = self._parts.jobs.take(queue, self._parts.executor, places, limit)
+        with self._places:
+            self._held[queue] += len(taken)
         for job in taken:
-            self._start_handed()  # these wait for nothing but this thread
             self._start(job)

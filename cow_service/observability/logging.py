@@ -72,7 +72,6 @@ MAX_TEXT = 10_000  # characters of a line, or of a value of one: errors of libra
 _NOT_EXTRA = frozenset((*vars(logging.makeLogRecord({})), "message", "asctime", "color_message", "taskName"))
 _SHOWN = ("request_id", "job_id", "owner")  # shown in a line of text
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
-_FAILED_JOB = "Exception encountered in background workflow"
 
 
 def add_ids(record: logging.LogRecord) -> bool:
@@ -146,7 +145,5 @@ def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None 
     # The job engine adds a handler of its own to a logger that has none.
     engine = logging.getLogger("dbos")
     engine.handlers, engine.propagate = [problems], False
-    # It need not log jobs that failed: the service does, with code and ids.
-    engine.filters = [lambda record: not str(record.msg).startswith(_FAILED_JOB)]
     engine.setLevel(logging.WARNING)
     logging.captureWarnings(True)

@@ -3,7 +3,7 @@
 import logging
 import sys
 from collections import Counter as Counts
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 import prometheus_client as prometheus
@@ -33,10 +33,21 @@ MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _REQUEST_BUCKETS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600)  # seconds
 _STAGE_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600, 1800)  # seconds
 
-QueueDepth = Callable[[], Mapping[tuple[str, str, str], int]]  # (queue, generator, "queued" | "running") -> jobs
-QueueUnserved = Callable[[], Mapping[tuple[str, str], int]]  # (queue, reason) -> jobs that no process takes
-QueueOldest = Callable[[], Mapping[str, float]]  # queue -> seconds that its oldest queued job has waited
-ListWorkers = Callable[[], Iterable[WorkerInfo]]
+# By name: description, labels.
+GAUGES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "cow_queue_depth": ("Jobs on the job database that wait or run.", ("queue", "generator", "state")),
+    "cow_queue_oldest_seconds": ("How long the oldest job has waited in a queue, s; 0 where none waits.", ("queue",)),
+    "cow_queue_unserved": (
+        "Jobs that wait, and that no process takes: none has their queue, or their workflow version.",
+        ("queue", "reason"),
+    ),
+    "cow_workers": ("Workers of this process.", ("queue", "state")),
+    "cow_worker_memory_bytes": ("Resident memory of a worker.", ("worker",)),
+    "cow_gpu_memory_bytes": (
+        "GPU memory: allocated and reserved by a worker, total of the device.",
+        ("worker", "device", "kind"),
+    ),
+}
 Samples = Iterable[tuple[Sequence[str], float]]  # the values of labels, and the value of the gauge
 OWN_PROCESS = ""  # the label `worker` of what this process itself uses
 BYTES = 1e6  # of the MB in which records tell memory
@@ -47,14 +58,16 @@ log = logging.getLogger("cow_service")
 class Metrics(Collector):
     """Counters and histograms, from several threads, and gauges that are read on request.
 
-    The job engine sets `queue_depth`, `queue_oldest`, `queue_unserved` and `workers`.
+    The job engine sets `workers`, and in `gauges` what reads those of queues.
     """
 
     def __init__(self) -> None:
-        self.queue_depth: QueueDepth = dict
-        self.queue_oldest: QueueOldest = dict
-        self.queue_unserved: QueueUnserved = dict
-        self.workers: ListWorkers = tuple
+        self.workers: Callable[[], Iterable[WorkerInfo]] = tuple
+        self.gauges: dict[str, Callable[[], Samples]] = {
+            "cow_workers": self._count_workers,
+            "cow_worker_memory_bytes": lambda: [((one.name,), one.memory_mb * BYTES) for one in self.workers()],
+            "cow_gpu_memory_bytes": self._measure_gpus,
+        }
         self._registry = registry = prometheus.CollectorRegistry()
         counter = partial(prometheus.Counter, registry=registry)
         histogram = partial(prometheus.Histogram, registry=registry)
@@ -75,40 +88,6 @@ class Metrics(Collector):
         )
         self.webhooks_given_up = counter(
             "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt."
-        )
-        # Name, description, labels, and what reads the values.
-        self._gauges: tuple[tuple[str, str, tuple[str, ...], Callable[[], Samples]], ...] = (
-            (
-                "cow_queue_depth",
-                "Jobs on the job database that wait or run.",
-                ("queue", "generator", "state"),
-                lambda: self.queue_depth().items(),
-            ),
-            (
-                "cow_queue_oldest_seconds",
-                "How long the oldest job has waited in a queue, s; 0 where none waits.",
-                ("queue",),
-                lambda: [((queue,), seconds) for queue, seconds in self.queue_oldest().items()],
-            ),
-            (
-                "cow_queue_unserved",
-                "Jobs that wait, and that no process takes: none has their queue, or their workflow version.",
-                ("queue", "reason"),
-                lambda: self.queue_unserved().items(),
-            ),
-            ("cow_workers", "Workers of this process.", ("queue", "state"), self._count_workers),
-            (
-                "cow_worker_memory_bytes",
-                "Resident memory of a worker.",
-                ("worker",),
-                lambda: [((worker.name,), worker.memory_mb * BYTES) for worker in self.workers()],
-            ),
-            (
-                "cow_gpu_memory_bytes",
-                "GPU memory: allocated and reserved by a worker, total of the device.",
-                ("worker", "device", "kind"),
-                self._measure_gpus,
-            ),
         )
         prometheus.ProcessCollector(registry=registry)
         registry.register(self)
@@ -132,14 +111,13 @@ class Metrics(Collector):
 
     def describe(self) -> Iterable[GaugeMetricFamily]:
         """The gauges without values, so that registering them computes nothing."""
-        return [GaugeMetricFamily(name, text, labels=labels) for name, text, labels, _ in self._gauges]
+        return [GaugeMetricFamily(name, text, labels=labels) for name, (text, labels) in GAUGES.items()]
 
     def collect(self) -> Iterable[GaugeMetricFamily]:
         """The gauges as of now."""
-        for name, text, labels, read in self._gauges:
-            gauge = GaugeMetricFamily(name, text, labels=labels)
+        for gauge in self.describe():
             try:
-                for values, number in read():
+                for values, number in self.gauges.get(gauge.name, tuple)():
                     gauge.add_metric(values, number)
             except Exception as error:  # the other metrics are wanted all the more
                 log.error("A metric could not be read", exc_info=error)

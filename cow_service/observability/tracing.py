@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING
 
 from opentelemetry import trace
@@ -81,7 +81,7 @@ def span(name: str, *, parent: str | None = None, **attributes: Attribute) -> Ge
     """
     above = None if parent is None else context.remote(parent)
     if _provider is not None:
-        with _recorded(_provider, name, trace.SpanKind.INTERNAL, above, **attributes):
+        with _recorded(_provider, name, trace.SpanKind.INTERNAL, above, attributes):
             yield
     elif above is not None:
         with trace.use_span(trace.get_current_span(above)):
@@ -95,7 +95,7 @@ def request_span(name: str, parent: str | None) -> Generator[None]:
     """The span of a request around the block; `parent` is the caller's traceparent."""
     above = context.remote(parent)
     if _provider is not None:
-        with _recorded(_provider, name, trace.SpanKind.SERVER, above):
+        with _recorded(_provider, name, trace.SpanKind.SERVER, above, {}):
             yield
         return
     caller = trace.get_current_span(above).get_span_context()
@@ -115,11 +115,9 @@ def describe(name: str, *, failed: bool, **attributes: Attribute) -> None:
         here.set_status(trace.StatusCode.ERROR)
 
 
-@contextmanager
 def _recorded(
-    provider: TracerProvider, name: str, kind: trace.SpanKind, above: Context | None, **attributes: Attribute
-) -> Generator[None]:
+    provider: TracerProvider, name: str, kind: trace.SpanKind, above: Context | None, attributes: dict[str, Attribute]
+) -> AbstractContextManager[trace.Span]:
     known = {key: value for key, value in attributes.items() if value is not None}
     tracer = provider.get_tracer("cow_service", __version__)
-    with tracer.start_as_current_span(name, context=above, kind=kind, attributes=known):
-        yield
+    return tracer.start_as_current_span(name, context=above, kind=kind, attributes=known)

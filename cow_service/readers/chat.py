@@ -16,12 +16,17 @@ class Upstream:
 
 @dataclass(frozen=True)
 class ChatTurn:
-    """What an MLLM replied that was not asked over OpenAI's protocol, in the form of that protocol."""
+    """What an MLLM replied, in one piece and in the form of OpenAI's protocol, whichever it was asked over."""
 
     body: dict[str, Any]  # a chat completion or, where the status is no success, an object with `error`
     status: int = HTTPStatus.OK
     warnings: tuple[str, ...] = ()  # what of the chat could not be sent
     headers: dict[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether it is a completion."""
+        return self.status == HTTPStatus.OK
 
 
 @runtime_checkable

@@ -18,7 +18,8 @@ from multiprocessing.connection import Connection
 import psutil
 
 from cow_service.concurrency import leave_decisions_to_the_parent
-from cow_service.errors import Canceled, CowError, unforeseen
+from cow_service.errors import CowError, unforeseen
+from cow_service.jobs.active import ActiveJob
 from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import TakenJob, error_as_json
@@ -44,19 +45,17 @@ class _Job:
 
     def __init__(self, job: TakenJob, send: Callable[[FromWorker], None]) -> None:
         self.job, self._send = job, send
-        self.canceled, self.key_held = threading.Event(), threading.Event()
-        self._told: tuple[Stage | None, float] = (None, 0.0)
+        self.active, self.key_held = ActiveJob(job.spec.kind), threading.Event()
 
     def compute(self, service: Service, database: Database) -> messages.Succeeded | messages.Failed:
         """Its end, to be sent."""
         job_id, spec = self.job.id, self.job.spec
         self._send(messages.Progressed(job_id, None, 0.0))  # from here on the job may be what ends the process
-        work = Work(
-            job=self.job,
-            progress=self._progress,
-            check=self._check,
-            looked_for=lambda stage, found: self._send(messages.LookedFor(job_id, stage, found)),
-        )
+
+        def looked_for(stage: Stage, found: bool) -> None:
+            self._send(messages.LookedFor(job_id, stage, found))
+
+        work = Work(self.job, self._progress, self.active.check, looked_for)
         try:
             with (
                 context.bound(request=spec.request_id, job=job_id),
@@ -69,14 +68,10 @@ class _Job:
             log.exception("job %s failed", job_id)
             return messages.Failed(job_id, error_as_json(unforeseen()))
 
-    def _check(self) -> None:
-        if self.canceled.is_set():
-            raise Canceled("The job was canceled.")
-
     def _progress(self, stage: Stage | None, done: float) -> None:
-        self._check()
-        if stage != self._told[0] or done >= min(1.0, self._told[1] + MIN_PROGRESS):
-            self._told = stage, done
+        self.active.check()
+        if stage != self.active.at[0] or done >= min(1.0, self.active.at[1] + MIN_PROGRESS):
+            self.active.at = stage, done
             self._send(messages.Progressed(self.job.id, stage, done))
 
     @contextmanager
@@ -112,7 +107,7 @@ class WorkerProcess:
                     self._jobs[job.id] = _Job(job, self._send)
                     self._threads.submit(self._work, job.id)
                 case messages.Cancel(job_id) if job_id in self._jobs:
-                    self._jobs[job_id].canceled.set()
+                    self._jobs[job_id].active.cancel_requested.set()
                 case messages.KeyHeld(job_id) if job_id in self._jobs:
                     self._jobs[job_id].key_held.set()
                 case messages.End():

@@ -19,23 +19,6 @@ from cow_service.jobs.job_table import error_from_json
 from cow_service.records import GpuMemory
 from cow_service.settings import Settings
 from cow_service.workers import messages
-from cow_service.workers.messages import (
-    Begin,
-    Cancel,
-    End,
-    Failed,
-    Heartbeat,
-    HoldKey,
-    KeyHeld,
-    Loaded,
-    LookedFor,
-    OfJob,
-    Progressed,
-    ReleaseKey,
-    Start,
-    Succeeded,
-    ToWorker,
-)
 
 MODULE = "cow_service.workers"  # what a worker process runs
 
@@ -76,16 +59,16 @@ class Worker:
         self._job_timeout = settings.job_timeout
         self._process, self._pipe = spawned.process, spawned.pipe
         self._sending = threading.Lock()
-        self._inboxes: dict[str, SimpleQueue[OfJob | None]] = {}
+        self._inboxes: dict[str, SimpleQueue[messages.OfJob | None]] = {}
         self._loaded = threading.Event()  # or failed to, or ended before
         self._load_error: CowError | None = None
         self.is_loaded = False  # or could not load them: it goes on with what needs others
         self._ended = threading.Event()
-        self._reason, self._is_final, self._stopped = "crashed", False, False
+        self._reason, self._is_final = "crashed", False
         self._end_reason: EndReason = "crashed"
         self._on_end = on_end
         threading.Thread(target=self._listen, name=f"cow-{name}", daemon=True).start()
-        self._send(Begin(settings.dump_secrets()))
+        self._send(messages.Begin(settings.dump_secrets()))
 
     @property
     def pid(self) -> int:
@@ -123,7 +106,7 @@ class Worker:
         inbox = self._inboxes[work.job.id] = SimpleQueue()
         try:
             with ExitStack() as keys:
-                self._send(Start(work.job))
+                self._send(messages.Start(work.job))
                 return self._follow(work, inbox, locks, keys)
         finally:
             del self._inboxes[work.job.id]
@@ -136,10 +119,9 @@ class Worker:
 
     def close(self, end_reason: EndReason = "stopped") -> None:
         """Ends the process. It has no jobs."""
-        self._stopped = True
         if self.is_alive:
             self._end_reason = end_reason
-        self._send(End())
+        self._send(messages.End())
         try:
             self._process.wait(END_SECONDS)
         except subprocess.TimeoutExpired:
@@ -148,7 +130,9 @@ class Worker:
         self._ended.wait()
         self._pipe.close()
 
-    def _follow(self, work: Work, inbox: SimpleQueue[OfJob | None], locks: KeyLocks, keys: ExitStack) -> JobOutcome:
+    def _follow(
+        self, work: Work, inbox: SimpleQueue[messages.OfJob | None], locks: KeyLocks, keys: ExitStack
+    ) -> JobOutcome:
         """Does what the messages about a job ask for, until its outcome. `keys` gives back those it still holds."""
         until, canceled, begun = math.inf, False, False  # its time does not begin while the process loads
         held: dict[str, ExitStack] = {}
@@ -165,22 +149,22 @@ class Worker:
                 with suppress(Empty):
                     message = inbox.get(timeout=POLL_SECONDS)
                     begun |= message is not None
-                if isinstance(message, HoldKey):
+                if isinstance(message, messages.HoldKey):
                     held[message.key] = keys.enter_context(ExitStack())
                     held[message.key].enter_context(locks.held(message.key, check))
-                    self._send(KeyHeld(work.job.id))
-                elif isinstance(message, Progressed) and not canceled:
+                    self._send(messages.KeyHeld(work.job.id))
+                elif isinstance(message, messages.Progressed) and not canceled:
                     work.progress(message.stage, message.done)
-                elif isinstance(message, LookedFor):
+                elif isinstance(message, messages.LookedFor):
                     work.looked_for(message.stage, message.found)
-                elif isinstance(message, ReleaseKey) and message.key in held:
+                elif isinstance(message, messages.ReleaseKey) and message.key in held:
                     held.pop(message.key).close()
             except Canceled:
                 canceled, until = True, time.monotonic() + (CANCEL_SECONDS if begun else 0.0)
-                self._send(Cancel(work.job.id))
-            if isinstance(message, Succeeded):
+                self._send(messages.Cancel(work.job.id))
+            if isinstance(message, messages.Succeeded):
                 return message.outcome
-            if isinstance(message, Failed):
+            if isinstance(message, messages.Failed):
                 raise error_from_json(message.error)
             if message is None:
                 self._check_alive(begun)
@@ -203,7 +187,7 @@ class Worker:
             never_began = not (begun or self.is_loaded)
             raise WorkerGone(self.end_reason, is_final=self._is_final, never_began=never_began)
 
-    def _send(self, message: ToWorker) -> None:
+    def _send(self, message: messages.ToWorker) -> None:
         with self._sending, suppress(OSError):  # its end is noticed where its messages are read
             messages.send(self._pipe, message)
 
@@ -212,9 +196,9 @@ class Worker:
         try:
             while True:
                 match messages.receive_from_worker(self._pipe):
-                    case Heartbeat(memory_bytes=memory_bytes, gpus=gpus):
+                    case messages.Heartbeat(memory_bytes=memory_bytes, gpus=gpus):
                         self.heard, self.memory_bytes, self.gpus = time.monotonic(), memory_bytes, gpus
-                    case Loaded(error=error):
+                    case messages.Loaded(error=error):
                         self._load_error = None if error is None else error_from_json(error)
                         self.heard, self.is_loaded = time.monotonic(), True
                         self._loaded.set()

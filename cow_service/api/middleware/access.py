@@ -35,30 +35,26 @@ def hash_of(key: str) -> str:
     return "sha256:" + sha256(key.encode(errors="surrogateescape")).hexdigest()
 
 
-class KeyRing:
-    """The hashes of a server's keys, by the name of their owner."""
-
-    def __init__(self, hashes: Mapping[str, str]) -> None:
-        self._hashes = {name: value.lower().encode() for name, value in hashes.items()}
-
-    def __len__(self) -> int:
-        return len(self._hashes)
-
-    def owner_of(self, key: str) -> str | None:
-        """The owner's name, or None where nobody has that key."""
-        asked = hash_of(key).encode()
-        owner = None
-        for name, known in self._hashes.items():  # all of them, so that the time is always the same
-            if hmac.compare_digest(asked, known):
-                owner = name
-        return owner
+def key_owner(key: str, hashes: Mapping[str, str]) -> str | None:
+    """The name of a key's owner, or None where nobody has it. `hashes` are those of COW_API_KEYS, by name."""
+    asked = hash_of(key)
+    owner = None
+    for name, known in hashes.items():  # all of them, so that the time is always the same
+        if hmac.compare_digest(asked, known):
+            owner = name
+    return owner
 
 
-PROBES = frozenset({"/livez", "/readyz"})
-PAGES = frozenset({"/", "/docs"})
+PROBES = ("/livez", "/readyz")
+PAGES = ("/", "/docs")
 PAGE_FILES = ("/docs/", "/web/")
 MAX_CALLERS = 10_000  # remembered; beyond that the one that has been idle longest gets a full bucket
 MAX_FAILURES = 30  # per minute from one address, before it has to wait
+
+
+def is_open(path: str) -> bool:
+    """Whether everybody may ask for it: probes, and pages with their files."""
+    return path in (*PROBES, *PAGES) or path.startswith(PAGE_FILES)
 
 
 class Guard:
@@ -89,8 +85,8 @@ class Callers:
     is added tomorrow is closed as well.
     """
 
-    def __init__(self, keys: KeyRing, settings: Settings) -> None:
-        self._keys = keys
+    def __init__(self, settings: Settings) -> None:
+        self._keys = settings.api_keys
         per_minute: dict[Unit, float | None] = {
             "requests": settings.rate_limit,
             "MB of bodies": settings.rate_limit_mb,
@@ -103,15 +99,13 @@ class Callers:
         """Why a request is refused, if it is."""
         state = scope.setdefault("state", {})
         owner = state["owner"] = None
-        if scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
-            path = scope["path"]
-            if path in PROBES or path in PAGES or path.startswith(PAGE_FILES):
-                return None
+        if scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and is_open(scope["path"]):
+            return None
         if self._keys:
             sent = Headers(scope=scope).getlist("authorization")
             scheme, _, rest = sent[0].strip().partition(" ") if len(sent) == 1 else ("", "", "")
             key = rest.strip() if scheme.lower() == "bearer" else ""
-            owner = state["owner"] = self._keys.owner_of(key) if key else None
+            owner = state["owner"] = key_owner(key, self._keys) if key else None
             if owner is None:
                 # A right key passes in any case: else one bad neighbour behind an address would lock all others out.
                 if self._failures is not None and (wait := self._failures.take(address_of(scope))):

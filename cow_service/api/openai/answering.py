@@ -1,17 +1,19 @@
 """Chats with a model without an MLLM: the last user message becomes an `AnswerRequest`, and its answer the reply."""
 
 import json
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import Iterator
 from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any
 
 from anyio import to_thread
 from pydantic import ValidationError
+from sse_starlette import ServerSentEvent
 
 from cow_service.api.openai import chats
+from cow_service.api.openai.forwarding import Events
 from cow_service.api.openai.records import Answerer
-from cow_service.api.openai.stream import DONE, chunk_of, event_of, follow_job, job_head, progress_chunk
+from cow_service.api.openai.stream import LAST_EVENT, chunk_of, event_of, follow_job, job_head, progress_chunk
 from cow_service.api.problems import invalid
 from cow_service.api.submission import Submission, Submitter
 from cow_service.errors import FieldError, InvalidRequest
@@ -40,12 +42,11 @@ NOT_SURE = "Not sure"
 class ParsedChat:
     """A chat that was parsed and validated. It is not a job yet."""
 
-    model: str
+    chat: chats.Chat
     request: AnswerRequest
     pointers: dict[str, str]  # by field of the request: JSON Pointers into the chat
     warnings: tuple[str, ...]  # what of it has no effect
     max_tokens: int | None
-    with_usage: bool
 
 
 def parse_chat(chat: chats.Chat, model: Answerer) -> ParsedChat:
@@ -71,14 +72,7 @@ def parse_chat(chat: chats.Chat, model: Answerer) -> ParsedChat:
     except ValidationError as error:
         raise invalid(error, lambda pointer: chats.point_into_chat(pointer, pointers)) from error
     limits = [limit for name in ("max_tokens", "max_completion_tokens") if type(limit := chat.fields.get(name)) is int]
-    return ParsedChat(
-        model=chat.model,
-        request=request,
-        pointers=pointers,
-        warnings=tuple(_warnings(chat, place)),
-        max_tokens=min(limits, default=None),
-        with_usage=chat.with_usage,
-    )
+    return ParsedChat(chat, request, pointers, tuple(_warnings(chat, place)), min(limits, default=None))
 
 
 def _image_of(messages: list[Any]) -> chats.ImagePart:
@@ -136,19 +130,19 @@ def _list_some(names: list[str], most: int = 10) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def completion_of(chat: ParsedChat, result: str) -> dict[str, Any]:
+def completion_of(parsed: ParsedChat, result: str) -> dict[str, Any]:
     """The `ChatCompletion` of a job's result. CPU work: not for the event loop."""
     answer = json.loads(result)  # as plain values: validating its thousands of numbers again would take long
     said = NOT_SURE if answer["answer"] is None else answer["answer"]
     reply = Reply(said, answer["option"], answer["reasoning"], answer["options_source"])
     content = reply_text(answer["question"], reply)  # a letter, a text, a line or JSON: as the question asks
-    warnings = list(chat.warnings)
-    if chat.max_tokens is not None and len(content.split()) > chat.max_tokens:
-        warnings.append(f"The answer is longer than {chat.max_tokens} tokens: answers are not cut.")
+    warnings = list(parsed.warnings)
+    if parsed.max_tokens is not None and len(content.split()) > parsed.max_tokens:
+        warnings.append(f"The answer is longer than {parsed.max_tokens} tokens: answers are not cut.")
     answer["warnings"] = [*warnings, *answer["warnings"]]
     message = {"content": content, "reasoning_content": answer["reasoning"] or None, "refusal": None}
     read, written = answer["usage"]["input_tokens"], answer["usage"]["output_tokens"]
-    return job_head(answer["id"], answer["created_at"], chat.model) | {
+    return job_head(answer["id"], answer["created_at"], parsed.chat.model) | {
         "object": "chat.completion",
         "choices": [
             {"index": 0, "message": {"role": "assistant"} | message, "finish_reason": "stop", "logprobs": None}
@@ -159,30 +153,30 @@ def completion_of(chat: ParsedChat, result: str) -> dict[str, Any]:
 
 
 async def answer_events(
-    submitter: Submitter, submission: Submission, chat: ParsedChat, created_at: str | None
-) -> AsyncGenerator[bytes]:
+    submitter: Submitter, submission: Submission, parsed: ParsedChat, created_at: str | None
+) -> Events:
     """The chunks of an answer job: progress first. Raises what the job fails with."""
     head: dict[str, Any] = {}
     async with aclosing(follow_job(submitter, submission, created_at)) as updates:
         async for update in updates:
             if not isinstance(update, Job):
-                for event in await to_thread.run_sync(_last_events, chat, update, head):
+                for event in await to_thread.run_sync(_last_events, parsed, update, head):
                     yield event
             elif head:
                 yield progress_chunk(update, head)
             else:
-                head = job_head(update.id, update.created_at, chat.model) | {"usage": None}
+                head = job_head(update.id, update.created_at, parsed.chat.model) | {"usage": None}
                 yield progress_chunk(update, head, {"role": "assistant", "content": ""})
-    yield DONE
+    yield LAST_EVENT
 
 
-def _last_events(chat: ParsedChat, result: str, head: dict[str, Any]) -> list[bytes]:
+def _last_events(parsed: ParsedChat, result: str, head: dict[str, Any]) -> list[ServerSentEvent]:
     """The message, its end, and its tokens where they were asked for. CPU work: not for the event loop."""
-    completion = completion_of(chat, result)
+    completion = completion_of(parsed, result)
     message = completion["choices"][0]["message"]
     deltas = [{name: message[name]} for name in ("reasoning_content", "content") if message[name] is not None]
     chunks = [chunk_of(head, delta) for delta in deltas]
     chunks.append(chunk_of(head, {}, "stop", cow=completion["cow"]))
-    if chat.with_usage:
+    if parsed.chat.with_usage:
         chunks.append(head | {"choices": [], "usage": completion["usage"]})
     return [event_of(chunk) for chunk in chunks]

@@ -6,7 +6,6 @@ Without one, the chat is a job as of `POST /answer`, and its result becomes the 
 
 import base64
 import time
-from collections.abc import AsyncGenerator
 from contextlib import AsyncExitStack, aclosing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,14 +21,14 @@ from cow_service.api.body import read_object
 from cow_service.api.openai import records, stream
 from cow_service.api.openai.answering import answer_events, completion_of, parse_chat
 from cow_service.api.openai.chats import EXTENSION, Chat, ImagePart, images_of, locate_in_chat, other_parts, wrong
-from cow_service.api.openai.forwarding import Forwarder, Whole
+from cow_service.api.openai.forwarding import Events, Forwarder
 from cow_service.api.openai.records import Answerer, ChatImagination
 from cow_service.api.problems import invalid
 from cow_service.jobs.engine import new_job_id
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import Imagined
-from cow_service.readers.chat import ChatReader
+from cow_service.readers.chat import ChatReader, ChatTurn
 from cow_service.readers.mllm.hypothesis import hypothesis, pictures
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Job, Simulation, Usage
@@ -110,7 +109,7 @@ class Completer:
 
     async def complete(
         self, request: Request, chat: Chat, *, stored: bool = True
-    ) -> Whole | stream.Streamed | Response:
+    ) -> ChatTurn | stream.Streamed | Response:
         """The reply, streamed where the chat says so; a response where the caller takes the job instead, which needs
         `stored`.
 
@@ -143,7 +142,7 @@ class Completer:
 
     async def _answer(
         self, request: Request, chat: Chat, answerer: Answerer, *, stored: bool
-    ) -> Whole | stream.Streamed | Response:
+    ) -> ChatTurn | stream.Streamed | Response:
         """The reply of a model without an MLLM."""
         submitter = self._submitter
         submission = submitter.submission(request, "answer")
@@ -161,7 +160,7 @@ class Completer:
             result = await submitter.result(request, submission, parsed.request)
             if result is None:
                 return await submitter.accepted(submission)
-            return Whole(await to_thread.run_sync(completion_of, parsed, result))
+            return ChatTurn(await to_thread.run_sync(completion_of, parsed, result))
         except errors.CowError as error:
             raise locate_in_chat(error, parsed.pointers) from error
 
@@ -171,7 +170,7 @@ class Completer:
         """Progress while the simulation runs, then the reply's own events."""
         stack = AsyncExitStack()
 
-        async def events() -> AsyncGenerator[bytes]:
+        async def events() -> Events:
             result = ""
             try:
                 async with aclosing(stream.follow_job(self._submitter, submission, created_at)) as updates:
@@ -190,34 +189,33 @@ class Completer:
         leave = partial(self._submitter.leave, submission, created_at)
         return stream.Streamed(events(), leave=leave, close=stack.aclose)
 
-    async def _forward(self, request: Request, enriched: EnrichedChat, reader: ChatReader) -> Whole | stream.Streamed:
+    async def _forward(
+        self, request: Request, enriched: EnrichedChat, reader: ChatReader
+    ) -> ChatTurn | stream.Streamed:
         """The reply of the MLLM. It is given up where the caller goes away before it has begun."""
         async with AsyncExitStack() as stack:
             reply = await submitting.unless_disconnected(request, self._ask(enriched, reader, stack))
-            refused = isinstance(reply, Whole) and not reply.succeeded
+            refused = isinstance(reply, ChatTurn) and not reply.succeeded
             if enriched.chat.stream and not refused:
                 return stream.Streamed(_events_of(reply, enriched), close=stack.pop_all().aclose)
-        if isinstance(reply, Whole):
+        if isinstance(reply, ChatTurn):
             return reply
         detail = "The server of the multimodal LLM streamed its reply, which the chat did not ask for."
         raise errors.MllmBadReply(detail)
 
-    async def _ask(
-        self, enriched: EnrichedChat, reader: ChatReader, stack: AsyncExitStack
-    ) -> Whole | AsyncGenerator[bytes]:
+    async def _ask(self, enriched: EnrichedChat, reader: ChatReader, stack: AsyncExitStack) -> ChatTurn | Events:
         """What the MLLM replies, with `cow` in a whole reply. A stream stays open until the stack is closed."""
         body = {name: value for name, value in enriched.chat.fields.items() if name != EXTENSION}
         if isinstance(body.get("messages"), list):
             body["messages"] = enriched.messages
         if reader.upstream is None:
-            turn = await reader.chat(body)
-            reply, warnings = Whole(turn.body, turn.status, turn.headers), turn.warnings
+            reply = await reader.chat(body)
         else:
             body["model"] = reader.upstream.model
-            reply, warnings = await stack.enter_async_context(self._forwarder.send(reader.upstream, body)), ()
-        if not isinstance(reply, Whole) or not reply.succeeded:
+            reply = await stack.enter_async_context(self._forwarder.send(reader.upstream, body))
+        if not isinstance(reply, ChatTurn) or not reply.succeeded:
             return reply
-        return replace(reply, body=reply.body | {EXTENSION: enriched.extension(*warnings)})
+        return replace(reply, body=reply.body | {EXTENSION: enriched.extension(*reply.warnings)})
 
 
 def preferences_without_key(request: Request) -> submitting.Preferences:
@@ -308,13 +306,13 @@ def add_frames(chat: Chat, what_if: WhatIf, result: str, artifacts: ArtifactStor
     return EnrichedChat(chat, messages, cow)
 
 
-async def _events_of(reply: Whole | AsyncGenerator[bytes], enriched: EnrichedChat) -> AsyncGenerator[bytes]:
+async def _events_of(reply: ChatTurn | Events, enriched: EnrichedChat) -> Events:
     """A reply as events: its own, behind one that carries `cow`; of a whole reply, chunks made of it."""
-    if isinstance(reply, Whole):
+    if isinstance(reply, ChatTurn):
         for chunk in stream.chunks_of(reply.body, with_usage=enriched.chat.with_usage):
             yield stream.event_of(chunk)
         if reply.succeeded:
-            yield stream.DONE
+            yield stream.LAST_EVENT
         return
     is_first = True
     async with aclosing(reply) as events:

@@ -2,19 +2,19 @@
 
 import asyncio
 import json
-import re
-from collections.abc import AsyncGenerator, AsyncIterator, Generator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import AsyncGenerator, Generator
+from contextlib import AsyncExitStack, aclosing, asynccontextmanager, contextmanager, suppress
 from http import HTTPStatus
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import httpx
+from httpx_sse import EventSource
+from sse_starlette import ServerSentEvent
 
 from cow_service import __version__
 from cow_service.api.openai.chats import as_json, wrong
 from cow_service.errors import MllmBadReply, MllmUnavailable, shortened
-from cow_service.readers.chat import Upstream
+from cow_service.readers.chat import ChatTurn, Upstream
 from cow_service.settings import Settings
 
 CONNECT_SECONDS = 10.0
@@ -23,21 +23,9 @@ PASSED_HEADERS = ("retry-after", "retry-after-ms", "x-should-retry")
 PASSED_PREFIX = "x-ratelimit-"
 # These say that this server's own key, or address, is wrong: nothing that a caller could mend.
 NOT_THE_CALLERS = (HTTPStatus.UNAUTHORIZED, HTTPStatus.PROXY_AUTHENTICATION_REQUIRED)
-_BLANK_LINE = re.compile(rb"\r\n\r\n|\n\n|\r\r")
+DONE = "[DONE]"  # the data of a stream's last event
 
-
-@dataclass(frozen=True)
-class Whole:
-    """A reply in one piece, be it a completion or an error, with the status that it came with."""
-
-    body: dict[str, Any]
-    status: int = HTTPStatus.OK
-    headers: dict[str, str] = field(default_factory=dict[str, str])
-
-    @property
-    def succeeded(self) -> bool:
-        """Whether it is a completion."""
-        return self.status == HTTPStatus.OK
+Events: TypeAlias = AsyncGenerator[ServerSentEvent]
 
 
 class Forwarder:
@@ -56,8 +44,8 @@ class Forwarder:
             self._client = None
 
     @asynccontextmanager
-    async def send(self, upstream: Upstream, body: dict[str, Any]) -> AsyncGenerator[Whole | AsyncGenerator[bytes]]:
-        """The reply to a chat, sent once: whole, or its events, each with the blank line at its end.
+    async def send(self, upstream: Upstream, body: dict[str, Any]) -> AsyncGenerator[ChatTurn | Events]:
+        """The reply to a chat, sent once: whole, or its events.
 
         Raises `InvalidRequest`, `MllmUnavailable`, `MllmBadReply`.
         """
@@ -115,30 +103,20 @@ def _translated() -> Generator[None]:
         raise MllmUnavailable(detail) from error
 
 
-async def _events(response: httpx.Response) -> AsyncGenerator[bytes]:
+async def _events(response: httpx.Response) -> Events:
     """The events of a stream. Raises `MllmUnavailable` where it breaks off before its end."""
     ended = False
     with _translated():
-        async for event in split_events(response.aiter_bytes()):
-            ended = ended or event.strip().removeprefix(b"data:").strip() == b"[DONE]"
-            yield event
+        async with aclosing(EventSource(response).aiter_sse()) as events:
+            async for event in events:
+                ended = ended or event.data.strip() == DONE
+                name = None if event.event == "message" else event.event  # that of an event without one
+                yield ServerSentEvent(event.data, event=name, sep="\n")
     if not ended:
         raise MllmUnavailable("The server of the multimodal LLM ended its stream before the reply was whole ([DONE]).")
 
 
-async def split_events(chunks: AsyncIterator[bytes]) -> AsyncGenerator[bytes]:
-    """Bytes as they arrive, cut where an event ends: behind a blank line, however lines end."""
-    held = b""
-    async for chunk in chunks:
-        held += chunk
-        while (end := _BLANK_LINE.search(held)) is not None:
-            yield held[: end.end()]
-            held = held[end.end() :]
-    if held.strip():
-        yield held
-
-
-def _whole(response: httpx.Response, upstream: Upstream) -> Whole:
+def _whole(response: httpx.Response, upstream: Upstream) -> ChatTurn:
     """A reply, or what the server says went wrong, in OpenAI's form. Raises `MllmBadReply`, `MllmUnavailable`."""
     status = response.status_code
     text, value = response.content.decode("utf-8", errors="replace"), None
@@ -147,7 +125,7 @@ def _whole(response: httpx.Response, upstream: Upstream) -> Whole:
     if status == HTTPStatus.OK:
         if not isinstance(value, dict):
             raise MllmBadReply("The server of the multimodal LLM replied with something that is no JSON object.")
-        return Whole(cast("dict[str, Any]", value))
+        return ChatTurn(cast("dict[str, Any]", value))
     if status in NOT_THE_CALLERS or status < HTTPStatus.BAD_REQUEST:
         raise MllmUnavailable(
             f"The server of the multimodal LLM answered with status {status}: its address or this server's own key for "
@@ -171,7 +149,7 @@ def _whole(response: httpx.Response, upstream: Upstream) -> Whole:
                 "code": error.get("code", str(status)),
             }
         }
-    return Whole(_without(error, upstream.key) if upstream.key else error, status, headers)
+    return ChatTurn(_without(error, upstream.key) if upstream.key else error, status, headers=headers)
 
 
 def _without(value: Any, key: str) -> Any:

@@ -2,12 +2,15 @@
 
 import time
 import uuid
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import Iterator
 from contextlib import aclosing
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
+from sse_starlette import ServerSentEvent
+
 from cow_service.api.openai.chats import EXTENSION, wrong
+from cow_service.api.openai.forwarding import Events
 from cow_service.api.openai.stream import Streamed, chunks_of, data_of, event_of
 from cow_service.api.problems import openai_error
 from cow_service.errors import CowError
@@ -39,18 +42,25 @@ def chat_fields(body: dict[str, Any]) -> dict[str, Any]:
     given = body.get("input")
     asked = [{"role": "user", "content": given}] if isinstance(given, str) else _messages(given)
     chat["messages"] = [*system, *asked]
-    text, reasoning = _object(body, "text"), _object(body, "reasoning")
+    text, reasoning = (
+        _as_object({} if body.get(name) is None else body[name], f"/{name}") for name in ("text", "reasoning")
+    )
     form = text.get("format")
     if isinstance(form, dict) and form.get("type") == "json_schema":
         form = {"type": "json_schema", "json_schema": _without_type(form)}
-    tools = [_tool(tool, f"/tools/{place}/type") for place, tool in enumerate(_array(body, "tools"))]
+    tools: list[dict[str, Any]] = []
+    for place, tool in enumerate(_array(body.get("tools"), "/tools")):
+        if (kind := _as_object(tool, f"/tools/{place}").get("type")) != "function":
+            shown = f"{str(kind)[:40]!r} is a tool of OpenAI's own servers"
+            raise wrong(f"/tools/{place}/type", f"{shown}: only `function` can be sent on")
+        tools.append({"type": "function", "function": _without_type(tool)})
     choice = body.get("tool_choice")
     if isinstance(choice, dict):
         named = cast("dict[str, Any]", choice)
         if named.get("type") != "function":
             raise wrong("/tool_choice/type", "only `function` can be chosen by name")
         choice = {"type": "function", "function": {"name": named.get("name")}}
-    include = _array(body, "include")
+    include = _array(body.get("include"), "/include")
     if unknown := [str(each)[:60] for each in include if each not in INCLUDED]:
         raise wrong("/include", f"only {', '.join(INCLUDED)} can be included, not {', '.join(unknown)}")
     if body.get("truncation") not in (None, "disabled"):
@@ -80,7 +90,7 @@ def _messages(given: Any) -> Iterator[dict[str, Any]]:
             case "message":
                 content = item.get("content")
                 if not isinstance(content, str):
-                    content = _parts(_array(item, "content", pointer), f"{pointer}/content")
+                    content = [*_parts(_array(content, f"{pointer}/content"), f"{pointer}/content")]
                 message = {"role": item.get("role", "user"), "content": content}
             case "function_call":
                 function = {"name": item.get("name"), "arguments": item.get("arguments")}
@@ -92,7 +102,7 @@ def _messages(given: Any) -> Iterator[dict[str, Any]]:
             case "function_call_output":
                 output = item.get("output")
                 if isinstance(output, list):
-                    output = _parts(cast("list[Any]", output), f"{pointer}/output")
+                    output = [*_parts(cast("list[Any]", output), f"{pointer}/output")]
                 message = {"role": "tool", "tool_call_id": item.get("call_id"), "content": output}
             case "reasoning":
                 continue
@@ -104,52 +114,40 @@ def _messages(given: Any) -> Iterator[dict[str, Any]]:
         before = message
 
 
-def _parts(parts: list[Any], pointer: str) -> list[dict[str, Any]]:
-    return [_part(_as_object(part, f"{pointer}/{place}"), f"{pointer}/{place}") for place, part in enumerate(parts)]
+def _parts(parts: list[Any], above: str) -> Iterator[dict[str, Any]]:
+    """The parts of a message, or of what a function returned, as chats have them."""
+    for place, each in enumerate(parts):
+        pointer = f"{above}/{place}"
+        match _as_object(each, pointer):
+            case {"type": "input_text" | "output_text" | "text", **part}:
+                yield {"type": "text", "text": part.get("text", "")}
+            case {"type": "refusal", **part}:
+                yield {"type": "refusal", "refusal": part.get("refusal", "")}
+            case {"type": "input_image", "image_url": str(url), **part}:
+                detail = {} if part.get("detail") is None else {"detail": part["detail"]}
+                yield {"type": "image_url", "image_url": {"url": url, **detail}}
+            case {"type": "input_image" | "input_file", "file_id": file} if file is not None:
+                raise wrong(f"{pointer}/file_id", f"{STATELESS}, and so no files: send the image itself as `image_url`")
+            case part:
+                kind = str(part.get("type"))[:40]
+                raise wrong(f"{pointer}/type", f"parts of the type {kind!r} cannot be sent on as a chat")
 
 
-def _part(part: dict[str, Any], pointer: str) -> dict[str, Any]:
-    match part:
-        case {"type": "input_text" | "output_text" | "text"}:
-            return {"type": "text", "text": part.get("text", "")}
-        case {"type": "refusal"}:
-            return {"type": "refusal", "refusal": part.get("refusal", "")}
-        case {"type": "input_image", "image_url": str(url)}:
-            detail = {} if part.get("detail") is None else {"detail": part["detail"]}
-            return {"type": "image_url", "image_url": {"url": url, **detail}}
-        case {"type": "input_image" | "input_file", "file_id": file} if file is not None:
-            raise wrong(f"{pointer}/file_id", f"{STATELESS}, and so no files: send the image itself as `image_url`")
-        case _:
-            kind = str(part.get("type"))[:40]
-            raise wrong(f"{pointer}/type", f"parts of the type {kind!r} cannot be sent on as a chat")
-
-
-def _tool(tool: Any, pointer: str) -> dict[str, Any]:
-    kind = tool.get("type") if isinstance(tool, dict) else "none"
-    if kind != "function":
-        shown = str(kind)[:40]
-        raise wrong(pointer, f"{shown!r} is a tool of OpenAI's own servers: only `function` can be sent on")
-    return {"type": "function", "function": _without_type(tool)}
-
-
-def _without_type(value: Any) -> dict[str, Any]:
-    return {name: held for name, held in cast("dict[str, Any]", value).items() if name != "type"}
+def _without_type(value: dict[str, Any]) -> dict[str, Any]:
+    return {name: held for name, held in value.items() if name != "type"}
 
 
 def _as_object(value: Any, pointer: str) -> dict[str, Any]:
+    """An object of the request."""
     if not isinstance(value, dict):
         raise wrong(pointer, "is no object")
     return cast("dict[str, Any]", value)
 
 
-def _object(body: dict[str, Any], name: str) -> dict[str, Any]:
-    return {} if body.get(name) is None else _as_object(body[name], f"/{name}")
-
-
-def _array(body: dict[str, Any], name: str, above: str = "") -> list[Any]:
-    value = body.get(name)
+def _array(value: Any, pointer: str) -> list[Any]:
+    """An array of the request, empty where it is left out."""
     if value is not None and not isinstance(value, list):
-        raise wrong(f"{above}/{name}", "is no array")
+        raise wrong(pointer, "is no array")
     return value or []
 
 
@@ -176,7 +174,7 @@ def as_response(streamed: Streamed, request: dict[str, Any], model: str) -> Stre
     """A chat's stream as that of a response."""
     response = ResponseEvents(request, model)
 
-    async def events() -> AsyncGenerator[bytes]:
+    async def events() -> Events:
         for event in response.begin():
             yield event
         try:
@@ -237,12 +235,12 @@ class ResponseEvents:
         self._open: _Item | None = None
         self._finish_reason: Any = None
 
-    def begin(self) -> Iterator[bytes]:
+    def begin(self) -> Iterator[ServerSentEvent]:
         """The first two."""
         yield self._event("response.created", response=self.response)
         yield self._event("response.in_progress", response=self.response)
 
-    def add(self, chunk: dict[str, Any]) -> Iterator[bytes]:
+    def add(self, chunk: dict[str, Any]) -> Iterator[ServerSentEvent]:
         """The events for a chunk; of several choices the first is taken."""
         cow = chunk.get(EXTENSION)
         if isinstance(cow, dict) and "progress" not in cow:
@@ -253,7 +251,7 @@ class ResponseEvents:
             if choice.get("index", 0) == 0:
                 yield from self._add_choice(choice)
 
-    def end(self) -> Iterator[bytes]:
+    def end(self) -> Iterator[ServerSentEvent]:
         """The end of the last item, and the whole response."""
         if not {"message", "function_call"} & {item.kind for item in self._items.values()}:
             yield from self._switch_to("message", "message")
@@ -267,12 +265,12 @@ class ResponseEvents:
         }
         yield self._event(f"response.{status}", response=self.response)
 
-    def fail(self, error: dict[str, Any]) -> bytes:
+    def fail(self, error: dict[str, Any]) -> ServerSentEvent:
         """The last event of a response that breaks off; `error` is OpenAI's."""
         flat = {name: error.get(name) for name in ("code", "message", "param")}
         return self._event("error", **flat, error=error)
 
-    def _add_choice(self, choice: dict[str, Any]) -> Iterator[bytes]:
+    def _add_choice(self, choice: dict[str, Any]) -> Iterator[ServerSentEvent]:
         delta = cast("dict[str, Any]", choice.get("delta") or {})
         self._finish_reason = choice.get("finish_reason") or self._finish_reason
         if thought := delta.get("reasoning_content") or delta.get("reasoning"):
@@ -293,7 +291,7 @@ class ResponseEvents:
             if arguments := function.get("arguments"):
                 yield self._add_text("response.function_call_arguments.delta", arguments)
 
-    def _switch_to(self, key: str, kind: str, **call: Any) -> Iterator[bytes]:
+    def _switch_to(self, key: str, kind: str, **call: Any) -> Iterator[ServerSentEvent]:
         """Goes on with an item; the one before it is closed, a new one is opened."""
         if self._open is not None and self._items.get(key) is self._open:
             return
@@ -306,12 +304,12 @@ class ResponseEvents:
             part = {"type": "output_text", "text": "", "annotations": [], "logprobs": []}
             yield self._item_event("response.content_part.added", item, content_index=0, part=part)
 
-    def _add_text(self, event: str, text: str, **others: Any) -> bytes:
+    def _add_text(self, event: str, text: str, **others: Any) -> ServerSentEvent:
         assert self._open is not None
         self._open.text += text
         return self._item_event(event, self._open, delta=text, **others)
 
-    def _close(self) -> Iterator[bytes]:
+    def _close(self) -> Iterator[ServerSentEvent]:
         item, self._open = self._open, None
         if item is None:
             return
@@ -327,10 +325,10 @@ class ResponseEvents:
             yield self._item_event("response.function_call_arguments.done", item, **arguments)
         yield self._event("response.output_item.done", output_index=item.index, item=whole)
 
-    def _item_event(self, kind: str, item: _Item, **others: Any) -> bytes:
+    def _item_event(self, kind: str, item: _Item, **others: Any) -> ServerSentEvent:
         return self._event(kind, item_id=item.id, output_index=item.index, **others)
 
-    def _event(self, kind: str, **others: Any) -> bytes:
+    def _event(self, kind: str, **others: Any) -> ServerSentEvent:
         self._number += 1
         return event_of({"type": kind, "sequence_number": self._number, **others}, kind)
 

@@ -12,12 +12,12 @@ from cow_service.api.openai import records
 from cow_service.api.openai.answering import FIELDS_OF_CHAT
 from cow_service.api.openai.chats import EXTENSION, Chat, ChatRequest, ResponsesRequest, as_json
 from cow_service.api.openai.completer import Completer
-from cow_service.api.openai.forwarding import Whole
 from cow_service.api.openai.responses import as_response, chat_fields, response_of
 from cow_service.api.openai.stream import EventsResponse, Streamed
 from cow_service.api.problems import MEDIA_TYPE, OPENAI_ROOT, ChatProblem, documented
 from cow_service.api.routes.simulate import ACCEPTED, FAILURES, PREFERENCES
 from cow_service.api.submission import from_app, json_response
+from cow_service.readers.chat import ChatTurn
 from cow_service.requests import AnswerRequest
 
 ANSWER_FIELDS = "ChatExtension"  # the schema of `cow` in a request
@@ -106,7 +106,7 @@ async def responses(request: Request, completer: ChatCompleter) -> Response:
     reply = await completer.complete(request, asked, stored=False)
     if isinstance(reply, Streamed):
         reply = as_response(reply, body, asked.model)
-    elif isinstance(reply, Whole) and reply.succeeded:
+    elif isinstance(reply, ChatTurn) and reply.succeeded:
         reply = replace(reply, body=response_of(reply.body, body))
     return await _respond(reply, completer)
 
@@ -132,10 +132,10 @@ def model(
     return records.ChatModel(id=model, created=completer.started)
 
 
-async def _respond(reply: Whole | Streamed | Response, completer: Completer) -> Response:
+async def _respond(reply: ChatTurn | Streamed | Response, completer: Completer) -> Response:
     if isinstance(reply, Streamed):
         return EventsResponse(reply, completer.service.settings)
-    if isinstance(reply, Whole):
+    if isinstance(reply, ChatTurn):
         return json_response(await to_thread.run_sync(as_json, reply.body), reply.status, reply.headers)
     return reply
 

@@ -6,39 +6,40 @@ from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
 from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from typing import Any, cast
 
 from anyio import to_thread
-from sse_starlette import EventSourceResponse
+from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.types import Message, Receive, Scope, Send
 
 from cow_service.api.openai.chats import EXTENSION, as_json
+from cow_service.api.openai.forwarding import DONE, Events
 from cow_service.api.openai.records import ChatProgress
 from cow_service.api.problems import chat_problem
 from cow_service.api.routes.jobs import PING_SECONDS
 from cow_service.api.submission import Submission, Submitter, do_nothing
 from cow_service.errors import CowError
-from cow_service.jobs.subscriptions import QUEUED, follow
+from cow_service.jobs.subscriptions import POLL_SECONDS
 from cow_service.records import TERMINAL, Job
 from cow_service.settings import Settings
 
 MIN_PROGRESS_SECONDS = 0.25  # between two chunks of progress
 CLOSING_SECONDS = 2.0  # for the last event of a stream, after the grace period of a server that stops
-DONE = b"data: [DONE]\n\n"
+LAST_EVENT = ServerSentEvent(DONE, sep="\n")
 HEAD = ("id", "created", "model", "system_fingerprint", "service_tier")  # the same in a completion and its chunks
 
 
-def event_of(data: dict[str, Any], name: str | None = None) -> bytes:
+def event_of(data: dict[str, Any], name: str | None = None) -> ServerSentEvent:
     """A server-sent event that holds a JSON object."""
-    head = "" if name is None else f"event: {name}\n"
-    return f"{head}data: {as_json(data)}\n\n".encode()
+    return ServerSentEvent(as_json(data), event=name, sep="\n")
 
 
-def data_of(event: bytes) -> dict[str, Any]:
-    """The JSON object of a server-sent event; empty for the end, and for comments."""
+def data_of(event: ServerSentEvent) -> dict[str, Any]:
+    """The JSON object of a server-sent event; empty for the end."""
     value: Any = None
     with suppress(ValueError):
-        value = json.loads(b"".join(line[5:] for line in event.splitlines() if line.startswith(b"data:")))
+        value = json.loads(event.data or "")
     return cast("dict[str, Any]", value) if isinstance(value, dict) else {}
 
 
@@ -95,16 +96,16 @@ def progress_of(job: Job) -> dict[str, Any]:
     return ChatProgress(job=job.id, status=job.status, stage=job.stage, progress=job.progress).model_dump()
 
 
-def progress_chunk(job: Job, head: dict[str, Any], delta: dict[str, Any] | None = None) -> bytes:
+def progress_chunk(job: Job, head: dict[str, Any], delta: dict[str, Any] | None = None) -> ServerSentEvent:
     """How far a job is, as an event."""
     return event_of(chunk_of(head, delta or {}, cow=progress_of(job)))
 
 
 @dataclass(frozen=True)
 class Streamed:
-    """A reply as it is streamed: server-sent events, each whole, with the blank line at its end."""
+    """A reply as it is streamed."""
 
-    events: AsyncGenerator[bytes]
+    events: Events
     locate: Callable[[CowError], CowError] = lambda error: error  # an error, pointing into what the caller sent
     leave: Callable[[], Awaitable[None]] = do_nothing  # to be called where the caller has disconnected
     close: Callable[[], Awaitable[None]] = do_nothing  # to be called at the end, however it came
@@ -118,7 +119,7 @@ class EventsResponse(EventSourceResponse):
             with suppress(CowError):
                 await streamed.leave()
 
-        async def events() -> AsyncGenerator[bytes]:
+        async def events() -> Events:
             try:
                 async with aclosing(streamed.events) as own:
                     async for event in own:
@@ -151,38 +152,26 @@ async def follow_job(submitter: Submitter, submission: Submission, created_at: s
     Raises what the job fails with.
     """
     engine = submitter.engine
-    job = (await to_thread.run_sync(lambda: engine.find(submission.job_id, submission.owner, full=False))).job
+    find = partial(engine.find, submission.job_id, submission.owner, full=False)
+    job = (await to_thread.run_sync(find)).job
     yield job
-    updates: asyncio.Queue[Job | None] = asyncio.Queue()  # None: the job has ended
-
-    async def listen() -> None:
-        with suppress(CowError):
-            async with aclosing(follow(engine, submission.job_id, QUEUED)) as events:
-                async for event in events:
-                    if event.job is not None and event.job.status not in TERMINAL:
-                        updates.put_nowait(event.job)
-
-    def end(task: asyncio.Future[str | None]) -> None:
-        if not task.cancelled():
-            task.exception()  # else asyncio logs it as never retrieved where the caller has disconnected
-        updates.put_nowait(None)
-
+    shown = progress_of(job)
     with engine.active.waiting(submission.job_id) as waiter:
-        listening = asyncio.ensure_future(listen())
         ending = asyncio.ensure_future(submitter.outcome(submission, waiter, created_at, may_have_ended=True))
-        ending.add_done_callback(end)
         try:
             while not ending.done():
-                update = await updates.get()
-                while update is not None and not updates.empty():
-                    update = updates.get_nowait()  # only the latest counts
-                if update is not None and progress_of(update) != progress_of(job):
-                    job = update
+                waiter.changed.clear()
+                with suppress(CowError):  # of which the end tells
+                    job = (await to_thread.run_sync(find)).job
+                if job.status not in TERMINAL and progress_of(job) != shown:
+                    shown = progress_of(job)
                     yield job
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(waiter.changed.wait(), POLL_SECONDS)
                 await asyncio.wait({ending}, timeout=MIN_PROGRESS_SECONDS)
             result = await ending
         finally:
-            listening.cancel()
             ending.cancel()
+            await asyncio.gather(ending, return_exceptions=True)
     assert result is not None, "it waits as long as it takes"
     yield result
