@@ -91,10 +91,16 @@ class CowError(Exception):
         cls.code, cls.status = code or cls.code, status or cls.status
 
     def __init__(
-        self, detail: str, *, errors: tuple[FieldError, ...] = (), headers: dict[str, str] | None = None
+        self,
+        detail: str,
+        *,
+        remedy: str = "",
+        errors: tuple[FieldError, ...] = (),
+        headers: dict[str, str] | None = None,
     ) -> None:
         self.detail = shortened(detail, MAX_DETAIL)
-        super().__init__(self.detail)
+        self.remedy = remedy  # what to give in a request; who has other means says so in words of their own
+        super().__init__(f"{self.detail} {remedy}".rstrip())
         self.errors = errors[:MAX_FIELDS]
         self.headers = headers or {}  # of the HTTP response
         self.usage: dict[str, Any] | None = None  # what was asked of a multimodal LLM before, where that was anything
@@ -113,7 +119,8 @@ class CowError(Exception):
             "detail": self.detail,
             "errors": [asdict(field) for field in self.errors],
         }
-        return problem if self.usage is None else problem | {"usage": self.usage}
+        others = {"remedy": self.remedy or None, "usage": self.usage}
+        return problem | {name: value for name, value in others.items() if value is not None}
 
 
 class InvalidRequest(CowError, code="invalid-request", status=422):

@@ -62,7 +62,7 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     if simulation is not None:  # whoever reads only the answer must see what it rests on
         warnings = tuple(dict.fromkeys((*simulation.warnings, *warnings)))
     if failure is not None:
-        why = f"{failure.code}: {failure.detail}"
+        why = f"{failure.code}: {failure}"
         warnings = (f"Nothing was imagined, the answer is from the image alone. {why}", *warnings)
     return Answer(
         **dict(verdicts.verdict),

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from collections.abc import Generator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from typing import ClassVar
@@ -144,21 +143,28 @@ def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
     readiness.start()
     readiness.wait(LOAD_SECONDS)
 
-    def serve() -> None:
-        engine.start()  # here and not in the caller's thread, whose event loop may be running
-        server.run()
+    failures: list[CowError] = []
 
-    with ThreadPoolExecutor(1, "cow-server") as thread:
-        ended = thread.submit(serve)
+    def serve() -> None:
         try:
-            while not server.started:
-                if ended.done():
-                    ended.result()
-                    raise StorageUnavailable("The server in this process ended before it had begun; its log says why.")
-                time.sleep(START_POLL_SECONDS)
-            yield server.address
-        finally:
-            server.should_exit = True
+            engine.start()  # here and not in the caller's thread, whose event loop may be running
+            server.run()
+        except CowError as error:
+            failures.append(error)
+
+    # A daemon: a program that ends without closing this, as Inspect does, would wait for a pool's threads for ever.
+    thread = threading.Thread(target=serve, name="cow-server", daemon=True)
+    thread.start()
+    try:
+        while not server.started:
+            if not thread.is_alive():
+                told = "The server in this process ended before it had begun; its log says why."
+                raise failures[0] if failures else StorageUnavailable(told)
+            time.sleep(START_POLL_SECONDS)
+        yield server.address
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngine, Readiness]:

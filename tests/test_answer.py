@@ -638,7 +638,7 @@ def test_the_folder_of_an_answer(tmp_path: Path) -> None:
     image = str(EXAMPLES / "ball-and-mug" / "image.jpg")
     question = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
     said = cow(tmp_path, "answer", image, question, "--choice", "Yes", "--choice", "No", "--out", "out")
-    assert "(A) Yes" in said.stdout
+    assert "A (Yes)" in said.stdout
     assert "votes" not in said.stdout
     assert Answer.model_validate_json((tmp_path / "out" / "answer.json").read_text()).answer == "A"
     assert (tmp_path / "out" / "overlay.jpg").exists()

@@ -61,6 +61,37 @@ def test_dragging_the_arrow_changes_path_and_answer(server: Server, windows: Win
     expect(page.locator(".verdict.looked .said")).to_have_text("No")
 
 
+def test_a_question_is_built_of_what_was_found(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, picture(7))
+    page.get_by_text("Build a question").click()
+    builder = page.locator(".builder")
+    builder.get_by_label("If the").select_option("red object")
+    builder.get_by_label("does what?").select_option("is thrown")
+    builder.get_by_label("which way?").select_option("towards the blue object")
+    builder.get_by_role("button", name="Take this question").click()
+    asked = "If the red object is thrown towards the blue object, will it hit the blue object?"
+    expect(page.locator("#question")).to_have_value(asked)
+    page.get_by_role("button", name="Ask", exact=True).click()
+    result(page)
+    assert said(page) == "Yes"
+
+
+def test_what_is_not_understood_is_told_with_questions_that_would_be(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, picture(8))
+    expect(page.get_by_role("list", name="Suggestions")).to_be_visible()
+    ask(page, "Wird der rote Ball den Würfel treffen?")
+    notice = page.locator(".notice.problem")
+    expect(notice).to_contain_text("it reads English")
+    expect(notice).not_to_contain_text("grounding")
+    instead = page.get_by_role("list", name="Questions that would be understood").get_by_role("button")
+    expect(instead.first).to_contain_text("If the ")
+    instead.first.click()
+    result(page)
+    expect(notice).to_have_count(0)
+
+
 @pytest.mark.slow
 def test_what_was_not_found_is_drawn(server: Server, windows: Windows) -> None:
     page = windows.open(server.address)
@@ -68,6 +99,7 @@ def test_what_was_not_found_is_drawn(server: Server, windows: Windows) -> None:
     ask(page, "If the toy car moves, will it hit the wooden crate?")
     notice = page.locator(".notice.problem")
     expect(notice).to_contain_text("toy car")
+    expect(notice).not_to_contain_text("grounding")
     assert page.locator(".mark").count() == 0
 
     notice.get_by_role("button", name="Draw its box").click()

@@ -65,7 +65,7 @@ def openai_error(error: errors.CowError) -> dict[str, Any]:
         steps = [step.replace("~1", "/").replace("~0", "~") for step in error.errors[0].pointer.split("/")[1:]]
         param = "".join(f"[{step}]" if re.fullmatch("[0-9]+", step) else f".{step}" for step in steps).lstrip(".")
     return {
-        "message": error.detail,
+        "message": str(error),
         "type": OPENAI_TYPES.get(HTTPStatus(error.status), other),
         "param": param or None,
         "code": error.code,

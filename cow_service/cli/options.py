@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _GIVE_PLACE = (
     "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME) for what moves, --other NAME=X0,Y0,X1,Y1 for the rest."
 )
-HINTS = {  # the options that an error's remedy asks for, by the error's code
+HINTS = {  # what an error's remedy asks for as options, by the error's code
     "cannot-ground": _GIVE_PLACE,
     "object-not-found": _GIVE_PLACE,
     "cannot-read-direction": "Here: --direction DX,DY.",
@@ -55,8 +55,8 @@ class Commands(TyperGroup):
         except CowError as error:
             typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
             typer.echo(printable(error.detail), err=True)
-            if error.code in HINTS:
-                typer.echo(HINTS[error.code], err=True)
+            if hint := HINTS.get(error.code, error.remedy):
+                typer.echo(hint, err=True)
             for field in (field for field in error.errors if field.detail not in error.detail):
                 typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
             raise typer.Exit(1) from error

@@ -106,6 +106,7 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
     fields = [field for field in given if isinstance(field, dict)] if isinstance(given, list) else []
     error = kind(
         str(problem.get("detail") or problem.get("title") or ""),
+        remedy=str(problem.get("remedy") or ""),
         errors=tuple(FieldError(str(field.get("pointer", "")), str(field.get("detail", ""))) for field in fields),
         headers=dict(headers or {}),
     )

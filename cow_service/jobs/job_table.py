@@ -405,15 +405,18 @@ _SHOWN = [
 
 
 def error_as_json(error: CowError) -> dict[str, Any]:
-    """Its code, detail, fields and usage, as JSON values."""
+    """Its code, detail, remedy, fields and usage, as JSON values."""
     fields = [asdict(field) for field in error.errors]
-    return {"code": error.code, "detail": error.detail, "errors": fields, "usage": error.usage}
+    told = {"code": error.code, "detail": error.detail, "remedy": error.remedy}
+    return told | {"errors": fields, "usage": error.usage}
 
 
 def error_from_json(kept: Mapping[str, Any]) -> CowError:
     """The same error; an internal one where a later version made it, and it is not known here."""
     kind = kinds().get(kept["code"], InternalError)
-    error = kind(kept["detail"], errors=tuple(FieldError(**field) for field in kept["errors"]))
+    error = kind(
+        kept["detail"], remedy=kept.get("remedy", ""), errors=tuple(FieldError(**field) for field in kept["errors"])
+    )
     error.usage = kept.get("usage")
     return error
 

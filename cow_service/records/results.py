@@ -147,7 +147,12 @@ class Problem(BaseModel):
     type: str = Field(description="Stable URI; its last segment is the code.")
     title: str = Field(description="The kind of error, the same for every occurrence.")
     status: int
-    detail: str = Field(description="What was wrong, with the value, and what to do.")
+    detail: str = Field(description="What was wrong, with the value, and what to do where `remedy` does not say that.")
+    remedy: str | None = Field(
+        default=None,
+        exclude_if=lambda remedy: remedy is None,
+        description="What to give in the request; left out where `detail` says all.",
+    )
     errors: list[ProblemField] = Field(default_factory=list[ProblemField])
     usage: Usage | None = Field(
         default=None,

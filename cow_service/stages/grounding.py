@@ -288,7 +288,7 @@ def _located(
                 known = ", ".join(f"'{each.object}'" for each in things)
                 detail = f"there is no '{name}' among the objects of the scene, which are {known}"
                 at = f"{pointer}/{field}"
-            raise InvalidRequest(f"`{field_of(at)}`: {detail}. {GIVE_OBJECT}", errors=(FieldError(at, detail),))
+            raise InvalidRequest(f"`{field_of(at)}`: {detail}.", remedy=GIVE_OBJECT, errors=(FieldError(at, detail),))
         found.append(thing)
     return Intervention(kind=change.kind, object=found[-1], relation=change.relation, targets=tuple(found[:-1]))
 

@@ -333,7 +333,7 @@ class Scene:
 
 
 def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
-    """The mover's arrow. Raises `CannotReadDirection`, which ends with `remedy`, where it has none or several."""
+    """The mover's arrow. Raises `CannotReadDirection`, with that `remedy`, where it has none or several."""
     arrow, near = scene.arrow_at(grounding.bbox), scene.arrows_near(grounding.bbox)
     if arrow is not None:
         return arrow
@@ -347,9 +347,10 @@ def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
     else:
         raise CannotReadDirection(
             f"The question speaks of one arrow, but {len(near)} were found, and none is clearly that of the "
-            f"{grounding.object}: {ends}. {remedy}"
+            f"{grounding.object}: {ends}.",
+            remedy=remedy,
         )
-    raise CannotReadDirection(f"The question speaks of an arrow, but {fault}. {remedy}")
+    raise CannotReadDirection(f"The question speaks of an arrow, but {fault}.", remedy=remedy)
 
 
 MOST_IMAGES = 8

@@ -68,7 +68,7 @@ class WhatIf:
         is_own = any("/".join(field.pointer.split("/")[:3]) in given for field in located.errors)
         if is_own or not isinstance(error, PASSED_OVER):
             raise located from error
-        return _nothing_imagined(error.code, error.detail, Usage.model_validate(error.usage or {}))
+        return _nothing_imagined(error.code, str(error), Usage.model_validate(error.usage or {}))
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ def find_what_if(chat: Chat, answerer: Answerer) -> WhatIf | ChatImagination:
         return WhatIf(SimulateRequest.model_validate(fields), asked, images[0], frozenset(chat.cow))
     except ValidationError as error:
         refused = invalid(error)
-        return _nothing_imagined(refused.code, refused.detail)
+        return _nothing_imagined(refused.code, str(refused))
 
 
 def _nothing_imagined(

@@ -117,6 +117,6 @@ def _located(name: str, bbox: BBox) -> LocatedObject:
 
 def _not_found(scene: Scene, told: str, phrase: ObjectPhrase) -> CannotGround:
     return CannotGround(
-        f"The question {told}, and '{phrase.text}' was not found, or not for certain. Seen: {describe(scene.regions)}. "
-        f"{GIVE_OBJECT}"
+        f"The question {told}, and '{phrase.text}' was not found, or not for certain. Seen: {describe(scene.regions)}.",
+        remedy=GIVE_OBJECT,
     )

@@ -21,7 +21,7 @@ from cow_service.readers.embedded.outlines import (
     log_ratio,
     looks_like,
 )
-from cow_service.readers.remedies import GIVE_OBJECT
+from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, LocatedObject
 from cow_service.vision.masks import is_same_object
 from cow_service.vision.regions import Region
@@ -246,11 +246,12 @@ def match_several(
     return fitting if is_clear else []
 
 
-def inside_drawn_box(scene: Scene, phrase: ObjectPhrase, remedy: str) -> BBox:
+def inside_drawn_box(scene: Scene, phrase: ObjectPhrase) -> BBox:
     """The object inside the only box drawn over the image."""
     if len(scene.boxes) != 1:
         count = f"{len(scene.boxes)} boxes" if scene.boxes else "no box"
-        raise CannotGround(f"Looked for '{phrase.text}' inside a drawn box, but the image shows {count}. {remedy}")
+        told = f"Looked for '{phrase.text}' inside a drawn box, but the image shows {count}."
+        raise CannotGround(told, remedy=GIVE_PLACE)
     x0, y0, x1, y1 = scene.boxes[0].bbox
     inside = np.zeros((scene.height, scene.width), bool)
     inside[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1] = True
@@ -297,7 +298,8 @@ def things_of_kinds(
         if not fitting:
             raise CannotGround(
                 f"The question asks about '{name}', and which things those are the image does not tell for certain. "
-                f"Seen: {describe(regions)}. {GIVE_OBJECT}"
+                f"Seen: {describe(regions)}.",
+                remedy=GIVE_OBJECT,
             )
         found += _named(fitting, kind)
     # Those of the kind in "which mug does it hit first"; none where the image does not tell which those are.

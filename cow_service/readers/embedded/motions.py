@@ -37,8 +37,8 @@ def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | N
     shares = [each.share for each in words if each.share is not None]
     if shares and way is None:
         raise CannotReadDirection(
-            f"The question says that it moves a part of the way, but not to what. {GIVE_DIRECTION} Or give "
-            "`motion.distance`."
+            "The question says that it moves a part of the way, but not to what.",
+            remedy=f"{GIVE_DIRECTION} Or give `motion.distance`.",
         )
     distances += [Quantity(share * (way or 0.0), "px") for share in shares]
     if bbox is not None:
@@ -56,7 +56,7 @@ def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | N
 
 def _one(name: str, values: list[_T]) -> _T | None:
     if len(set(values)) > 1:
-        raise CannotReadDirection(f"The question names more than one {name} of the motion. {GIVE_DIRECTION}")
+        raise CannotReadDirection(f"The question names more than one {name} of the motion.", remedy=GIVE_DIRECTION)
     return values[0] if values else None
 
 
@@ -77,7 +77,7 @@ def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[
         name, motion, kind = other.object.text, other.motion, other.motion.kind or "linear"
         found = next((each for each in grounding.others if each.object == name), None)
         if found is None:
-            raise CannotReadDirection(f"'{name}' moves, too, and was not found. {GIVE_DIRECTION}")
+            raise CannotReadDirection(f"'{name}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
         way, goal = (None, 0.0), None
         if kind in DIRECTED_KINDS:
             direction = motion.direction
@@ -97,7 +97,7 @@ def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
     if direction is None and depth:
         return depth_motion(depth)
     if direction is None:
-        raise CannotReadDirection(f"Which way a part of the motion goes was not understood. {GIVE_DIRECTION}")
+        raise CannotReadDirection("Which way a part of the motion goes was not understood.", remedy=GIVE_DIRECTION)
     return direction, depth
 
 
@@ -121,7 +121,8 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
         if words.near is not None and near is None:
             raise CannotGround(
                 f"The question tells the end of the trail by '{words.near.text}', which was not found, or not for "
-                f"certain. Seen: {describe(scene.regions)}. {GIVE_PLACE}"
+                f"certain. Seen: {describe(scene.regions)}.",
+                remedy=GIVE_PLACE,
             )
         trail = trail.ending(None if near is None else near.bbox, words.side)
     if not trail.end_known:
@@ -153,5 +154,6 @@ def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> Motio
         return None
     raise CannotReadDirection(
         f"The question speaks of a trail, and no three positions of the {grounding.object} one after another were "
-        f"found in the image. {GIVE_DIRECTION}"
+        f"found in the image.",
+        remedy=GIVE_DIRECTION,
     )

@@ -85,7 +85,8 @@ class EmbeddedReader:
             raise CannotGround(
                 "The question does not say in words what moves, as far as the embedded reader understands it; it reads "
                 f"English. It did not understand '{named}'. "
-                f'Ask like "If the red ball moves to the left, will it hit the vase?". {GIVE_PLACE}'
+                f'Ask like "If the red ball moves to the left, will it hit the vase?".',
+                remedy=GIVE_PLACE,
             )
         with given.cpu():
             changes.check_changes(question)
@@ -188,29 +189,33 @@ def create(settings: Settings) -> EmbeddedReader:
 
 def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: ObjectPhrase) -> BBox:
     if phrase.text.lower().split()[0] in _SEVERAL:
-        raise CannotGround(f"The question moves '{phrase.text}' at once: ask of one thing, or name each. {GIVE_PLACE}")
+        raise CannotGround(
+            f"The question moves '{phrase.text}' at once: ask of one thing, or name each.", remedy=GIVE_PLACE
+        )
     if phrase.inside_box:
-        return matching.inside_drawn_box(scene, phrase, GIVE_PLACE)
+        return matching.inside_drawn_box(scene, phrase)
     if not scene.regions:
         raise CannotGround(
             f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to "
-            f"tell its objects apart. {GIVE_PLACE}"
+            f"tell its objects apart.",
+            remedy=GIVE_PLACE,
         )
     fitting = matching.best_matches(regions, phrase, question.others)
     if len(fitting) > 1 and question.mentions_arrow:
         fitting = scene.at_arrow(fitting) or fitting
     seen = describe(scene.regions)
     if not fitting:
-        raise CannotGround(f"Looked for '{phrase.text}' and found nothing that fits. Seen: {seen}. {GIVE_PLACE}")
+        raise CannotGround(f"Looked for '{phrase.text}' and found nothing that fits. Seen: {seen}.", remedy=GIVE_PLACE)
     if len(fitting) > 1:
         raise CannotGround(
-            f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. "
-            f"Seen in all: {seen}. {GIVE_PLACE}"
+            f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. Seen in all: {seen}.",
+            remedy=GIVE_PLACE,
         )
     if phrase.colour is None and not matching.is_known(phrase) and len(scene.regions) > 1:
         raise CannotGround(
             f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
-            f"Seen: {seen}. {GIVE_PLACE}"
+            f"Seen: {seen}.",
+            remedy=GIVE_PLACE,
         )
     return fitting[0].bbox
 
@@ -230,12 +235,14 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
     if kind == "static" and question.names_direction:
         raise CannotReadDirection(
             f"The question says that the {name} does not move, and speaks of a direction all the same: "
-            f"which is meant was not understood. {GIVE_DIRECTION}"
+            f"which is meant was not understood.",
+            remedy=GIVE_DIRECTION,
         )
     if words.contradictory:
         raise CannotReadDirection(
             f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict "
-            f"each other: which is meant was not understood. {GIVE_DIRECTION}"
+            f"each other: which is meant was not understood.",
+            remedy=GIVE_DIRECTION,
         )
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
@@ -243,8 +250,8 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
         return MotionReading("fall", None, "gravity")  # down a slope, or over an edge, by its weight
     if scene.side_view is not None and words.depth:
         raise CannotReadDirection(
-            "The image is a drawing seen from the side: nothing in it moves towards the viewer, or away. "
-            f"{GIVE_DIRECTION}"
+            "The image is a drawing seen from the side: nothing in it moves towards the viewer, or away.",
+            remedy=GIVE_DIRECTION,
         )
     said = _as_said(scene, words, kind, grounding)
     if said is not None:
@@ -255,11 +262,12 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
     told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
     if not noun_phrases.is_vehicle(name):
         raise CannotReadDirection(
-            f"{told} The embedded reader sees only of vehicles with wheels which way they face. {GIVE_DIRECTION}"
+            f"{told} The embedded reader sees only of vehicles with wheels which way they face.",
+            remedy=GIVE_DIRECTION,
         )
     way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
     if way is None:
-        raise CannotReadDirection(f"{told} Which way it faces could not be seen for certain. {GIVE_DIRECTION}")
+        raise CannotReadDirection(f"{told} Which way it faces could not be seen for certain.", remedy=GIVE_DIRECTION)
     return MotionReading(kind, way if words.forward else (-way[0], -way[1]), "orientation")
 
 
@@ -272,8 +280,8 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
         said = words.direction or (x, y)
         if x * said[0] + y * said[1] < AGREES * math.hypot(x, y) * math.hypot(*said):
             raise CannotReadDirection(
-                "The question names the arrow and another direction, and the arrow does not point there. "
-                f"{GIVE_DIRECTION}"
+                "The question names the arrow and another direction, and the arrow does not point there.",
+                remedy=GIVE_DIRECTION,
             )
         return MotionReading(kind, (x, y), "arrow", along_arrow=along)
     if words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth:
@@ -297,19 +305,20 @@ def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: M
     clause = (item for item in question.clause if item.phrase is not None and item.phrase.head in ARROWS)
     if any(item.start not in question.read for item in clause):
         raise CannotReadDirection(
-            f"How the {grounding.object} moves by the arrow that the question names was not understood. "
-            f"{GIVE_DIRECTION}"
+            f"How the {grounding.object} moves by the arrow that the question names was not understood.",
+            remedy=GIVE_DIRECTION,
         )
     if near and question.names_direction:
         raise CannotReadDirection(
             "The question has words of direction that could not be read as the motion's, so the drawn arrow was "
-            f"not followed either. {GIVE_DIRECTION}"
+            "not followed either.",
+            remedy=GIVE_DIRECTION,
         )
     if len(near) != 1:
         raise CannotReadDirection(
             "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
-            f"image shows {len(near) or 'no'} arrow{'s' if len(near) > 1 else ''} at the {grounding.object}. "
-            f"{GIVE_DIRECTION}"
+            f"image shows {len(near) or 'no'} arrow{'s' if len(near) > 1 else ''} at the {grounding.object}.",
+            remedy=GIVE_DIRECTION,
         )
     note = "The question names no direction; the arrow drawn at the object was followed."
     return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
@@ -324,7 +333,8 @@ def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Locate
     if bbox is None:
         raise CannotReadDirection(
             f"The {grounding.object} moves towards '{phrase.text}', which was not found. "
-            f"Seen: {describe(scene.regions)}. {GIVE_DIRECTION}"
+            f"Seen: {describe(scene.regions)}.",
+            remedy=GIVE_DIRECTION,
         )
     return LocatedObject(object=phrase.text, bbox=bbox)
 

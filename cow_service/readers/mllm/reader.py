@@ -87,11 +87,12 @@ class MllmReader:
         image, identified = self._identify(given)
         if identified is None:
             raise ObjectNotFound(
-                f"{self._subject} sees nothing in the image that the question could move. {GIVE_PLACE}"
+                f"{self._subject} sees nothing in the image that the question could move.",
+                remedy=GIVE_PLACE,
             )
         located, hints = self._locate(given, image, identified, identified.object, None)
         if located is None:
-            raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image. {GIVE_PLACE}")
+            raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image.", remedy=GIVE_PLACE)
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
             warnings = box_warnings(given.scene, bbox, identified.object)
@@ -103,7 +104,8 @@ class MllmReader:
             found = known.get(name_words(name))
             if found is None:
                 raise ObjectNotFound(
-                    f"{self._subject} does not see '{name}' in the image, which the question changes. {GIVE_PLACE}"
+                    f"{self._subject} does not see '{name}' in the image, which the question changes.",
+                    remedy=GIVE_PLACE,
                 )
             return found.model_copy(update={"role": "target"})
 
@@ -150,7 +152,7 @@ class MllmReader:
             if place is not None:
                 others.append(base.OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
             elif others_sought:
-                raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found. {GIVE_DIRECTION}")
+                raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
             else:
                 warnings.append(f"'{hint.object}' moves, too, and was left out: it has no place. {GIVE_OBJECT}")
         kind = hints.kind or DEFAULT_KIND
@@ -236,7 +238,8 @@ class MllmReader:
         if hints.ends is None:
             raise CannotReadDirection(
                 f"{self._subject} found nothing in the image or the question that tells which way the "
-                f"{grounding.object} moves. {GIVE_DIRECTION}"
+                f"{grounding.object} moves.",
+                remedy=GIVE_DIRECTION,
             )
         if hints.depth_degrees is not None:
             depth = math.sin(math.radians(hints.depth_degrees))

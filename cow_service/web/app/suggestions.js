@@ -27,3 +27,21 @@ export function suggestionsOf(bodies) {
   }
   return [...new Set(questions)].slice(0, MOST);
 }
+
+/** What a sentence can say that a thing does, by the words of the choice; `ways`: it says which way, too. */
+export const CHANGES = {
+  moves: { says: (thing, way) => `the ${thing} moves ${way}`, ways: true },
+  "is thrown": { says: (thing, way) => `the ${thing} is thrown ${way}`, ways: true },
+  falls: { says: (thing) => `the ${thing} falls freely` },
+  "is taken away": { says: (thing, way, first) => `the ${thing} is removed and the ${first} moves ${way}`, ways: true, needsMover: true },
+};
+const WAYS = ["to the right", "to the left", "away from the camera", "towards the camera", "along the arrow"];
+export const OUTCOMES = { hit: "it hit", hide: "it hide", "land on": "it land on" };
+
+/** The ways that a thing can go: also towards each other thing. */
+export const waysOf = (others) => [...WAYS, ...others.map((other) => `towards the ${other}`)];
+
+/** A question of the parts of the builder. */
+export function sentenceOf({ thing, change, way, mover, outcome, target }) {
+  return `If ${CHANGES[change].says(thing, way, mover)}, will ${OUTCOMES[outcome]} the ${target}?`;
+}

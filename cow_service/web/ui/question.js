@@ -1,12 +1,14 @@
 // The question, suggestions, and how it is to be answered.
 
-import { html, useEffect, useRef } from "../vendor/htm-preact.js";
+import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
 import { ask, cancel, changeSettings, correct } from "../app/asking.js";
 import { correctedWords } from "../app/corrections.js";
 import { NOTHING_CORRECTED, set } from "../app/store.js";
-import { suggestionsOf } from "../app/suggestions.js";
+import { CHANGES, OUTCOMES, sentenceOf, suggestionsOf, waysOf } from "../app/suggestions.js";
 
 const MOST_CHARACTERS = 4000;
+// Where a question was not understood, others are shown that would be.
+const NOT_UNDERSTOOD = ["cannot-ground", "object-not-found", "cannot-read-direction"];
 
 function send(event) {
   event.preventDefault();
@@ -25,18 +27,20 @@ export function Question({ state }) {
     current.style.height = `${Math.min(current.scrollHeight + 2, 260)}px`;
   }, [question]);
   const corrected = correctedWords(state.corrections);
-  const suggestions = result || question ? [] : suggestionsOf(found);
+  const stuck = NOT_UNDERSTOOD.includes(state.problem?.code);
+  const suggestions = (result || question) && !stuck ? [] : suggestionsOf(found);
   return html`<form class="question" onSubmit=${send}>
     <label for="question">What if…</label>
     <textarea id="question" ref=${field} dir="auto" rows="2" maxlength=${MOST_CHARACTERS} value=${question} placeholder="If the toy car moves forward, will it hit the vase?"
       onInput=${(event) => set({ question: event.target.value })}
       onKeyDown=${(event) => event.key === "Enter" && !event.shiftKey && !event.isComposing && send(event)}></textarea>
-    ${suggestions.length > 0 && html`<ul class="suggestions" aria-label="Suggestions">
+    ${suggestions.length > 0 && html`<ul class="suggestions" aria-label=${stuck ? "Questions that would be understood" : "Suggestions"}>
       ${suggestions.map((text) => html`<li key=${text}><button type="button" dir="auto" onClick=${() => {
         set({ question: text });
         void ask();
       }}>${text}</button></li>`)}
     </ul>`}
+    <${Builder} names=${[...new Set(found.map((body) => body.object).filter((name) => name && name !== "object"))]} />
     ${corrected && html`<p class="hint">Asked with your corrections: ${corrected}. <button type="button" class="plain" onClick=${() => correct(NOTHING_CORRECTED)}>Forget them</button></p>`}
     <div class="row">
       <button class="primary" disabled=${!picture || !question.trim()}>${settings.kind === "answer" ? "Ask" : "Imagine"}</button>
@@ -50,6 +54,34 @@ function Choice({ label, value, options, onChange }) {
   return html`<label>${label}<select value=${value} onChange=${(event) => onChange(event.target.value)}>
     ${options.map(([name, text]) => html`<option key=${name} value=${name} selected=${name === value}>${text}</option>`)}
   </select></label>`;
+}
+
+/** Makes a question of choices among the things that were found. */
+function Builder({ names }) {
+  const [parts, setParts] = useState({ change: "moves", outcome: "hit" });
+  if (names.length < 2) return null;
+  const among = (name, others) => (others.includes(parts[name]) ? parts[name] : others[0]);
+  const thing = among("thing", names);
+  const { ways, needsMover } = CHANGES[parts.change];
+  const others = names.filter((name) => name !== thing);
+  const mover = among("mover", others);
+  const targets = needsMover && others.length > 1 ? others.filter((name) => name !== mover) : others;
+  const target = among("target", targets);
+  const way = among("way", waysOf(others.filter((name) => !needsMover || name !== mover)));
+  const choice = (label, name, value, options) => html`<${Choice} label=${label} value=${value}
+    options=${options.map((each) => [each, each])} onChange=${(chosen) => setParts({ ...parts, [name]: chosen })} />`;
+  return html`<details class="builder">
+    <summary>Build a question</summary>
+    <div class="fields">
+      ${choice("If the", "thing", thing, names)}
+      ${choice("does what?", "change", parts.change, needsMover || others.length > 1 ? Object.keys(CHANGES) : Object.keys(CHANGES).filter((each) => !CHANGES[each].needsMover))}
+      ${needsMover && choice("and then moves: the", "mover", mover, others)}
+      ${ways && choice("which way?", "way", way, waysOf(others.filter((name) => !needsMover || name !== mover)))}
+      ${choice("will it", "outcome", parts.outcome, Object.keys(OUTCOMES))}
+      ${choice("the", "target", target, targets)}
+    </div>
+    <button type="button" onClick=${() => set({ question: sentenceOf({ ...parts, thing, mover, way, target }) })}>Take this question</button>
+  </details>`;
 }
 
 function Whole({ label, value, min, max, onChange }) {
