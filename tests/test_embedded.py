@@ -218,6 +218,13 @@ def refusal(error, scene: Scene, question: str) -> str:
     return str(caught.value)
 
 
+@pytest.mark.parametrize(("name", "is_doubtful"), [("grean ball", True), ("shiny ball", False), ("left ball", False)])
+def test_what_is_nearly_a_colour_is_not_passed_over(name: str, is_doubtful: bool) -> None:
+    found = reader.ground(ReaderInput(drawn(False), f"If the {name} moves left, will it hit the cube?"))
+    assert found.is_doubtful is is_doubtful
+    assert any("is no colour that is known" in each for each in found.warnings) is is_doubtful
+
+
 def test_refusals_say_what_was_looked_for_what_was_seen_and_what_to_give() -> None:
     told = refusal(CannotGround, drawn(), "If the purple ball moves left, will it hit the cube?")
     assert "'purple ball'" in told

@@ -9,7 +9,7 @@ import numpy as np
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
-from cow_service.readers.embedded.english.lexicon import ObjectPhrase, words
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase, like_a_colour, words
 from cow_service.readers.embedded.english.noun_phrases import TABLES, Kind, kind_of, may_name, shape_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.outlines import (
@@ -337,7 +337,11 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         if own is not None:
             # Its colour speaks for the thing, and a torn outline does not outweigh that; else the likelier kind counts.
             is_other = is_other_kind(region, head) if phrase.colour else is_odd or fits_better(region, looks, own)
-        if looks is not None and is_other and phrase.noun is not None and head not in _ANYTHING:
+        colour = None if phrase.colour else like_a_colour(phrase.text)
+        if colour is not None:
+            warnings.append(f"'{phrase.text}' was taken for what is {place}: '{colour}' is no colour that is known.")
+            doubtful.add(bbox)
+        elif looks is not None and is_other and phrase.noun is not None and head not in _ANYTHING:
             warnings.append(f"'{phrase.text}' was taken for what is {place}, which looks like a {looks}, not '{head}'.")
             doubtful.add(bbox)
         elif is_odd:

@@ -6,6 +6,7 @@ import re
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib.resources import files
 from typing import Literal, NamedTuple
 
@@ -34,6 +35,7 @@ METRES = {  # of a unit of length
     for unit, text in TABLES["metres"].items()
     for word in (unit, *text.split()[1:])
 }  # fmt: skip
+NEARLY = 0.8  # difflib's ratio from which a word is nearly a colour's name
 PLACES = DIRECTIONS.keys() | SETS["places"]
 DETERMINERS, VAGUE_DETERMINERS = SETS["determiners"], SETS["vague_determiners"]
 CONDITIONALS, AUXILIARIES, BE, NEGATIONS = (SETS[n] for n in ("conditionals", "auxiliaries", "be", "negations"))
@@ -151,6 +153,12 @@ class ObjectPhrase:
     def words(self) -> set[str]:
         """The lower case words of the text."""
         return set(self.text.lower().split())
+
+
+def like_a_colour(text: str) -> str | None:
+    """A word of a noun phrase that is nearly a colour's name, and no other word that is known: "grean"; or None."""
+    unknown = (word for word in text.lower().split()[:-1] if word not in SETS["adjectives"] and word not in PLACES)
+    return next((word for word in unknown if get_close_matches(word, COLOURS, 1, NEARLY)), None)
 
 
 @dataclass(frozen=True)
