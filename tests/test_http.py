@@ -25,7 +25,7 @@ def problem(response: httpx.Response, status: int, code: str) -> dict:
     assert response.status_code == status, response.text
     assert response.headers["content-type"] == "application/problem+json"
     body = response.json()
-    assert set(body) == {"type", "title", "status", "detail", "errors"}
+    assert set(body) - {"remedy"} == {"type", "title", "status", "detail", "errors"}
     assert body["type"] == "urn:cow:problem:" + code, body
     assert body["status"] == status
     assert body["title"]
@@ -139,6 +139,8 @@ def test_refusals_of_the_reader(http: httpx.Client) -> None:
         http.post("/simulate", json={**BODY, "question": "If the pink car turns, what?"}), 422, "cannot-ground"
     )
     assert "pink car" in told["detail"]
+    assert "grounding" not in told["detail"]
+    assert "`grounding.point`" in told["remedy"]
     forward = {**BODY, "question": "If the red ball moves forward, will it hit the blue cube?"}
     problem(http.post("/simulate", json=forward), 422, "cannot-read-direction")
 
