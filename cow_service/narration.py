@@ -168,10 +168,12 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
         for left, _, right, bottom in trajectory.faint
     ]
     if trajectory.outcome is not None and "outline" in trajectory.outcome.depends_on:
+        outcome, met = trajectory.outcome, {each.object for each in trajectory.encounters}
+        matter = {trajectory.bodies[0].object, outcome.subject, outcome.object} | met
         found += [
             f"'{body.object}' was not seen clearly: give its box for an answer that may rest on it."
             for body in trajectory.bodies
-            if not body.is_clear
+            if not body.is_clear and body.object in matter
         ]
     found += [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
     found += [

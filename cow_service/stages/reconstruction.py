@@ -174,8 +174,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
     scene, grounding, bodies = situation.scene, situation.grounding, list[SeenBody]()
     located = {each.bbox: each for each in situation.located}
     mover = LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior, source=grounding.source)
-    silhouette = CroppedMask.of(scene.silhouette(mover.bbox))
-    first = Obstacle(mover.object, mover.bbox, silhouette, scene.confidence_of(mover.bbox))
+    first = Obstacle(mover.object, mover.bbox, CroppedMask.of(scene.silhouette(mover.bbox)))
     for seen in (first, *situation.obstacles, *situation.removed):
         thing = located.get(seen.bbox) if bodies else mover
         said, region = None if thing is None else thing.prior, scene.region_of(seen.bbox)

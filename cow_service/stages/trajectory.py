@@ -1,6 +1,7 @@
 """Stage 3: what the mover and everything it meets do over the clip, and how sure that is."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from cow_service.narration import facts_of, facts_of_both, warnings_of
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
@@ -30,7 +31,7 @@ def simulate_world(situation: Situation) -> Trajectory:
     Simulates what the mover and everything it meets do, many times, within what the picture leaves open.
     """
     world, query, path = reconstruct(situation)
-    results = run_ensemble(world, query, situation.request.ensemble)
+    results = [check_outlines(situation, each) for each in run_ensemble(world, query, situation.request.ensemble)]
     outcomes = [judge(situation.grounding, each) for each in results]
     trajectories = [
         record_trajectory(situation, result, outcome, path) for result, outcome in zip(results, outcomes, strict=True)
@@ -107,6 +108,14 @@ def judge(grounding: Grounding, result: EnsembleResult) -> Outcome | None:
     if doubts:
         decided |= {"sure": False, "robust": False, "depends_on": (*doubts, *result.decided.depends_on)}
     return outcome.model_copy(update=decided)
+
+
+def check_outlines(situation: Situation, result: EnsembleResult) -> EnsembleResult:
+    """The result with the bodies that matter as sure as their outlines are: doubtful ones are cut out a second time."""
+    bodies = list(result.world.bodies)
+    for body in bodies_that_matter(result):
+        bodies[body] = replace(bodies[body], confidence=situation.scene.confidence_of(bodies[body].bbox))
+    return replace(result, world=replace(result.world, bodies=tuple(bodies)))
 
 
 def bodies_that_matter(result: EnsembleResult) -> list[int]:

@@ -292,7 +292,9 @@ class Scene:
                 if not is_same_object(other.bbox, mover):
                     region = None if other.mask is not None else self.region_of(other.bbox)
                     mask = CroppedMask.of(self.silhouette(other.bbox)) if region is None else region.mask
-                    obstacles.append(Obstacle(other.object, other.bbox, mask, self.confidence_of(other.bbox)))
+                    found = region is not None and region.bbox == other.bbox  # here, not by the request or a reader
+                    confidence = region.confidence if region is not None and found else 1.0
+                    obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
             for region in self.regions:
                 area = region.mask.area
                 if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
@@ -305,8 +307,7 @@ class Scene:
                 larger = [other.mask for other in obstacles if doubtful and area < OWN_SHARE * other.mask.area]
                 if any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger):
                     continue
-                name, confidence = f"{region.colour} object", self.confidence_of(region.bbox)
-                obstacles.append(Obstacle(name, region.bbox, region.mask, confidence))
+                obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
             return tuple(obstacles)
 
         return self.once(("obstacles", mover, tuple(named)), find)
