@@ -122,6 +122,18 @@ def test_what_happens_in_a_drawing(
     assert answer.answer == expected, answer.reasoning
 
 
+def test_what_is_released_on_a_slope_rolls_down_it_and_does_not_fly(service: Service) -> None:
+    image, question, _ = CASES["rolls down a slope"]
+    info = service.keep_image(png_bytes(image))
+    answer = service.answer(AnswerRequest.model_validate({"image": {"artifact": info.sha256}, "question": question}))
+    assert answer.simulation is not None
+    trajectory = answer.simulation.trajectory
+    assert trajectory.bodies[0].support == "green object"
+    assert "green object" not in {each.object for each in trajectory.encounters}, "it lies there from the start"
+    assert trajectory.outcome is not None
+    assert trajectory.outcome.facts.startswith("The red ball rolls to the right")
+
+
 def test_a_table_that_is_not_seen_is_not_the_floor(service: Service) -> None:
     info = service.keep_image(png_bytes(drawing(ball(120, 22, RED, 92), box(420, 120, 90, BLUE))))
     question = "If the red ball falls, will it land on the table?"

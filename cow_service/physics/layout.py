@@ -240,7 +240,8 @@ def lay_out(
         depth = cameras.focal * motion.metres_per_pixel.value
         cameras = cameras.at_height((level - size[1] / 2) * depth / cameras.focal)
         supports = supports_in_side_view(bodies, level)
-        stands = [not flies(bodies[0], motion), *(on != HANGS for on in supports[1:])]
+        stands = [on != HANGS for on in supports]  # what is released may lie on a slope
+        stands[0] = stands[0] if motion.kind == "fall" else not flies(bodies[0], motion)
         placed = [in_the_air(cameras, body.bbox, body.shape, depth) for body in bodies]
         placed = [replace(body, stands=each) for body, each in zip(placed, stands, strict=True)]
     if motion.rises:

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from cow_service.narration import facts_of, facts_of_both, warnings_of
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
 from cow_service.records import CLEAR, BBox, Doubt, Grounding, Motion, Outcome, Trajectory
@@ -14,7 +16,7 @@ from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
 from cow_service.vision.masks import iou
 
-FEW_WORLDS = 0.1  # share of the worlds
+FEW_WORLDS = 0.2  # share of the worlds: what is touched in no more of them turns no answer that is clear
 
 
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
@@ -119,8 +121,13 @@ def check_outlines(situation: Situation, result: EnsembleResult) -> EnsembleResu
 
 
 def bodies_that_matter(result: EnsembleResult) -> list[int]:
-    """The mover, what is asked about, and what the mover touches in more than a few worlds."""
+    """The mover, what is asked about, and what the mover touches before that in more than a few worlds."""
     query, count = result.query, len(result.world.bodies)
     meant = {0} if query is None else {0, query.subject, query.target}
-    events = None if result.ensemble is None else result.ensemble.events.of[0]
-    return [i for i in range(count) if i in meant or (events is not None and events.share("touches", i) > FEW_WORLDS)]
+    if result.ensemble is None:
+        return [i for i in range(count) if i in meant]
+    touches = result.ensemble.events.of[0].times["touches"]
+    # Of what is struck by something else in turn, what comes first is not told here.
+    target = None if query is None or query.subject or query.asked.relation != "touches" else query.target
+    before = np.full(len(touches), np.inf) if target is None else touches[:, target]
+    return [i for i in range(count) if i in meant or float(np.mean(touches[:, i] < before)) > FEW_WORLDS]

@@ -119,11 +119,13 @@ def _shapes(labels: NDArray[np.int64], rest: Mask) -> list[Mask]:
         shared = [int(np.count_nonzero(near & body)) for body in bodies]
         if shared and max(shared) > 0:
             bodies[int(np.argmax(shared))] |= line
-    return [masks.without_holes(body) if _is_ring(body) else body for body in bodies if body.mean() > LEAST_SHAPE]
+    return [
+        masks.without_holes(body) if _has_small_holes(body) else body for body in bodies if body.mean() > LEAST_SHAPE
+    ]
 
 
-def _is_ring(body: Mask) -> bool:
-    """Whether the holes of a shape are small: patterns on it."""
+def _has_small_holes(body: Mask) -> bool:
+    """Whether the holes of a shape are patterns on it, and nothing has room in them."""
     return float(np.count_nonzero(body)) > 0.8 * np.count_nonzero(masks.without_holes(body))
 
 
