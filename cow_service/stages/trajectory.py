@@ -129,5 +129,6 @@ def bodies_that_matter(result: EnsembleResult) -> list[int]:
     touches = result.ensemble.events.of[0].times["touches"]
     # Of what is struck by something else in turn, what comes first is not told here.
     target = None if query is None or query.subject or query.asked.relation != "touches" else query.target
-    before = np.full(len(touches), np.inf) if target is None else touches[:, target]
+    # What was removed, numbered after the bodies, is never met.
+    before = touches[:, target] if target is not None and target < count else np.full(len(touches), np.inf)
     return [i for i in range(count) if i in meant or float(np.mean(touches[:, i] < before)) > FEW_WORLDS]
