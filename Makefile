@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
 
-.PHONY: demo serve test test-fast soak chaos lint unasync openapi lock sbom bench clean
+.PHONY: demo serve test test-fast soak chaos lint openapi lock sbom bench clean
 
 # Tools that the project is not built with, apart from what they look at.
 TOOLS ?= .tools
@@ -41,14 +41,11 @@ lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-unasync: $(VENV)/.test ## write the classes of the blocking client from the async ones
-	$(BIN)/python tests/sync_twins.py
-
 openapi: $(VENV)/.base ## write openapi.yaml from the app
 	$(BIN)/cow openapi > openapi.yaml
 
 lock: $(TOOLS)/.made ## write versions and hashes of what the images install; UPGRADE=--upgrade takes newer ones
-	echo "hatchling>=1.27" | $(LOCK) - --output-file docker/locks/build.txt
+	printf "%s\n" "hatchling>=1.27" "unasync>=0.6" | $(LOCK) - --output-file docker/locks/build.txt
 	$(LOCK) pyproject.toml $(CPU_EXTRAS) --output-file docker/locks/cpu.txt
 	$(LOCK) pyproject.toml $(CUDA_EXTRAS) --output-file docker/locks/cuda.txt
 
@@ -71,12 +68,15 @@ clean: ## remove what the other targets made
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.base: pyproject.toml | $(BIN)/python
+# What an installation makes the blocking classes of the SDK from.
+TWINS := hatch_build.py cow_service/client/async_client.py cow_service/client/async_results.py
+
+$(VENV)/.base: pyproject.toml $(TWINS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable .
 	touch $@
 
 # Most of these packages' modules are never imported: they are not compiled beforehand.
-$(VENV)/.test: pyproject.toml tests/constraints.txt | $(BIN)/python
+$(VENV)/.test: pyproject.toml tests/constraints.txt $(TWINS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test]" --constraint tests/constraints.txt
 	touch $(VENV)/.base $@
 

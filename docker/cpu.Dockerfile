@@ -22,7 +22,7 @@ RUN python -m venv --without-pip /opt/cow
 RUN --mount=type=cache,target=/root/.cache/pip \
     pip --python /opt/cow/bin/python install --only-binary :all: --require-hashes --requirement docker/locks/cpu.txt \
     && pip install --only-binary :all: --require-hashes --requirement docker/locks/build.txt
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml hatch_build.py README.md LICENSE ./
 COPY models models
 COPY prompts prompts
 COPY examples/ball-and-mug/image.jpg examples/ball-and-mug/

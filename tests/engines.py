@@ -14,6 +14,8 @@ from job_rows import open_jobs
 
 from cow_service.api.app import create_app
 from cow_service.jobs.engine import JobEngine
+from cow_service.jobs.webhooks import Webhooks
+from cow_service.observability.metrics import Metrics
 from cow_service.service import Service
 from cow_service.settings import Settings
 
@@ -41,8 +43,14 @@ def app_for(service: Service) -> FastAPI:
     end_jobs(engine)
     if engine.service is not service:
         engine.service.close()  # its connections to an MLLM
-    engine.use(service)
+    engine._parts.service = service
+    use_webhooks(engine.webhooks, service.settings, service.metrics)
     return create_app(engine, closing=False)
+
+
+def use_webhooks(webhooks: Webhooks, settings: Settings, metrics: Metrics) -> None:
+    """Signs with the secret of other settings, and counts elsewhere."""
+    webhooks._secret, webhooks._metrics = settings.webhook_secret, metrics
 
 
 def end_jobs(engine: JobEngine, seconds: float = 30.0 * SLOWNESS) -> None:

@@ -16,10 +16,10 @@ from conftest import EXAMPLES, Server
 from PIL import Image
 from sdk import KINDS, Connect
 from servers import IMAGE, QUESTION, data_url
-from sync_twins import CLIENT, TWINS, twin_of
 
 from cow_service import client as sdk
 from cow_service.client import CowError
+from hatch_build import CLIENT, TWINS, twin_of
 
 PAIRS = [
     (sdk.Client, sdk.AsyncClient),
@@ -45,7 +45,7 @@ SMALL: dict[str, Any] = {
 
 @pytest.mark.parametrize("source", TWINS)
 def test_the_blocking_twin_is_up_to_date(source: str) -> None:
-    assert twin_of(CLIENT / source) == (CLIENT / TWINS[source]).read_text(), "run `make unasync`"
+    assert twin_of(CLIENT / source) == (CLIENT / TWINS[source]).read_text(), "install the package again"
 
 
 def _members(kind: type) -> dict[str, Any]:

@@ -17,11 +17,13 @@ from pathlib import Path
 
 import pytest
 
+from hatch_build import TWINS
+
 PACKAGE = Path(__file__).resolve().parents[1] / "cow_service"
 MAX_ROOT_FILES, MAX_ROOMS = 12, 30
 # A file is one idea that a reader wants to see whole: 120 to 400 lines in most cases.
 MAX_FILE_LINES, MAX_FILES, MAX_SHORT_FILES, SHORT = 600, 230, 15, 80
-MAX_LINES = 44_800
+MAX_LINES = 44_000
 MAX_HELPERS_USED_ONCE, MAX_IMPORT_LINES = 0.12, 0.065  # of all functions; of all lines. To be lowered.
 MAX_PIPELINE_LINES, MAX_PIPELINE_FUNCTION_LINES, MAX_FUNCTION_LINES = 150, 40, 85
 
@@ -42,7 +44,8 @@ def test_the_root_and_the_rooms_are_few() -> None:
 
 
 def test_files_are_neither_long_nor_many() -> None:
-    sizes = {str(path.relative_to(PACKAGE)): lines(path) for path in PACKAGE.rglob("*.py")}
+    written = (path for path in PACKAGE.rglob("*.py") if path.name not in TWINS.values())
+    sizes = {str(path.relative_to(PACKAGE)): lines(path) for path in written}
     assert {name: size for name, size in sizes.items() if size > MAX_FILE_LINES} == {}
     assert len(sizes) <= MAX_FILES
     assert sum(sizes.values()) <= MAX_LINES

@@ -116,68 +116,45 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("suffix", ["pth", "npy"])
-def test_tracks_out_and_back(simulated: Path, suffix: str) -> None:
-    """An exported trajectory, imported and simulated, is the same trajectory."""
-    exported = cow(simulated, "tracks", "export", "out/simulation.json", "--out", f"tracks.{suffix}")
-    assert exported.returncode == 0, exported.stderr
-    assert "5 moving and 8 static tracks over 81 frames" in exported.stdout
-    imported = cow(simulated, "tracks", "import", f"tracks.{suffix}", "--out", "trajectory.json")
-    assert imported.returncode == 0, imported.stderr
-    assert "5 moving and 8 static tracks" in imported.stdout
-    question = BALL.meta["question"]
-    options = ("--trajectory", "trajectory.json", "--no-video", "--out", f"{suffix}-out")
-    again = cow(simulated, "simulate", "image.jpg", question, *options)
-    assert again.returncode == 0, again.stderr
-    first, second = (
-        Simulation.model_validate_json((simulated / name / "simulation.json").read_bytes()).trajectory
-        for name in ("out", f"{suffix}-out")
-    )
-    # A point that has left the image is not visible, and its place in the file is the same for all that.
-    np.testing.assert_allclose(second.path.tracks, first.path.tracks, atol=0.01)
-    np.testing.assert_allclose(second.anchors, first.anchors, atol=0.01)
-    inside = np.array(first.path.visible)
-    middle = np.mean(first.path.tracks, axis=0)
-    np.testing.assert_allclose(np.array(second.path.points)[inside], middle[inside], atol=0.01)
-
-
-def test_import_prints_what_a_request_takes(simulated: Path) -> None:
-    cow(simulated, "tracks", "export", "out/simulation.json", "--out", "a.npz")
-    printed = json.loads(cow(simulated, "tracks", "import", "a.npz", "--fps", "8").stdout)
-    assert printed["fps"] == 8
-    assert len(printed["points"]) == len(printed["visible"]) == 81
+def test_the_tracks_of_a_simulation_as_files(simulated: Path) -> None:
+    for suffix in ("pth", "npy"):
+        exported = cow(simulated, "tracks", "out/simulation.json", "--out", f"tracks.{suffix}")
+        assert exported.returncode == 0, exported.stderr
+        assert "5 moving and 8 static tracks over 81 frames" in exported.stdout
+    simulation = Simulation.model_validate_json((simulated / "out" / "simulation.json").read_bytes())
+    path, anchors = simulation.trajectory.path, simulation.trajectory.anchors
+    points = np.load(simulated / "tracks.npy")[0]
+    np.testing.assert_allclose(points[:, :5], np.transpose(path.tracks, (1, 0, 2)), atol=0.01)
+    np.testing.assert_allclose(points[:, 5:], np.broadcast_to(anchors, (81, 8, 2)), atol=0.01)
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("export", "image.jpg", "--out", "a.npz"), "image.jpg is not a simulation"),
-        (("export", "out/simulation.json", "--out", "a.csv"), "suffix '.csv'"),
-        (("export", "out/simulation.json", "--out", "absent/a.npz"), "cannot be written"),
-        (("import", "image.jpg"), "suffix '.jpg'"),
-        (("import", "still.npy"), "none of them moves"),
-        (("import", "hidden.npy"), "none of them is ever visible"),
+        (("image.jpg", "--out", "a.npz"), "image.jpg is not a simulation"),
+        (("out/simulation.json", "--out", "a.csv"), "suffix '.csv'"),
+        (("out/simulation.json", "--out", "absent/a.npz"), "cannot be written"),
     ],
 )
 def test_what_cannot_be_done_is_said(simulated: Path, arguments: tuple[str, ...], said: str) -> None:
-    np.save(simulated / "still.npy", np.full((81, 3, 2), 5.0))
-    np.save(simulated / "hidden.npy", np.zeros((81, 3, 2)))
-    np.save(simulated / "hidden-visibility.npy", np.zeros((81, 3), bool))
     done = cow(simulated, "tracks", *arguments)
     assert done.returncode == 1
     assert said in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_a_file_of_many_tracks_keeps_each_ones_visibility(simulated: Path) -> None:
+def test_a_trajectory_of_many_tracks_keeps_each_ones_visibility(simulated: Path) -> None:
     frames, count = 81, 400
     points = np.arange(frames)[:, None, None] * [1.0, 0.5] + np.linspace(50, 200, count)[None, :, None]
     visible = np.random.default_rng(0).random((frames, count)) < 0.9
     visible[0] = visible[-1] = True
-    np.save(simulated / "many.npy", points.astype(np.float32))
-    np.save(simulated / "many-visibility.npy", visible)
-    imported = cow(simulated, "tracks", "import", "many.npy", "--out", "many.json")
-    assert "400 moving and 0 static tracks" in imported.stdout, imported.stderr
+    given = {
+        "points": points.mean(axis=1).tolist(),
+        "fps": 16,
+        "tracks": points.transpose(1, 0, 2).tolist(),
+        "tracks_visible": visible.T.tolist(),
+    }
+    (simulated / "many.json").write_text(json.dumps(given))
     told = ("--object", "yellow ball", "--trajectory", "many.json", "--num-frames", "41")
     done = cow(simulated, "simulate", "image.jpg", "?", *told, "--no-video", "--out", "many-out")
     assert done.returncode == 0, done.stderr

@@ -19,7 +19,7 @@ from typing import Any
 import httpx
 import pytest
 from dbos import DBOS
-from engines import app_for, running_engine
+from engines import app_for, running_engine, use_webhooks
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from servers import ASYNC, BODY, SLOW_GENERATOR, TIME_LIMIT, events_of, eventually, problem, slow
@@ -106,7 +106,7 @@ def app(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FastAPI]:
     hooks = running_engine().webhooks
     monkeypatch.setitem(vars(hooks), "_egress", Egress(None, permitted=lambda address: address == "127.0.0.1"))
     yield app
-    hooks.use(Settings(data_dir=tmp_path / "data"), service.metrics)
+    use_webhooks(hooks, Settings(data_dir=tmp_path / "data"), service.metrics)
 
 
 @pytest.fixture

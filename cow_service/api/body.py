@@ -21,9 +21,9 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from cow_service.api.problems import invalid
 from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody, pointer_part, shortened
 from cow_service.requests import SimulateRequest
+from cow_service.requests.values import SHOWN_CHARACTERS
 
 FORM_FIELDS = ("image", "question", "request")
-SHOWN_CHARACTERS = 80  # of what the caller sent
 MAX_VALUES = 2_000_000  # of a JSON text: the longest tracks that a request may hold, twice; each takes up to 100 bytes
 MAX_KEYS = 1000  # of one JSON object
 MAX_OBJECTS = 100_000  # of a JSON text; each is checked in Python

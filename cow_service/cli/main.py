@@ -9,7 +9,7 @@ import typer
 
 from cow_service import __version__
 from cow_service.cli import batch, eval, models, options, server
-from cow_service.cli.options import AsJson, Commands, Texts, Url, option, with_request_options
+from cow_service.cli.options import AsJson, Commands, Texts, option, with_request_options
 from cow_service.cli.server import open_service
 
 app = typer.Typer(
@@ -160,23 +160,11 @@ def openapi() -> None:
     typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 
-@app.command()
-def top(url: Url = None, once: Annotated[bool, option("Print one picture, and end.", "--once")] = False) -> None:
-    """Show processes, workers and queues of a server, until Ctrl-C.
-
-    Where standard output is no terminal, one picture is printed.
-    """
-    from cow_service.cli.top import show_processes  # noqa: PLC0415
-
-    show_processes(url, once=once)
-
-
-for command in (server.serve, server.worker, server.migrate, server.mcp, batch.batch):
+for command in (server.serve, server.worker, server.migrate, server.mcp, batch.batch, models.tracks):
     app.command()(command)
 app.add_typer(eval.app, name="eval")
 app.add_typer(server.keys, name="keys")
 app.add_typer(models.app, name="models")
-app.add_typer(models.tracks, name="tracks")
 
 if __name__ == "__main__":
     sys.exit(app())

@@ -11,7 +11,6 @@ from cow_service.cli.options import EXISTING, AsJson, Texts, argument, option, w
 from cow_service.errors import InvalidRequest
 
 if TYPE_CHECKING:
-    from pydantic import ValidationError
     from rich.console import Console
 
     from cow_service.weights.manifests import Manifest, Source
@@ -163,19 +162,11 @@ def _downloads(manifest: Manifest, weights_dir: Path, revisions: dict[str, str])
     return [resolve(source, weights_dir, chosen.get(name)) for name, source in sources.items()]
 
 
-tracks = typer.Typer(
-    rich_markup_mode=None, no_args_is_help=True, help="Write and read the track files of ATI and Wan-Move."
-)
-
-ANCHOR_MAX_MOVE_PX = 1.0  # a track that never moves further from its start is an anchor
-
-
-@tracks.command(name="export")
-def export_tracks(
+def tracks(
     simulation: Annotated[Path, argument("A simulation.json.", "SIMULATION", **EXISTING)],
     out: Annotated[Path, option("tracks.pth or .npz for ATI, tracks.npy for Wan-Move.", "--out", "-o")],
 ) -> None:
-    """Write a simulation's tracks, in pixels of its input image: of what moves, the mover's first, then the anchors."""
+    """Write a simulation's tracks as ATI and Wan-Move read them: of what moves, the mover's first, then the anchors."""
     from pydantic import ValidationError  # noqa: PLC0415
 
     from cow_service.generators.wan.tracks import tracks_of, write_tracks  # noqa: PLC0415
@@ -184,68 +175,15 @@ def export_tracks(
     try:
         record = Simulation.model_validate_json(simulation.read_bytes())
     except ValidationError as error:
-        raise _invalid(f"{simulation.name} is not a simulation", error, "the file") from error
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise InvalidRequest(f"{simulation.name} is not a simulation: {place}: {first['msg']}.") from error
     if not record.trajectory.path.states:
         raise InvalidRequest(f"{simulation.name} is a minimal result, without tracks: get it without `return=minimal`.")
-    tracks = tracks_of(record.trajectory, record.image.width, record.image.height)
+    found = tracks_of(record.trajectory, record.image.width, record.image.height)
     with writable(out):
-        written = write_tracks(tracks, out)
+        written = write_tracks(found, out)
     still = len(record.trajectory.anchors)
-    moving = tracks.points.shape[1] - still
+    moving = found.points.shape[1] - still
     names = " and ".join(str(path) for path in written)
-    typer.echo(f"{moving} moving and {still} static tracks over {tracks.num_frames} frames: {names}")
-
-
-@tracks.command(name="import")
-def import_tracks(
-    file: Annotated[Path, argument(".pth, .npz or .npy.", "FILE", **EXISTING)],
-    visibility: Annotated[
-        Path | None, option("Wan-Move's other file.", **EXISTING, shown="FILE's name with -visibility")
-    ] = None,
-    fps: Annotated[float, option("Frames per second of the clip.")] = 16,
-    out: Annotated[Path | None, option("Where to write it.", "--out", "-o", shown="standard output")] = None,
-) -> None:
-    """Turn a track file into the `trajectory` of a request, for `cow simulate --trajectory` or `POST /simulate`.
-
-    Tracks that stay where they are become anchors. `points` is the mean of those that move.
-    """
-    import numpy as np  # noqa: PLC0415
-    from pydantic import ValidationError  # noqa: PLC0415
-
-    from cow_service.generators.wan.tracks import read_tracks  # noqa: PLC0415
-    from cow_service.requests import TrajectoryRequest  # noqa: PLC0415
-
-    read = read_tracks(file, visibility)
-    if not read.visible.any():
-        raise InvalidRequest(f"{file.name} has {read.points.shape[1]} tracks, and none of them is ever visible.")
-    held = read.held()
-    moves = np.abs(held.points - held.points[:1]).max(axis=(0, 2)) > ANCHOR_MAX_MOVE_PX
-    if not moves.any():
-        raise InvalidRequest(
-            f"{file.name} has {moves.size} tracks, and none of them moves by more than {ANCHOR_MAX_MOVE_PX:g} px."
-        )
-    moving = held.points[:, moves].astype(float).round(3)
-    try:
-        trajectory = TrajectoryRequest(
-            points=tuple(map(tuple, moving.mean(axis=1).round(3).tolist())),
-            fps=fps,
-            visible=tuple(map(bool, np.any(held.visible[:, moves], axis=1).tolist())),
-            tracks_visible=tuple(tuple(map(bool, track)) for track in held.visible[:, moves].T.tolist()),
-            tracks=tuple(tuple(map(tuple, track)) for track in moving.transpose(1, 0, 2).tolist()),
-            anchors=tuple(map(tuple, held.points[0, ~moves].astype(float).round(3).tolist())),
-        )
-    except ValidationError as error:
-        raise _invalid(f"{file.name} does not make a trajectory", error, "trajectory") from error
-    if out is None:
-        typer.echo(trajectory.model_dump_json())
-        return
-    with writable(out):
-        out.write_text(trajectory.model_dump_json(), encoding="utf-8")
-    typer.echo(f"{int(moves.sum())} moving and {int((~moves).sum())} static tracks: {out}")
-
-
-def _invalid(fault: str, error: ValidationError, whole: str) -> InvalidRequest:
-    """The first fault of a file, with its place; `whole` names the place where it is none of the fields."""
-    first = error.errors()[0]
-    place = ".".join(map(str, first["loc"])) or whole
-    return InvalidRequest(f"{fault}: {place}: {first['msg']}.")
+    typer.echo(f"{moving} moving and {still} static tracks over {found.num_frames} frames: {names}")

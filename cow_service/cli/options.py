@@ -156,9 +156,7 @@ def request_body(
         ),
     ] = None,
     ensemble: Annotated[int, option("How many worlds the probabilities are counted in; 0: none.")] = 50,
-    trajectory: Annotated[
-        Path | None, option("JSON with the `trajectory` of a request, as `cow tracks import` makes it.", **EXISTING)
-    ] = None,
+    trajectory: Annotated[Path | None, option("JSON with the `trajectory` of a request.", **EXISTING)] = None,
     fields: Annotated[
         str | None,
         option('Other fields of the request: {"camera": {"pitch": 25}}.', "--request", metavar="JSON", shown="none"),

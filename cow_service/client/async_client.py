@@ -1,6 +1,6 @@
 """`AsyncClient`: the calls of the SDK.
 
-Change `async_client.py`: `make unasync` writes `sync_client.py` from it.
+`sync_client.py` is made from this file when the package is installed or built.
 """
 
 from __future__ import annotations

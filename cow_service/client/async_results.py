@@ -1,6 +1,6 @@
 """Results and jobs of `AsyncClient`: what they say, and their pictures, which are downloaded from the server.
 
-Change `async_results.py`: `make unasync` writes `sync_results.py` from it.
+`sync_results.py` is made from this file when the package is installed or built.
 """
 
 from __future__ import annotations

@@ -76,11 +76,6 @@ class JobEngine:
         """The service that does the work."""
         return self._parts.service
 
-    def use(self, service: Service) -> None:
-        """Runs the jobs of another service from now on, on the same database. Only tests do this."""
-        self._parts.service = service
-        self.webhooks.use(service.settings, service.metrics)
-
     def wait_for_database(self, stop: threading.Event) -> None:
         """Waits until the database can be reached, or until `stop` is set, and logs that it waits."""
         pause = FIRST_WAIT

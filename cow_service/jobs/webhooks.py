@@ -52,10 +52,6 @@ class Webhooks:
             lazy=True,
         )
 
-    def use(self, settings: Settings, metrics: Metrics) -> None:
-        """Takes the secret from other settings, and counts elsewhere. Only tests do this."""
-        self._secret, self._metrics = settings.webhook_secret, metrics
-
     def check(self, url: str) -> None:
         """Raises `WebhookNotAllowed` for a URL that would not be called."""
         if self._secret is None:

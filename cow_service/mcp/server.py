@@ -26,48 +26,9 @@ from cow_service.mcp import arguments
 from cow_service.mcp.arguments import ToolName
 from cow_service.mcp.results import output_schema, tool_result
 from cow_service.media.artifacts import media_type_of
+from cow_service.readers.prompts import load_prompt
 from cow_service.records import Job
 
-INSTRUCTIONS = """\
-COW imagines what would happen in a picture. Use it for what-if questions about one still image in which something \
-moves: will it hit, reach, hide or be hidden by something, where does it come to, what does it land on. `simulate` \
-returns imagined frames for you to look at; `answer` returns an answer with its imagined frames. Both compute where \
-the thing goes rather than guess, from an image and a question in plain English."""
-
-LIMITS = """\
-Limits: what happens is computed in a small physical world that is estimated from the picture, many times within what \
-the picture leaves open: hypotheses with probabilities, not measurements. Nothing breaks or bends. `warnings` say what \
-was assumed. Where the thing or its direction is not found, the error says what was seen and which arguments to add."""
-
-DESCRIPTIONS: dict[ToolName, str] = {
-    "simulate": f"""\
-Imagine the future of a still image: finds the thing that moves, reads its motion from the question and from arrows \
-drawn in the image, computes its path, and makes frames of what would be seen. Use it when you want to look for \
-yourself before you answer a question on motion, collision, occlusion or falling.
-
-Returns pictures (first the image with box, direction and path drawn, then frames at the moments that matter), and in \
-words and as data: what moves, how, and what it touches, passes in front of or passes behind, and when.
-
-{LIMITS}
-
-Examples:
-  image="/photos/table.jpg", question="If the red ball moves to the left, will it hit the vase?"
-  image="/photos/shelf.png", question="What does the cup land on if it falls?", bbox=[310, 80, 365, 150], \
-object="cup", motion_kind="fall"
-""",
-    "answer": f"""\
-Answer a what-if question about a still image by imagining it first: does what `simulate` does, has the result looked \
-at, and returns the answer with the pictures that it rests on. Use it when you want a verdict. List the options in the \
-question, '(A) Yes (B) No (C) Not sure', or in `options`; then the answer is a letter. An answer can be 'not sure': \
-then look at the pictures and judge for yourself, or say more exactly what moves (`bbox`, `direction`).
-
-{LIMITS} Without a multimodal LLM on the server (reader 'embedded'), only plain questions on hitting, landing on, \
-hiding and being hidden by one thing are answered; all else is 'not sure'.
-
-Example:
-  image="/photos/table.jpg", question="If the yellow ball moves against the arrow, will it hit the mug? (A) Yes (B) No"
-""",
-}
 TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
 # It only looks; asking again changes nothing, though a model that samples may answer otherwise; images may be fetched,
 # and shown to a provider's model.
@@ -102,7 +63,7 @@ def create_server(connect: Connect, lifespan: Lifespan, *, paths: bool, links: b
         "cow",
         title="COW",
         version=__version__,
-        instructions=INSTRUCTIONS,
+        instructions=load_prompt("tools").render(),
         lifespan=lifespan,
         on_list_tools=tools.list,
         on_call_tool=tools.call,
@@ -116,16 +77,17 @@ class _Tools:
     def __init__(self, connect: Connect, *, paths: bool, links: bool) -> None:
         self._connect, self._paths, self._links = connect, paths, links
         image = arguments.HELP_WITH_PATHS if paths else arguments.HELP_WITHOUT_PATHS
+        limits = load_prompt("tool-limits").render()
         self._listed = [
             types.Tool(
                 name=name,
-                title=TITLES[name],
-                description=description,
+                title=title,
+                description=load_prompt(f"tool-{name}").render(limits=limits),
                 input_schema=arguments.input_schema(name, image),
                 output_schema=output_schema(name),
-                annotations=types.ToolAnnotations(title=TITLES[name], **HINTS),
+                annotations=types.ToolAnnotations(title=title, **HINTS),
             )
-            for name, description in DESCRIPTIONS.items()
+            for name, title in TITLES.items()
         ]
 
     async def list(self, *_: Any) -> types.ListToolsResult:
@@ -136,7 +98,7 @@ class _Tools:
     ) -> types.CallToolResult:
         """What a tool returns; an error is text in it, since that is where a model looks."""
         tool = params.name
-        if tool not in DESCRIPTIONS:
+        if tool not in TITLES:
             raise MCPError(code=types.INVALID_PARAMS, message=f"Unknown tool: {tool[:80]!r}")
 
         async def report(done: float, stage: str) -> None:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -32,22 +33,7 @@ LARGEST = 420.0  # area of the marker of the fullest bin, points²
 SMALLEST = 14.0
 COST_PANEL, COST_WIDTH = 2.9, 7.5  # inches
 RANGE_FOR_LOG = 12.0  # between the dearest and the cheapest arm
-STYLE = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans", "Verdana", "sans-serif"],
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "grid.color": LINE,
-    "grid.linewidth": 0.7,
-    "text.parse_math": False,  # a name with two dollar signs is a name
-    "legend.frameon": False,
-    "svg.fonttype": "none",  # text stays text: it can be searched, and read aloud
-    "axes.axisbelow": True,
-}
+STYLE = Path(__file__).with_suffix(".mplstyle")
 
 
 @dataclass(frozen=True)

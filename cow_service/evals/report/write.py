@@ -5,7 +5,6 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from cow_service.errors import InvalidRequest, StorageUnavailable
 from cow_service.evals.report import tables
@@ -77,15 +76,14 @@ def write_plots(folder: Path, summaries: Sequence[ArmSummary]) -> tuple[Path, ..
     same bytes of SVG.
     """
     # A second of imports, which nobody but the writer of a report should wait for.
-    import matplotlib  # noqa: PLC0415
+    from matplotlib import style  # noqa: PLC0415
 
     from cow_service.evals.report import figures  # noqa: PLC0415
 
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name, draw in figures.DRAWINGS.items():
-        style: dict[Any, Any] = {**figures.STYLE, "svg.hashsalt": "cow"}
-        with matplotlib.rc_context(style), warnings.catch_warnings():
+        with style.context(figures.STYLE), warnings.catch_warnings():
             # Names of models may have letters that the font has not: the SVG keeps them as text.
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
             figure = draw(summaries)

@@ -5,16 +5,14 @@ A trajectory is sampled at the frames of its clip, in pixels of the input image.
 its last frame a track stays where it is.
 
 ATI's `.pth` is a saved string of bytes: the `.npz` file, whose array is called `array`. Wan-Move keeps positions in one
-`.npy` file and visibility in another. Reading runs no code that a file brings: no pickled objects are taken.
+`.npy` file and visibility in another.
 
 Sources: the public implementations of ATI (arXiv 2505.22944) and Wan-Move (arXiv 2512.08765).
 """
 
 import io
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,20 +42,6 @@ class Tracks:
     def num_frames(self) -> int:
         """F, the frames of the clip."""
         return self.points.shape[0]
-
-    def held(self) -> "Tracks":
-        """Without tracks that are never visible; zeros where a track is not, which stand for no place, become its last.
-
-        Before a track is first seen they become its first place.
-        """
-        ever = self.visible.any(axis=0)
-        points, visible = self.points[:, ever].copy(), self.visible[:, ever]
-        placed = visible | points.any(axis=2)
-        for track in range(points.shape[1]):
-            known = placed[:, track]
-            last = np.maximum.accumulate(np.where(known, np.arange(self.num_frames), -1))
-            points[:, track] = points[np.where(last < 0, known.argmax(), last), track]
-        return Tracks(points, visible)
 
     def scaled(self, x: float, y: float) -> "Tracks":
         """The same tracks on the image resized by these factors."""
@@ -112,18 +96,6 @@ def to_ati_file(tracks: Tracks) -> Floats32:
     return samples.transpose(1, 0, 2)[:, :, None].astype(np.float32)
 
 
-def from_ati_file(samples: Floats32) -> Tracks:
-    """The tracks at the 81 frames of a clip from ATI's file form [N, 121, 1, 3]: each frame at its own time.
-
-    ATI's own reader (`to_ati_tensor`) takes every odd frame from the sample a third of a frame before it.
-    """
-    at = np.arange(MAX_FRAMES) * SAMPLES_PER_FRAME
-    before, after = np.floor(at).astype(int), np.ceil(at).astype(int)
-    values = samples[:, :, 0].astype(np.float64).transpose(1, 0, 2) / FILE_UNITS_PER_PIXEL
-    points = (values[before, :, :2] + values[after, :, :2]) / 2
-    return Tracks(points.astype(np.float32), values[np.rint(at).astype(int), :, 2] > 0.5)
-
-
 def to_ati_tensor(samples: Floats32, width: int, height: int) -> Floats32:
     """[81, N, 4]: time, x, y and visible from ATI's file form [N, 121, 1, 3], on an image of this size (px).
 
@@ -142,22 +114,20 @@ def _inside(points: Floats, width: int, height: int) -> Bools:
     return (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
-ARRAY = "array"  # its name in the .npz file
-VISIBILITY = "-visibility"  # between the name of Wan-Move's file of positions and its suffix
-MOST = 10_000_000  # numbers in a file
-
-
 def write_tracks(tracks: Tracks, path: Path) -> tuple[Path, ...]:
     """Writes the form that the suffix names, and says which files that were.
 
     Raises `InvalidRequest` for another suffix, a clip that is too long for ATI, or `.pth` without PyTorch.
     """
-    _check_suffix(path)
+    if path.suffix not in (".pth", ".npz", ".npy"):
+        raise InvalidRequest(
+            f"{path.name} has the suffix '{path.suffix}': track files are .pth or .npz (ATI) and .npy (Wan-Move)."
+        )
     if path.suffix == ".npy":
-        other = path.with_name(path.stem + VISIBILITY + path.suffix)
+        visibility = path.with_stem(f"{path.stem}-visibility")
         np.save(path, tracks.points[None])
-        np.save(other, tracks.visible[None])
-        return path, other
+        np.save(visibility, tracks.visible[None])
+        return path, visibility
     if tracks.num_frames > MAX_FRAMES:
         raise InvalidRequest(
             f"The trajectory has {tracks.num_frames} frames: ATI's files hold {MAX_FRAMES}. Simulate with that many."
@@ -166,97 +136,10 @@ def write_tracks(tracks: Tracks, path: Path) -> tuple[Path, ...]:
     np.savez_compressed(zipped, array=to_ati_file(tracks))
     if path.suffix == ".npz":
         path.write_bytes(zipped.getvalue())
-    else:
-        _import_torch().save(zipped.getvalue(), path)
-    return (path,)
-
-
-def read_tracks(path: Path, visibility: Path | None = None) -> Tracks:
-    """The tracks of a file, at the frames of a clip.
-
-    `visibility` is the other file of Wan-Move; without it the one that `write_tracks` puts beside is taken, and where
-    there is none every point counts as visible. Raises `InvalidRequest` saying what is wrong with the file.
-    """
-    _check_suffix(path)
-    if visibility is not None and path.suffix != ".npy":
-        raise InvalidRequest(f"{path.name} holds its own visibility: a file of it goes with .npy alone.")
-    try:
-        if path.suffix == ".npy":
-            return _wan_move(path, visibility)
-        return from_ati_file(_ati_array(path))
-    except InvalidRequest:
-        raise
-    except Exception as error:  # NumPy, zipfile and PyTorch raise a dozen kinds on damaged files
-        reason = f"it is damaged, or holds more than the plain numbers of a {path.suffix} file, which could run code"
-        reason = "there is no such file" if isinstance(error, FileNotFoundError) else reason
-        raise InvalidRequest(f"{path.name} cannot be read: {reason}.") from error
-
-
-def _ati_array(path: Path) -> Floats32:
-    if path.suffix == ".npz":
-        data: Any = path.read_bytes()
-    else:
-        torch = _import_torch()
-        with warnings.catch_warnings():  # PyTorch remarks on how it was pickled
-            warnings.simplefilter("ignore")
-            data = torch.load(path, map_location="cpu", weights_only=True)
-        if isinstance(data, torch.Tensor):
-            data = data.detach().float().numpy()
-        elif not isinstance(data, bytes):
-            kind = type(data).__name__
-            raise InvalidRequest(f"{path.name} holds a {kind}: ATI's tracks are the bytes of an .npz file.")
-    if isinstance(data, bytes):
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            if ARRAY not in arrays:
-                raise InvalidRequest(f"{path.name} has no '{ARRAY}', but {', '.join(arrays) or 'nothing'}.")
-            data = arrays[ARRAY]
-    array = _numbers(path, data)
-    if array.ndim == 4 and array.shape[0] == FILE_SAMPLES != array.shape[1]:
-        array = array.transpose(1, 0, 2, 3)
-    if array.ndim != 4 or array.shape[1:] != (FILE_SAMPLES, 1, 3):
-        raise InvalidRequest(f"{path.name} holds {list(array.shape)}: ATI's tracks are [N, {FILE_SAMPLES}, 1, 3].")
-    return array
-
-
-def _wan_move(path: Path, visibility: Path | None) -> Tracks:
-    points = _numbers(path, np.load(path, allow_pickle=False))
-    points = points[0] if points.ndim == 4 and points.shape[0] == 1 else points
-    if points.ndim != 3 or points.shape[2] != 2 or not points.shape[0]:
-        raise InvalidRequest(f"{path.name} holds {list(points.shape)}: Wan-Move's tracks are [F, N, 2].")
-    # As `write_tracks` names it, and as Wan-Move's own examples do.
-    names = path.stem + VISIBILITY, *(path.stem.replace(word, "visibility") for word in ("tracks", "track"))
-    beside = [path.with_stem(name) for name in names if name != path.stem]
-    file = visibility or next((other for other in beside if other.is_file()), None)
-    if file is None:
-        return Tracks(points, np.ones(points.shape[:2], bool))
-    visible = np.load(file, allow_pickle=False)
-    visible = visible[0] if visible.ndim == 3 and visible.shape[0] == 1 else visible
-    if visible.shape != points.shape[:2]:
-        raise InvalidRequest(f"{file.name} holds {list(visible.shape)}: the tracks need {list(points.shape[:2])}.")
-    return Tracks(points, visible.astype(bool))
-
-
-def _numbers(path: Path, data: NDArray[np.generic]) -> Floats32:
-    if data.size > MOST:
-        raise InvalidRequest(f"{path.name} holds {data.size} numbers, more than {MOST}.")
-    if not np.issubdtype(data.dtype, np.number) or np.iscomplexobj(data):
-        raise InvalidRequest(f"{path.name} holds {data.dtype}, not numbers.")
-    array = data.astype(np.float32)
-    if not np.isfinite(array).all():
-        raise InvalidRequest(f"{path.name} holds numbers that are not finite.")
-    return array
-
-
-def _import_torch() -> Any:
+        return (path,)
     try:
         import torch  # noqa: PLC0415
     except ImportError as error:
         raise InvalidRequest('.pth files need PyTorch: pip install "cow-service[wan]", or use .npz.') from error
-    return torch
-
-
-def _check_suffix(path: Path) -> None:
-    if path.suffix not in (".pth", ".npz", ".npy"):
-        raise InvalidRequest(
-            f"{path.name} has the suffix '{path.suffix}': track files are .pth or .npz (ATI) and .npy (Wan-Move)."
-        )
+    torch.save(zipped.getvalue(), path)
+    return (path,)
