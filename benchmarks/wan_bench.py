@@ -36,6 +36,7 @@ class Bench:
         self.pipeline = build(case, self._plain)
         self.built = self.clock.now() - begun  # seconds
         self._transformer: Any = self.pipeline.transformer
+        self._eager: dict[tuple[int, int], Tensor] = {}  # what passes gave first, by frames and seed
         time_parts(self.pipeline, self.clock)
 
     def put(self, form: Acceleration) -> None:
@@ -51,17 +52,23 @@ class Bench:
         self._form = form
 
     def passes(self, count: int = 2, num_frames: int | None = None, batch: int = 1) -> dict[str, Any]:
-        """Seconds of that many passes, one after the other, for clips of some length; what the last one comes to."""
+        """Seconds of that many passes, one after the other, for clips of some length; what the last one comes to.
+
+        `off_eager`: its relative distance from what the first form gave for the same inputs, which is the eager one.
+        """
         frames = num_frames or self.case.num_frames
         reset_cache(self._transformer, count)
         self._forget_peak()
         # Other inputs each time: a cache finds no change between two passes that are the same.
-        seconds = [self._pass(self._inputs(frames, batch, seed)) for seed in range(count)]
+        done = [self._pass(self._inputs(frames, batch, seed)) for seed in range(count)]
+        seconds, found = [each for each, _ in done], done[-1][1][:1]
+        eager = self._eager.setdefault((frames, count - 1), found) if batch == 1 else found
         flops = batch * pass_flops(
             self.case.manifest.architecture, frames, self.case.width, self.case.height, self._image_tokens
         )
         return {
             "pass_s": [rounded(each) for each in seconds],
+            "off_eager": rounded(float((found - eager).norm() / eager.norm())),
             "tflops": rounded(flops / seconds[-1] / 1e12),
             "share_of_peak": rounded(flops / seconds[-1] / self.peak),
             **self._peaks(),
@@ -224,11 +231,11 @@ class Bench:
         }
 
     @torch.no_grad()
-    def _pass(self, given: dict[str, Tensor]) -> float:
+    def _pass(self, given: dict[str, Tensor]) -> tuple[float, Tensor]:
         begun = self.clock.now()
         with self._transformer.cache_context("cond"):
-            self._transformer(**given, return_dict=False)
-        return self.clock.now() - begun
+            found = self._transformer(**given, return_dict=False)[0]
+        return self.clock.now() - begun, found.float().cpu()
 
     def _forget_peak(self) -> None:
         if self.case.device.type == "cuda":

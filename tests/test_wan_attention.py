@@ -52,6 +52,21 @@ def test_backends_that_work_are_timed_and_the_others_say_why_not() -> None:
     assert "flash" in (timed["flash"].reason or "").lower()
 
 
+def test_a_backend_that_cannot_attend_to_the_picture_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    def attend(name: str, *tensors: torch.Tensor) -> torch.Tensor:
+        if name != "native" and tensors[1].shape[1] == 257:
+            raise RuntimeError("No kernel for 257 keys.")
+        return tensors[0]
+
+    monkeypatch.setattr(attention, "_attended", attend)
+    longer = SMALL._replace(tokens=600)
+    found = time_backends(("native", "_native_math"), longer, torch.float32, CPU)
+    assert [(one.usable, one.reason) for one in found] == [
+        (True, None),
+        (False, "RuntimeError: No kernel for 257 keys."),
+    ]
+
+
 def test_a_gpu_that_fails_is_no_missing_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(name: str, *tensors: Any) -> Any:
         if name != "native":

@@ -447,3 +447,16 @@ def test_weights_are_offloaded_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bench._transformer is not old
     assert hasattr(bench._transformer.blocks[0], "_diffusers_hook")
     assert min(found["pinning_s"], *found["pass_s"], found["host_peak_gb"]) > 0
+
+
+@pytest.mark.soak_only
+@pytest.mark.timeout(600)
+def test_first_contact_goes_the_whole_way(tmp_path: Path) -> None:
+    given = ("--toy", "--num-frames", "5", "--profile", "exact", "--json", str(tmp_path / "found.json"))
+    subprocess.run([sys.executable, str(BENCHMARKS / "first_contact.py"), *given], check=True, capture_output=True)
+    found = {row["name"]: row for row in json.loads((tmp_path / "found.json").read_text())["rows"]}
+    assert found["portable"]["exit"] == 0
+    assert found["exact"]["exit"] == (0 if torch.cuda.is_available() else 1)
+    assert found["exact"].get("grey_levels_off_portable", 0) < 2
+    assert found["serve: cancel"]["status"] == "canceled"
+    assert [found[f"serve: {clip}"]["status"] for clip in ("first clip", "after a cancel")] == [200, 200]

@@ -20,7 +20,7 @@ from diffusers.models.attention_dispatch import attention_backend, dispatch_atte
 from torch import Tensor
 
 from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities
-from cow_service.generators.wan.checkpoints import diffusers_config
+from cow_service.generators.wan.checkpoints import TEXT_LENGTH, diffusers_config
 from cow_service.generators.wan.memory import has_failed, wait_until_done
 from cow_service.generators.wan.pipeline import token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile
@@ -31,6 +31,7 @@ TRIALS = 3  # after one that is not counted
 MARGIN = 1.05  # of two that are closer, the first one is taken: else noise would choose, each time another
 MAX_ERROR = 0.02  # of the largest value: the roundings of bfloat16 stay below it
 FRAMES = 81  # of the longest clip
+CROSS_KEYS = TEXT_LENGTH, 257  # of text and picture, to which a clip attends besides itself
 
 log = logging.getLogger("cow_service")
 
@@ -76,19 +77,21 @@ def time_backends(
     """Times each backend on the same random inputs. One that fails says why; a GPU that fails is raised."""
     drawn = torch.Generator(device).manual_seed(0)
     q, k, v = (torch.randn(1, *shape, generator=drawn, device=device).to(dtype) for _ in range(3))
-    expected = _attended(NATIVE, q, k, v)
+    attended = [(k[:, :keys], v[:, :keys]) for keys in (shape.tokens, *CROSS_KEYS)]
+    expected = [_attended(NATIVE, q, *each) for each in attended]
 
     def timed(name: str) -> TimedBackend:
         try:
-            found = _attended(name, q, k, v)
-            error = float((found - expected).abs().max() / expected.abs().max())
-            del found
+            errors = [
+                (_attended(name, q, *each) - wanted).abs().max() / wanted.abs().max()
+                for each, wanted in zip(attended, expected, strict=True)
+            ]
             seconds: list[float] = []
             for _ in range(TRIALS):
                 begun = time.perf_counter()
                 _attended(name, q, k, v)
                 seconds.append(time.perf_counter() - begun)
-            return TimedBackend(name, statistics.median(seconds), error)
+            return TimedBackend(name, statistics.median(seconds), float(torch.stack(errors).max()))
         except Exception as problem:
             if isinstance(problem, RuntimeError) and not is_out_of_memory(problem) and has_failed(device, problem):
                 raise  # nothing can be computed on the device any more
