@@ -78,6 +78,6 @@ def test_a_job_without_a_result_and_a_preference_that_is_none(http: TestClient) 
 def test_tracks_of_a_minimal_result_are_refused(http: TestClient, tmp_path: Path) -> None:
     file = tmp_path / "simulation.json"
     file.write_text(http.post("/simulate", json=BODY, headers=MINIMAL).text)
-    found = CliRunner().invoke(cli, ["tracks", "export", str(file), "--out", str(tmp_path / "tracks.npz")])
+    found = CliRunner().invoke(cli, ["tracks", str(file), "--out", str(tmp_path / "tracks.npz")])
     assert found.exit_code == 1
     assert "minimal result" in found.output

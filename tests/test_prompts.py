@@ -40,7 +40,6 @@ def test_fields() -> None:
 
 
 SAMPLES: dict[str, object] = {
-    "limits": "Limits: some.",
     "object": "red ball",
     "kind": "linear",
     "words": "to the left",

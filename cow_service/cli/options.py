@@ -221,12 +221,12 @@ def with_request_options(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-def open_client(url: str | None, **named: Any) -> Client:
+def open_client(url: str | None) -> Client:
     """A client of the SDK. Raises `InvalidRequest` for what is no address."""
     from cow_service.client import Client  # noqa: PLC0415
 
     try:
-        return Client(url, **named)
+        return Client(url)
     except ValueError as error:
         raise InvalidRequest(f"{error}.") from error
 

@@ -48,6 +48,8 @@ __all__ = ["errors", *_MODULE_OF]  # noqa: PLE0604 # pyright: ignore[reportUnsup
 
 
 def __getattr__(name: str) -> Any:
+    if name == "errors":
+        return import_module("cow_service.client.errors")
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

@@ -28,6 +28,7 @@ from cow_service.mcp.results import output_schema, tool_result
 from cow_service.media.artifacts import media_type_of
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Job
+from cow_service.weights.manifests import TOOL_PROMPTS
 
 TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
 # It only looks; asking again changes nothing, though a model that samples may answer otherwise; images may be fetched,
@@ -63,7 +64,7 @@ def create_server(connect: Connect, lifespan: Lifespan, *, paths: bool, links: b
         "cow",
         title="COW",
         version=__version__,
-        instructions=load_prompt("tools").render(),
+        instructions=load_prompt("server", TOOL_PROMPTS).render(),
         lifespan=lifespan,
         on_list_tools=tools.list,
         on_call_tool=tools.call,
@@ -77,12 +78,12 @@ class _Tools:
     def __init__(self, connect: Connect, *, paths: bool, links: bool) -> None:
         self._connect, self._paths, self._links = connect, paths, links
         image = arguments.HELP_WITH_PATHS if paths else arguments.HELP_WITHOUT_PATHS
-        limits = load_prompt("tool-limits").render()
+        limits = load_prompt("limits", TOOL_PROMPTS).render()
         self._listed = [
             types.Tool(
                 name=name,
                 title=title,
-                description=load_prompt(f"tool-{name}").render(limits=limits),
+                description=load_prompt(name, TOOL_PROMPTS).render(limits=limits),
                 input_schema=arguments.input_schema(name, image),
                 output_schema=output_schema(name),
                 annotations=types.ToolAnnotations(title=title, **HINTS),

@@ -13,7 +13,7 @@ from jinja2 import StrictUndefined, Template
 from jinja2.meta import find_undeclared_variables
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from cow_service.weights.manifests import PROMPTS
+from cow_service.weights.manifests import PROMPTS, Resources
 
 # No autoescape: prompts are plain text for a model, and HTML entities would change the words it reads.
 _ENVIRONMENT = ImmutableSandboxedEnvironment(autoescape=False, undefined=StrictUndefined, trim_blocks=True)
@@ -42,9 +42,9 @@ class Prompt:
 
 
 @cache
-def load_prompt(name: str) -> Prompt:
+def load_prompt(name: str, of: Resources = PROMPTS) -> Prompt:
     """A shipped prompt. Raises `LookupError` where there is none, `ValueError` where its file is not well formed."""
-    return parse_prompt(name, PROMPTS.read(name))
+    return parse_prompt(name, of.read(name))
 
 
 def parse_prompt(name: str, text: str) -> Prompt:

@@ -49,6 +49,7 @@ class Resources:
 
 
 PROMPTS = Resources("prompts", ".md", "prompt")
+TOOL_PROMPTS = Resources("prompts/tools", ".md", "prompt of a tool")
 MANIFESTS = Resources("models", ".yaml", "model manifest")
 FAMILIES = Resources("models/families", ".yaml", "family of MLLMs")
 EXAMPLES = {  # each has one, `image`

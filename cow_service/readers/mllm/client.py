@@ -40,7 +40,7 @@ MAX_SEED = 2**31  # what every provider takes is below
 SYSTEM_PROMPT = "looking"
 
 _PARSER_BUGS = (ArithmeticError, LookupError, TypeError, ValueError, RecursionError)
-_log = logging.getLogger(__name__)
+log = logging.getLogger("cow_service")
 
 T = TypeVar("T")
 
@@ -78,7 +78,7 @@ class _ReplyParser(Generic[T]):
             self.fault = str(error)
             raise ModelRetry(f"That cannot be used: {error}.") from error
         except _PARSER_BUGS as error:  # over something that nobody foresaw; the other votes must not be lost
-            _log.warning("a reply could not be parsed", exc_info=error)
+            log.warning("a reply could not be parsed", exc_info=error)
             self.fault = "it could not be read"
             raise ModelRetry("That cannot be read. Reply with the JSON object alone.") from error
 

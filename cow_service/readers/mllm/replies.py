@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, ClassVar, TypeGuard, TypeVar, cast
 
-from json_repair import repair_json
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
 
 Schema = dict[str, Any]
@@ -216,6 +215,8 @@ def _parsed(text: str) -> Any:
 
 
 def _bracketed(text: str) -> list[Any]:
+    from json_repair import repair_json  # noqa: PLC0415 # of an extra, without which the server starts all the same
+
     values: list[Any] = []
     for span in _spans(text):
         with suppress(ValueError, RecursionError):
