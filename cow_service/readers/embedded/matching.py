@@ -346,6 +346,8 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
             doubtful.add(bbox)
         elif is_odd:
             warnings.append(f"'{phrase.text}' was taken for what is {place}, which does not look like '{head}'.")
+            if scene.side_view is not None and is_other_kind(region, head, is_drawn=True):
+                doubtful.add(bbox)
         elif not is_known(phrase):
             warnings.append(
                 f"'{phrase.text}' was taken for what is {place}: whether '{phrase.head}' is right, the embedded reader "

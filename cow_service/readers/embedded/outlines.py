@@ -82,14 +82,14 @@ def looks_like(region: Region) -> str | None:
     return form if ratio >= _CLEARLY else None
 
 
-def is_other_kind(region: Region, noun: str | None) -> bool:
-    """Whether an outline is that of another kind of thing for certain, as it is not where it is torn or half hidden."""
+def is_other_kind(region: Region, noun: str | None, *, is_drawn: bool = False) -> bool:
+    """Whether an outline is that of another kind for certain: of a known one where it may be torn, and is not drawn."""
     form = form_of(noun)
     if form is None or is_cut(region):
         return False
     measured = _measures(region)
     misfits = {name: _misfit(measured, name) for name in OUTLINES}
-    return misfits[form] >= 2 * CONTRADICTS and min(misfits.values()) < FITS
+    return misfits[form] >= 2 * CONTRADICTS and (is_drawn or min(misfits.values()) < FITS)
 
 
 def fits_better(region: Region, form: str | None, other: str) -> bool:
