@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tempfile
 from pathlib import Path
@@ -33,9 +34,16 @@ class CustomBuildHook(BuildHookInterface[Any]):
 
 
 def write_twins() -> None:
-    """Write both blocking modules beside the async ones."""
+    """Write both blocking modules beside the async ones, where they are not as they should be.
+
+    In one step: another process may import them.
+    """
     for source, twin in TWINS.items():
-        (CLIENT / twin).write_text(twin_of(CLIENT / source))
+        path, text = CLIENT / twin, twin_of(CLIENT / source)
+        if not path.exists() or path.read_text() != text:
+            draft = path.with_suffix(f".{os.getpid()}")
+            draft.write_text(text)
+            draft.replace(path)
 
 
 def twin_of(source: Path) -> str:

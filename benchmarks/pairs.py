@@ -78,6 +78,8 @@ def main() -> None:
         parser.error("name a benchmark behind --, as in: -- latency.py --runs 5")
     checkouts = given.a.resolve(), given.b.resolve()
     for checkout in checkouts:
+        if (checkout / "hatch_build.py").exists():  # makes the modules that an installation makes
+            subprocess.run([sys.executable, "hatch_build.py"], cwd=checkout, check=True)
         measured(checkout, command)
     runs: dict[Path, list[dict[str, float]]] = {checkout: [] for checkout in checkouts}
     for number in range(given.pairs):

@@ -6,7 +6,9 @@ DIR holds one folder per scene with image.jpg, clean.jpg, ids.png and meta.json,
 IoU, direction error (degrees), path error (% of the image's width: mean distance of the true centres, up to the first
 contact, to the computed path), centre error (px: where the mover is found in rendered frames against its trajectory),
 background error (grey levels: the largest difference to the input away from mover, hole and drawing), arrow error (grey
-levels: mean difference to clean.jpg where the arrow stood), and whether the encounters give the true answer.
+levels: mean difference to clean.jpg where the arrow stood), mask IoU of the mover, residue (grey levels: mean
+difference of the background that frames are composed on to the true one, background.jpg where a scene has it, where
+the mover and its shadow were and in a ring around), and whether the encounters give the true answer.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import json
 import statistics
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +30,9 @@ from rich.console import Console
 from rich.table import Table
 
 from cow_service.errors import CowError
+from cow_service.generators.base import GeneratorInput
+from cow_service.generators.cutout import generator as cutout
+from cow_service.generators.cutout.layers import Layers, take_apart
 from cow_service.records import BBox, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
@@ -35,6 +41,7 @@ from cow_service.vision.masks import iou
 from cow_service.vision.scene import Scene
 
 DRAWN = 40  # grey levels between image and clean image where something was drawn
+SHADED = 8  # grey levels between the clean image and the true background where the mover's shadow is
 AWAY = 15  # px around the true mover, its hole and the drawing that may differ
 LOST = 900  # squared grey levels: the best match is no match
 INDICES = (0, 2, 4, 8, 12, 16, 24, 32, 40, 60, 80)
@@ -55,13 +62,42 @@ class Row:
     centre_error: float | None = None
     background_error: float | None = None
     arrow_error: float | None = None
+    mask_iou: float | None = None
+    residue: float | None = None
     encounter: str | None = None
     truth: str | None = None
     agrees: bool | None = None
     seconds: float | None = None
 
 
-def measure(service: Service, folder: Path) -> Row:
+class Composed:
+    """Keeps what the compositor composes its frames of."""
+
+    def __init__(self) -> None:
+        self.last: Layers | None = None
+        cutout.take_apart = self.take_apart
+
+    def take_apart(self, given: GeneratorInput) -> Layers:
+        """As the compositor's own."""
+        self.last = take_apart(given)
+        return self.last
+
+
+def residue(composed: Layers, folder: Path, mover: Mask, others: Mask) -> float | None:
+    """Mean difference (grey levels) to the true background where mover and shadow were, and around; None without one.
+
+    `mover` and `others` [H, W] are true masks; what the other things hide or may have moved to is left out.
+    """
+    if not (folder / "background.jpg").exists() or composed.background.shape[:2] != mover.shape:
+        return None
+    truth, clean = (_pixels((folder / name).read_bytes()).astype(int) for name in ("background.jpg", "clean.jpg"))
+    shadow = np.asarray(np.abs(clean - truth).max(axis=2) > SHADED)
+    ring = np.asarray(cv2.dilate(mover.astype(np.uint8), np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)) > 0)
+    there = (ring | shadow) & ~(others & ~mover)
+    return float(np.abs(composed.background.astype(int) - truth)[there].mean())
+
+
+def measure(service: Service, folder: Path, composed: Composed) -> Row:
     """Runs one scene by image and question alone, as a caller would, and holds the result against the truth."""
     meta = json.loads((folder / "meta.json").read_text())
     image = service.keep_image((folder / "image.jpg").read_bytes())
@@ -70,18 +106,21 @@ def measure(service: Service, folder: Path) -> Row:
         "question": meta["question"],
         "frames": {"indices": INDICES, "max_side": None},
     }
+    composed.last = None
     try:
         simulation = service.simulate(SimulateRequest.model_validate(body))
     except CowError as error:
         return Row(folder.name, meta["task"], error.code, truth=meta["answer"])
-    return _row(service, folder, meta, simulation, "ok")
+    return _row(service, folder, meta, simulation, composed)
 
 
-def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simulation, outcome: str) -> Row:
+def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simulation, composed: Composed) -> Row:
     pixels, clean = (_pixels((folder / name).read_bytes()) for name in ("image.jpg", "clean.jpg"))
     frames = [_pixels(service.artifacts.read(frame.sha256)) for frame in simulation.frames]
     ids = cv2.imread(str(folder / "ids.png"), cv2.IMREAD_UNCHANGED)
     truth = np.asarray(ids == meta["id_of"][meta["object"]])
+    layers = composed.last
+    seen = None if layers is None or layers.moving[0].mask.shape != truth.shape else layers.moving[0].mask
     others = [tuple(boxes[0]) for name, boxes in meta["boxes"].items() if name != meta["object"]]
     centre, background, arrow = _frame_errors(
         simulation, frames, Scene(np.ascontiguousarray(pixels)), clean, truth, others
@@ -97,13 +136,15 @@ def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simul
     return Row(
         scene=folder.name,
         task=meta["task"],
-        outcome=outcome,
+        outcome="ok",
         iou=iou(simulation.grounding.bbox, tuple(meta["bbox"])),
         direction_error=None if direction is None else _angle(direction, meta["direction"]),
         path_error=_path_error(simulation, meta),
         centre_error=centre,
         background_error=background,
         arrow_error=arrow,
+        mask_iou=None if seen is None else float((seen & truth).sum() / (seen | truth).sum()),
+        residue=None if layers is None else residue(layers, folder, truth, np.asarray(ids) > 0),
         encounter=", ".join(kinds) or "-",
         truth=meta["answer"],
         agrees=yes == (meta["answer"] == "A"),
@@ -216,6 +257,8 @@ def show(rows: list[Row]) -> dict[str, Any]:
         "centre px",
         "bg",
         "arrow",
+        "mask",
+        "residue",
         "encounters",
         "truth",
         "s",
@@ -225,6 +268,7 @@ def show(rows: list[Row]) -> dict[str, Any]:
     for row in rows:
         numbers = [_text(v) for v in (row.iou, row.direction_error, row.path_error, row.centre_error)]
         errors = [_text(v, 1) for v in (row.background_error, row.arrow_error)]
+        errors += [_text(row.mask_iou), _text(row.residue, 1)]
         verdict = "" if row.agrees is None else (" ✓" if row.agrees else " ✗")
         table.add_row(
             row.scene,
@@ -259,6 +303,8 @@ def summarise(rows: list[Row]) -> dict[str, Any]:
         "centre error, worst (px)": _worst(rows, "centre_error"),
         "background error, worst (grey levels)": _worst(rows, "background_error"),
         "arrow error, worst (grey levels)": _worst(rows, "arrow_error"),
+        "mover mask IoU, mean and least": _mean_and(rows, "mask_iou", min),
+        "residue, mean and worst (grey levels)": _mean_and(rows, "residue", max),
         "path error, median (% of width)": round(
             statistics.median(r.path_error for r in rows if r.path_error is not None), 2
         ),
@@ -270,6 +316,11 @@ def summarise(rows: list[Row]) -> dict[str, Any]:
 def _worst(rows: list[Row], name: str) -> float | None:
     values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
     return round(max(values), 2) if values else None
+
+
+def _mean_and(rows: list[Row], name: str, worst: Callable[[list[float]], float]) -> list[float] | None:
+    values = [getattr(row, name) for row in rows if getattr(row, name) is not None]
+    return [round(statistics.mean(values), 3), round(worst(values), 3)] if values else None
 
 
 def _text(value: float | None, digits: int = 2) -> str:
@@ -291,7 +342,8 @@ def main() -> int:
         return 2
     with tempfile.TemporaryDirectory() as data:
         service = Service(Settings(data_dir=Path(data)))
-        rows = [measure(service, folder) for folder in folders]
+        composed = Composed()
+        rows = [measure(service, folder, composed) for folder in folders]
     summary = show(rows)
     if arguments.json is not None:
         arguments.json.write_text(

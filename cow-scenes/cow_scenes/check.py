@@ -71,7 +71,7 @@ def check_row(row: dict, folder: Path, report: Report) -> None:
         return
     meta = json.loads(path.read_text())
     found = check_picture(row["image"]["bytes"], meta["image_size"])
-    for name in ("clean.jpg", "ids.png", *(f"future_{n}.jpg" for n in meta["future"])):
+    for name in ("clean.jpg", "background.jpg", "ids.png", *(f"future_{n}.jpg" for n in meta["future"])):
         found = found or check_picture((path.parent / name).read_bytes(), meta["image_size"])
     told = meta["options"][ord(meta["answer"]) - ord("A")]
     tests = {

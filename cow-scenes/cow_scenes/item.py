@@ -45,7 +45,8 @@ def write_item(folder: Path, item: Accepted, settings: Settings, threads: int) -
     clean = studio.render(0)
     trail = studio.render_trail() if item.draft.trail_times else None
     picture, meta = question_picture(item, clean, trail)
-    pictures = {"image": picture, "clean": clean, **{f"future_{n}": studio.render(n) for n in FUTURE}}
+    pictures = {"image": picture, "clean": clean, "background": studio.render_background()}
+    pictures |= {f"future_{n}": studio.render(n) for n in FUTURE}
     for name, drawn in pictures.items():
         drawn.save(folder / f"{name}.jpg", quality=settings.quality, optimize=True)
     ids_of(item).save(folder / "ids.png", optimize=True)

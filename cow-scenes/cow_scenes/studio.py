@@ -177,6 +177,16 @@ class Studio:
             with Image.open(path) as picture:
                 return picture.convert("RGB")
 
+    def render_background(self) -> Image.Image:
+        """The picture at t = 0 without the mover and all that comes of it: its shadow, its light on other things."""
+        parts = self.parts[self.item.draft.world.mover]
+        for part in parts:
+            part.hide_render = True
+        picture = self.render(0)
+        for part in parts:
+            part.hide_render = False
+        return picture
+
     def render_trail(self) -> Image.Image:
         """The picture at t = 0 with the mover at its earlier positions too."""
         draft = self.item.draft

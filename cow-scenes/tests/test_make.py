@@ -61,7 +61,7 @@ def test_truth_folders_are_complete(made):
     folders = list(made.glob("truth/*/*"))
     assert len(folders) == 3
     for folder in folders:
-        names = {"image.jpg", "clean.jpg", "ids.png", "future_12.jpg", "future_36.jpg", "meta.json"}
+        names = {"image.jpg", "clean.jpg", "background.jpg", "ids.png", "future_12.jpg", "future_36.jpg", "meta.json"}
         assert {p.name for p in folder.iterdir()} == names
         assert json.loads((folder / "meta.json").read_text())["id"] == folder.name
         with Image.open(folder / "ids.png") as ids:
