@@ -36,8 +36,6 @@ MAX_VERIFIED = 10_000  # digests that a process remembers to have compared with 
 TEMPORARY_SUFFIX = ".part"
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_FULL = (errno.ENOSPC, errno.EDQUOT)
-_MAX_SHOWN_CHARACTERS = 80
 
 log = logging.getLogger("cow_service")
 
@@ -321,7 +319,7 @@ def disk_errors(sha256: str | None = None) -> Generator[None]:
     except OSError as error:
         if sha256 is not None and isinstance(error, FileNotFoundError):
             raise not_found(sha256) from error
-        if error.errno in _FULL:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise StorageUnavailable("The disk of the data folder is full: free some space and try again.") from error
         reason = os.strerror(error.errno) if error.errno else type(error).__name__
         raise StorageUnavailable(
@@ -360,9 +358,7 @@ def is_digest(name: str) -> bool:
 def check_digest(name: str) -> None:
     """Raises `ArtifactNotFound` for what is no digest: nothing else may become part of a path."""
     if not is_digest(name):
-        raise ArtifactNotFound(
-            f"No artifact is named {name[:_MAX_SHOWN_CHARACTERS]!r}: give its SHA-256, 64 lower-case hex digits."
-        )
+        raise ArtifactNotFound(f"No artifact is named {name[:80]!r}: give its SHA-256, 64 lower-case hex digits.")
 
 
 def not_found(sha256: str) -> ArtifactNotFound:

@@ -80,7 +80,6 @@ _FOREIGN = {  # by what their first bytes match
     rb"(?i:(\xef\xbb\xbf)?\s*(<svg|(<\?xml|<!--|<!doctype svg).*<svg))": "an SVG file",
     rb"(?i:(\xef\xbb\xbf)?\s*(<!doctype html|<html))": "an HTML page",
 }
-_SNIFFED_BYTES = 1024
 
 
 @dataclass(frozen=True)
@@ -226,7 +225,7 @@ def tiled(frames: Sequence[NDArray[np.uint8]], columns: int, gap: int, grey: int
 
 
 def _describe_foreign(data: bytes) -> str:
-    head = data[:_SNIFFED_BYTES]
+    head = data[:1024]
     for pattern, name in _FOREIGN.items():
         if re.match(pattern, head, re.DOTALL):
             return name

@@ -64,14 +64,11 @@ class YuvFrames:
 
 
 _CRF = "18"  # x264's constant rate factor, 0 (lossless) to 51; 18 looks lossless
-_PRESET = "veryfast"
 # x264's AVX-512 code gives the same frames other bytes from run to run, and so another digest.
 _AVX_512 = 13  # OpenCV's number of the feature
 _UP_TO_AVX2 = "asm=MMX2,SSE2Fast,SSSE3,SSE4.2,AVX,FMA3,BMI2,AVX2"
-_THREADS = 2
 _MAX_DENOMINATOR = 1001  # of the frame rate: 30000/1001 is broadcast's 29.97
 _BT709 = 1  # code point of its matrix, primaries and transfer alike (ITU-T H.273)
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def write_mp4(frames: Iterable[Pixels], path: Path, *, fps: float, width: int, height: int) -> int:
@@ -90,7 +87,7 @@ def write_mp4(frames: Iterable[Pixels], path: Path, *, fps: float, width: int, h
         try:
             count = _encode(frames, path, rate, width, height)
         except FFmpegError as error:
-            if error.errno in _FULL:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise StorageUnavailable(
                     "The disk is full, the video could not be written: free some space and try again."
                 ) from error
@@ -103,7 +100,7 @@ def write_mp4(frames: Iterable[Pixels], path: Path, *, fps: float, width: int, h
 
 
 def _encode(frames: Iterable[Pixels], path: Path, rate: Fraction, width: int, height: int) -> int:
-    options = {"crf": _CRF, "preset": _PRESET, "profile": "high"}
+    options = {"crf": _CRF, "preset": "veryfast", "profile": "high"}
     if cv2.checkHardwareSupport(_AVX_512):
         options["x264-params"] = _UP_TO_AVX2
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
@@ -115,7 +112,7 @@ def _encode(frames: Iterable[Pixels], path: Path, rate: Fraction, width: int, he
         # Without these tags players guess the matrix from the height of the video, and colours shift.
         context.colorspace = context.color_primaries = context.color_trc = _BT709
         context.color_range = ColorRange.MPEG
-        context.thread_count = _THREADS
+        context.thread_count = 2
         # Slices, the default, would cost compression.
         context.thread_type = "FRAME"
         planes = YuvFrames(context.height, context.width)
