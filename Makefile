@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# The tests start hundreds of processes; where bytecode is not kept, each would compile its libraries again.
+unexport PYTHONDONTWRITEBYTECODE
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
 
