@@ -94,6 +94,8 @@ def residue(composed: Layers, folder: Path, mover: Mask, others: Mask) -> float 
     shadow = np.asarray(np.abs(clean - truth).max(axis=2) > SHADED)
     ring = np.asarray(cv2.dilate(mover.astype(np.uint8), np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)) > 0)
     there = (ring | shadow) & ~(others & ~mover)
+    for body in composed.moving[1:]:  # what is drawn over the background, too
+        there &= ~body.mask
     return float(np.abs(composed.background.astype(int) - truth)[there].mean())
 
 

@@ -271,6 +271,9 @@ class TestSupports:
     def test_a_ball_on_a_table_stands_on_it(self) -> None:
         assert supports_of([body((300, 180, 340, 220), "sphere"), self.table()]) == [1, None]
 
+    def test_one_before_the_far_corner_of_a_table_stands_on_it(self) -> None:
+        assert supports_of([body((300, 205, 340, 245), "sphere"), self.table()]) == [1, None]
+
     def test_one_behind_a_box_does_not_and_one_before_it_neither(self) -> None:
         assert supports_of([body((300, 150, 340, 200), "sphere"), self.table()]) == [None, None]
         assert supports_of([body((300, 290, 340, 330), "sphere"), self.table()]) == [None, None]

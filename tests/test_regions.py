@@ -111,8 +111,8 @@ def test_a_large_object_does_not_count_as_its_own_surroundings() -> None:
 
 def test_confidence_falls_with_contrast_and_at_the_border() -> None:
     clear, faint, cut = (
-        find_regions(jpeg(ball(floor(), (x, 180), 40, rgb)))[0].confidence
-        for x, rgb in ((300, RGB["red"]), (300, (176, 146, 136)), (12, RGB["red"]))
+        find_regions(jpeg(block(floor(), (x, 140, x + 80, 220), rgb)))[0].confidence
+        for x, rgb in ((260, RGB["red"]), (260, (165, 150, 140)), (0, RGB["red"]))
     )
     assert clear > 0.9
     assert clear > cut

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runs import run_of
 
-from cow_service.errors import CannotReadDirection
+from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
 from cow_service.readers.embedded.reader import EmbeddedReader
@@ -142,6 +142,14 @@ def test_an_end_that_nothing_tells_is_that_nearest_to_what_is_asked_about() -> N
         "4 places one after another" in each and "nearest to the green cube" in each
         for each in run.results["grounding"].warnings
     )
+
+
+def test_an_end_told_by_what_is_as_far_from_both_is_refused() -> None:
+    image = jpeg(trail(block(floor(), (310, 290, 370, 350), GREEN), PLACES, [26.0] * 4, ORANGE, [1.0] * 4), 95)
+    nearest = ", the last of which is the one nearest to the green cube"
+    run = run_of(image, reader=EmbeddedReader, question=QUESTION.format(nearest))
+    with pytest.raises(CannotGround, match="as far from either end"):
+        run.stage("grounding", ground)
 
 
 def test_a_trail_that_is_not_there_is_refused() -> None:

@@ -88,11 +88,6 @@ class SeenBody:
         return widths / widths.max() if self.mask.area else np.ones(1)
 
     @cached_property
-    def fullness(self) -> float:
-        """Volume of the body that its outline would turn to about its axis, of that of the cylinder around it."""
-        return float(np.mean(self.widths**2))
-
-    @cached_property
     def middle(self) -> float:
         """Height of the centre of mass of that body, of its height."""
         volumes = self.widths**2
@@ -121,20 +116,22 @@ class SeenBody:
     def carries(self, other: SeenBody) -> bool:
         """Whether the foot of another one lies on its top, and it is wider and lower than that.
 
-        What stands behind a thing ends at its upper edge; what stands on it has some of its top to either side.
+        What stands behind a thing ends at its upper edge; what stands on it has some of its top to either side, and
+        reaches above it, or has it beneath its foot, too, where what stands before it has floor.
         """
         x, y = other.foot
         (x0, y0, x1, y1), (left, top, right, _) = self.bbox, other.bbox
         if self.shape not in ("box", "cylinder") or x1 - x0 <= WIDER * (right - left):
             return False
-        if not (x0 < x < x1 and y0 < y < y0 + ON_TOP * (y1 - y0) and top < y0):
+        if not (x0 < x < x1 and y0 < y < y0 + ON_TOP * (y1 - y0)):
             return False
-        shown, mask = math.inf, self.mask
+        above, below, mask = math.inf, math.inf, self.mask  # px of it beside the other one, over and under its foot
         for column in (left - BESIDE, right + BESIDE):
             at = int(column) - mask.columns.start
             rows = np.nonzero(mask.patch[:, at])[0] if 0 <= at < mask.patch.shape[1] else np.zeros(0)
-            shown = min(shown, y - (float(rows[0] + mask.rows.start) if len(rows) else math.inf))
-        return shown > SHOWN * (right - left)
+            above = min(above, y - (float(rows[0] + mask.rows.start) if len(rows) else math.inf))
+            below = min(below, (float(rows[-1] + mask.rows.start) if len(rows) else -math.inf) - y)
+        return above > SHOWN * (right - left) and (top < y0 or below > SHOWN * (right - left))
 
     @property
     def is_flying(self) -> bool:

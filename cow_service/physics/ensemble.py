@@ -81,7 +81,7 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     it, the likeliest world of those that agree is shown.
     """
     given, queries = (world,), [query]
-    if world.is_changed:
+    if world.removed or world.placed_before:
         as_it_is = query
         if query is not None and query.asked.form == "changes":  # of the world as it is: what it is that would change
             form = "what-happens" if query.target is None else "whether"

@@ -90,11 +90,6 @@ class WorldInput:
         """Frames of the clip, and of what happens until the horizon."""
         return max(self.num_frames, math.ceil(self.horizon * self.fps) + 1)
 
-    @property
-    def is_changed(self) -> bool:
-        """Whether something is taken away, or put somewhere before anything moves."""
-        return bool(self.removed or self.placed_before)
-
     def as_it_is(self) -> WorldInput:
         """With nothing put elsewhere and nothing taken away: those things are then the last bodies."""
         return replace(self, bodies=(*self.bodies, *self.removed), removed=(), placed_before=())
@@ -198,7 +193,8 @@ class _Draw:
                 half_height=tall,
                 position=(x, y, z),
                 yaw=turn,
-                density=seen.fullness if shape == "cylinder" else 1.0,
+                # What its outline would turn to about its axis, of the volume of the cylinder around it.
+                density=float(np.mean(seen.widths**2)) if shape == "cylinder" else 1.0,
                 friction=friction,
                 restitution=restitution,
                 falls=body.stands,

@@ -294,7 +294,14 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
         return [component]
     distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
     owner = distances.argmin(axis=0)
-    return [component & (owner == i) for i in range(len(seeds))]
+    parts = [component & (owner == i) for i in range(len(seeds))]
+    # A piece that lies apart from the seed it is nearest to, such as half a cap beside a ball, is of what it lies at.
+    for seed, part in zip(seeds, parts, strict=True):
+        for piece in (each for each in _blobs(part, 0) if not (each & seed).any()):
+            near = masks.dilated(piece) & ~part
+            at = max(parts, key=lambda other: np.count_nonzero(near & other))
+            part[piece], at[piece] = False, True
+    return parts
 
 
 def _half_width(mask: Mask) -> float:
@@ -312,14 +319,15 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     """How sure it is that a part is one separable thing with this outline: a product of four shares, each 0..1.
 
     Edges: the share of its outline, image border aside, that lies on edges; a disc was fitted to them. Contrast: its
-    median distance from the surroundings in Lab over `SURE_CONTRAST`. Size: its area over `SURE_AREA` (square roots of
-    both). Border: 1 less half the share of its outline along the image's border, beyond which it may go on.
+    median distance from the surroundings in Lab over `SURE_CONTRAST`, but for a disc: a circle that fits is no chance.
+    Size: its area over `SURE_AREA` (square roots of both). Border: 1 less half the share of its outline along the
+    image's border, beyond which it may go on.
     """
     outline = masks.outline_of(part)
     inner = outline & ~border
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
-    contrast = float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / SURE_CONTRAST
+    contrast = 1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / SURE_CONTRAST
     size = float(np.count_nonzero(part)) / SURE_AREA
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
     edges = max(sharp, 0.9) if is_disc else sharp

@@ -176,13 +176,10 @@ def _fits(image: Image, seen: _Seen, pitches: Iterable[float], turns: Floats) ->
                 # Intersection over union of the outlines, and the weighted agreement of the parts.
                 drawn = model.drawn(seen.corner, seen.scale, seen.labels.shape[:2])
                 whole = float((inside & (drawn > 0)).sum()) / max(1, int((inside | (drawn > 0)).sum()))
-                tyres, glass = (_dice(seen.labels == label, drawn == label, least) for label in (DARK, OTHER))
+                pairs = ((seen.labels == label, drawn == label) for label in (DARK, OTHER))
+                # Sørensen-Dice coefficients, smoothed: 1 where both are empty.
+                tyres, glass = ((2 * (a & b).sum() + least) / (a.sum() + b.sum() + least) for a, b in pairs)
                 yield whole + TYRES * tyres + GLASS * glass, model
-
-
-def _dice(a: Mask, b: Mask, least: float) -> float:
-    """Sørensen-Dice coefficient, smoothed: 1 where both are empty."""
-    return (2 * float((a & b).sum()) + least) / (float(a.sum() + b.sum()) + least)
 
 
 def _seen(image: Image, mask: Mask, bbox: BBox) -> _Seen | None:

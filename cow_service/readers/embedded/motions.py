@@ -1,5 +1,6 @@
 """How a thing moves by the words of a question: its direction in the image, and what they say of speed and distance."""
 
+import math
 from collections.abc import Sequence
 from typing import TypedDict, TypeVar
 
@@ -15,6 +16,8 @@ from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, Until, Vector
 from cow_service.vision.scene import Scene
 from cow_service.vision.trails import trail_of
+
+NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
 
 _T = TypeVar("_T")
 
@@ -118,10 +121,12 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
     if words is not None:
         near = None if words.near is None else match_one(beside, words.near)
-        if words.near is not None and near is None:
+        ends = (trail.positions[0], trail.positions[-1]) if near else ()
+        gaps = sorted(math.dist(end.centre, near.centre) for end in ends if near)
+        if words.near is not None and (not gaps or gaps[0] > NEARER * gaps[1]):
             raise CannotGround(
-                f"The question tells the end of the trail by '{words.near.text}', which was not found, or not for "
-                f"certain. Seen: {describe(scene.regions)}.",
+                f"The question tells the end of the trail by '{words.near.text}', which was not found, not for "
+                f"certain, or about as far from either end. Seen: {describe(scene.regions)}.",
                 remedy=GIVE_PLACE,
             )
         trail = trail.ending(None if near is None else near.bbox, words.side)

@@ -102,9 +102,7 @@ class _Grammar:
         return self.kept[key]
 
 
-@cache
-def _grammar() -> _Grammar:
-    return _Grammar()
+_grammar = cache(_Grammar)
 
 
 def terminals(word: str) -> Set[str]:

@@ -35,9 +35,7 @@ class InterventionWords:
 
 def split_interventions(found: Sequence[Item]) -> tuple[tuple[InterventionWords, ...], list[Item]]:
     """The interventions of a question, and its items without them and without the conditions they leave empty."""
-    changes: list[InterventionWords] = []
-    gone: set[int] = set()
-    tries = 0
+    changes, gone, tries = list[InterventionWords](), set[int](), 0
     for at, item in enumerate(found):
         begins = item.key in _ANYWHERE or (key_at(found, at - 1) in _BEFORE and item.key not in _BEFORE)
         if not begins or at in gone or tries == MAX_TRIES:

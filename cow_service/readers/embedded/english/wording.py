@@ -36,8 +36,6 @@ _MAX_TRIES = 12  # of one question
 _LONGEST_FIRST = sorted(map(re.escape, lex.TABLES["said_as"]), key=len, reverse=True)
 _SAID_AS = re.compile(rf"\b(?:{'|'.join(_LONGEST_FIRST)})\b", re.IGNORECASE)
 _TAG = re.compile(rf",\s*(?:{'|'.join(lex.SETS['tags'])})\s*\?(?=\s+\S)", re.IGNORECASE)  # and something else is asked
-
-
 _CLAIM = re.compile(r"(^|[.!]\s)\s*true or false\s*[:?,]?\s+([^.?!]+)[.?]?\s*$", re.IGNORECASE)  # the last sentence
 
 
