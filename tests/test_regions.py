@@ -119,6 +119,13 @@ def test_confidence_falls_with_contrast_and_at_the_border() -> None:
     assert clear > faint
 
 
+def test_what_stands_on_a_pale_table_lends_it_no_rim() -> None:
+    image = ball(block(floor(), (240, 190, 440, 330), (225, 225, 225)), (340, 180), 40, RGB["purple"])
+    boxes = {region.colour: region.bbox for region in find_regions(jpeg(image, 75))}
+    assert boxes["white"][1] > 180
+    assert boxes["purple"] == pytest.approx((300, 140, 380, 220), abs=2)
+
+
 def test_a_shadow_is_no_object() -> None:
     image = floor().astype(np.float32)
     shade = cv2.GaussianBlur(

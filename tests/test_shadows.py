@@ -149,6 +149,7 @@ THROWS = {
     "green floor": Throw(floor_tint=(0.75, 1.05, 0.8), ball_rgb=(230, 60, 60)),
     "dark floor, bright ball": Throw(grey=90, ball_rgb=(235, 200, 40)),
     "soft and faint": Throw(softness=0.2, shade=0.12),
+    "of a thing high above the floor": Throw(softness=0.45, shade=0.3),
 }
 
 

@@ -28,6 +28,8 @@ MAX_TRIES, MAX_CANDIDATES = 40, 3  # the darkest patches are looked at, and so m
 RIVAL_SHADE = 0.6  # of the darkest patch's shade: another one as dark leaves it open which is the shadow
 EXPLAINED = 0.5  # of what a smooth floor leaves unexplained around the patch, by a soft ellipse in it
 SOFTNESS = (0.02, 0.3)  # of the ellipse: the width of its edge. An object's is sharper, a smear of light wider
+# That of a thing high above the floor is as wide as a smear's; it is far darker than one, and an ellipse all the same.
+MOST_SOFT, DARK, WELL_EXPLAINED = 0.9, 0.15, 0.85
 SAME_HUE = 5.0  # Lab units in the a*b* plane, by which a shade may differ from the floor about it, darkened
 MIN_EVENNESS = 0.35  # of the mean step up to the floor on the four sides: the least of them
 QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)  # radians
@@ -161,9 +163,9 @@ class _Floor:
         fits = (
             LEAST_SHADE < shade < MOST_SHADE
             and explained > EXPLAINED
-            and SOFTNESS[0] < soft < SOFTNESS[1]
+            and SOFTNESS[0] < soft < (MOST_SOFT if shade > DARK and explained > WELL_EXPLAINED else SOFTNESS[1])
             and float(np.hypot(*tint)) < SAME_HUE
-            and 0.7 * width < 2 * wide < 1.6 * width
+            and 0.6 * width < 2 * wide < 1.6 * width
             and 0.15 < high / wide < 0.95
             and float(np.hypot((px - x) / a, (py - y) / b)) < 0.6
             and abs(tilt) < 0.7

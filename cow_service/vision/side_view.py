@@ -119,14 +119,9 @@ def _shapes(labels: NDArray[np.int64], rest: Mask) -> list[Mask]:
         shared = [int(np.count_nonzero(near & body)) for body in bodies]
         if shared and max(shared) > 0:
             bodies[int(np.argmax(shared))] |= line
-    return [
-        masks.without_holes(body) if _has_small_holes(body) else body for body in bodies if body.mean() > LEAST_SHAPE
-    ]
-
-
-def _has_small_holes(body: Mask) -> bool:
-    """Whether the holes of a shape are patterns on it, and nothing has room in them."""
-    return float(np.count_nonzero(body)) > 0.8 * np.count_nonzero(masks.without_holes(body))
+    found = [(body, masks.without_holes(body)) for body in bodies if body.mean() > LEAST_SHAPE]
+    # Small holes are patterns on a shape: nothing has room in them.
+    return [whole if np.count_nonzero(body) > 0.8 * np.count_nonzero(whole) else body for body, whole in found]
 
 
 def pieces_of(shape: CroppedMask) -> list[Floats32]:

@@ -190,7 +190,8 @@ def take_shadows(
                 shadows.append(partial(_cast_shadow, ground, body.path, shade, light))
                 image, _ = _without_shade(image, shade, ~objects)
             continue
-        masks = [other.mask for other in still if other.index == body.support]
+        # Of a table all that nothing else hides: its shaded part may be missing from its mask.
+        masks = [other.mask | (other.outline & ~objects) for other in still if other.index == body.support]
         beside = eroded(masks[0], 2 * RIM + 1) if masks else floor
         shade = None if body.airborne else contact_shade(image, body.mask, bbox_of(body.mask), beside)
         if shade is None:

@@ -424,11 +424,6 @@ class Scale(Reply):
         note = f"{self.reference or 'an object of known size'}: {self.metres:g} m over {span:.0f} px"
         return records.MetresPerPixel(value=self.metres / span, source="reference", note=note)
 
-    @property
-    def way_down(self) -> Vector:
-        """A unit vector in the image."""
-        return DOWN[self.down or "bottom"]
-
 
 def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scale]:
     """The call that asks how large the scene is at the object `name`, and which way is down."""

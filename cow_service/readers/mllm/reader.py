@@ -19,7 +19,7 @@ from cow_service.readers.mllm.coordinates import EncodedImage, covers_image, enc
 from cow_service.readers.mllm.estimates import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import Identified, identify_call
-from cow_service.readers.mllm.locate import Located, Scale, locate_call, scale_call, separate_objects
+from cow_service.readers.mllm.locate import DOWN, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
@@ -220,7 +220,7 @@ class MllmReader:
         if identified is not None:
             hints |= identified.hints
         if isinstance(scaled, Scale):
-            hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": scaled.way_down}
+            hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": DOWN[scaled.down or "bottom"]}
         elif isinstance(scaled, CowError):
             hints["scale_error"] = scaled.code
         return located, MotionHints(**hints)
