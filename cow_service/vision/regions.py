@@ -63,7 +63,7 @@ DARK = 28.0  # lightness below which a part may be the underside of another
 SAME_TOP = 0.6  # of a smaller region, taken up by what stands on another: it is no object of its own
 
 DISC = 0.93  # roundness from which a drawn shape is a disc
-RIM = 11  # px: twice as far around another thing what is as thin as `_DISC` is its rim
+RIM = 11  # px: twice as far around a ball, what is thinner than `_DISC` is no part of another thing
 SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
 SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
 
@@ -160,8 +160,8 @@ def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
     whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
-    taken = np.logical_or.reduce([one.mask for one in whole_ones] or [border])
-    regions = [_without_rim(one, taken).region((height, width)) for one in whole_ones]
+    balls = np.logical_or.reduce([border & False, *(one.mask for one in whole_ones if one.is_disc)])
+    regions = [_without_rim(one, balls).region((height, width)) for one in whole_ones]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -306,10 +306,10 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     return parts
 
 
-def _without_rim(one: _Found, taken: Mask) -> _Found:
-    """Without the rim along another thing, where that one's colour mixes with the floor's; `taken` [H, W]: by all."""
+def _without_rim(one: _Found, balls: Mask) -> _Found:
+    """Without the rim around balls [H, W], where their colour mixes with the floor's: a pale table's is like that."""
     broad = cv2.morphologyEx(one.mask.astype(np.uint8), cv2.MORPH_OPEN, _DISC) > 0
-    return one if one.is_disc else replace(one, mask=one.mask & (broad | ~masks.dilated(taken & ~one.mask, RIM)))
+    return one if one.is_disc else replace(one, mask=one.mask & (broad | ~masks.dilated(balls, RIM)))
 
 
 def _half_width(mask: Mask) -> float:
