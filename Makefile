@@ -65,7 +65,7 @@ bench: $(VENV)/.base ## the figures of the README
 	$(BIN)/python benchmarks/chat.py
 
 clean: ## remove what the other targets made
-	rm -rf $(VENV) $(TOOLS) demo dist build
+	rm -rf $(VENV) $(TOOLS) demo dist build cow_service/client/sync_client.py cow_service/client/sync_results.py
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -56,7 +56,7 @@ RANK = 4  # of the LoRA
 EXAMPLE = ROOT / "examples" / "ball-and-mug"
 QUESTION = json.loads((EXAMPLE / "meta.json").read_text())["question"]
 READY_SECONDS, CLIP_SECONDS = 240.0, 240.0  # limits
-ROOM = 1.5e9  # bytes that are left to a server whose GPU's memory runs out
+ROOM = 1.5e9  # bytes that are left to a server when another process takes the rest of the GPU's memory
 
 Row = dict[str, Any]
 
@@ -142,9 +142,12 @@ def simulate(home: Path, profile: str, num_frames: int) -> Row:
         str(out), "--generator", "ati", "--num-frames", str(num_frames), "--no-video", "--option", "steps=3",
     ]  # fmt: skip
     begun = time.monotonic()
-    done = subprocess.run(
-        command, env=environment(home, profile), capture_output=True, text=True, check=False, timeout=CLIP_SECONDS
-    )
+    try:
+        done = subprocess.run(
+            command, env=environment(home, profile), capture_output=True, text=True, check=False, timeout=CLIP_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return {"name": profile, "exit": None, "said": f"not done after {CLIP_SECONDS} s"}
     row: Row = {"name": profile, "seconds": round(time.monotonic() - begun, 1), "exit": done.returncode}
     if done.returncode:
         return row | {"said": done.stderr[-1500:]}
@@ -193,7 +196,10 @@ def serving(home: Path, profile: str) -> Generator[str]:
         yield address
     finally:
         process.terminate()
-        process.wait(30)
+        try:
+            process.wait(30)
+        except subprocess.TimeoutExpired:
+            process.kill()
 
 
 def over_http(home: Path, profile: str, num_frames: int, device: torch.device, keep: Callable[[Row], None]) -> None:
@@ -289,7 +295,12 @@ def main() -> int:
             over_http(home, profile, given.num_frames, device, keep)
         except (RuntimeError, httpx.HTTPError) as error:
             keep({"name": "serve", "failed": f"{type(error).__name__}: {error}"})
-    return 0
+    return int(
+        any(
+            "failed" in row or row.get("exit", 0) != 0 or row.get("status", 200) not in (200, "canceled")
+            for row in rows
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -134,8 +134,9 @@ def test_what_is_released_on_a_slope_rolls_down_it_and_does_not_fly(service: Ser
     assert trajectory.outcome.facts.startswith("The red ball rolls to the right")
 
 
-def test_a_table_that_is_not_seen_is_not_the_floor(service: Service) -> None:
-    info = service.keep_image(png_bytes(drawing(ball(120, 22, RED, 92), box(420, 120, 90, BLUE))))
+@pytest.mark.parametrize("below", [box(420, 120, 90, BLUE), slope(40, 240, 140, GREEN)], ids=["box", "slope"])
+def test_a_table_that_is_not_seen_is_not_the_floor(service: Service, below: Paint) -> None:
+    info = service.keep_image(png_bytes(drawing(ball(120, 22, RED, 92), below)))
     question = "If the red ball falls, will it land on the table?"
     answer = service.answer(AnswerRequest.model_validate({"image": {"artifact": info.sha256}, "question": question}))
     assert answer.not_sure

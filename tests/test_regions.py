@@ -126,6 +126,12 @@ def test_what_stands_on_a_pale_table_lends_it_no_rim() -> None:
     assert boxes["purple"] == pytest.approx((300, 140, 380, 220), abs=2)
 
 
+def test_a_thin_thing_at_a_ball_is_no_rim_of_nothing() -> None:
+    image = ball(floor(), (250, 200), 63, RGB["yellow"])
+    image[130:134, 242:258] = RGB["red"]
+    assert "yellow" in {region.colour for region in find_regions(jpeg(image, 95))}
+
+
 def test_a_shadow_is_no_object() -> None:
     image = floor().astype(np.float32)
     shade = cv2.GaussianBlur(

@@ -147,7 +147,7 @@ def supports_in_side_view(bodies: Sequence[SeenBody], level: float) -> list[int 
     """As `supports_of`, for shapes of a drawing whose floor is at a height in the image (px); `HANGS` without any."""
     found: list[int | None] = []
     for body in bodies:
-        lower = np.roll(body.mask.full(), TOUCHING, axis=0)
+        lower = np.pad(body.mask.full(), ((TOUCHING, 0), (0, 0)))[:-TOUCHING]
         shared = [0 if other is body else other.mask.shared_with(lower) for other in bodies]
         under = int(np.argmax(shared))
         floor = None if body.bbox[3] > level - TOUCHING else HANGS

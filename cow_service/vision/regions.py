@@ -63,7 +63,7 @@ DARK = 28.0  # lightness below which a part may be the underside of another
 SAME_TOP = 0.6  # of a smaller region, taken up by what stands on another: it is no object of its own
 
 DISC = 0.93  # roundness from which a drawn shape is a disc
-RIM = 11  # px: twice as far around a ball, what is thinner than `_DISC` is no part of another thing
+RIM = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
 SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
 SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
 
@@ -307,9 +307,10 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
 
 
 def _without_rim(one: _Found, balls: Mask) -> _Found:
-    """Without the rim around balls [H, W], where their colour mixes with the floor's: a pale table's is like that."""
+    """Without the rim around balls [h, w], where their colour mixes with the floor's: a pale table's is like that."""
     broad = cv2.morphologyEx(one.mask.astype(np.uint8), cv2.MORPH_OPEN, _DISC) > 0
-    return one if one.is_disc else replace(one, mask=one.mask & (broad | ~masks.dilated(balls, RIM)))
+    kept = one.mask & (broad | ~masks.dilated(balls, RIM))
+    return one if one.is_disc or 2 * kept.sum() < one.mask.sum() else replace(one, mask=kept)
 
 
 def _half_width(mask: Mask) -> float:

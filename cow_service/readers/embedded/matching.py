@@ -261,12 +261,13 @@ def inside_drawn_box(scene: Scene, phrase: ObjectPhrase) -> BBox:
     return max(held, key=lambda region: region.mask.area).bbox if held else scene.boxes[0].bbox
 
 
-TABLE = 0.6  # of its box: a drawn table fills less, with the space between its legs
+TOP, LEGS = 0.05, 0.8  # of its height: a drawn table is as broad as it is at the one, and stands on legs at the other
 
 
 def table_among(regions: Sequence[Region]) -> Region | None:
     """The one region of a drawing seen from the side that has legs; None where none or several have."""
-    found = [each for each in regions if not each.is_disc and each.mask.area < TABLE * each.mask.patch.size]
+    rows = [(each, *(each.mask.patch[int(at * len(each.mask.patch))] for at in (TOP, LEGS))) for each in regions]
+    found = [each for each, top, low in rows if top.mean() > LEGS and np.count_nonzero(np.diff(low, prepend=0) > 0) > 1]
     return found[0] if len(found) == 1 else None
 
 
