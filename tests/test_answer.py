@@ -568,6 +568,24 @@ def test_nothing_is_sure_of_what_looks_like_something_else(service: Service, sce
     assert any(f"looks like a {noun}, not '{other}'" in warning for warning in told.warnings)
 
 
+@pytest.mark.parametrize(
+    ("scene", "noun", "other"),
+    [("falling-ball", "cylinder", "bowl"), ("bottle-passes-cylinder", "cylinder", "gizmo")],
+)
+def test_nothing_is_sure_of_what_is_not_as_it_is_called(service: Service, scene: str, noun: str, other: str) -> None:
+    called = example(scene)
+    assert not answered(service, called.image, called.meta["question"]).not_sure
+    told = answered(service, called.image, called.meta["question"].replace(noun, other))
+    assert told.not_sure
+    assert other in " ".join(told.warnings)
+
+
+@pytest.mark.parametrize("itself", ["the yellow ball", "itself", "the ball"])
+def test_nothing_meets_itself(service: Service, itself: str) -> None:
+    question = f"If the yellow ball moves opposite to the direction of the arrow, will it hit {itself}?"
+    assert answered(service, example("ball-and-mug").image, question).not_sure
+
+
 def test_a_car_whose_way_is_not_known_is_not_guessed_about(service: Service) -> None:
     scene = example("car-forward")
     told = answered(service, scene.image, scene.meta["question"].replace(" forward", ""))

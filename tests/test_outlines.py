@@ -13,6 +13,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import parse_noun_phrase
 from cow_service.readers.embedded.matching import best_matches, match_one
+from cow_service.readers.embedded.outlines import is_unlike
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.regions import Region, find_regions
 
@@ -31,6 +32,18 @@ def turned(image: Image, middle: int, noun: str) -> Image:
     left = [(middle - half, y) for half, y in zip(HALF_WIDTHS[noun], heights, strict=True)]
     cv2.fillPoly(image, [np.array([*right, *left[::-1]]).round().astype(np.int32)], PURPLE, cv2.LINE_AA)
     return image
+
+
+def test_two_that_are_seen_as_one_are_unlike_either() -> None:
+    """One cylinder behind another of its hue, to its left."""
+    image = floor()
+    image[150:240, 280:330], image[200:300, 310:370] = GREEN, GREEN
+    (region,) = find_regions(jpeg(image))
+    assert is_unlike(region, "cylinder")
+    alone = floor()
+    alone[150:240, 280:330] = GREEN
+    (region,) = find_regions(jpeg(alone))
+    assert not is_unlike(region, "cylinder")
 
 
 def matches(regions: tuple[Region, ...], text: str) -> list[int]:

@@ -267,7 +267,8 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
         values = []
     if len(values) != count:
         raise InvalidRequest(
-            f"{option} takes {count} numbers with commas between, such as {','.join(['10'] * count)}; got '{text}'."
+            f"{option} takes {count} numbers with commas between, such as {'10,20,90,140' if count == 4 else '10,20'}; "
+            f"got '{text}'."
         )
     return values
 

@@ -64,7 +64,7 @@ class PlaceRequest(Record):
     @classmethod
     def _has_area(cls, bbox: records.BBox | None) -> records.BBox | None:
         if bbox is not None and (bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2):
-            raise ValueError(f"[x0, y0, x1, y1] must span at least 2 px each way, got {list(bbox)}")
+            raise ValueError(f"[x0, y0, x1, y1] must have x1 and y1 at least 2 px beyond x0 and y0, got {list(bbox)}")
         return bbox
 
 

@@ -13,11 +13,10 @@ from cow_service.readers.embedded.english.lexicon import ObjectPhrase, like_a_co
 from cow_service.readers.embedded.english.noun_phrases import TABLES, Kind, kind_of, may_name, shape_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.outlines import (
-    contradicts,
-    fits_better,
     form_of,
     is_cut,
     is_other_kind,
+    is_unlike,
     log_ratio,
     looks_like,
 )
@@ -125,7 +124,7 @@ Row = list[float]  # the log ratio of each region
 
 def is_known(phrase: ObjectPhrase) -> bool:
     """Whether the noun says something of a shape, or claims nothing."""
-    return phrase.noun is None or form_of(phrase.head) is not None or phrase.head in _SOLID | _ANYTHING
+    return phrase.noun is None or form_of(phrase.head) is not None or phrase.head in _SOLID | _ANYTHING | TABLES
 
 
 def log_ratios(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> Row:
@@ -333,11 +332,9 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
             continue
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
         # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
-        head, looks, is_odd = phrase.head or "", looks_like(region), contradicts(region, phrase.head)
-        is_other, own = shape_of(head) != shape_of(looks or ""), form_of(head)
-        if own is not None:
-            # Its colour speaks for the thing, and a torn outline does not outweigh that; else the likelier kind counts.
-            is_other = is_other_kind(region, head) if phrase.colour else is_odd or fits_better(region, looks, own)
+        head, looks, own = phrase.head or "", looks_like(region), form_of(phrase.head)
+        is_odd = own is not None and is_unlike(region, own)
+        is_other = is_odd if own is not None else shape_of(head) != shape_of(looks or "")
         colour = None if phrase.colour else like_a_colour(phrase.text)
         if colour is not None:
             warnings.append(f"'{phrase.text}' was taken for what is {place}: '{colour}' is no colour that is known.")
@@ -347,11 +344,11 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
             doubtful.add(bbox)
         elif is_odd:
             warnings.append(f"'{phrase.text}' was taken for what is {place}, which does not look like '{head}'.")
-            if scene.side_view is not None and is_other_kind(region, head, is_drawn=True):
-                doubtful.add(bbox)
+            doubtful.add(bbox)
         elif not is_known(phrase):
             warnings.append(
                 f"'{phrase.text}' was taken for what is {place}: whether '{phrase.head}' is right, the embedded reader "
                 "cannot tell."
             )
+            doubtful.add(bbox)
     return warnings, frozenset(doubtful)

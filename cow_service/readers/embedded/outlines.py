@@ -21,6 +21,7 @@ Range = tuple[float, float]
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
 CONTRADICTS = 7.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
+UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
 FITS = 2.0  # misfit below which an outline is well described
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
 CIRCLE = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
@@ -41,7 +42,7 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "mug": ((0.9, 1.5), (0.84, 1.0), (0.6, 1.0), (0.7, 1.0), (0.75, 1.0), (0.7, 1.0), (0.5, 0.92)),
     "bowl": ((0.3, 1.0), (0.93, 1.0), (0.7, 1.0), (0.85, 1.0), (0.75, 1.0), (0.4, 0.85), (0.3, 0.75)),
     "car": ((0.3, 0.9), (0.82, 0.96), (0.2, 0.9), (0.5, 0.97), (0.85, 1.0), (0.75, 1.0), (0.2, 0.97)),
-    "box": ((0.4, 1.6), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
+    "box": ((0.15, 6.0), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
 }
 # Share of things of which something reaches out on one side between their ends, or has a hole; of others `NO_HANDLE`.
 HANDLES = {"mug": 0.52, "cone": 0.45, "car": 0.3, "candle": 0.15}
@@ -68,10 +69,11 @@ def form_of(noun: str | None) -> str | None:
     return _FORMS.get(noun or "")
 
 
-def contradicts(region: Region, noun: str | None) -> bool:
-    """Whether an outline is clearly not that of a noun."""
-    form = form_of(noun)
-    return form is not None and not is_cut(region) and _misfit(_measures(region), form) >= CONTRADICTS
+def is_unlike(region: Region, form: str) -> bool:
+    """Whether an outline is not that of a row of `OUTLINES`: another one's, or that of a torn or half hidden thing."""
+    if is_cut(region):
+        return False
+    return _misfit(_measures(region), form) >= CONTRADICTS or log_ratio(region, form) < UNLIKE
 
 
 def looks_like(region: Region) -> str | None:
@@ -82,20 +84,14 @@ def looks_like(region: Region) -> str | None:
     return form if ratio >= _CLEARLY else None
 
 
-def is_other_kind(region: Region, noun: str | None, *, is_drawn: bool = False) -> bool:
-    """Whether an outline is that of another kind for certain: of a known one where it may be torn, and is not drawn."""
+def is_other_kind(region: Region, noun: str | None) -> bool:
+    """Whether an outline is that of another kind of thing for certain, as it is not where it is torn or half hidden."""
     form = form_of(noun)
     if form is None or is_cut(region):
         return False
     measured = _measures(region)
     misfits = {name: _misfit(measured, name) for name in OUTLINES}
-    return misfits[form] >= 2 * CONTRADICTS and (is_drawn or min(misfits.values()) < FITS)
-
-
-def fits_better(region: Region, form: str | None, other: str) -> bool:
-    """Whether an outline lies nearer to the ranges of one row of `OUTLINES` than to those of another."""
-    measured = _measures(region)
-    return form is not None and _misfit(measured, form) < _misfit(measured, other)
+    return misfits[form] >= 2 * CONTRADICTS and min(misfits.values()) < FITS
 
 
 def log_ratio(region: Region, form: str) -> float:

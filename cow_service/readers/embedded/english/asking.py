@@ -70,7 +70,11 @@ class Clause:
         things = [] if form == "where" else self.things  # "what does it land on, the floor or the mug?"
         negations = sum(name in _NEGATIONS for name in names)
         which_of_them = any(word.text == "them" for word in self.pronouns)
-        if which_of_them or negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
+        kinds = {word.kind for word in self.subject}
+        of_it = any(word.text == "it" for word in self.objects)
+        by_mover = self.mover_acted and not self.done_to and not kinds.isdisjoint({"M", "PRONOUN"})
+        too_much = negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"})
+        if too_much or which_of_them or (by_mover and not of_it and not things):  # "does the ball hit the ball?"
             return None
         if form == "which-first" and not things and not self.listed and "lands_on" in nodes:
             form = "where"  # "what does it land on?": on the floor, too
@@ -81,8 +85,7 @@ class Clause:
         if self.several and not of_another:
             return self._of_several(asking)
         # "Does the ball hit it?": not the ball itself, but the one other thing.
-        mover_asked = any(word.kind == "M" for word in self.subject)
-        of_it = mover_asked and any(word.text == "it" for word in self.objects)
+        of_it = of_it and "M" in kinds
         pronoun = next((word.text for word in self.subject if word.kind == "PRONOUN"), None)
         beside = [each.object for each in self.question.motion.others]
         if pronoun == "they" and target is None and not of_it:
