@@ -42,7 +42,7 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "mug": ((0.9, 1.5), (0.84, 1.0), (0.6, 1.0), (0.7, 1.0), (0.75, 1.0), (0.7, 1.0), (0.5, 0.92)),
     "bowl": ((0.3, 1.0), (0.93, 1.0), (0.7, 1.0), (0.85, 1.0), (0.75, 1.0), (0.4, 0.85), (0.3, 0.75)),
     "car": ((0.3, 0.9), (0.82, 0.96), (0.2, 0.9), (0.5, 0.97), (0.85, 1.0), (0.75, 1.0), (0.2, 0.97)),
-    "box": ((0.15, 6.0), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
+    "box": ((0.4, 1.6), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
 }
 # Share of things of which something reaches out on one side between their ends, or has a hole; of others `NO_HANDLE`.
 HANDLES = {"mug": 0.52, "cone": 0.45, "car": 0.3, "candle": 0.15}
@@ -73,7 +73,9 @@ def is_unlike(region: Region, form: str) -> bool:
     """Whether an outline is not that of a row of `OUTLINES`: another one's, or that of a torn or half hidden thing."""
     if is_cut(region):
         return False
-    return _misfit(_measures(region), form) >= CONTRADICTS or log_ratio(region, form) < UNLIKE
+    is_box = form == "box"  # which may be flat, or as high as a tower
+    measured = [0.0, *_measures(region)[1:]] if is_box else _measures(region)
+    return _misfit(measured, form) >= CONTRADICTS or (not is_box and log_ratio(region, form) < UNLIKE)
 
 
 def looks_like(region: Region) -> str | None:
