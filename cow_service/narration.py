@@ -226,6 +226,18 @@ DOUBTS: dict[records.Doubt, str] = {  # what an outcome depends on
 }
 
 
+def with_facts(
+    mover: str, changes: Sequence[Intervention], trajectories: Sequence[Trajectory]
+) -> tuple[Trajectory, ...]:
+    """The trajectories with their outcomes in words; of two, the first one's words compare both."""
+    facts = [facts_of(mover, each) for each in trajectories]
+    if len(trajectories) > 1:
+        facts[0] = facts_of_both(changes, mover, *trajectories)
+    pairs = zip(trajectories, facts, strict=True)
+    outcomes = [(each, each.outcome and each.outcome.model_copy(update={"facts": said})) for each, said in pairs]
+    return tuple(each.model_copy(update={"outcome": outcome}) for each, outcome in outcomes)
+
+
 def facts_of(mover: str, trajectory: Trajectory) -> str:
     """One sentence: how the mover goes, what it meets, how it ends, what it sets in motion, and how many worlds agree.
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from cow_service.physics.ballistic import GRAVITY, Camera, FreePath, ballistic_path, given_path, has_passed, roll_out
 from cow_service.physics.camera import depth_motion
+from cow_service.physics.recording import points_inside, spread_anchors, swept
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Path
 from cow_service.requests import TrajectoryRequest
-from cow_service.stages.paths import points_inside, spread_anchors, swept
 from cow_service.vision.masks import CroppedMask
 
 number = st.floats(-50, 50)

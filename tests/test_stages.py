@@ -245,7 +245,7 @@ def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, eve
         ({"interventions": [{"kind": "place", "object": "a", "relation": "into", "targets": ["A"]}]}, "different"),
         ({"interventions": [{"kind": "place", "object": "a", "relation": "between", "targets": ["b"]}]}, "2 of"),
         ({"motion": {"kind": "fall", "depth_deviation": 9}}, "takes no `direction`"),
-        ({"grounding": {"bbox": [10, 10, 10, 90]}}, "span at least 2 px"),
+        ({"grounding": {"bbox": [10, 10, 10, 90]}}, "x1 and y1 at least 2 px beyond"),
         ({"motion": {"direction": [0, 0]}}, "must have a length"),
         ({"motion": {"kind": "projectile"}}, "needs a `direction`"),
         ({"trajectory": {"points": [[1, 1]]}}, "at least 2"),

@@ -10,7 +10,8 @@ from floors import TrueCamera, known, outline
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.events import Events, encounters, find_world_events, rotation, seen_paths, states
+from cow_service.physics.events import Events, encounters, find_world_events, seen_paths
+from cow_service.physics.recording import rotation, states
 from cow_service.physics.world import WorldInput, Worlds, run_world
 from cow_service.records import MetresPerPixel, Motion
 from cow_service.vision.masks import CroppedMask

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cow_service.records import BBox, ObjectPrior, Shape, Source
+from cow_service.records import FALLING_KINDS, BBox, Motion, ObjectPrior, Point, Shape, Source
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats
 
@@ -40,6 +40,17 @@ class SeenBody:
     equal_sided: bool = False  # a cube: as wide as high
     is_form_known: bool = True  # its shape was seen or said; else how deep it is, is not known
     taper: float = 1.0  # its width at its lower end, of that at its upper end
+    point: Point | None = None  # px: of the mover, the one it was grounded at
+
+    @property
+    def start(self) -> Point:
+        """Where its path begins, px: the point it was grounded at, else the middle of its box."""
+        return self.point or ((self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2)
+
+    @property
+    def radius(self) -> float:
+        """A quarter of its box's width and height together, px."""
+        return (self.bbox[2] - self.bbox[0] + self.bbox[3] - self.bbox[1]) / 4
 
     @property
     def foot(self) -> tuple[float, float]:
@@ -138,13 +149,19 @@ class SeenBody:
         """Said to be in the air."""
         return self.prior is not None and self.prior.stands_on == "air"
 
+    def flies(self, motion: Motion) -> bool:
+        """Whether it is in the air at the first frame, as far as is said, if it is what moves."""
+        if self.prior is not None and self.prior.stands_on is not None:
+            return self.is_flying
+        return motion.kind in FALLING_KINDS
+
 
 TOUCHING = 6  # px: so far apart are shapes of a drawing that touch
 HANGS = -1  # in the place of a support: it is drawn above nothing
 
 
-def supports_in_side_view(bodies: Sequence[SeenBody], level: float) -> list[int | None]:
-    """As `supports_of`, for shapes of a drawing whose floor is at a height in the image (px); `HANGS` without any."""
+def _drawn_supports(bodies: Sequence[SeenBody], level: float) -> list[int | None]:
+    """Of shapes of a drawing; `HANGS` for what is drawn above nothing."""
     found: list[int | None] = []
     for body in bodies:
         lower = np.pad(body.mask.full(), ((TOUCHING, 0), (0, 0)))[:-TOUCHING]
@@ -155,8 +172,13 @@ def supports_in_side_view(bodies: Sequence[SeenBody], level: float) -> list[int 
     return found
 
 
-def supports_of(bodies: Sequence[SeenBody]) -> list[int | None]:
-    """For each body the one that it stands on, by what is said of it or by where its foot is; None: the floor."""
+def supports_of(bodies: Sequence[SeenBody], level: float | None = None) -> list[int | None]:
+    """For each body the one that it stands on, by what is said of it or by where its foot is; None: the floor.
+
+    `level` is the height in the image (px) of the floor of a drawing that is seen from the side.
+    """
+    if level is not None:
+        return _drawn_supports(bodies, level)
     found: list[int | None] = []
     for body in bodies:
         said = None if body.prior is None else body.prior.stands_on

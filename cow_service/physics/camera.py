@@ -9,7 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from cow_service.records import BBox, CameraEstimate, CameraSource
+from cow_service.physics.bodies import SeenBody
+from cow_service.records import BBox, CameraEstimate, CameraSource, Vector
+from cow_service.requests import CameraRequest
 from cow_service.vision.shadows import Shadow
 from cow_service.vision.types import Floats
 
@@ -156,6 +158,62 @@ class Standing:
     bbox: BBox
     rim: tuple[float, float] | None = None  # of a round top: minor to major axis as seen, and its deviation
     is_cube: bool = False
+
+    @staticmethod
+    def of(body: SeenBody) -> Standing:
+        """What a body shows."""
+        rim = body.rim if body.shape == "cylinder" and body.is_form_known else None
+        return Standing(body.bbox, rim, is_cube=body.prior is not None and body.prior.equal_sided)
+
+
+GIVEN_PITCH_SIGMA, GIVEN_ROLL_SIGMA = math.radians(1.0), math.radians(0.5)
+GIVEN_FOCAL_SIGMA = 0.02  # of the logarithm
+LEAST_HEIGHT_SIGMA = 0.05  # of the logarithm of a height that is said
+FIXED = 1e-6  # deviation of a focal length that must not vary
+
+
+def given_camera(
+    size: tuple[int, int], down: Vector, given: CameraRequest | None, fixed_focal: bool = False
+) -> CameraFit:
+    """The camera of an image of a size (width, height; px) as far as a request gives it; the rest is a guess.
+
+    `down` is where the vertical leads in the image; `fixed_focal` holds the focal length where it is.
+    """
+    fit, given = prior(math.atan2(*down)), given or CameraRequest.model_construct()
+    mean, sigma = fit.mean.copy(), np.sqrt(np.diag(fit.covariance))
+    if given.pitch is not None:
+        mean[0], sigma[0] = math.radians(given.pitch), GIVEN_PITCH_SIGMA
+    if given.focal is not None:
+        mean[1], sigma[1] = math.log(given.focal / size[0]), GIVEN_FOCAL_SIGMA
+    if fixed_focal:
+        mean[1], sigma[1] = math.log(FOCAL_WIDTHS), FIXED
+    if given.roll is not None:
+        fit = replace(fit, roll=math.radians(given.roll), roll_sigma=GIVEN_ROLL_SIGMA)
+    source = "request" if given.model_fields_set else fit.source
+    return replace(fit, mean=mean, covariance=np.diag(sigma**2), source=source)
+
+
+def camera_of(
+    fit: CameraFit,
+    size: tuple[int, int],
+    standing: Sequence[SeenBody],
+    flying: SeenBody | None,
+    metres_per_pixel: float,
+    shadow: Shadow | None,
+) -> CameraFit:
+    """The camera by what stands on the floor and, of a mover that is in the air, by its height as said and its shadow.
+
+    `metres_per_pixel` holds at the mover.
+    """
+    said = None if flying is None or flying.prior is None else flying.prior.height
+    if flying is not None and said is not None:
+        radius = flying.radius * metres_per_pixel
+        height = 1 + said.value / radius  # of its middle, in its radii
+        mean, covariance = fit.mean.copy(), fit.covariance.copy()
+        mean[2], covariance[2, 2] = math.log(height), max(said.deviation / radius / height, LEAST_HEIGHT_SIGMA) ** 2
+        fit = replace(fit, mean=mean, covariance=covariance)
+    fit = narrowed(fit, [Standing.of(body) for body in standing], size)
+    return fit if shadow is None or flying is None else fit_shadow(fit, flying.bbox, shadow, size) or fit
 
 
 def narrowed(fit: CameraFit, things: Sequence[Standing], size: tuple[int, int]) -> CameraFit:

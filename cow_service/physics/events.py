@@ -24,8 +24,6 @@ ANY_PART = 0.06  # share from which a part of it is covered: less is an inexact 
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 PerKind = dict[EncounterKind, Floats]  # [K, B] each
-UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x, y, z, w
-MOST_LEAN = np.radians(25)
 PASSED = 0.08  # of its first depth: closer than this, a body has passed the camera
 SAMPLES = 96  # points of a silhouette that are looked up in the other
 CHUNK = 2048  # draws and frames at a time, to bound the memory
@@ -58,63 +56,6 @@ def seen_paths(worlds: Worlds, body: int) -> SeenPaths:
         before = before[:, 0]
     first = np.maximum(first, 1e-9)
     return SeenPaths(points, depth, first / np.maximum(depth, PASSED * first), depth <= PASSED * first, before)
-
-
-def states(worlds: Worlds, body: int) -> Floats:
-    """[F, 6] metres and m/s in the frame of the camera, of the first draw."""
-    cameras, run = worlds.layout.cameras, worlds.runs[0]
-    position = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
-    return np.hstack([position @ cameras.axes[0], run.velocities[body] @ cameras.axes[0]])
-
-
-def rotation(worlds: Worlds, body: int) -> Floats:
-    """Degrees [F] that a body of the first draw has turned in the image, clockwise, since the first frame.
-
-    A sphere turns by its spin about the line of sight. Of anything else the upright axis is followed: what turns about
-    it looks the same.
-    """
-    run, cameras = worlds.runs[0], worlds.layout.cameras
-    turns = run.turns[body]
-    if worlds.shapes[0][body].shape == "sphere":
-        sight = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
-        sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
-        # Right, up and ahead are a left-handed frame: there a positive turn about the line of sight is anticlockwise.
-        before, after = turns[:-1], turns[1:]
-        axis = before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] + np.cross(before[:, :3], after[:, :3])
-        half = np.einsum("fi,fi->f", before, after)
-        axis = axis * np.where(half < 0, -1.0, 1.0)[:, None]
-        length = np.linalg.norm(axis, axis=1)
-        steps = axis * (2 * np.arctan2(length, np.abs(half)) / np.maximum(length, 1e-12))[:, None]  # rotation vectors
-        about = -np.einsum("fi,fi->f", steps, sight[1:])
-        return np.concatenate([[0.0], np.degrees(np.cumsum(about))])
-    return _leaned(worlds, run.positions[body], turns)
-
-
-def rotation_where_put(worlds: Worlds, body: int) -> float:
-    """Degrees, clockwise, that a body of the first draw is turned at its first frame against how the image shows it.
-
-    A sphere looks the same wherever it is put.
-    """
-    if worlds.seen is None or worlds.shapes[0][body].shape == "sphere":
-        return 0.0
-    positions = np.array([worlds.seen[0][body].position, worlds.shapes[0][body].position])
-    turn = worlds.shapes[0][body].turn
-    return float(_leaned(worlds, positions, np.array([UPRIGHT, UPRIGHT if turn is None else turn]))[1])
-
-
-def _leaned(worlds: Worlds, positions: Floats, turns: Floats) -> Floats:
-    """Degrees [F], clockwise, that an upright axis has leaned since the first of positions [F, 3] and turns [F, 4]."""
-    upright = np.tile(np.array([0.0, 1.0, 0.0]), (len(turns), 1))
-    cameras, leans = worlds.layout.cameras, list[Floats]()
-    step = 1e-3 * float(cameras.height[0])
-    for axis in (turned(turns, upright[0]), upright):
-        points, _ = cameras.repeated(1).project((positions + np.stack([axis, -axis]) * step)[None])
-        way = points[0, 0] - points[0, 1]
-        leans.append(np.unwrap(np.arctan2(way[:, 0], -way[:, 1])))
-    leaning, plumb = leans
-    angle = np.unwrap(leaning - plumb)
-    # Verticals lean in the image as they come to its side; close to the camera they lean without bounds.
-    return np.degrees(angle - angle[0] + np.clip(plumb - plumb[0], -MOST_LEAN, MOST_LEAN))
 
 
 def turned(turns: Floats, vector: Floats) -> Floats:

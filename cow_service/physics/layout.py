@@ -12,10 +12,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cow_service.physics.bodies import HANGS, SeenBody, supports_in_side_view, supports_of
+from cow_service.physics.bodies import HANGS, SeenBody, supports_of
 from cow_service.physics.camera import FLAT, HORIZON, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN, quantiles
-from cow_service.records import FALLING_KINDS, BBox, Cue, Motion, Shape
+from cow_service.records import BBox, Cue, Motion, Shape
 from cow_service.vision.types import Floats
 
 SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
@@ -232,16 +232,14 @@ def lay_out(
     the floor of a drawing that is seen from the side.
     """
     cameras, parameters = Cameras.drawn(fit, size, draws)
+    supports = supports_of(bodies, level)
     if level is None:
-        picture = _Picture(bodies, supports_of(bodies), motion, draws)
-        cameras, placed = picture.placed(cameras, parameters, fit)
-        supports = picture.supports
+        cameras, placed = _Picture(bodies, supports, motion, draws).placed(cameras, parameters, fit)
     else:
         depth = cameras.focal * motion.metres_per_pixel.value
         cameras = cameras.at_height((level - size[1] / 2) * depth / cameras.focal)
-        supports = supports_in_side_view(bodies, level)
         stands = [on != HANGS for on in supports]  # what is released may lie on a slope
-        stands[0] = stands[0] if motion.kind == "fall" else not flies(bodies[0], motion)
+        stands[0] = stands[0] if motion.kind == "fall" else not bodies[0].flies(motion)
         placed = [in_the_air(cameras, body.bbox, body.shape, depth) for body in bodies]
         placed = [replace(body, stands=each) for body, each in zip(placed, stands, strict=True)]
     if motion.rises:
@@ -265,13 +263,6 @@ def lay_out(
     return Layout(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
 
 
-def flies(mover: SeenBody, motion: Motion) -> bool:
-    """Whether the mover is in the air at the first frame, as far as is said."""
-    if mover.prior is not None and mover.prior.stands_on is not None:
-        return mover.prior.stands_on == "air"
-    return motion.kind in FALLING_KINDS
-
-
 @dataclass(frozen=True)
 class _Picture:
     """What the picture shows, as draws [K, P] have it."""
@@ -285,7 +276,7 @@ class _Picture:
         """The cameras at the heights that the mover tells, and the bodies."""
         bodies, motion, draws = self.bodies, self.motion, self.draws
         mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
-        if not flies(mover, motion):
+        if not mover.flies(motion):
             share = self.depth_share(cameras)
             unit = self.standing(0, cameras, draws, share)
             if unit is not None:

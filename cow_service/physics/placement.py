@@ -53,6 +53,7 @@ class PlacementGoal:
     side: int = 1  # of `next-to`: 1 to the right as the camera sees it, -1 to the left
     body: int = 0  # which of the bodies is put there
     by_heading: bool = False  # the target sets out: in front of it is where it goes
+    place: str = ""  # in words, such as "between the bowl and the cone"
 
     @property
     def meant(self) -> PlacementResult:

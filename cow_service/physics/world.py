@@ -14,7 +14,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
-from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, flies, lay_out, speed_factors
+from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out, speed_factors
 from cow_service.physics.placement import (
     CARRIED,
     MOST_CARRIED,
@@ -25,7 +25,7 @@ from cow_service.physics.placement import (
     new_supports,
     settle,
 )
-from cow_service.records import FALLING_KINDS, Motion, Shape
+from cow_service.records import FALLING_KINDS, BBox, Motion, Shape
 from cow_service.vision.side_view import pieces_of
 from cow_service.vision.types import Floats, Mask
 
@@ -73,6 +73,7 @@ class WorldInput:
     placement: PlacementGoal | None = None  # the mover is carried somewhere and released
     placed_before: tuple[PlacementGoal, ...] = ()  # what is put somewhere before anything moves, in this order
     level: float | None = None  # px: height in the image of the floor of a drawing that is seen from the side
+    faint: tuple[BBox, ...] = ()  # px: where the image may show things, too faint to tell
 
     @property
     def horizon(self) -> float:
@@ -253,7 +254,7 @@ class _Draw:
         if index == 0 and given.prescribed is not None:
             changes |= {"follows": self.along_path(given.prescribed), "falls": False}
         else:
-            changes["falls"] = motion.kind in FALLING_KINDS or not (motion.rises or flies(seen, motion))
+            changes["falls"] = motion.kind in FALLING_KINDS or not (motion.rises or seen.flies(motion))
             changes["glides"] = motion.kind == "linear"
             if motion.kind == "linear":
                 factor = float(speed_factors(motion, self.draws[self.k : self.k + 1], speed)[0])

@@ -109,10 +109,10 @@ def generate(
 
     Raises `InvalidRequest`, `GeneratorOutOfMemory`, `Canceled`.
     """
+    with run.cpu():
+        given, as_it_is = _inputs(run, grounding, motion, trajectory)
+    made_by = run.generator.describe(given)
     with run.backends.artifacts.batch(run.retry_policy) as put, ThreadPoolExecutor(1) as encoder:
-        with run.cpu():
-            given, as_it_is = _inputs(run, grounding, motion, trajectory)
-        made_by = run.generator.describe(given)
         with run.device():
             frames, video = _render(run, given, made_by, put, encoder)
             factual: list[EncodedFrame] = []
@@ -125,15 +125,10 @@ def generate(
                     EncodedFrame.of(_marked(pixels, made_by), index, trajectory.fps, wanted.max_side, encoder)
                     for index, pixels in zip(indices, pictures, strict=True)
                 ]
+        kept, kept_factual = stored(frames, put), stored(factual, put)
         with run.cpu():
-            overlay = _draw_overlay(run.image.pixels, given, as_it_is or given)
-        clip = Clip(
-            frames=stored(frames, put),
-            factual_frames=stored(factual, put),
-            video=video,
-            overlay=put(overlay, "image/jpeg"),
-            generator=made_by,
-        )
+            overlay = put(_draw_overlay(run.image.pixels, given, as_it_is or given), "image/jpeg")
+    clip = Clip(frames=kept, factual_frames=kept_factual, video=video, overlay=overlay, generator=made_by)
     named = (*clip.frames, *clip.factual_frames, *([] if video is None else [video]), clip.overlay)
     warnings = (TOY.format(name=made_by.name),) if made_by.is_toy else ()
     return StageResult(value=clip, warnings=warnings, artifacts=tuple(each.sha256 for each in named))

@@ -38,8 +38,9 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         given, reading, warnings = _read_places(run)
     source = "request" if reading is not None else run.reader.source
     if reading is None:
-        names = (name for name in request.changed_names if not any(same_name(name, each.object) for each in given))
-        reading = run.reader.ground(replace(run.reader_input("grounding"), known=given, sought=tuple(names)))
+        empty, changed = run.reader_input("grounding"), request.changed_names
+        sought = tuple(name for name in changed if not any(same_name(name, each.object) for each in given))
+        reading = run.reader.ground(replace(empty, known=given, sought=sought))
     # What the image shows, now that it is known what moves.
     shows_trail = question.trail_named or (reading.hints is not None and reading.hints.cue == "trail")
     with run.cpu():

@@ -12,7 +12,7 @@ from cow_service import records
 from cow_service.errors import FieldError, InvalidRequest, field_of
 from cow_service.narration import bare_name, direction_words, place_words, same_name
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
-from cow_service.physics.camera import FloorCamera, depth_motion
+from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera
 from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.prompts import load_prompt
@@ -20,7 +20,6 @@ from cow_service.records import BBox, Grounding, Law, LocatedObject, Motion, Mot
 from cow_service.requests import CameraRequest, MotionRequest, SimulateRequest
 from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
-from cow_service.stages.reconstruction import camera_of
 from cow_service.stages.run import Run
 from cow_service.vision.scene import Scene
 from cow_service.vision.shadows import find_shadow
@@ -173,7 +172,7 @@ def scale_of(
     told = {} if given is None else {"metres_per_pixel": given.value}
     things = [LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior), *grounding.others]
     width, height = run.image.info.width, run.image.info.height
-    fit = camera_of((width, height), reading.down, run.request.camera)
+    fit = given_camera((width, height), reading.down, run.request.camera)
     camera = FloorCamera(width, height, math.exp(fit.mean[1]) * width, float(fit.mean[0]), fit.roll, 1.0)
     depths = camera.floor_points(np.array([((x0 + x1) / 2, y1) for x0, _, x1, y1 in (each.bbox for each in things)]))
     sizes: list[tuple[float, float, bool]] = []  # log of the metres per pixel at the mover, deviation, taken as exact
@@ -350,9 +349,10 @@ def along_trail(
         measured["direction"] = straight_direction(trail.positions)
     throw = None
     if motion.kind == "projectile":
-        shadow = find_shadow(scene, grounding.bbox)
-        fit = camera_of((scene.width, scene.height), motion.down, camera, shadow, grounding.bbox)
-        throw = fit_throw(trail.positions, fit, (scene.width, scene.height))
+        shadow, size = find_shadow(scene, grounding.bbox), (scene.width, scene.height)
+        fit = given_camera(size, motion.down, camera)
+        fit = fit if shadow is None else fit_shadow(fit, grounding.bbox, shadow, size) or fit
+        throw = fit_throw(trail.positions, fit, size)
     if throw is not None:
         measured["direction"] = throw.direction
         measured["depth"] = math.sin(math.radians(throw.turn))

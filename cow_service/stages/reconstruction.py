@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,28 +11,23 @@ import numpy as np
 from cow_service.errors import CannotGround
 from cow_service.narration import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
-from cow_service.physics.bodies import SeenBody, supports_in_side_view, supports_of
-from cow_service.physics.camera import FOCAL_WIDTHS, SIDE_VIEW, CameraFit, Standing, fit_shadow, narrowed, prior
+from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.camera import SIDE_VIEW, camera_of, given_camera
 from cow_service.physics.ensemble import BY_EVENTS, Query
-from cow_service.physics.layout import flies
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
-from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion, Vector
-from cow_service.requests import CameraRequest, SimulateRequest
+from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, Motion
+from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Obstacle, Scene
-from cow_service.vision.shadows import Shadow, find_shadow
+from cow_service.vision.shadows import find_shadow
 from cow_service.vision.side_view import SideView
 
 PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
 HIDDEN = 0.25  # of the columns of a body: with so many ending at another one, its foot is hidden
-GIVEN_PITCH_SIGMA, GIVEN_ROLL_SIGMA = math.radians(1.0), math.radians(0.5)
-GIVEN_FOCAL_SIGMA = 0.02  # of the logarithm
-LEAST_HEIGHT_SIGMA = 0.05  # of the logarithm of a height that is said
-FIXED = 1e-6  # deviation of a focal length that must not vary
 
 
 @dataclass(frozen=True)
@@ -109,22 +103,20 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     motion, request = situation.motion, situation.request
     bodies = seen_bodies(situation)
     present = bodies[: 1 + len(situation.obstacles)]
-    carried, before = placement_goals(situation, present)
-    query = query_of(situation, bodies, carried)
-    is_ball_in_air = bodies[0].shape == "sphere" and flies(bodies[0], motion)
-    fit = camera_of(
-        situation.size,
-        motion.down,
-        request.camera,
-        find_shadow(situation.scene, bodies[0].bbox) if is_ball_in_air else None,
-        bodies[0].bbox,
-        fixed_focal=situation.follows_path,
-        standing=standing_things(bodies, motion),
-        radii=_height_in_radii(bodies[0], motion),
-    )
     level = None if situation.side_view is None else situation.side_view.level
-    if level is not None:
-        fit = SIDE_VIEW
+    in_air = [body.is_flying if index else body.flies(motion) for index, body in enumerate(bodies)]
+    on_floor = [on is None and not flies for on, flies in zip(supports_of(bodies, level), in_air, strict=True)]
+    query = query_of(situation, bodies, on_floor)
+    carried, before = placement_goals(situation, present)
+    if query is None and situation.grounding.asked is None and carried is not None:
+        # Nothing is asked but whether it gets there: shown is what it does in most worlds.
+        query = Query(Asked(relation="inside"), carried.targets[0])
+    faint = situation.scene.faint_beside([body.bbox for body in bodies])
+    shadow = find_shadow(situation.scene, bodies[0].bbox) if bodies[0].shape == "sphere" and in_air[0] else None
+    fit = given_camera(situation.size, motion.down, request.camera, fixed_focal=situation.follows_path)
+    standing = [body for body, stands in zip(bodies, on_floor, strict=True) if stands]
+    flying = bodies[0] if in_air[0] else None
+    fit = camera_of(fit, situation.size, standing, flying, motion.metres_per_pixel.value, shadow)
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
@@ -141,7 +133,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     world = WorldInput(
         bodies=tuple(replace(body, taper=bottoms.get(index, body.taper)) for index, body in enumerate(present)),
         motion=motion,
-        fit=fit,
+        fit=fit if level is None else SIDE_VIEW,
         size=situation.size,
         num_frames=request.num_frames,
         fps=request.fps,
@@ -152,6 +144,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         placement=carried,
         placed_before=before,
         level=level,
+        faint=faint,
     )
     if not situation.follows_path:
         return world, query, None
@@ -187,6 +180,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
             source=(None if thing is None else thing.source) or "embedded",
             confidence=seen.confidence,
             prior=said,
+            point=None if bodies else grounding.point,
         )
         if said is not None and said.shape is not None:
             body = replace(body, shape=said.shape)
@@ -200,14 +194,11 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
     return tuple(bodies)
 
 
-def query_of(situation: Situation, bodies: Sequence[SeenBody], carried: PlacementGoal | None) -> Query | None:
-    """What is asked of bodies; None where nothing is, or one that is named was not found under that name.
-
-    Where the mover is put somewhere and nothing is asked, whether it gets there: shown is what it does in most worlds.
-    """
+def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequence[bool]) -> Query | None:
+    """What is asked of bodies; None where nothing is, or one that is named was not found under that name."""
     asked = situation.grounding.asked
     if asked is None:
-        return None if carried is None else Query(Asked(relation="inside"), carried.targets[0])
+        return None
 
     def named(words: str) -> tuple[int, ...]:
         if same_name(words, situation.grounding.object):
@@ -223,75 +214,12 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], carried: Placemen
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
     asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
     query = Query(asked, targets[0], subjects[0], known)
-    if carried is not None and asked.relation == "inside":
+    if situation.carried is not None and asked.relation == "inside":
         return query
     # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.
-    subject = bodies[query.subject]
-    in_air = subject.is_flying if query.subject else flies(subject, situation.motion)
-    view = situation.side_view
-    supports = supports_of(bodies) if view is None else supports_in_side_view(bodies, view.level)
-    stands_on_floor = not in_air and supports[query.subject] is None
     is_present = situation.is_separated and query.subject <= len(situation.obstacles)
-    is_seen = asked.relation in BY_EVENTS and not (stands_on_floor and asked.relation == "lands")
+    is_seen = asked.relation in BY_EVENTS and not (on_floor[query.subject] and asked.relation == "lands")
     return replace(query, is_decidable=is_present and is_seen)
-
-
-# --- the camera
-
-
-def camera_of(
-    size: tuple[int, int],
-    down: Vector,
-    given: CameraRequest | None,
-    shadow: Shadow | None = None,
-    flying: BBox = (0, 0, 0, 0),
-    fixed_focal: bool = False,
-    standing: Sequence[Standing] = (),
-    radii: Estimate | None = None,
-) -> CameraFit:
-    """The camera of an image of a size (width, height; px), by what stands on the floor and the shadow of what flies.
-
-    `fixed_focal` holds the focal length where it is; `radii` is what is said of the height of what flies, in its radii.
-    """
-    fit, given = prior(math.atan2(*down)), given or CameraRequest.model_construct()
-    mean, sigma = fit.mean.copy(), np.sqrt(np.diag(fit.covariance))
-    if given.pitch is not None:
-        mean[0], sigma[0] = math.radians(given.pitch), GIVEN_PITCH_SIGMA
-    if given.focal is not None and not fixed_focal:
-        mean[1], sigma[1] = math.log(given.focal / size[0]), GIVEN_FOCAL_SIGMA
-    if given.roll is not None:
-        fit = replace(fit, roll=math.radians(given.roll), roll_sigma=GIVEN_ROLL_SIGMA)
-    if radii is not None:
-        mean[2], sigma[2] = math.log(radii.value), max(radii.deviation / radii.value, LEAST_HEIGHT_SIGMA)
-    if fixed_focal:
-        mean[1], sigma[1] = math.log(FOCAL_WIDTHS), FIXED
-    source = "request" if given.model_fields_set else fit.source
-    fit = replace(fit, mean=mean, covariance=np.diag(sigma**2), source=source)
-    fit = narrowed(fit, standing, size)
-    return fit if shadow is None else fit_shadow(fit, flying, shadow, size) or fit
-
-
-def _height_in_radii(mover: SeenBody, motion: Motion) -> Estimate | None:
-    """What is said of the height of the middle of what flies above the floor, in its radii."""
-    said = None if mover.prior is None else mover.prior.height
-    if said is None or not flies(mover, motion):
-        return None
-    x0, y0, x1, y1 = mover.bbox
-    radius = (x1 - x0 + y1 - y0) / 4 * motion.metres_per_pixel.value
-    return Estimate(value=1 + said.value / radius, deviation=said.deviation / radius)
-
-
-def standing_things(bodies: Sequence[SeenBody], motion: Motion) -> list[Standing]:
-    """What the bodies that stand on the floor show of the camera."""
-    return [
-        Standing(
-            body.bbox,
-            rim=body.rim if body.shape == "cylinder" and body.is_form_known else None,
-            is_cube=body.prior is not None and body.prior.equal_sided,
-        )
-        for index, (body, on) in enumerate(zip(bodies, supports_of(bodies), strict=True))
-        if on is None and not (body.is_flying if index else flies(body, motion))
-    ]
 
 
 # --- what is put somewhere
@@ -309,16 +237,18 @@ def placement_goals(
     if motion.kind == "place" and carried is None:
         raise _says_no_place(situation.grounding.object)
     goals: list[PlacementGoal] = []
-    for each in (*([] if carried is None else [carried]), *situation.placed_before):
-        goal, name = _goal(situation.scene, each, bodies), each.object.object
+    placed = (*([] if carried is None else [carried]), *situation.placed_before)
+    for each, where in [(each, place_words(each)) for each in placed]:
+        name = each.object.object
+        goal = replace(_goal(situation.scene, each, bodies), place=where)
         if each is not carried and motion.kind == "place" and 0 in goal.targets:
             raise CannotGround(
-                f"'{name}' is put {place_words(each)}, which is put somewhere itself, and seen going there last. Ask "
+                f"'{name}' is put {where}, which is put somewhere itself, and seen going there last. Ask "
                 "of one change at a time."
             )
         if each is not carried and situation.follows_path and goal.body == 0:
             raise CannotGround(
-                f"'{name}' cannot be put {place_words(each)} before it moves: its path, which is given or follows the "
+                f"'{name}' cannot be put {where} before it moves: its path, which is given or follows the "
                 "ballistic law, begins where the image shows it. Leave the path out, or ask for the law `contact`."
             )
         sets_out = 0 in goal.targets and motion.kind == "linear"

@@ -5,16 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from cow_service.narration import facts_of, facts_of_both, warnings_of
+from cow_service.narration import warnings_of, with_facts
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
+from cow_service.physics.events import seen_paths
+from cow_service.physics.recording import record_trajectory
 from cow_service.records import CLEAR, BBox, Doubt, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
-from cow_service.stages.grounding import others_of, removed_of
 from cow_service.stages.keys import StageResult
-from cow_service.stages.paths import record_trajectory
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
-from cow_service.vision.masks import iou
 
 FEW_WORLDS = 0.2  # share of the worlds: what is touched in no more of them turns no answer that is clear
 
@@ -33,64 +32,29 @@ def simulate_world(situation: Situation) -> Trajectory:
     Simulates what the mover and everything it meets do, many times, within what the picture leaves open.
     """
     world, query, path = reconstruct(situation)
-    results = [check_outlines(situation, each) for each in run_ensemble(world, query, situation.request.ensemble)]
-    outcomes = [judge(situation.grounding, each) for each in results]
-    trajectories = [
-        record_trajectory(situation, result, outcome, path) for result, outcome in zip(results, outcomes, strict=True)
-    ]
-    # What was located, by whomever, is there: it may be pale, but it is no doubt.
-    known = [body.bbox for body in (*results[0].world.bodies, *results[0].world.removed)]
-    faint = [box for box in situation.scene.faint if not any(is_inside(box, each) for each in known)]
-    trajectories = [add_faint(faint, each) for each in trajectories]
-    first, *as_it_is = add_facts(situation, trajectories)
+    given, known = situation.request.trajectory, situation.is_separated
+    judged = [judge(situation, each) for each in run_ensemble(world, query, situation.request.ensemble)]
+    trajectories = [record_trajectory(*each, path, given, known) for each in judged]
+    changes = tuple(each for each in situation.grounding.interventions if each is not situation.carried)
+    first, *as_it_is = with_facts(situation.grounding.object, changes, trajectories)
     factual = as_it_is[0].model_copy(update={"anchors": ()}) if as_it_is else None
     return first.model_copy(update={"factual": factual})
 
 
-def is_inside(box: BBox, other: BBox) -> bool:
-    """Whether the middle of a box lies in another one."""
-    x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
-    return other[0] < x < other[2] and other[1] < y < other[3]
-
-
-def add_faint(faint: Sequence[BBox], trajectory: Trajectory) -> Trajectory:
-    """The trajectory with what may be things, and with an outcome that is not sure where it moves over one."""
-    outcome = trajectory.outcome
-    (x0, y0, x1, y1), (x, y) = trajectory.bodies[0].bbox, trajectory.path.points[0]
-    swept = [(x0 + px - x, y0 + py - y, x1 + px - x, y1 + py - y) for px, py in trajectory.path.points]
-    if outcome is not None and any(iou(box, each) > 0 for box in swept for each in faint):
-        outcome = outcome.model_copy(
-            update={"sure": False, "robust": False, "depends_on": ("faint", *outcome.depends_on)}
-        )
-    return trajectory.model_copy(update={"faint": tuple(faint), "outcome": outcome})
-
-
-def add_facts(situation: Situation, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """The trajectories with their outcomes in words; of two, the first one's words compare both."""
-    grounding = situation.grounding
-    if grounding.asked is None:
-        return list(trajectories)
-    facts = [facts_of(grounding.object, each) for each in trajectories]
-    if len(trajectories) > 1:
-        changes = tuple(each for each in grounding.interventions if each is not situation.carried)
-        facts[0] = facts_of_both(changes, grounding.object, *trajectories)
-    outcomes = [
-        each.outcome and each.outcome.model_copy(update={"facts": said})
-        for each, said in zip(trajectories, facts, strict=True)
-    ]
-    return [each.model_copy(update={"outcome": outcome}) for each, outcome in zip(trajectories, outcomes, strict=True)]
-
-
-def judge(grounding: Grounding, result: EnsembleResult) -> Outcome | None:
-    """What the worlds say to what is asked, if anything is; without a probability where they cannot tell.
+def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult, Outcome | None]:
+    """The result, its bodies as sure as their outlines are; and what the worlds say to what is asked, if anything is.
 
     However the worlds agree, nothing is sure of a thing that may be another one than the question means, nor where a
-    thing that matters was not seen clearly.
+    thing that matters was not seen clearly: doubtful outlines of those are cut out a second time.
     """
-    asked = grounding.asked
+    asked, world, bodies = situation.grounding.asked, result.world, list(result.world.bodies)
+    matter = bodies_that_matter(result)
+    for body in matter:
+        bodies[body] = replace(bodies[body], confidence=situation.scene.confidence_of(bodies[body].bbox))
+    result = replace(result, world=replace(world, bodies=tuple(bodies)))
     if asked is None:
-        return None
-    query, names = result.query, [body.name for body in (*result.world.bodies, *result.world.removed)]
+        return result, None
+    query, names = result.query, [body.name for body in (*bodies, *world.removed)]
     outcome = Outcome(
         asked=asked if query is None else query.asked,
         subject=None if query is None or not query.subject else names[query.subject],
@@ -99,25 +63,27 @@ def judge(grounding: Grounding, result: EnsembleResult) -> Outcome | None:
         robust=False,
     )
     if result.decided is None:
-        return outcome
+        return result, outcome
     first = None if result.decided.first is None else names[result.decided.first]
     decided = vars(result.decided) | {"first": first}
     doubts: list[Doubt] = []
-    if any(thing.is_doubtful for thing in (grounding, *others_of(grounding), *removed_of(grounding))):
+    if any(thing.is_doubtful for thing in (situation.grounding, *situation.located)):
         doubts.append("identity")
-    if any(result.world.bodies[body].confidence < CLEAR for body in bodies_that_matter(result)):
+    if any(bodies[body].confidence < CLEAR for body in matter):
         doubts.append("outline")
+    if moves_over(result, world.faint):
+        doubts.append("faint")
     if doubts:
         decided |= {"sure": False, "robust": False, "depends_on": (*doubts, *result.decided.depends_on)}
-    return outcome.model_copy(update=decided)
+    return result, outcome.model_copy(update=decided)
 
 
-def check_outlines(situation: Situation, result: EnsembleResult) -> EnsembleResult:
-    """The result with the bodies that matter as sure as their outlines are: doubtful ones are cut out a second time."""
-    bodies = list(result.world.bodies)
-    for body in bodies_that_matter(result):
-        bodies[body] = replace(bodies[body], confidence=situation.scene.confidence_of(bodies[body].bbox))
-    return replace(result, world=replace(result.world, bodies=tuple(bodies)))
+def moves_over(result: EnsembleResult, boxes: Sequence[BBox]) -> bool:
+    """Whether the mover's box meets one of some boxes (px) on its way."""
+    mover, path = result.world.bodies[0].bbox, seen_paths(result.shown.worlds.within_horizon, 0)
+    away = path.points[0] - path.seen[0]
+    swept = np.array(mover) + np.hstack([away, away])
+    return any(bool(((swept[:, :2] < box[2:]) & (swept[:, 2:] > box[:2])).all(axis=1).any()) for box in boxes)
 
 
 def bodies_that_matter(result: EnsembleResult) -> list[int]:

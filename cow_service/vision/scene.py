@@ -168,6 +168,12 @@ class Scene:
         """Boxes [x0, y0, x1, y1] of what may be things of the image, too faint to tell."""
         return () if self.side_view else find_faint(self._view, (self.width, self.height), self.regions)
 
+    def faint_beside(self, known: Sequence[BBox]) -> tuple[BBox, ...]:
+        """Those of `faint` whose middles lie in none of the boxes of what was located: that is there, if pale."""
+        middles = [((x0 + x1) / 2, (y0 + y1) / 2) for x0, y0, x1, y1 in self.faint]
+        inside = [any(a < x < c and b < y < d for a, b, c, d in known) for x, y in middles]
+        return tuple(box for box, is_known in zip(self.faint, inside, strict=True) if not is_known)
+
     def with_mover(self, bbox: BBox) -> Scene:
         """This scene where its trails end as they are, else the scene in which the one in a box ends there."""
         trail = trail_ending_at(self.trails, bbox)

@@ -11,20 +11,23 @@ import numpy as np
 
 from cow_service import records
 from cow_service.errors import CannotGround
-from cow_service.narration import cannot_stay, place_words
+from cow_service.narration import cannot_stay
 from cow_service.physics import events
 from cow_service.physics.ballistic import FreePath, latest, sampled
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import FloorCamera
 from cow_service.physics.ensemble import EnsembleResult
 from cow_service.physics.placement import Placements
+from cow_service.physics.world import Worlds
 from cow_service.records import BBox, Path, Placement, Point, Trajectory
 from cow_service.records.world import BAND_PERCENTILES
-from cow_service.stages.reconstruction import Situation
+from cow_service.requests import TrajectoryRequest
 from cow_service.vision.masks import CroppedMask, dilated, scaled_size, turning
 from cow_service.vision.types import Floats, Mask
 
-UPRIGHT = 1.0  # degrees: with less, the box of what leans stays that of what stands upright
+LEANS = 1.0  # degrees: with less, the box of what leans stays that of what stands upright
+MOST_LEAN = np.radians(25)
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion x, y, z, w
 MOVED = 0.5  # px: what moves less in the image stays where it is
 PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
 SETTLED = 0.25  # px per frame: what moves less is at rest
@@ -41,29 +44,33 @@ LEAST_STAYING = 0.5  # of the worlds: what stays in fewer where it is put is ref
 
 
 def record_trajectory(
-    situation: Situation, result: EnsembleResult, outcome: records.Outcome | None, path: FreePath | None
+    result: EnsembleResult,
+    outcome: records.Outcome | None,
+    path: FreePath | None,
+    given: TrajectoryRequest | None,
+    encounters_known: bool,
 ) -> Trajectory:
-    """The record of one world that is shown, and of the ensemble around it; `path` is one that no contact changes.
+    """The record of one world that is shown, and of the ensemble around it.
 
-    Raises `CannotGround` for what does not stay where it is put.
+    `path` is one that no contact changes, and `given` what the request says of it. Raises `CannotGround` for what does
+    not stay where it is put.
     """
-    shown, request, given = _Shown(situation, result), situation.request, situation.request.trajectory
+    shown, world = _Shown(result), result.world
     worlds, light = shown.worlds, shown.worlds.layout.light
     camera = shown.record_camera()
     placement = None
     if worlds.placements is not None:
         others = None if shown.ensemble is None else shown.ensemble.placements
-        placement = _placement(situation.grounding.object, worlds.placements, others)
+        placement = _placement(world.bodies[0].name, worlds.placements, others)
     placed = shown.record_placed()
-    paths = shown.record_paths() if path is None else (shown.record_free_path(path),)
-    until = moving_until(paths, request.fps)
+    paths = shown.record_paths() if path is None else (shown.record_free_path(path, given),)
+    until = moving_until(paths, world.fps)
     contacts = shown.record_contacts(camera)
     # Points off every body and off the way of all that moves, unless the request gives them.
     anchors = None if given is None else given.anchors
     if anchors is None:
         starts = [
-            np.array(each.points[0]) if each.body in shown.put else shown.start_of(each.body, shown.bodies)
-            for each in paths
+            np.array(each.points[0] if each.body in shown.put else shown.bodies[each.body].start) for each in paths
         ]
         movable = swept([shown.bodies[each.body].mask for each in paths], starts, paths)
         for body in shown.bodies:
@@ -71,41 +78,45 @@ def record_trajectory(
         anchors = spread_anchors(movable)
     return Trajectory(
         law="contact" if path is None else "ballistic",
-        fps=request.fps,
+        fps=world.fps,
         camera=camera,
         bodies=shown.record_bodies(),
         paths=paths,
         contacts=contacts,
-        light=(float(light[0, 0]), float(light[0, 1])) if result.world.fit.source == "shadow" else None,
+        light=(float(light[0, 0]), float(light[0, 1])) if world.fit.source == "shadow" else None,
         moving_until=until,
         anchors=anchors,
         encounters=events.encounters(
             result.shown.events,
             None if result.ensemble is None else result.ensemble.events,
             shown.bodies,
-            request.fps,
-            request.num_frames,
+            world.fps,
+            world.num_frames,
             result.query is not None and result.query.asked.partly,
         ),
-        encounters_known=situation.is_separated,
+        encounters_known=encounters_known,
         outcome=outcome,
         placement=placement,
         placed=placed,
-        ensemble=request.ensemble,
+        faint=world.faint,
+        ensemble=0 if shown.ensemble is None else len(shown.ensemble.runs),
     )
 
 
 class _Shown:
     """The world that is shown, the first draw, as the camera sees it; and the ensemble around it."""
 
-    def __init__(self, situation: Situation, result: EnsembleResult) -> None:
-        self.situation, self.world = situation, result.world
-        clip = situation.request.num_frames
-        self.worlds = result.shown.worlds.cut(clip, (clip - 1) / situation.request.fps)
+    def __init__(self, result: EnsembleResult) -> None:
+        self.world = result.world
+        self.clip = (self.world.num_frames - 1) / self.world.fps  # s
+        self.worlds = result.shown.worlds.cut(self.world.num_frames, self.clip)
         self.events = result.shown.events
         self.ensemble = None if result.ensemble is None else result.ensemble.worlds
         self.seen = result.world.bodies  # as the image shows them
         self.paths = [events.seen_paths(self.worlds, index) for index in range(len(self.seen))]
+        self.moving = sorted({0} | self.worlds.runs[0].moved)
+        ensemble = self.ensemble
+        self.spread = {} if ensemble is None else {i: events.seen_paths(ensemble, i).points for i in self.moving}
         # As they are when the motion begins: some are put elsewhere, or pushed away by that.
         self.put = {index for index in range(len(self.seen)) if self._was_put(index)}
         self.bodies = tuple(self._where_put(i) if i in self.put else body for i, body in enumerate(self.seen))
@@ -118,10 +129,10 @@ class _Shown:
 
     def _where_put(self, index: int) -> SeenBody:
         """A body of the image with its box and mask where it is when the motion begins."""
-        body, path, degrees = self.seen[index], self.paths[index], events.rotation_where_put(self.worlds, index)
+        body, path, degrees = self.seen[index], self.paths[index], rotation_where_put(self.worlds, index)
         start, to, scale = path.seen[0], path.points[0, 0], float(path.scale[0, 0])
         mask, corners = body.mask, np.array(body.bbox).reshape(2, 2)
-        if abs(degrees) > UPRIGHT and mask.area:  # then its box is that of its pixels
+        if abs(degrees) > LEANS and mask.area:  # then its box is that of its pixels
             pixels = np.argwhere(mask.patch)[:, None, ::-1] + np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
             corners = pixels.reshape(-1, 2) + np.array([mask.columns.start, mask.rows.start], np.float64)
         moved = to + (corners - start) @ turning(scale, degrees).T
@@ -163,7 +174,7 @@ class _Shown:
                     size=(2 * shape.half_width, 2 * shape.half_height, 2 * shape.half_depth),
                     position=(x, y, z),
                     support=self.bodies[on].name if on is not None else "floor" if stands else "air",
-                    rotation=events.rotation_where_put(self.worlds, index) if index in self.put else 0.0,
+                    rotation=rotation_where_put(self.worlds, index) if index in self.put else 0.0,
                     source=seen.source,
                     confidence=seen.confidence,
                 )
@@ -194,9 +205,7 @@ class _Shown:
     def record_paths(self) -> tuple[Path, ...]:
         """Paths of the mover, from its grounded point, and of what it set in motion; from where they are put."""
         moved = MOVED if self.worlds.placements is None else PUSHED
-        ways = {
-            i: self.paths[i].points[0] - self.paths[i].points[0, 0] for i in sorted({0} | self.worlds.runs[0].moved)
-        }
+        ways = {i: self.paths[i].points[0] - self.paths[i].points[0, 0] for i in self.moving}
         return tuple(
             self._path(index)
             for index, way in ways.items()
@@ -206,24 +215,23 @@ class _Shown:
 
     def moves_later(self, index: int) -> bool:
         """Whether a body is set in motion after the clip has ended."""
-        clip = (self.situation.request.num_frames - 1) / self.situation.request.fps
-        return clip < float(self.events.moved[0, index]) < math.inf
+        return self.clip < float(self.events.moved[0, index]) < math.inf
 
     def _path(self, index: int) -> Path:
         worlds, path, body = self.worlds, self.paths[index], self.bodies[index]
-        start, scale = self.start_of(index, self.seen), path.scale[0]
+        start, scale = np.array(self.seen[index].start), path.scale[0]
         # The body's centre as placed and where its silhouette is differ a little: what is drawn starts where it is.
         points = path.points[0] + scale[:, None] * (start - path.seen[0])
         if worlds.seen is not None:
             start, scale = points[0], scale / scale[0]
         band, futures = self._spread(index, points - path.points[0])
         points, scale = np.round(points, POINT_DECIMALS), np.round(scale, SCALE_DECIMALS)
-        turned = np.round(events.rotation(worlds, index), ROTATION_DECIMALS)
+        turned = np.round(rotation(worlds, index), ROTATION_DECIMALS)
         visible = np.all((points >= 0) & (points < np.array(self.world.size)), axis=1) & ~path.passed[0]
-        states = np.round(events.states(worlds, index), STATE_DECIMALS)
+        moving = np.round(states(worlds, index), STATE_DECIMALS)
         return Path(
             body=index,
-            states=tuple(tuple(state) for state in states.tolist()),
+            states=tuple(tuple(state) for state in moving.tolist()),
             points=pairs(points),
             visible=tuple(visible.tolist()),
             scale=tuple(scale.tolist()),
@@ -243,7 +251,7 @@ class _Shown:
         """
         if self.ensemble is None:
             return (), ()
-        worlds = events.seen_paths(self.ensemble, index).points
+        worlds = self.spread[index]
         stamps = np.arange(worlds.shape[1]) * (self.ensemble.every / self.ensemble.fps)
         frames = np.arange(len(shift)) / self.worlds.fps
 
@@ -257,15 +265,13 @@ class _Shown:
         futures = (pairs(at_frames(worlds[world]).round(FUTURE_DECIMALS)) for world in chosen)
         return band, tuple(futures) if index == 0 else ()
 
-    def record_free_path(self, path: FreePath) -> Path:
+    def record_free_path(self, path: FreePath, given: TrajectoryRequest | None) -> Path:
         """The mover's path as it was given, or as the ballistic law has it."""
-        request, times = self.situation.request, np.arange(len(path.points)) / self.situation.request.fps
-        given, seen = request.trajectory, None
+        times, seen = np.arange(len(path.points)) / self.world.fps, None
         if given is not None and given.tracks is not None:
             found = [sampled(np.array(track), given.fps, times) for track in given.tracks]
         else:
-            start = np.array(self.situation.grounding.point)
-            found = tracks(self.seen[0], start, path.points, path.scale, np.zeros(len(times)))
+            found = tracks(self.seen[0], np.array(self.seen[0].start), path.points, path.scale, np.zeros(len(times)))
         if given is not None and given.tracks_visible is not None:
             frames = latest(given, times)
             seen = tuple(tuple(track[frame] for frame in frames) for track in given.tracks_visible)
@@ -284,23 +290,18 @@ class _Shown:
         times = {"moved_at": self.events.moved, "tipped_at": self.events.tipped}
         return {name: time for name, each in times.items() if math.isfinite(time := float(each[0, index]))}
 
-    def start_of(self, index: int, bodies: Sequence[SeenBody]) -> Floats:
-        """Where the path of a body starts: the mover's at its grounded point, others' in the middle of their boxes."""
-        x0, y0, x1, y1 = bodies[index].bbox
-        return np.array(((x0 + x1) / 2, (y0 + y1) / 2) if index else self.situation.grounding.point)
-
     # --- what was put somewhere
 
     def record_placed(self) -> tuple[records.PlacedBefore, ...]:
         """What becomes of each thing that is put somewhere before the motion; nothing of the world as it is."""
         found: list[records.PlacedBefore] = []
         for number, goal in enumerate(self.world.placed_before):
-            each, placements = self.situation.placed_before[number], self.worlds.before[number]
+            placements = self.worlds.before[number]
             others = None if self.ensemble is None else self.ensemble.before[number]
             placed = records.PlacedBefore(
-                **dict(_placement(each.object.object, placements, others)),
+                **dict(_placement(self.seen[goal.body].name, placements, others)),
                 body=goal.body,
-                place=place_words(each),
+                place=goal.place,
                 visible=self._visible_share(goal.body),
                 by_heading=goal.by_heading,
             )
@@ -321,6 +322,63 @@ class _Shown:
         ]
         within = inside / max((x1 - x0) * (y1 - y0), 1e-9)
         return 0.0 if bool(path.passed[0, 0]) else within * max(0.0, 1 - max(hidden, default=0.0))
+
+
+def states(worlds: Worlds, body: int) -> Floats:
+    """[F, 6] metres and m/s in the frame of the camera, of the first draw."""
+    cameras, run = worlds.layout.cameras, worlds.runs[0]
+    position = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
+    return np.hstack([position @ cameras.axes[0], run.velocities[body] @ cameras.axes[0]])
+
+
+def rotation(worlds: Worlds, body: int) -> Floats:
+    """Degrees [F] that a body of the first draw has turned in the image, clockwise, since the first frame.
+
+    A sphere turns by its spin about the line of sight. Of anything else the upright axis is followed: what turns about
+    it looks the same.
+    """
+    run, cameras = worlds.runs[0], worlds.layout.cameras
+    turns = run.turns[body]
+    if worlds.shapes[0][body].shape == "sphere":
+        sight = run.positions[body] - np.array([0.0, cameras.height[0], 0.0])
+        sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
+        # Right, up and ahead are a left-handed frame: there a positive turn about the line of sight is anticlockwise.
+        before, after = turns[:-1], turns[1:]
+        axis = before[:, 3:] * after[:, :3] - after[:, 3:] * before[:, :3] + np.cross(before[:, :3], after[:, :3])
+        half = np.einsum("fi,fi->f", before, after)
+        axis = axis * np.where(half < 0, -1.0, 1.0)[:, None]
+        length = np.linalg.norm(axis, axis=1)
+        steps = axis * (2 * np.arctan2(length, np.abs(half)) / np.maximum(length, 1e-12))[:, None]  # rotation vectors
+        about = -np.einsum("fi,fi->f", steps, sight[1:])
+        return np.concatenate([[0.0], np.degrees(np.cumsum(about))])
+    return _leaned(worlds, run.positions[body], turns)
+
+
+def rotation_where_put(worlds: Worlds, body: int) -> float:
+    """Degrees, clockwise, that a body of the first draw is turned at its first frame against how the image shows it.
+
+    A sphere looks the same wherever it is put.
+    """
+    if worlds.seen is None or worlds.shapes[0][body].shape == "sphere":
+        return 0.0
+    positions = np.array([worlds.seen[0][body].position, worlds.shapes[0][body].position])
+    turn = worlds.shapes[0][body].turn
+    return float(_leaned(worlds, positions, np.array([UPRIGHT, UPRIGHT if turn is None else turn]))[1])
+
+
+def _leaned(worlds: Worlds, positions: Floats, turns: Floats) -> Floats:
+    """Degrees [F], clockwise, that an upright axis has leaned since the first of positions [F, 3] and turns [F, 4]."""
+    upright = np.tile(np.array([0.0, 1.0, 0.0]), (len(turns), 1))
+    cameras, leans = worlds.layout.cameras, list[Floats]()
+    step = 1e-3 * float(cameras.height[0])
+    for axis in (events.turned(turns, upright[0]), upright):
+        points, _ = cameras.repeated(1).project((positions + np.stack([axis, -axis]) * step)[None])
+        way = points[0, 0] - points[0, 1]
+        leans.append(np.unwrap(np.arctan2(way[:, 0], -way[:, 1])))
+    leaning, plumb = leans
+    angle = np.unwrap(leaning - plumb)
+    # Verticals lean in the image as they come to its side; close to the camera they lean without bounds.
+    return np.degrees(angle - angle[0] + np.clip(plumb - plumb[0], -MOST_LEAN, MOST_LEAN))
 
 
 def _placement(name: str, shown: Placements, ensemble: Placements | None) -> Placement:
