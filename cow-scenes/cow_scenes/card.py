@@ -12,8 +12,8 @@ TEXT = """# What-if questions with known truth
 {count} items made with seed {seed}: Bullet computed the motion, Blender's Cycles drew it. Columns as in the public
 CausalSpatial data: `id`, `question`, `answer`, `image`, `not_sure`. The configuration `physics` holds the task that the
 paper calls Trajectory. `truth/<configuration>/<id>/` holds what is known of each item: the picture without arrow or
-trail (`clean.jpg`), the same without the mover and its shadow (`background.jpg`), object ids (`ids.png`), the future at
-samples 12 and 36 (30 per second), and `meta.json`.
+trail (`clean.jpg`), the same without the mover and its shadow (`background.jpg`), object ids (`ids.png`), depth
+(`depth.png`), the future at samples 12 and 36 (30 per second), and `meta.json`.
 
 | configuration | level 1 | level 2 |
 |---|---|---|

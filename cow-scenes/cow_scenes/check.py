@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
@@ -16,6 +17,11 @@ from .plan import SUBSET_OF
 BALANCE = (0.35, 0.65)
 BALANCE_FROM = 12
 """Yes/No items per subset and level from which on their balance is checked."""
+PICTURES = {1: ("clean.jpg", "ids.png"), 2: ("clean.jpg", "background.jpg", "ids.png", "depth.png")}
+"""Pictures of a truth folder, apart from `image.jpg` and the future, by the manifest's format.
+
+Sets of format 1 may have `background.jpg`: it was added without a new number.
+"""
 
 
 @dataclass
@@ -63,16 +69,37 @@ def check_picture(data: bytes, size: list[int]) -> str | None:
         return f"the picture does not decode ({error})"
 
 
-def check_row(row: dict, folder: Path, report: Report) -> None:
+def check_depth(folder: Path) -> str | None:
+    """What is wrong with the depth of a truth folder, or None."""
+    with Image.open(folder / "depth.png") as depth, Image.open(folder / "ids.png") as ids:
+        if depth.mode != "I;16":
+            return f"depth.png has the mode {depth.mode}, not 16-bit grey"
+        unknown = (np.asarray(ids) > 0) & (np.asarray(depth) == 0)
+    return f"depth.png is 0 at {unknown.sum()} pixels of objects" if unknown.any() else None
+
+
+def check_pictures(folder: Path, names: list[str], size: list[int]) -> str | None:
+    """The first thing that is wrong with the pictures of a truth folder, or None."""
+    for name in names:
+        wrong = check_picture((folder / name).read_bytes(), size)
+        if wrong:
+            return f"{name}: {wrong}"
+    return check_depth(folder) if "depth.png" in names else None
+
+
+def check_row(row: dict, folder: Path, pictures: tuple[str, ...], report: Report) -> None:
     """One row against its truth folder."""
     path = folder / row["id"] / "meta.json"
     if not path.exists():
         report.problems.append(f"{row['id']}: {path} is missing")
         return
     meta = json.loads(path.read_text())
-    found = check_picture(row["image"]["bytes"], meta["image_size"])
-    for name in ("clean.jpg", "background.jpg", "ids.png", *(f"future_{n}.jpg" for n in meta["future"])):
-        found = found or check_picture((path.parent / name).read_bytes(), meta["image_size"])
+    names = ["image.jpg", *pictures, *(f"future_{n}.jpg" for n in meta["future"])]
+    missing = [name for name in names if not (path.parent / name).exists()]
+    if missing:
+        report.problems.append(f"{row['id']}: {', '.join(missing)} missing")
+        return
+    found = check_pictures(path.parent, names, meta["image_size"])
     told = meta["options"][ord(meta["answer"]) - ord("A")]
     tests = {
         "the id differs from meta.json's": meta["id"] == row["id"],
@@ -111,15 +138,18 @@ def check_balance(report: Report) -> None:
 
 
 def check_set(out: Path) -> Report:
-    """Everything about a set. Raises UsageError if there is none."""
+    """Everything about a set. Raises UsageError if there is none, or one of a format that is not known."""
     if not (out / "manifest.json").exists():
         raise UsageError(f"{out} holds no finished set (no manifest.json); run `cow-scenes make` first")
+    made_as = json.loads((out / "manifest.json").read_text())["format"]
+    if made_as not in PICTURES:
+        raise UsageError(f"{out} has format {made_as}; this version knows {', '.join(map(str, PICTURES))}")
     report = Report()
     for subset in SUBSET_OF.values():
         for shard in sorted((out / subset).glob("*.parquet")):
             for row in pq.read_table(shard).to_pylist():
                 report.ids.append(row["id"])
-                check_row(row, out / "truth" / subset, report)
+                check_row(row, out / "truth" / subset, PICTURES[made_as], report)
     twice = [name for name, count in Counter(report.ids).items() if count > 1]
     report.problems += [f"{name}: stands {report.ids.count(name)} times" for name in twice]
     check_manifest(out, report)

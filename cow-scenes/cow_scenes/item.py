@@ -11,17 +11,10 @@ from PIL import Image
 from .accept import Accepted, find_world, still
 from .arrows import draw_arrow, draw_style, ends_of
 from .layout import TEMPORARY, truth_folder
+from .maps import depth_picture, maps_of
 from .meta import FUTURE, box_of, direction_of, meta_of
 from .plan import ItemKey
-from .raster import depths, id_picture
 from .settings import Settings
-
-
-def ids_of(item: Accepted) -> Image.Image:
-    """Object ids at t = 0 as an 8-bit grey picture."""
-    things = item.draft.world.things
-    layers = depths(item.camera, things, {t.name: still(t) for t in things}, item.draft.world.table)
-    return Image.fromarray(id_picture(layers, {t.name: i + 1 for i, t in enumerate(things)}), "L")
 
 
 def question_picture(item: Accepted, clean: Image.Image, trail: Image.Image | None) -> tuple[Image.Image, dict]:
@@ -49,7 +42,9 @@ def write_item(folder: Path, item: Accepted, settings: Settings, threads: int) -
     pictures |= {f"future_{n}": studio.render(n) for n in FUTURE}
     for name, drawn in pictures.items():
         drawn.save(folder / f"{name}.jpg", quality=settings.quality, optimize=True)
-    ids_of(item).save(folder / "ids.png", optimize=True)
+    ids, depth = maps_of(item)
+    Image.fromarray(ids).save(folder / "ids.png", optimize=True)
+    depth_picture(depth).save(folder / "depth.png", optimize=True)
     (folder / "meta.json").write_text(json.dumps(meta, separators=(",", ":")) + "\n")
 
 

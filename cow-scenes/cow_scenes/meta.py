@@ -6,6 +6,7 @@ from .accept import Accepted, still, trail_of
 from .arrows import Arrow
 from .camera import Camera
 from .catalogue import BOWL_OPENING
+from .maps import DEPTH_SCALE, id_numbers
 from .plan import ItemKey
 from .raster import placed
 from .world import FPS, SAMPLES, Run, Thing
@@ -114,6 +115,17 @@ def naming(key: ItemKey, item: Accepted) -> dict:
     }  # fmt: skip
 
 
+def camera_of(camera: Camera) -> dict:
+    """The camera as matrices and in words; `depth_scale` is metres per unit of `depth.png`."""
+    right, down, forward = camera.pose[:3, :3].T
+    return {
+        "K": rounded(camera.matrix, 6), "world_from_camera": rounded(camera.pose, 8),
+        "focal": round(camera.focal, 6), "pitch": round(float(np.degrees(np.arcsin(-forward[2]))), 6),
+        "roll": round(float(np.degrees(np.arctan2(-right[2], -down[2]))), 6) + 0.0,
+        "height": round(float(camera.pose[2, 3]), 6), "depth_scale": DEPTH_SCALE,
+    }  # fmt: skip
+
+
 def geometry(item: Accepted) -> dict:
     """What is seen: pixels by sample, ids and the camera."""
     things, camera = item.draft.world.things, item.camera
@@ -123,9 +135,9 @@ def geometry(item: Accepted) -> dict:
         "bbox": rounded(box_of(camera, mover, *still(mover)), 2), "direction": rounded(direction_of(item), 6),
         "fps": FPS, "track": rounded(camera.project(item.run.centres[mover.name]), 2),
         "boxes": {t.name: rounded(boxes_of(item, t), 1) for t in things},
-        "id_of": {t.name: i + 1 for i, t in enumerate(things)}, "future": list(FUTURE),
+        "id_of": id_numbers(item), "future": list(FUTURE),
         "trail": rounded(camera.project(trail_of(item.draft)), 2) if item.draft.trail_times else [],
-        "camera": {"K": rounded(camera.matrix, 6), "world_from_camera": rounded(camera.pose, 8)},
+        "camera": camera_of(camera),
     }  # fmt: skip
 
 

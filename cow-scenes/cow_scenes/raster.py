@@ -67,7 +67,7 @@ def depths(
 
 
 def id_picture(layers: dict[str, np.ndarray], id_of: dict[str, int]) -> np.ndarray:
-    """Ids (height, width) uint8 of what is in front; 0 for floor, walls and table."""
+    """Ids (height, width) uint8 of what is in front; 0 for the room and for what has no id."""
     stack = np.stack(list(layers.values()))
     numbers = np.array([id_of.get(name, 0) for name in layers], np.uint8)
     return np.where(np.isfinite(stack.min(0)), numbers[stack.argmin(0)], 0).astype(np.uint8)

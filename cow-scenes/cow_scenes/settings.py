@@ -8,6 +8,8 @@ from .errors import UsageError
 from .plan import LEVELS, TASKS, ItemKey, plan_items
 
 LIBRARIES = ("bpy", "numpy", "pillow", "pyarrow", "pybullet")
+FORMAT = 2
+"""Version of the layout: 2 added `depth.png`, the camera in words, and an id for the table."""
 
 
 @dataclass(frozen=True)
@@ -44,4 +46,4 @@ class Settings:
     def record(self) -> dict:
         """What `manifest.json` says of how the set was made."""
         versions = {"cow-scenes": __version__, **{name: version(name) for name in LIBRARIES}}
-        return {"format": 1, "versions": versions, "seed": self.seed, "arguments": asdict(self)}
+        return {"format": FORMAT, "versions": versions, "seed": self.seed, "arguments": asdict(self)}

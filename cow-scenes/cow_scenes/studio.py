@@ -12,10 +12,8 @@ from .accept import Accepted, still, trail_of
 from .catalogue import ACCENTS, COLOURS
 from .meshes import Part, parts_of
 from .raster import table_mesh, turn_matrix
+from .room import FLOOR_HALF, Room, room_of
 from .world import Thing
-
-FLOORS = ((0.30, 0.17, 0.085), (0.20, 0.125, 0.09), (0.38, 0.32, 0.25), (0.27, 0.27, 0.265))
-WALLS = ((0.60, 0.56, 0.50), (0.55, 0.55, 0.54), (0.62, 0.58, 0.54))
 
 
 def pose_matrix(centre: np.ndarray, turn: np.ndarray, scale: float) -> Matrix:
@@ -103,7 +101,7 @@ class Studio:
         self.looks = {name: material(name, colour, 0.4) for name, colour in ACCENTS.items()}
         self.set_render(samples, threads)
         self.set_camera()
-        self.set_room(item.key.random("look"))
+        self.set_room(room_of(item))
         self.parts = {t.name: add_parts(t, self.looks) for t in item.draft.world.things}
         if item.draft.world.table:
             add_mesh("table", *table_mesh(item.draft.world.table), self.looks["table"], False)
@@ -135,28 +133,20 @@ class Studio:
         bpy.context.scene.collection.objects.link(made)
         bpy.context.scene.camera = made
 
-    def set_room(self, random: np.random.Generator) -> None:
+    def set_room(self, room: Room) -> None:
         """Floor with grain, two far walls, a soft sun and an even sky."""
         world = bpy.data.worlds.new("sky")
         world.use_nodes = True
         world.node_tree.nodes["Background"].inputs[0].default_value = (0.9, 0.93, 1.0, 1)
-        world.node_tree.nodes["Background"].inputs[1].default_value = float(random.uniform(0.55, 0.75))
+        world.node_tree.nodes["Background"].inputs[1].default_value = room.sky
         bpy.context.scene.world = world
-        streak = (8.0, 0.7, 1.0) if random.uniform() < 0.5 else (0.7, 8.0, 1.0)
-        floor = textured("floor", FLOORS[int(random.integers(len(FLOORS)))], streak)
-        square = np.array([[-12, -12, 0], [12, -12, 0], [12, 12, 0], [-12, 12, 0]], float)
-        add_mesh("floor", square, np.array([[0, 1, 2], [0, 2, 3]]), floor, False)
-        wall = material("wall", WALLS[int(random.integers(len(WALLS)))], 0.9)
-        away = self.item.camera.pose[:2, 2] / np.linalg.norm(self.item.camera.pose[:2, 2])
-        yaw = np.arctan2(away[1], away[0]) + random.uniform(-0.5, 0.5)
-        for turn in (0.0, np.pi / 2 * random.choice([-1, 1])):
-            out = np.array([np.cos(yaw + turn), np.sin(yaw + turn)]) * random.uniform(3.4, 4.4)
-            along = np.array([-out[1], out[0]]) / np.linalg.norm(out) * 14
-            corners = [(*(out + s * along), z) for s, z in ((-1, 0), (1, 0), (1, 4), (-1, 4))]
-            add_mesh("wall", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), wall, False)
-        angle = random.uniform(0, 2 * np.pi)
-        sun = np.array([np.cos(angle) * 0.8, np.sin(angle) * 0.8, 2.4])
-        add_light("SUN", float(random.uniform(1.8, 2.4)), sun, float(np.radians(random.uniform(9, 16))))
+        square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * FLOOR_HALF
+        two = np.array([[0, 1, 2], [0, 2, 3]])
+        add_mesh("floor", square, two, textured("floor", room.floor, room.streak), False)
+        look = material("wall", room.wall, 0.9)
+        for wall in room.walls:
+            add_mesh("wall", room.wall_corners(wall), two, look, False)
+        add_light("SUN", room.sun_energy, np.array(room.sun), room.sun_size)
 
     def place(self, sample: int) -> None:
         """Put every object where it is at a sample; at sample 0 nothing has been taken away yet."""

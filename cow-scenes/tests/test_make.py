@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
@@ -61,11 +62,11 @@ def test_truth_folders_are_complete(made):
     folders = list(made.glob("truth/*/*"))
     assert len(folders) == 3
     for folder in folders:
-        names = {"image.jpg", "clean.jpg", "background.jpg", "ids.png", "future_12.jpg", "future_36.jpg", "meta.json"}
-        assert {p.name for p in folder.iterdir()} == names
+        pictures = {"image.jpg", "clean.jpg", "background.jpg", "ids.png", "depth.png"}
+        assert {p.name for p in folder.iterdir()} == pictures | {"future_12.jpg", "future_36.jpg", "meta.json"}
         assert json.loads((folder / "meta.json").read_text())["id"] == folder.name
-        with Image.open(folder / "ids.png") as ids:
-            assert ids.mode == "L"
+        with Image.open(folder / "ids.png") as ids, Image.open(folder / "depth.png") as depth:
+            assert (ids.mode, depth.mode) == ("L", "I;16")
 
 
 def test_a_killed_run_goes_on_and_gives_the_same_bytes(made, tmp_path):
@@ -107,6 +108,34 @@ def test_check_passes_and_finds_what_was_changed(made, tmp_path):
     assert done.returncode == 1
     for text in ("the answer differs", "the answer contradicts the motion", "its SHA-256 differs"):
         assert text in done.stderr
+    path.with_name("depth.png").unlink()
+    done = scenes("check", copy)
+    assert done.returncode == 1
+    assert "depth.png missing" in done.stderr
+
+
+def test_check_finds_objects_without_depth(made, tmp_path):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", str(made), str(copy)], check=True)
+    path = next(copy.glob("truth/collision/*/depth.png"))
+    Image.fromarray(np.zeros((120, 208), np.uint16)).save(path)
+    assert "depth.png is 0 at" in scenes("check", copy).stderr
+    Image.new("L", (208, 120), 5).save(path)
+    assert "not 16-bit grey" in scenes("check", copy).stderr
+
+
+def test_a_set_of_format_1_needs_no_depth(made, tmp_path):
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", str(made), str(copy)], check=True)
+    manifest = json.loads((copy / "manifest.json").read_text())
+    for path in (*copy.glob("truth/*/*/depth.png"), *copy.glob("truth/*/*/background.jpg")):
+        path.unlink()
+        del manifest["files"][str(path.relative_to(copy))]
+    (copy / "manifest.json").write_text(json.dumps({**manifest, "format": 1}))
+    done = scenes("check", copy)
+    assert done.returncode == 0, done.stderr
+    (copy / "manifest.json").write_text(json.dumps({**manifest, "format": 99}))
+    assert "has format 99" in scenes("check", copy).stderr
 
 
 @pytest.mark.parametrize("end", ["tar.zst", "zip"])

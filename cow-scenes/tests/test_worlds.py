@@ -8,7 +8,7 @@ from cow_scenes.accept import CLEAR, COVERED
 from cow_scenes.arrows import draw_style
 from cow_scenes.check import expected_answer
 from cow_scenes.forms import FORM_OF
-from cow_scenes.item import ids_of
+from cow_scenes.maps import maps_of
 from cow_scenes.meta import meta_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -65,9 +65,10 @@ def test_everything_is_in_view_and_named_once(worlds):
 
 def test_ids_lie_in_their_boxes(worlds):
     for item, meta in list(zip(worlds, records(worlds), strict=True))[:12]:
-        ids = np.asarray(ids_of(item))
-        for name, number in meta["id_of"].items():
-            y, x = np.nonzero(ids == number)
+        ids, _ = maps_of(item)
+        assert list(meta["id_of"]) == [*meta["boxes"], *(["table"] if meta["table"] else [])]
+        for name in meta["boxes"]:
+            y, x = np.nonzero(ids == meta["id_of"][name])
             left, top, right, bottom = meta["boxes"][name][0]
             assert x.min() >= left - 1
             assert x.max() <= right + 1
