@@ -163,6 +163,14 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
     if abs(path - clip) * request.fps > 1.5:
         happens = "its rest is not shown" if path > clip else "from its end on the object stays where it is"
         found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
+    if trajectory.depth is not None and not trajectory.depth.is_of_scene:
+        if trajectory.depth.floor is not None:
+            why = f"knows no depth where '{grounding.object}' is"
+        elif trajectory.camera is not None and trajectory.camera.source == "side-view":
+            why = "was given for a drawing that is seen from the side"
+        else:
+            why = "shows no floor that things could stand on"
+        found.append(f"The depth map {why}: nothing is answered from it. Leave `depth` out, or give another map.")
     found += [
         f"Something may stand at ({(left + right) / 2:.0f}, {bottom:.0f}) that is too faint to tell: no world has it."
         for left, _, right, bottom in trajectory.faint

@@ -123,7 +123,7 @@ class Service:
         )
 
     def digested(self, request: Request, image: bytes | None = None) -> tuple[Request, list[File]]:
-        """The request with its image and masks by their digests, and what is to be kept for it: nothing is yet.
+        """The request with its pictures by their digests, and what is to be kept for it: nothing is yet.
 
         `image`: the bytes of its image, where they came apart from it. Raises `InvalidRequest`, the errors of `fetch`
         and of `images.check`. Masks are not decoded before they are needed.
@@ -135,16 +135,19 @@ class Service:
             files.append((data, media_type))
             return ImageArtifact(artifact=hashlib.sha256(data).hexdigest())
 
-        def with_digest(place: Place, pointer: str) -> Place:
-            if not isinstance(place.mask, str):
-                return place
-            data = decode_data_url(place.mask, pointer)
+        def png_digest(url: str, pointer: str) -> ImageArtifact:
+            data = decode_data_url(url, pointer)
             if media_type_of(data) != "image/png":
                 detail = "is no PNG"
                 raise errors.InvalidRequest(
                     f"`{errors.field_of(pointer)}` {detail}.", errors=(errors.FieldError(pointer, detail),)
                 )
-            return place.model_copy(update={"mask": digest(data, "image/png")})
+            return digest(data, "image/png")
+
+        def with_digest(place: Place, pointer: str) -> Place:
+            if not isinstance(place.mask, str):
+                return place
+            return place.model_copy(update={"mask": png_digest(place.mask, pointer)})
 
         if image is None and not isinstance(request.image, ImageArtifact):
             image = self.fetch(request.image)
@@ -156,6 +159,9 @@ class Service:
             changed["objects"] = tuple(
                 with_digest(given, f"/objects/{index}/mask") for index, given in enumerate(request.objects)
             )
+        if request.depth is not None and isinstance(request.depth.map, str):
+            map_ = png_digest(request.depth.map, "/depth/map")
+            changed["depth"] = request.depth.model_copy(update={"map": map_})
         return request.model_copy(update=changed), files
 
     def keep(self, files: Iterable[File]) -> None:

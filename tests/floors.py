@@ -6,8 +6,10 @@ Places are metres right of the camera, above the floor and ahead.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,6 +54,24 @@ class TrueCamera:
             return None
         return float(right / sink * self.height), float(ahead / sink * self.height)
 
+    def depth(self, boxes: Sequence[Box] = ()) -> Floats:
+        """Depth [H, W] (m) along the optical axis of the floor, nan above the horizon, and of upright boards in boxes.
+
+        A board (px) faces the camera and stands at the middle of its lower edge.
+        """
+        width, height = self.size
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        u, v = (x - width / 2) / self.focal, (y - height / 2) / self.focal
+        pitch, roll = np.radians(self.pitch), np.radians(self.roll)
+        down = u * np.sin(roll) + v * np.cos(roll)
+        sink, ahead = down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - down * np.sin(pitch)
+        depth = np.where(sink > 0.02, self.height / np.where(sink > 0.02, sink, 1.0), np.nan)
+        for x0, y0, x1, y1 in ((round(edge) for edge in box) for box in boxes):
+            at = min(height - 1, y1), min(width - 1, (x0 + x1) // 2)
+            board = slice(y0, y1), slice(x0, x1)
+            depth[board] = depth[at] * ahead[at] / ahead[board]
+        return depth
+
     def away(self, place: tuple[float, float]) -> float:
         """Distance (m) of a place on the floor from the camera."""
         return math.hypot(*place, self.height)
@@ -95,3 +115,10 @@ def known(camera: TrueCamera, deviation: float = 1e-8) -> CameraFit:
     mean = np.array([math.radians(camera.pitch), math.log(camera.focal / camera.size[0]), math.log(5), 0.0, 0.1])
     sigma = np.array([deviation, deviation, 0.6, 0.5, 0.45])
     return CameraFit(mean, np.diag(sigma**2), math.radians(camera.roll), 0.0, "prior")
+
+
+def depth_png(depth: Floats, scale: float = 0.001) -> bytes:
+    """The PNG of 16 bits of a depth [H, W] (m), in units of a scale (m)."""
+    encoded, data = cv2.imencode(".png", np.nan_to_num(depth / scale).clip(0, 65535).round().astype(np.uint16))
+    assert encoded
+    return data.tobytes()

@@ -11,6 +11,7 @@ from typing import Any, Union, get_args, get_origin
 import numpy as np
 import pytest
 from drawn import Image, ball, block, floor, png_bytes
+from floors import TrueCamera, depth_png
 from pydantic import BaseModel
 
 from cow_service.records import Answer, Simulation
@@ -23,8 +24,12 @@ BALL, BLOCK, POST = (40, 105, 66, 131), (150, 95, 185, 131), (220, 75, 240, 115)
 PICTURE = ball(block(block(floor(320, 200), POST, GREEN), BLOCK, BLUE), (53, 118), 13, RED)
 
 
+def data_url(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
 def sent(image: Image) -> str:
-    return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()
+    return data_url(png_bytes(image))
 
 
 def mask_of(bbox: tuple[int, int, int, int]) -> str:
@@ -38,6 +43,9 @@ BASE: dict[str, Any] = {
     "image": sent(PICTURE), "question": "If the red ball rolls to the right, will it hit the blue block?",
     "num_frames": 9, "ensemble": 6, "frames": {"count": 1}, "video": False,
 }  # fmt: skip
+CAMERA = TrueCamera(focal=320, size=(320, 200))
+DEPTH = {"map": data_url(depth_png(CAMERA.depth([BALL, BLOCK, POST]))), "scale": 0.001, "focal": 320}
+FARTHER = data_url(depth_png(CAMERA.depth([BALL, (150, 95, 185, 115), POST])))
 MOVES = {"kind": "linear", "direction": [1, 0], "speed": 200}
 BLOCKS = {"object": "blue block", "bbox": BLOCK}
 PATH = {"points": [[53, 118], [103, 118], [153, 118]], "fps": 2}
@@ -112,6 +120,10 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "camera.focal": ({}, 200, 450),
     "camera.pitch": ({}, 10, 40),
     "camera.roll": ({"camera": {"pitch": 20}}, 0, 10),
+    "depth.map": ({"depth": DEPTH}, DEPTH["map"], FARTHER),
+    "depth.scale": ({"depth": DEPTH}, 0.001, 0.01),
+    "depth.focal": ({"depth": DEPTH}, 320, 400),
+    "depth.deviation": ({"depth": DEPTH}, 0.01, 0.1),
     "ensemble": ({}, 0, 6),
     "num_frames": ({}, 9, 12),
     "fps": ({}, 16, 24),

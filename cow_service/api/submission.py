@@ -285,9 +285,9 @@ class Submitter:
         """Raises what is wrong with a request before its image is looked at; returns its reader and generator."""
         if isinstance(body.image, ImageArtifact) and submission.image is None:
             self.engine.may_read(body.image.artifact, submission.owner)
-        for mask in body.masks:
-            if isinstance(mask, ImageArtifact):
-                self.engine.may_read(mask.artifact, submission.owner)
+        for picture in body.attached:
+            if isinstance(picture, ImageArtifact):
+                self.engine.may_read(picture.artifact, submission.owner)
         backends = self.engine.service.precheck(body)
         if body.webhook is not None:
             self.engine.webhooks.check(body.webhook)

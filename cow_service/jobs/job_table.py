@@ -66,10 +66,11 @@ class JobSpec(Record):
         return digest
 
     @property
-    def masks(self) -> list[str]:
-        """The digests of the masks that the request gives."""
+    def attached(self) -> list[str]:
+        """The digests of the masks that the request gives, and of its depth map."""
         places = [self.request.get("grounding") or {}, *self.request.get("objects", ())]
-        return [place["mask"]["artifact"] for place in places if place.get("mask")]
+        given = [place.get("mask") for place in places] + [(self.request.get("depth") or {}).get("map")]
+        return [picture["artifact"] for picture in given if picture]
 
     def accepted(self) -> AcceptedRequest:
         """The request as its caller may send it again."""
@@ -171,7 +172,7 @@ class JobTable:
             added = self._database.insert(JOBS).on_conflict_do_nothing().returning(JOBS.c.id)
             if connection.execute(added, row).one_or_none() is None:
                 return False
-            needed = [{"sha256": sha256, "job_id": job_id} for sha256 in {spec.image, *spec.masks}]
+            needed = [{"sha256": sha256, "job_id": job_id} for sha256 in {spec.image, *spec.attached}]
             connection.execute(self._database.insert(REFERENCES).on_conflict_do_nothing(), needed)
             if behind := [job.id for job in jobs if moves(job, owner, spec.priority, turn)]:
                 waits = JOBS.c.id.in_(behind), JOBS.c.executor.is_(None)

@@ -172,6 +172,17 @@ def decode_own(data: bytes) -> NDArray[np.uint8]:
     return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
 
 
+def decode_depth(data: bytes, *, max_megapixels: float) -> NDArray[np.uint16]:
+    """The values [H, W] of a grey PNG of 16 bits, as they are stored. Raises as `decode`, and for other PNGs."""
+    media_type, stripped, _ = _read_header(data, max_megapixels)
+    kind, opener = _OPENERS[media_type]
+    with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
+        if not image.mode.startswith("I"):
+            detail = f"The picture has the colours {image.mode}, not grey with 16 bits per pixel: save it as such."
+            raise errors.ImageTypeUnsupported(detail)
+        return np.asarray(image).astype(np.uint16)
+
+
 def encode_png(pixels: NDArray[np.uint8] | NDArray[np.bool_], *, level: int = 1) -> bytes:
     """Encode [H, W, 3] RGB, [H, W] grey or an [H, W] boolean mask (one bit per pixel) as PNG.
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody
-from cow_service.records import BBox, CameraEstimate, CameraSource, Vector
+from cow_service.records import BBox, CameraEstimate, CameraSource, Estimate, Vector
 from cow_service.requests import CameraRequest
 from cow_service.vision.shadows import Shadow
 from cow_service.vision.types import Floats
@@ -173,16 +173,23 @@ FIXED = 1e-6  # deviation of a focal length that must not vary
 
 
 def given_camera(
-    size: tuple[int, int], down: Vector, given: CameraRequest | None, fixed_focal: bool = False
+    size: tuple[int, int],
+    down: Vector,
+    given: CameraRequest | None,
+    focal: Estimate | None = None,
+    fixed_focal: bool = False,
 ) -> CameraFit:
     """The camera of an image of a size (width, height; px) as far as a request gives it; the rest is a guess.
 
-    `down` is where the vertical leads in the image; `fixed_focal` holds the focal length where it is.
+    `down` is where the vertical leads in the image; `focal` (px) is the focal length by what else tells it, which the
+    request overrules; `fixed_focal` holds it where it is.
     """
     fit, given = prior(math.atan2(*down)), given or CameraRequest.model_construct()
     mean, sigma = fit.mean.copy(), np.sqrt(np.diag(fit.covariance))
     if given.pitch is not None:
         mean[0], sigma[0] = math.radians(given.pitch), GIVEN_PITCH_SIGMA
+    if focal is not None:
+        mean[1], sigma[1] = math.log(focal.value / size[0]), focal.deviation / focal.value
     if given.focal is not None:
         mean[1], sigma[1] = math.log(given.focal / size[0]), GIVEN_FOCAL_SIGMA
     if fixed_focal:

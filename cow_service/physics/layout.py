@@ -15,9 +15,12 @@ import numpy as np
 from cow_service.physics.bodies import HANGS, SeenBody, supports_of
 from cow_service.physics.camera import FLAT, HORIZON, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN, quantiles
+from cow_service.physics.geometry import Footprint, Measurement
 from cow_service.records import BBox, Cue, Motion, Shape
 from cow_service.vision.types import Floats
 
+MEASURED_SIGMA = 0.03  # of a body's size by its depth: of the logarithm
+ORDER = 17  # how far the draws of one body's depth are from those of the next
 SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
 FOOT_SIGMA = 0.02  # of a body's height in the image: where it meets the floor
 SLIMMEST, TALLEST = 0.2, 12.0  # half heights, in half widths
@@ -107,6 +110,7 @@ class LiftedBody:
     half_height: Floats  # [K]
     stands: bool  # on the floor or on another body; else it is in the air
     depth_share: Floats | float = 1.0  # [K]: how deep it is along the line of sight, of its width
+    yaw: float | None = None  # radians from right to ahead, of its width, where that was measured
 
     def repeated(self, count: int) -> LiftedBody:
         """As the first draw has it, so many times."""
@@ -225,15 +229,18 @@ def lay_out(
     draws: Floats,
     others: Mapping[int, Motion] = MappingProxyType({}),
     level: float | None = None,
+    measured: Measurement | None = None,
 ) -> Layout:
     """Places bodies seen in an image of a size (width, height), px.
 
     `others` are motions of other bodies, by their places among `bodies`; `level` is the height in the image (px) of
-    the floor of a drawing that is seen from the side.
+    the floor of a drawing that is seen from the side; `measured` is what a depth map says.
     """
     cameras, parameters = Cameras.drawn(fit, size, draws)
-    supports = supports_of(bodies, level)
-    if level is None:
+    supports = supports_of(bodies, level) if measured is None else list(measured.supports)
+    if measured is not None:
+        cameras, placed = _Measured(bodies, supports, motion, draws, measured).placed(cameras, parameters, fit)
+    elif level is None:
         cameras, placed = _Picture(bodies, supports, motion, draws).placed(cameras, parameters, fit)
     else:
         depth = cameras.focal * motion.metres_per_pixel.value
@@ -361,6 +368,62 @@ class _Picture:
         across = math.sqrt(max(0.0, 1 - along**2))
         share = (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
         return np.full(len(self.draws), share)
+
+
+@dataclass(frozen=True)
+class _Measured(_Picture):
+    """What a depth map shows; what it does not show is where the picture has it, by the camera over the same floor."""
+
+    measured: Measurement
+
+    def placed(self, cameras: Cameras, parameters: Floats, fit: CameraFit) -> tuple[Cameras, list[LiftedBody]]:
+        """The cameras above the measured floor, and the bodies."""
+        floor, footprints = self.measured.floor, self.measured.footprints
+        depth, found = cameras.focal * self.motion.metres_per_pixel.value, dict[int, LiftedBody]()
+        if footprints[0] is None:
+            cameras, (found[0], *_) = super().placed(cameras, parameters, fit)
+        elif (metres := self.measured.scale) is not None:
+            cameras = cameras.at_height(np.full(len(depth), floor.height * metres))
+        else:  # it has no unit: what is said or guessed of the mover's size fixes the scale
+            cameras = cameras.at_height(floor.height * depth / float(floor.position(footprints[0].centre)[2]))
+        scale = cameras.height / floor.height
+
+        def place(index: int) -> LiftedBody:
+            """A body, after what it stands on."""
+            footprint, on = footprints[index], self.supports[index]
+            if index not in found and footprint is None:
+                found[index] = self.body_at(index, cameras, depth)
+            elif index not in found and footprint is not None:
+                flies = self.bodies[index].is_flying if index else self.bodies[0].flies(self.motion)
+                plane = np.zeros(len(scale)) if on is None else place(on).top
+                found[index] = self.at_footprint(index, footprint, cameras, scale, None if flies else plane)
+            return found[index]
+
+        return cameras, [place(index) for index in range(len(self.bodies))]
+
+    def at_footprint(
+        self, index: int, footprint: Footprint, cameras: Cameras, scale: Floats, plane: Floats | None
+    ) -> LiftedBody:
+        """A body where its footprint is, scaled [K], on a plane at a height [K] (m) or, for None, in the air."""
+        x, y, z = self.measured.floor.position(footprint.centre).tolist()
+        point = np.array([x, y]) / z * self.measured.focal + np.array([cameras.width, cameras.height_px]) / 2
+        # Errors of two bodies' depths have nothing to do with one another: each takes the draws in another order.
+        error = np.exp(footprint.deviation * np.roll(self.draws[:, COLUMN["foot"]], ORDER * index))
+        size = scale * error * np.exp(MEASURED_SIGMA * self.draws[:, COLUMN["size"]])
+        centre = cameras.coordinates(cameras.rays(point) * (z * scale * error)[:, None])
+        half, tall, deep = footprint.half_width * size, footprint.half_height * size, footprint.half_depth * size
+        if not footprint.depth_seen:  # what lies behind is not seen: the body reaches further back than its pixels
+            shallowest, deepest = np.log(DEPTHS)
+            drawn = half * np.exp(shallowest + (deepest - shallowest) * quantiles(self.draws[:, COLUMN["deep"]]))
+            hidden = np.maximum(drawn - deep, 0.0)
+            deep = deep + hidden
+            back = np.array([-math.sin(footprint.yaw), 0.0, math.cos(footprint.yaw)])
+            centre = centre + hidden[:, None] * back
+        if plane is not None:
+            centre[:, 1] = plane + tall
+        yaw = None if footprint.shape == "sphere" else footprint.yaw
+        share = deep / np.maximum(half, 1e-9)
+        return LiftedBody(footprint.shape, centre, half, tall, plane is not None, share, yaw)
 
 
 def _velocity(

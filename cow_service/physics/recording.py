@@ -80,6 +80,8 @@ def record_trajectory(
         law="contact" if path is None else "ballistic",
         fps=world.fps,
         camera=camera,
+        depth=world.depth,
+        surfaces=shown.record_surfaces(camera),
         bodies=shown.record_bodies(),
         paths=paths,
         contacts=contacts,
@@ -175,10 +177,45 @@ class _Shown:
                     position=(x, y, z),
                     support=self.bodies[on].name if on is not None else "floor" if stands else "air",
                     rotation=rotation_where_put(self.worlds, index) if index in self.put else 0.0,
+                    footprint=self.record_footprint(index),
                     source=seen.source,
                     confidence=seen.confidence,
                 )
             )
+        return tuple(found)
+
+    def record_footprint(self, index: int) -> records.Footprint:
+        """How a body stands in the likeliest world, and how far that varies."""
+        shape, measured = self.worlds.shapes[0][index], self.world.measured
+        seen, covariance = None if measured is None else measured.footprints[index], None
+        if self.ensemble is not None:
+            spots = np.array([shapes[index].position for shapes in self.ensemble.shapes])[:, [0, 2]]
+            (a, b), (_, c) = np.cov(spots.T, bias=True).tolist()
+            covariance = (a, b, c)
+        return records.Footprint(
+            centre=(shape.position[0], shape.position[2]),
+            half_width=shape.half_width,
+            half_depth=shape.half_depth,
+            yaw=-math.degrees(shape.yaw),
+            height=2 * shape.half_height,
+            covariance=covariance,
+            seen=None if measured is None else 0.0 if seen is None else seen.share,
+        )
+
+    def record_surfaces(self, estimate: records.CameraEstimate) -> tuple[records.Surface, ...]:
+        """The floor, and the tops of the bodies that others stand on."""
+        camera = FloorCamera.of(estimate, *self.world.size)
+        x, y, z = camera.up.tolist()
+        found = [records.Surface(body=None, normal=(x, y, z), distance=estimate.height)]
+        for index in sorted({on for on in self.worlds.layout.supports if on is not None and on < len(self.bodies)}):
+            shape = self.worlds.shapes[0][index]
+            cosine, sine = abs(math.cos(shape.yaw)), abs(math.sin(shape.yaw))
+            across = cosine * shape.half_width + sine * shape.half_depth
+            along = sine * shape.half_width + cosine * shape.half_depth
+            right, up, ahead = shape.position
+            extent = (right - across, ahead - along, right + across, ahead + along)
+            distance = estimate.height - up - shape.half_height
+            found.append(records.Surface(body=index, normal=(x, y, z), distance=distance, extent=extent))
         return tuple(found)
 
     def record_contacts(self, estimate: records.CameraEstimate) -> tuple[records.Contact, ...]:

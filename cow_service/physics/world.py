@@ -14,6 +14,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
+from cow_service.physics.geometry import Measurement
 from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out, speed_factors
 from cow_service.physics.placement import (
     CARRIED,
@@ -25,7 +26,7 @@ from cow_service.physics.placement import (
     new_supports,
     settle,
 )
-from cow_service.records import FALLING_KINDS, BBox, Motion, Shape
+from cow_service.records import FALLING_KINDS, BBox, DepthEstimate, Motion, Shape
 from cow_service.vision.side_view import pieces_of
 from cow_service.vision.types import Floats, Mask
 
@@ -73,6 +74,8 @@ class WorldInput:
     placement: PlacementGoal | None = None  # the mover is carried somewhere and released
     placed_before: tuple[PlacementGoal, ...] = ()  # what is put somewhere before anything moves, in this order
     level: float | None = None  # px: height in the image of the floor of a drawing that is seen from the side
+    measured: Measurement | None = None  # by a depth map, of `bodies` and then of `removed`
+    depth: DepthEstimate | None = None  # of the map that was given
     faint: tuple[BBox, ...] = ()  # px: where the image may show things, too faint to tell
 
     @property
@@ -130,7 +133,7 @@ def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
     if len(draws) == 1:
         fps, frames = given.fps, given.frames
     bodies, goals = (*given.bodies, *given.removed), given.placed_before
-    layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.others, given.level)
+    layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.others, given.level, given.measured)
     layout = layout.first(len(given.bodies))
     if goals:
         layout = layout.rearranged(new_supports(goals, layout.supports))
@@ -184,7 +187,10 @@ class _Draw:
                 side = min(max(tall, half / math.sqrt(2)), half)  # it is seen between its face's width and its diagonal
             x, y, z = body.centre[k].tolist()
             shape, deep, turn = body.shape, side, yaw if body.shape == "box" and not seen.elongated else 0.0
-            if not seen.is_form_known:  # it shows its width, which nothing says is that of something round
+            if body.yaw is not None:
+                side, turn = half, -body.yaw
+                deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
+            elif not seen.is_form_known:  # it shows its width, which nothing says is that of something round
                 shape, side, turn = "box", half, math.atan2(x, z)
                 deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
             rigid = RigidShape(
@@ -261,7 +267,8 @@ class _Draw:
                 changes["course"] = course_of(motion, velocities, motion.speed * factor)
         fast = float(np.hypot(velocity[0], velocity[2]))
         # A vehicle is longer along its heading than across, as wide as it is seen.
-        if seen.elongated and fast > 0 and given.level is None:
+        is_measured = self.layout.bodies[index].yaw is not None
+        if seen.elongated and fast > 0 and given.level is None and not is_measured:
             placed, k = self.layout.bodies[index], self.k
             sight = placed.centre[k, [0, 2]] / np.linalg.norm(placed.centre[k, [0, 2]])
             along = abs(float(velocity[[0, 2]] @ sight)) / fast

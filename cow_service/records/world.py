@@ -154,7 +154,7 @@ class MetresPerPixel(Record):
     """The scale of the scene at the object, and where it came from."""
 
     value: float = Field(gt=0, description="Metres per pixel at the object's depth.")
-    source: Literal["default", "reference", "request"]
+    source: Literal["default", "reference", "request", "depth"]
     note: str = Field(default="", description="What it was taken from, in words.")
 
 
@@ -239,11 +239,12 @@ MEETINGS: dict[EncounterKind, str] = {
     "occluded-by": "passes behind",
 }  # what the mover does with the other object, in words
 BAND_PERCENTILES = (10, 90)  # of the points over the ensemble, across and down apart: what `Path.band` lies between
-Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "outline", "faint"]
+Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "outline", "faint", "depth"]
 """What a world is uncertain of: `place` is how far from the camera and how high bodies are, `identity` whether things
-are what they are called, `outline` where their outlines run, `faint` whether what is too faint to tell is a thing."""
+are what they are called, `outline` where their outlines run, `faint` whether what is too faint to tell is a thing,
+`depth` whether the depth map is one of this scene."""
 CLEAR = 0.77  # confidence of a body below which no outcome that rests on it is sure
-CameraSource = Literal["shadow", "edges", "request", "side-view", "prior"]
+CameraSource = Literal["request", "exif", "depth", "edges", "shadow", "side-view", "prior"]
 
 
 class CameraDeviations(Record):
@@ -266,6 +267,54 @@ class CameraEstimate(Record):
     deviations: CameraDeviations
 
 
+class Footprint(Record):
+    """How a body stands, as seen from above: right of the camera and ahead of it, over the floor."""
+
+    centre: tuple[float, float] = Field(description="[right, ahead], m.")
+    half_width: float = Field(ge=0, description="m, of the side that `yaw` turns.")
+    half_depth: float = Field(ge=0, description="m, of the other side.")
+    yaw: float = Field(description="Degrees from right to ahead, of the first side.")
+    height: float = Field(ge=0, description="m, of the body.")
+    covariance: tuple[float, float, float] | None = Field(
+        default=None,
+        description="Of the centre over the ensemble: of right, of right with ahead, and of ahead, m^2; null without "
+        "one.",
+    )
+    seen: float | None = Field(
+        default=None, ge=0, le=1, description="Share of its pixels whose depth is known; null without a depth map."
+    )
+
+
+class Surface(Record):
+    """A plane that things stand on: the floor, or the top of a body."""
+
+    body: int | None = Field(description="Which of `Trajectory.bodies` it is the top of; null: the floor.")
+    normal: Position = Field(description="Unit vector upwards in the frame of the camera.")
+    distance: float = Field(description="Of the camera above it, m.")
+    extent: BBox | None = Field(
+        default=None, description="[right, ahead, right, ahead], m: what it spans; null: no end is known."
+    )
+
+
+class DepthEstimate(Record):
+    """The depth map that a world was measured in."""
+
+    scale: float | None = Field(description="Metres per unit; null: relative depth.")
+    focal: float = Field(gt=0, description="px.")
+    valid: float = Field(ge=0, le=1, description="Share of the pixels whose depth is known.")
+    deviation: float = Field(ge=0, description="Relative: one standard deviation.")
+    floor: float | None = Field(
+        description="Share of the pixels beside the bodies that show the floor; null: the map shows none, or the image "
+        "is a drawing without depth, and the map was not used."
+    )
+    mover: float = Field(ge=0, le=1, description="Share of the mover's pixels whose depth is known; 0: too few.")
+
+    @property
+    def is_of_scene(self) -> bool:
+        """Whether an outcome can rest on it: the floor and the mover are seen in it."""
+        return self.floor is not None and self.mover > 0
+
+
 class Body(Record):
     """An object of the world, as it is at the first frame."""
 
@@ -280,6 +329,7 @@ class Body(Record):
         description="Degrees, clockwise, that it leans in the image against how the input shows it: of what was put "
         "somewhere before the motion.",
     )
+    footprint: Footprint | None = Field(default=None, description="Null in results of older versions.")
     source: Literal["embedded", "mllm", "request"] = Field(description="Who says that it is there.")
     confidence: float = Field(
         ge=0,
@@ -458,6 +508,8 @@ class Trajectory(Record):
     fps: float = Field(gt=0, description="Frames per second of the clip.")
     units: TrajectoryUnits = TrajectoryUnits()
     camera: CameraEstimate | None = Field(default=None, description="Null where nothing was estimated.")
+    depth: DepthEstimate | None = Field(default=None, description="Null where no depth map was given.")
+    surfaces: tuple[Surface, ...] = Field(default=(), description="What bodies stand on, the floor first.")
     bodies: tuple[Body, ...] = ()
     paths: tuple[Path, ...] = Field(min_length=1, description="Of the bodies that move, the mover's first.")
     contacts: tuple[Contact, ...] = Field(default=(), description="In the order of their times.")

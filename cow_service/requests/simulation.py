@@ -303,6 +303,24 @@ class CameraRequest(Record):
         return self
 
 
+class DepthRequest(Record):
+    """A depth map of the image: how far from the camera, along its optical axis, what each pixel shows is."""
+
+    map: MaskRef = Field(
+        description="PNG of the upright image's size, grey with 16 bits: the depth in units of `scale`; 0 where "
+        "nothing is known."
+    )
+    scale: Annotated[Finite, Field(ge=1e-9, le=1e6)] | None = Field(
+        default=None, description="Metres per unit of the map; null: relative depth, whose unit nobody knows."
+    )
+    focal: Annotated[Finite, Field(ge=1, le=1_000_000)] | None = Field(
+        default=None, description="Focal length that the map was made with, px; by default the camera's."
+    )
+    deviation: Annotated[Finite, Field(ge=0, le=1)] = Field(
+        default=0.05, description="How far its depths may be off, relative: one standard deviation."
+    )
+
+
 MAX_FRAMES = 481
 MAX_VALUES = 10_000  # of each field but the trajectory
 Priority = Literal["low", "normal", "high"]
@@ -386,6 +404,9 @@ class SimulateRequest(Record):
         default=None, description="What the question wants to know; by default it is read from the question."
     )
     camera: CameraRequest | None = None
+    depth: DepthRequest | None = Field(
+        default=None, description="A depth map: the floor, the camera and the bodies are then measured in it."
+    )
     ensemble: Whole = Field(
         default=50,
         ge=0,
@@ -453,10 +474,11 @@ class SimulateRequest(Record):
         return tuple(dict.fromkeys(named))
 
     @property
-    def masks(self) -> tuple[MaskRef, ...]:
-        """The masks that it gives, the mover's first."""
+    def attached(self) -> tuple[MaskRef, ...]:
+        """The pictures that it gives beside its image: masks, the mover's first, and the depth map."""
         places = (*([] if self.grounding is None else [self.grounding]), *self.objects)
-        return tuple(place.mask for place in places if place.mask is not None)
+        masks = (place.mask for place in places if place.mask is not None)
+        return (*masks, *([] if self.depth is None else [self.depth.map]))
 
     @model_validator(mode="before")
     @classmethod

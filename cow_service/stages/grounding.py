@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from cow_service import errors
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
 from cow_service.narration import same_name
@@ -13,7 +12,7 @@ from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, ObjectPrior
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
-from cow_service.stages.run import Run
+from cow_service.stages.run import UNREADABLE, Run
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Mask
@@ -21,7 +20,6 @@ from cow_service.vision.types import Mask
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 WHITE = 128  # grey level from which a pixel of a mask is the object's
-UNREADABLE = (errors.ArtifactNotFound, errors.ImageTooLarge, errors.ImageTypeUnsupported, errors.ImageUnreadable)
 MAX_MASK_SHARE = 0.95  # of the image: more is no object, but an image without a mask
 
 

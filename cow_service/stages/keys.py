@@ -89,7 +89,7 @@ class KeyFields:
     read_with: str | None = None  # a stage: where the reader reads for it, too, it says no less of this one
 
 
-TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "ensemble", "num_frames", "fps")
+TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "depth", "ensemble", "num_frames", "fps")
 KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "grounding": KeyFields(
@@ -104,7 +104,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         ("question", "seed", "left_to_reader"),
         "reader",
         set_by_request=("stated_motion", "trajectory"),
-        always=("law", "motion", "camera"),
+        always=("law", "motion", "camera", "depth"),
         prompt="motion-sentence",
     ),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),

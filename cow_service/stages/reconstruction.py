@@ -14,9 +14,10 @@ from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, give
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import SIDE_VIEW, camera_of, given_camera
 from cow_service.physics.ensemble import BY_EVENTS, Query
+from cow_service.physics.geometry import DepthMap, measure_scene
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
-from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, Motion
+from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
@@ -25,6 +26,7 @@ from cow_service.vision.scene import Obstacle, Scene
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.side_view import SideView
 
+FOCAL_DEVIATION = 0.03  # relative, of the focal length that comes with a depth map
 PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
 HIDDEN = 0.25  # of the columns of a body: with so many ending at another one, its foot is hidden
@@ -40,11 +42,14 @@ class Situation:
     request: SimulateRequest
     obstacles: Sequence[Obstacle]
     removed: Sequence[Obstacle] = ()
+    depth: DepthMap | None = None
 
     @staticmethod
-    def of(scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest) -> Situation:
+    def of(
+        scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest, depth: DepthMap | None = None
+    ) -> Situation:
         """With the obstacles that the scene shows."""
-        return Situation(scene, grounding, motion, request, *obstacles_of(scene, grounding))
+        return Situation(scene, grounding, motion, request, *obstacles_of(scene, grounding), depth)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -65,6 +70,12 @@ class Situation:
     def side_view(self) -> SideView | None:
         """The drawing without depth that the image is, unless its mover follows a path through space."""
         return None if self.follows_path else self.scene.side_view
+
+    @property
+    def focal(self) -> Estimate | None:
+        """The focal length (px) that a depth map was made with."""
+        known = None if self.depth is None else self.depth.focal
+        return None if known is None else Estimate(value=known, deviation=FOCAL_DEVIATION * known)
 
     @cached_property
     def located(self) -> tuple[LocatedObject, ...]:
@@ -113,10 +124,14 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         query = Query(Asked(relation="inside"), carried.targets[0])
     faint = situation.scene.faint_beside([body.bbox for body in bodies])
     shadow = find_shadow(situation.scene, bodies[0].bbox) if bodies[0].shape == "sphere" and in_air[0] else None
-    fit = given_camera(situation.size, motion.down, request.camera, fixed_focal=situation.follows_path)
-    standing = [body for body, stands in zip(bodies, on_floor, strict=True) if stands]
-    flying = bodies[0] if in_air[0] else None
-    fit = camera_of(fit, situation.size, standing, flying, motion.metres_per_pixel.value, shadow)
+    fit = given_camera(situation.size, motion.down, request.camera, situation.focal, situation.follows_path)
+    if situation.depth is None or level is not None or situation.follows_path:
+        standing = [body for body, stands in zip(bodies, on_floor, strict=True) if stands]
+        flying = bodies[0] if in_air[0] else None
+        fit = camera_of(fit, situation.size, standing, flying, motion.metres_per_pixel.value, shadow)
+        measured = None
+    else:
+        fit, measured = measure_scene(situation.depth, fit, bodies)
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
@@ -144,6 +159,8 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         placement=carried,
         placed_before=before,
         level=level,
+        measured=measured,
+        depth=None if situation.depth is None else situation.depth.estimate(fit, measured),
         faint=faint,
     )
     if not situation.follows_path:

@@ -9,20 +9,26 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, Generic, Self, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from cow_service import errors
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, RetryPolicy, try_once
-from cow_service.media.images import DecodedImage, decode_own
+from cow_service.media.images import DecodedImage, decode_depth, decode_own
 from cow_service.observability.logging import rfc3339
+from cow_service.physics.geometry import DepthMap
 from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
 from cow_service.records import Artifact, BBox, Cue, Grounding, ReaderInfo, Record, Usage
-from cow_service.requests import AnswerRequest, SimulateRequest, Stage
+from cow_service.requests import AnswerRequest, ImageArtifact, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
 from cow_service.vision.types import Mask
+
+# What reading a picture that a request attaches may end with.
+UNREADABLE = (errors.ArtifactNotFound, errors.ImageTooLarge, errors.ImageTypeUnsupported, errors.ImageUnreadable)
 
 
 def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
@@ -46,14 +52,14 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
         detail = f"this generator makes no clip of {request.num_frames} frames; take {' or '.join(map(str, legal))}"
         raise InvalidRequest(f"`num_frames`: {detail}.", errors=(FieldError("/num_frames", detail),))
     last = request.num_frames - 1
-    errors = tuple(
+    faults = tuple(
         FieldError(f"/frames/indices/{place}", f"the clip has frames 0 to {last}, got {index}")
         for place, index in enumerate(request.frames.indices or ())
         if index > last
     )
-    if errors:
+    if faults:
         raise InvalidRequest(
-            f"`frames.indices` names frames that the clip does not have: it has 0 to {last}.", errors=errors
+            f"`frames.indices` names frames that the clip does not have: it has 0 to {last}.", errors=faults
         )
     return options
 
@@ -88,6 +94,13 @@ def now() -> str:
 def priority_of(turn: int, created_at: str) -> str:
     """A string that sorts by turn, then by time (RFC 3339)."""
     return f"{turn:010d} {created_at}"
+
+
+def _no_depth(fault: str) -> InvalidRequest:
+    return InvalidRequest(
+        f"`depth.map` {fault}. Give a grey PNG with 16 bits, of the size of the upright image.",
+        errors=(FieldError("/depth/map", fault),),
+    )
 
 
 @dataclass(frozen=True)
@@ -154,6 +167,26 @@ class Run(Generic[Request_co]):
 
     def _stored_mask(self, mask: Artifact) -> Mask:
         return decode_own(self.backends.artifacts.read(mask.sha256))[..., 0] > 0
+
+    @cached_property
+    def depth(self) -> DepthMap | None:
+        """The depth map of the request. Raises `InvalidRequest` for one that is none of this image."""
+        given, image = self.request.depth, self.image.info
+        if given is None:
+            return None
+        assert isinstance(given.map, ImageArtifact), "the pictures of a request are kept before its stages run"
+        try:
+            data = self.backends.artifacts.read(given.map.artifact)
+            values = decode_depth(data, max_megapixels=image.width * image.height / 1e6)
+        except UNREADABLE as error:
+            raise _no_depth(f"cannot be read: {error.detail}") from error
+        if values.shape != (image.height, image.width):
+            size = f"{values.shape[1]} x {values.shape[0]} px"
+            raise _no_depth(f"has {size} where the upright image has {image.width} x {image.height} px")
+        if not values.any():
+            raise _no_depth("is empty: every pixel is 0, which says that nothing is known")
+        depth = np.where(values > 0, values.astype(np.float64), np.nan)
+        return DepthMap(depth, given.scale, given.deviation, given.focal)
 
     @cached_property
     def question(self) -> QuestionReading:

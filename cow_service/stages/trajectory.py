@@ -22,7 +22,7 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
         scene = run.scene_of(grounding, motion.cue)
-        trajectory = simulate_world(Situation.of(scene, grounding, motion, run.request))
+        trajectory = simulate_world(Situation.of(scene, grounding, motion, run.request, run.depth))
     return StageResult(value=trajectory, warnings=warnings_of(run.request, grounding, trajectory))
 
 
@@ -62,6 +62,8 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
         sure=False,
         robust=False,
     )
+    if world.depth is not None and not world.depth.is_of_scene:
+        return result, outcome.model_copy(update={"depends_on": ("depth",)})
     if result.decided is None:
         return result, outcome
     first = None if result.decided.first is None else names[result.decided.first]

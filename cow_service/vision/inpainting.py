@@ -178,7 +178,7 @@ def _texture(
         y, x = inner[0].start + sy * step_y, inner[1].start + sx * step_x
         place = slice(y, y + step_y), slice(x, x + step_x)
         is_inside = y >= 0 and x >= 0 and y + step_y <= height and x + step_x <= across
-        if not is_inside or (unusable[place][::2, ::2] & shape).any():
+        if not is_inside or not shape.any() or (unusable[place][::2, ::2] & shape).any():
             continue
         patch = image[place][::2, ::2].astype(np.float32)  # every other pixel tells enough of its unrest
         unrest = float(np.percentile(np.abs(patch - cv2.blur(patch, (half, half)))[shape], 99))

@@ -1,0 +1,359 @@
+"""The floor, the camera above it and the bodies on it, as a depth map shows them.
+
+Of a pixel, u and v are its place right of the image's middle and below it, in focal lengths: it shows what lies at
+z (u, v, 1), where z is its depth. A plane N . p = 1 has the inverse depths N . (u, v, 1), so the floor is a straight
+line fit. Lengths have the unit of the map; over the floor they are right, up and ahead, the camera above the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.camera import CameraFit, axes_of
+from cow_service.records import BBox, DepthEstimate, Shape
+from cow_service.vision.masks import CroppedMask, eroded
+from cow_service.vision.types import Floats, Mask
+
+SAMPLES = 6000  # pixels that the floor is sought in
+TRIES = 300  # planes through three of them
+LEVEL = math.radians(20)  # the floor rolls no more than that against the vertical that is assumed
+STEEPEST, FLATTEST = math.radians(85), math.radians(-10)  # pitches at which a floor is a floor
+LEAST_TOLERANCE = 0.01  # of the depth: how far a pixel of the floor may lie off its plane
+BELOW = 3.0  # how much more a pixel that would lie under the floor counts than one on it
+LEAST_FLOOR = 0.1  # of the pixels that show no body: the floor has at least so many
+FARTHEST = 8.0  # of the nearest depths: what lies beyond tells little of the floor that things stand on
+CELLS = 3, 4  # rows and columns: errors of a depth map are alike within such a part of the image
+SURE = 0.003  # of the depth: no map is more exact
+LEAST_SEEN = 0.3  # of a body's pixels: with fewer known depths it is not measured
+LEAST_PIXELS = 24
+EDGE = 5  # px across: at outlines depths are those of neither side
+TRIM = 2.0  # percent of the points at either end that are left out
+FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
+AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
+ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
+ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
+FLAT = 0.015  # of its distance: what rises less above the floor is no body, but a mark or a shadow on it
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """How far from the camera, along its optical axis, what the pixels of an image show is."""
+
+    depth: Floats  # [H, W] in the unit of the map; nan where nothing is known
+    scale: float | None  # metres per unit; None: relative depth
+    deviation: float  # relative, one standard deviation
+    focal: float | None  # px; None: it is not known
+
+    def metres_per_pixel(self, bbox: BBox, focal: float) -> float | None:
+        """At what is in the middle of a box (px); None where nobody knows it.
+
+        `focal` (px) is taken where the map has no focal length of its own.
+        """
+        x0, y0, x1, y1 = bbox
+        across, down = (x1 - x0) / 4, (y1 - y0) / 4
+        inner = self.depth[int(y0 + down) : math.ceil(y1 - down), int(x0 + across) : math.ceil(x1 - across)]
+        if self.scale is None or np.isfinite(inner).mean() < LEAST_SEEN:
+            return None
+        return float(np.nanmedian(inner)) * self.scale / (self.focal or focal)
+
+    def estimate(self, fit: CameraFit, measured: Measurement | None) -> DepthEstimate:
+        """The record of it, with what was measured in it, if anything was."""
+        mover = None if measured is None else measured.footprints[0]
+        return DepthEstimate(
+            scale=self.scale,
+            focal=self.focal or math.exp(fit.mean[1]) * self.depth.shape[1],
+            valid=float(np.isfinite(self.depth).mean()),
+            deviation=self.deviation,
+            floor=None if measured is None else measured.floor.share,
+            mover=0.0 if mover is None else mover.share,
+        )
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The plane on which things stand."""
+
+    pitch: float  # radians that the camera looks down on it
+    roll: float  # radians
+    height: float  # of the camera above it, in the unit of the map
+    sigma: tuple[float, float, float]  # of pitch and roll, and of the logarithm of the height
+    share: float  # of the pixels that show no body
+
+    @property
+    def axes(self) -> Floats:
+        """Rows right, up and ahead over it [3, 3], in the frame of the camera."""
+        return axes_of(np.array([self.pitch]), np.array([self.roll]))[0]
+
+    def coordinates(self, positions: Floats) -> Floats:
+        """Right, up and ahead [N, 3] of positions [N, 3] in the frame of the camera."""
+        return positions @ self.axes.T + np.array([0.0, self.height, 0.0])
+
+    def position(self, coordinates: tuple[float, float, float]) -> Floats:
+        """Position [3] in the frame of the camera."""
+        return (np.array(coordinates) - np.array([0.0, self.height, 0.0])) @ self.axes
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Where a body is and how far it reaches, as its pixels show it."""
+
+    shape: Shape
+    centre: tuple[float, float, float]  # right, up and ahead
+    half_width: float  # across the line of sight, about
+    half_depth: float  # along it, as far as it is seen
+    half_height: float
+    yaw: float  # radians from right to ahead: of the side that is `half_width`
+    bottom: float  # height of its lowest pixels above the floor
+    depth_seen: bool  # its top shows how deep it is; else it may be deeper
+    deviation: float  # of its depth, relative
+    share: float  # of its pixels whose depth is known
+
+    @property
+    def top(self) -> float:
+        """Height of its upper end above the floor."""
+        return self.centre[1] + self.half_height
+
+    @property
+    def distance(self) -> float:
+        """From the camera, over the floor."""
+        return math.hypot(self.centre[0], self.centre[2])
+
+    def is_over(self, other: Footprint) -> bool:
+        """Whether its middle lies over another one."""
+        away = np.array([self.centre[0] - other.centre[0], self.centre[2] - other.centre[2]])
+        along = abs(float(away @ [math.cos(other.yaw), math.sin(other.yaw)]))
+        across = abs(float(away @ [-math.sin(other.yaw), math.cos(other.yaw)]))
+        return along < other.half_width and across < max(other.half_depth, other.half_width * (not other.depth_seen))
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What a depth map says of a scene: the floor, its bodies, and what each of them stands on (None: the floor)."""
+
+    floor: Floor
+    footprints: tuple[Footprint | None, ...]
+    supports: tuple[int | None, ...]
+    deviation: float  # relative, of depths
+    focal: float  # px
+    scale: float | None  # metres per unit of the map; None: relative depth
+
+
+def measure_scene(given: DepthMap, fit: CameraFit, bodies: Sequence[SeenBody]) -> tuple[CameraFit, Measurement | None]:
+    """The camera and the bodies by a depth map, where the camera is known as `fit` says; None where it has no floor."""
+    focal = math.exp(fit.mean[1]) * given.depth.shape[1]
+    floor = find_floor(given, focal, [body.mask for body in bodies], fit.roll)
+    if floor is None:
+        return fit, None
+    footprints = measure(given, focal, floor, bodies)
+    supports = tuple(_supports(bodies, footprints, given.deviation))
+    return camera_over(floor, fit), Measurement(floor, footprints, supports, given.deviation, focal, given.scale)
+
+
+def _supports(bodies: Sequence[SeenBody], footprints: Sequence[Footprint | None], deviation: float) -> list[int | None]:
+    """What each body stands on: what is beneath its middle and ends where it begins; as seen, where that is unknown."""
+    found = supports_of(bodies)
+    for index, (body, own) in enumerate(zip(bodies, footprints, strict=True)):
+        if own is None or (body.prior is not None and body.prior.stands_on is not None):
+            continue
+        allowed = ON_TOP * 2 * own.half_height + deviation / 2 * own.distance
+        under = {
+            other: abs(own.bottom - each.top)
+            for other, each in enumerate(footprints)
+            if each is not None and other != index and each.top < own.top and own.is_over(each)
+        }
+        on = min(under, key=lambda other: under[other], default=None)
+        found[index] = on if on is not None and under[on] < min(allowed, abs(own.bottom)) else None
+    return found
+
+
+def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], roll: float = 0.0) -> Floor | None:
+    """The floor in a depth map of an image with that focal length (px), beside bodies; None where none is seen.
+
+    It is the plane, level but for the pitch of the camera, on which most pixels lie and beneath which hardly any do.
+    `roll` (radians) is that of the vertical that is assumed.
+    """
+    height, width = given.depth.shape
+    covered = np.zeros((height, width), bool)
+    for body in bodies:
+        body.add_to(covered)
+    step = max(1, math.isqrt(height * width // SAMPLES))
+    chosen = np.argwhere((~covered & np.isfinite(given.depth))[step // 2 :: step, step // 2 :: step]) * step + step // 2
+    if len(chosen) < LEAST_PIXELS:
+        return None
+    rng = np.random.default_rng(0)  # the same map must give the same floor
+    depth = given.depth[tuple(chosen.T)]
+    near = depth < FARTHEST * np.percentile(depth, 5)
+    chosen, depth = chosen[near], depth[near]
+    rays = _rays(chosen[:, 1], chosen[:, 0], width, height, focal)
+    rows = rays * depth[:, None]  # a plane N has rows @ N = 1
+    tolerance = LEAST_TOLERANCE + given.deviation / 2
+    threes = rows[rng.integers(0, len(rows), (TRIES, 3))]
+    threes = threes[np.abs(np.linalg.det(threes)) > 1e-9 * np.median(depth) ** 3]
+    planes = np.linalg.solve(threes, np.ones((len(threes), 3, 1)))[..., 0]
+    planes = planes[[_is_level(plane, roll) for plane in planes]]
+    if not len(planes):
+        return None
+    off = planes @ rows.T - 1  # how much farther than the plane a pixel is, of its depth
+    score = (np.abs(off) < tolerance).sum(axis=1) - BELOW * (off > 3 * tolerance).sum(axis=1)
+    plane = planes[int(score.argmax())]
+    for _ in range(6):
+        off = rows @ plane - 1
+        weight = np.clip(1 - (off / (3 * tolerance)) ** 2, 0, None)
+        weighted = rows * weight[:, None]
+        plane = np.linalg.lstsq(weighted.T @ rows, weighted.sum(axis=0), rcond=None)[0]
+    off = rows @ plane - 1
+    near = np.abs(off) < 2 * tolerance
+    share = float(near.mean())
+    if share < LEAST_FLOOR or not _is_level(plane, roll) or float(score.max()) <= 0:
+        return None
+    # Neighbouring pixels are wrong alike: a sum over parts of the image, each of which has one error.
+    used, places = rows[near], chosen[near] * np.array(CELLS) // np.array([height, width])
+    inverse = np.linalg.inv(used.T @ used)
+    parts = [used[(places == cell).all(axis=1)].sum(axis=0) for cell in np.unique(places, axis=0)]
+    spread = max(SURE, given.deviation, float(np.std(off[near])))
+    root = np.stack(parts) @ inverse * spread
+    pitch, found_roll, distance = _of_plane(plane)
+    steps = np.stack([np.array(_of_plane(plane + each)) - [pitch, found_roll, distance] for each in root])
+    sigma = np.sqrt((steps**2).sum(axis=0)) / np.array([1.0, 1.0, distance])
+    return Floor(pitch, found_roll, distance, (float(sigma[0]), float(sigma[1]), float(sigma[2])), share)
+
+
+def _rays(x: ArrayLike, y: ArrayLike, width: int, height: int, focal: float) -> Floats:
+    """Rays [N, 3] of depth 1 through the middles of pixels in columns [N] and rows [N]."""
+    across, down = np.asarray(x, np.float64) + 0.5, np.asarray(y, np.float64) + 0.5
+    return np.stack([(across - width / 2) / focal, (down - height / 2) / focal, np.ones(len(across))], axis=1)
+
+
+def _of_plane(plane: Floats) -> tuple[float, float, float]:
+    """Pitch and roll (radians) of the camera over a plane [3], and its height."""
+    length = float(np.linalg.norm(plane))
+    down = plane / length
+    return math.asin(float(np.clip(down[2], -1, 1))), math.atan2(float(down[0]), float(down[1])), 1 / length
+
+
+def _is_level(plane: Floats, roll: float) -> bool:
+    pitch, found, _ = _of_plane(plane)
+    return FLATTEST < pitch < STEEPEST and abs(math.remainder(found - roll, math.tau)) < LEVEL
+
+
+def camera_over(floor: Floor, fit: CameraFit) -> CameraFit:
+    """The camera over a floor that was measured with the focal length of a fit: its doubt makes the pitch doubtful."""
+    mean, covariance = fit.mean.copy(), np.diag(np.diag(fit.covariance))
+    tilt = -math.sin(floor.pitch) * math.cos(floor.pitch)  # of the pitch, by the logarithm of the focal length
+    mean[0] = floor.pitch
+    covariance[0, 0] = floor.sigma[0] ** 2 + tilt**2 * covariance[1, 1] + 1e-12
+    covariance[0, 1] = covariance[1, 0] = tilt * covariance[1, 1]
+    return replace(fit, mean=mean, covariance=covariance, roll=floor.roll, roll_sigma=floor.sigma[1], source="depth")
+
+
+def measure(given: DepthMap, focal: float, floor: Floor, bodies: Sequence[SeenBody]) -> tuple[Footprint | None, ...]:
+    """The footprints of bodies; None of one whose depth is not known."""
+    known, covered = np.isfinite(given.depth), np.zeros(given.depth.shape, bool)
+    for body in bodies:
+        body.mask.add_to(covered)
+    filled = np.where(known, given.depth, 0.0).astype(np.float32)
+    smooth = np.asarray(cv2.medianBlur(filled, EDGE), np.float64)
+    known &= smooth > 0
+    found = list[Footprint | None]()
+    for body in bodies:
+        off = None if body.is_flying else _floor_error(body, smooth, known & ~covered, focal, floor, given.deviation)
+        depth, left = (smooth, 1.0) if off is None else (smooth / off, ALIKE)
+        one = _footprint(body, depth, known, focal, floor)
+        found.append(one and replace(one, deviation=SURE + left * given.deviation))
+    return tuple(found)
+
+
+def _floor_error(
+    body: SeenBody, depth: Floats, free: Mask, focal: float, floor: Floor, deviation: float
+) -> float | None:
+    """How far the depths [H, W] of the free pixels [H, W] around the foot of a body are off the floor, as a factor.
+
+    Errors of a map are alike in neighbouring pixels: the body is off by the same. None where no floor is seen there.
+    """
+    (x0, y0, x1, y1), (height, width) = body.bbox, depth.shape
+    across, down = AROUND * (x1 - x0), AROUND * (y1 - y0)
+    rows = slice(max(0, int(y1 - down)), min(height, math.ceil(y1 + down)))
+    columns = slice(max(0, int(x0 - across)), min(width, math.ceil(x1 + across)))
+    y, x = np.nonzero(free[rows, columns])
+    y, x = y + rows.start, x + columns.start
+    lower = -floor.axes[1]  # the unit vector downwards
+    off = depth[y, x] * (_rays(x, y, width, height, focal) @ lower) / floor.height
+    on_floor = off[np.abs(off - 1) < 3 * (LEAST_TOLERANCE + deviation)]
+    return float(np.median(on_floor)) if len(on_floor) >= max(LEAST_PIXELS, 0.3 * len(off)) else None
+
+
+def _footprint(body: SeenBody, depth: Floats, known: Mask, focal: float, floor: Floor) -> Footprint | None:
+    """Of one body, by depths [H, W] and where they are known [H, W]."""
+    mask, (height, width) = body.mask, depth.shape
+    inner = eroded(np.pad(mask.patch, EDGE), EDGE)[EDGE:-EDGE, EDGE:-EDGE]
+    inner = inner if np.count_nonzero(inner) >= LEAST_PIXELS else mask.patch
+    there = inner & known[mask.rows, mask.columns]
+    share = np.count_nonzero(there) / max(1, np.count_nonzero(inner))
+    if share < LEAST_SEEN or np.count_nonzero(there) < LEAST_PIXELS:
+        return None
+    y, x = np.nonzero(there)
+    y, x = y + mask.rows.start, x + mask.columns.start
+    z = depth[y, x].astype(np.float64)
+    rays = _rays(x, y, width, height, focal)
+    edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
+    if body.shape == "sphere":
+        x0, y0, x1, y1 = body.bbox
+        radius = body.radius / focal
+        near = np.hypot(x + 0.5 - (x0 + x1) / 2, y + 0.5 - (y0 + y1) / 2) < body.radius / 3
+        front = float(np.median(z[near] if near.any() else z))
+        middle = front / max(1 - radius, 0.1)
+        ray = _rays(np.array([(x0 + x1 - 1) / 2]), np.array([(y0 + y1 - 1) / 2]), width, height, focal)
+        across, up, ahead = floor.coordinates(ray * middle)[0].tolist()
+        half = radius * middle
+        return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, 0.0, share)
+    right, up, ahead = floor.coordinates(rays * z[:, None]).T
+    bottom, top = (float(value) for value in np.percentile(up, (TRIM, 100 - TRIM)))
+    sight = math.atan2(float(np.median(ahead)), float(np.median(right)))
+    from_above = (floor.height - top) / math.hypot(float(np.median(right)), float(np.median(ahead)), floor.height)
+    seen = from_above > FROM_ABOVE
+    if body.is_form_known and body.shape in ("cylinder", "cone"):
+        yaw = sight - math.pi / 2
+    else:
+        spots = np.stack([right, ahead], axis=1)
+        _, sides, degrees = cv2.minAreaRect(np.asarray(_core(spots), np.float32))
+        yaw = math.radians(degrees)
+        # Of its two sides the one that lies across the line of sight.
+        yaw += math.pi / 2 * round((sight - math.pi / 2 - yaw) / (math.pi / 2))
+        yaw = yaw if max(sides) > 0 else sight - math.pi / 2
+    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    along = np.stack([right, ahead], axis=1) @ turn.T
+    (left, near), (far_right, far) = np.percentile(along, (TRIM, 100 - TRIM), axis=0)
+    half_width, half_depth = (far_right - left) / 2 + edge, (far - near) / 2
+    middle = np.array([(left + far_right) / 2, (near + far) / 2])
+    if body.is_form_known and body.shape in ("cylinder", "cone"):
+        half_depth, seen = half_width, True
+        middle[1] = near + half_width
+    x_, z_ = middle @ turn
+    low = max(0.0, bottom) if body.prior is not None and body.prior.stands_on == "air" else 0.0
+    tall = max((top + edge - low) / 2, 1e-6)
+    return Footprint(
+        body.shape if body.is_form_known else "box",
+        (float(x_), low + tall, float(z_)),
+        float(half_width),
+        float(half_depth),
+        tall,
+        yaw,
+        bottom,
+        seen,
+        0.0,
+        share,
+    )
+
+
+def _core(spots: Floats) -> Floats:
+    """Points [N, 2] without the few that lie far out."""
+    low, high = np.percentile(spots, (TRIM, 100 - TRIM), axis=0)
+    kept = spots[((spots >= low) & (spots <= high)).all(axis=1)]
+    return kept if len(kept) >= LEAST_PIXELS // 2 else spots
