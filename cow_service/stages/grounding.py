@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from cow_service import errors
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
-from cow_service.narration import same_name
+from cow_service.narration import OF_ITSELF, OF_TARGET, same_name
 from cow_service.readers.base import GroundingReading, NamedChange, WordReader
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT
@@ -82,6 +82,8 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
             f"Taken for drawn over the image though the question speaks of none: {places}. "
             "A generator that cleans cues takes them out; `generator_options.clean_cues: false` keeps them."
         )
+    if name := asked_of_itself(grounding):
+        warnings.append(f"A thing cannot meet itself, so what is asked of '{name}' is open: ask of another thing.")
     if request.asked is not None or source != "embedded":  # which warns of what it does not find
         known = [each.object for each in (mover, *others_of(grounding), *removed_of(grounding))]
         asked = grounding.asked
@@ -300,6 +302,14 @@ def placed_mover(grounding: Grounding) -> Intervention | None:
     """The intervention that puts the grounded object somewhere; None where it stays or moves by itself."""
     placed = (each for each in grounding.interventions if each.kind == "place")
     return next((each for each in placed if is_same_object(each.object.bbox, grounding.bbox)), None)
+
+
+def asked_of_itself(grounding: Grounding) -> str | None:
+    """The thing of which it is asked whether it meets, hides or holds itself: none can."""
+    asked = grounding.asked
+    if asked is None or asked.target is None or asked.relation in (*OF_TARGET, *OF_ITSELF):
+        return None
+    return asked.target if same_name(asked.target, asked.subject or grounding.object) else None
 
 
 def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
