@@ -358,7 +358,7 @@ def test_a_tool_takes_what_people_know_better(here: tuple[Session, Path]) -> Non
         ({"image": "https://example.org/a.png"}, ("image-url-not-allowed", "COW_ALLOW_IMAGE_URLS")),
         ({"image": "data:image/png;base64,AAAA"}, ("image-type-unsupported", "image")),
         ({"bbox": [1, 2, 3]}, ("invalid-request", "bbox/3: ")),
-        ({"bbox": [9, 9, 9, 9]}, ("invalid-request", "bbox: [x0, y0, x1, y1] must span at least 2 px")),
+        ({"bbox": [9, 9, 9, 9]}, ("invalid-request", "bbox: [x0, y0, x1, y1] must have x1 and y1 at least 2 px")),
         ({"object": "ball"}, ("invalid-request", "give either `bbox` or `point`")),
         ({"motion_kind": "projectile"}, ("invalid-request", "needs a `direction`")),
         ({"frames_count": 1000}, ("invalid-request", "frames_count: ")),

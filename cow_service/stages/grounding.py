@@ -22,7 +22,7 @@ DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 WHITE = 128  # grey level from which a pixel of a mask is the object's
 UNREADABLE = (errors.ArtifactNotFound, errors.ImageTooLarge, errors.ImageTypeUnsupported, errors.ImageUnreadable)
-MAX_MASK_SHARE = 0.95  # of the image: more is no object, but an image without a mask
+MAX_SHARE = 0.95  # of the image that a box or a mask covers: more is no object
 
 
 def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
@@ -151,8 +151,8 @@ def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], 
 def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Place:
     """The place of an object; `pointer` is the JSON Pointer to `given`.
 
-    Raises `InvalidRequest` for a place outside the image and for a mask that is none of this image, and `CannotGround`
-    where what can be cut out around a point is no object.
+    Raises `InvalidRequest` for a place outside the image or all over it and for a mask that is none of this image, and
+    `CannotGround` where what can be cut out around a point is no object.
     """
     run.check_canceled()
     scene, field = run.scene, field_of(pointer)
@@ -163,9 +163,15 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     if given.bbox is not None:
         x0, y0, x1, y1 = given.bbox
         clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
-        if clipped[2] - clipped[0] < 2 or clipped[3] - clipped[1] < 2:
+        wide, high = clipped[2] - clipped[0], clipped[3] - clipped[1]
+        if wide < 2 or high < 2:
             raise _outside(f"{pointer}/bbox", given.bbox, scene)
-        return Place(clipped)
+        if (share := wide * high / (scene.width * scene.height)) > MAX_SHARE:
+            detail = f"{list(given.bbox)} covers {share:.0%} of the image"
+            message = f"`{field}.bbox` {detail}: give the box of the object alone."
+            raise InvalidRequest(message, errors=(FieldError(f"{pointer}/bbox", detail),))
+        beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
+        return Place(clipped, warnings=() if clipped == given.bbox else (beyond,))
     x, y = given.point or (0.0, 0.0)
     if not (0 <= x < scene.width and 0 <= y < scene.height):
         raise _outside(f"{pointer}/point", (x, y), scene)
@@ -214,7 +220,7 @@ def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
         raise refused(f"has {given_size} where the upright image has {size}")
     if not share:
         raise refused("is empty: no pixel is white")
-    if share > MAX_MASK_SHARE:
+    if share > MAX_SHARE:
         raise refused(f"covers {share:.0%} of the image: white, or transparent, is the object alone")
     return mask
 
