@@ -53,9 +53,11 @@ def run_request(
     try:
         request = model.model_validate({"image": {"artifact": artifact.sha256}, **body})
     except ValidationError as error:
-        fields = field_errors(error.errors())
+        fields, known = field_errors(error.errors()), [*model.model_fields][2:]
         faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
-        raise InvalidRequest(f"{faults}.", errors=fields) from error
+        is_unknown = any(fault["type"] == "extra_forbidden" for fault in error.errors())
+        remedy = f"--request takes these fields: {', '.join(known)}. A server's /docs says what each holds."
+        raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy if is_unknown else "") from error
     result: Simulation | Answer
     with stages_shown(console) as show:
         if isinstance(request, AnswerRequest):
