@@ -70,6 +70,23 @@ def test_simulate_writes_frames_video_overlay_and_record(tmp_path: Path, picture
     assert not result.stderr
 
 
+def test_no_result_of_another_picture_is_written_over_and_no_old_frame_stays(tmp_path: Path, picture: Path) -> None:
+    short = ("--num-frames", "9", "--frames", "uniform", "--ensemble", "0", "--no-video", "--count")
+    assert cow(tmp_path, "simulate", str(picture), QUESTION, *short, "5").returncode == 0
+    (tmp_path / "toys-cow" / "notes.txt").touch()
+    assert cow(tmp_path, "simulate", str(picture), QUESTION, *short, "2").returncode == 0
+    names = {"frame_000.png", "frame_008.png", "overlay.jpg", "simulation.json"}
+    assert {path.name for path in (tmp_path / "toys-cow").iterdir()} == names | {"notes.txt"}
+    (tmp_path / "elsewhere").mkdir()
+    other = tmp_path / "elsewhere" / "toys.png"
+    other.write_bytes(png_bytes(ball(floor(), (150, 200), 50, (210, 20, 20))))
+    for _ in range(2):  # the second time it finds its own
+        result = cow(tmp_path, "simulate", str(other), "If the red ball moves right, what happens?", *short, "2")
+        assert "Wrote to toys-cow-2" in result.stdout
+    assert {path.name for path in (tmp_path / "toys-cow-2").iterdir()} == names
+    assert {path.name for path in tmp_path.glob("toys-cow*")} == {"toys-cow", "toys-cow-2"}
+
+
 def test_the_demo_needs_nothing(tmp_path: Path) -> None:
     result = cow(tmp_path, "demo")
     assert result.returncode == 0, result.stderr

@@ -1,5 +1,6 @@
 """What `simulate`, `answer`, `models` and `doctor` show: progress, results in a folder, tables."""
 
+import hashlib
 import platform
 import shutil
 import sys
@@ -116,10 +117,33 @@ def print_stages(console: Console, simulation: Simulation) -> None:
         console.print(f"[dim]outcome[/]: {escape(outcome)}")
 
 
+RECORD, OTHER_FILES = "simulation.json", ("answer.json", "clip.gif", "clip.webp", "sheet.png")
+
+
+def _result_in(folder: Path) -> Simulation | None:
+    try:
+        return Simulation.model_validate_json((folder / RECORD).read_bytes())
+    except (OSError, ValueError):
+        return None
+
+
+def default_folder(image: Path) -> Path:
+    """`<name of the image>-cow`, or the first with a number behind it, without the result of another picture."""
+    folder, number, sha256 = Path(f"{image.stem}-cow"), 1, hashlib.sha256(read_file(image)).hexdigest()
+    while (folder / RECORD).exists() and ((found := _result_in(folder)) is None or found.image.sha256 != sha256):
+        number += 1
+        folder = Path(f"{image.stem}-cow-{number}")
+    return folder
+
+
 def save(service: Service, result: Simulation | Answer, out: Path, formats: Sequence[str]) -> list[str]:
     """Writes frames, video, overlay, the result as JSON and the clip in other formats; returns the names of files."""
     artifacts, documents, made = records.artifacts_of(result), records.documents_of(result), dict[str, Any]()
+    earlier = _result_in(out)
     with writable(out):
+        # What an earlier run wrote is not taken for a part of this one.
+        for name in () if earlier is None else (*records.artifacts_of(earlier), RECORD, *OTHER_FILES):
+            (out / name).unlink(missing_ok=True)
         for name, sha256 in artifacts.items():
             (out / name).write_bytes(service.artifacts.read(sha256))
         for name, text in documents.items():
