@@ -203,7 +203,6 @@ _KINDS: dict[str, records.EncounterKind] = {"touches": "touches", "covers": "occ
 _NOTHING_MET = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
 OF_TARGET: tuple[records.AskedRelation, ...] = ("tips", "moves")  # what is asked about does these
 OF_ITSELF: tuple[records.AskedRelation, ...] = ("leaves", "lands")  # nothing else is part of these
-NO_BODY = ("floor", "air")  # as a support
 # What the subject of each other relation does, and that it does not.
 EVENTS: dict[records.AskedRelation, tuple[str, str]] = {
     "touches": ("touches", "does not touch"),
@@ -304,15 +303,15 @@ class _Facts:
         self._trajectory = trajectory
         self._outcome = trajectory.outcome
         self._names = [mover, *(body.object for body in trajectory.bodies[1:])]
+        self._supports = [body.support for body in trajectory.bodies] or ["floor"]
         self._paths = {path.body: path for path in reversed(trajectory.paths)}
         # Which body it is whose encounter is asked about; None where nothing is asked or that body is not there.
         self._subject = None if self._outcome is None else 0
         if self._outcome is not None and self._outcome.subject is not None:
             others = enumerate(self._names[1:], 1)
             self._subject = next((index for index, name in others if name == self._outcome.subject), None)
-        self._leaving = (
-            self._subject if self._outcome is not None and self._outcome.asked.relation == "leaves" else None
-        )
+        asked = None if self._outcome is None else self._outcome.asked.relation
+        self._leaving = self._subject if asked == "leaves" else None
         self._asked = self._asked_about()
 
     def sentence(self) -> str:
@@ -327,24 +326,20 @@ class _Facts:
     def agreement(self) -> float | None:
         """The share of the worlds in which what the sentence says of the question, or of its first encounter, is so."""
         outcome, placement, first = self._outcome, self._trajectory.placement, self._asked
-        if outcome is not None and outcome.probability is not None and outcome.asked.relation in OF_ITSELF:
-            told = None if outcome.asked.within is not None else self._landing(self._subject or 0)
-            happens = told is not None and told[0] < math.inf
-            agrees = outcome.probability if happens != outcome.asked.negated else 1 - outcome.probability
-            return None if told is None else agrees
         if placement is not None:
             return placement.probabilities.get(placement.result, 0.0) if placement.probabilities else None
         if outcome is None or outcome.probability is None:
             told = self._told(0)
             return told[0].probability if told else None
         asked = outcome.asked
-        if asked.relation not in _KINDS or asked.within is not None or asked.partly or asked.every:
+        if asked.relation not in (*_KINDS, *OF_ITSELF) or asked.within is not None or asked.partly or asked.every:
             return None
-        met = None if first is None else first.object
-        kind = _KINDS[asked.relation]
+        met, kind = None if first is None else first.object, _KINDS.get(asked.relation)
+        landing = self._landing(self._subject or 0) if asked.relation in OF_ITSELF else None
+        happens = first is not None if landing is None else landing[0] < math.inf
         own = [e for e in self._trajectory.encounters if e.subject == self._subject and e.kind == kind]
         meant = {(each.body, each.object) for each in own if _has_happened(each) and self._is_meant(each.object)}
-        agrees = outcome.probability if asked.negated == (first is None) else 1 - outcome.probability
+        agrees = outcome.probability if asked.negated != happens else 1 - outcome.probability
         agreeing = {
             "whether": agrees,
             "how-many": outcome.probability if len(meant) == outcome.count else None,
@@ -396,10 +391,9 @@ class _Facts:
             going, landing = ["stays where it is"], self._landing(body)
             if path is not None and _distance_moved(path) >= MOVED:
                 times = [self._time(each) for each in met if each.kind == "touches"]
-                going = self._going(path, [*times, *([0.0] if landing is not None else [])])
+                going = self._going(path, times if landing is None or body == self._leaving else [0.0])
             told = [*((self._time(each), self._meeting(each)) for each in met), *([landing] if landing else [])]
-            happening = [words for _, words in sorted(told, key=lambda each: each[0])]
-            parts = [*going, *happening, *self._missed(body, met), *self._end(body, path)]
+            parts = [*going, *(words for _, words in sorted(told)), *self._missed(body, met), *self._end(body, path)]
         said = " and ".join(parts) if len(parts) < 3 else f"{', '.join(parts[:-1])} and {parts[-1]}"
         return f"{named(self._names[body], 'The')} {said}"
 
@@ -451,16 +445,12 @@ class _Facts:
             effect = "and pushes "
         return f"meets {effect}{name} after {time}{later}"
 
-    def _support(self, body: int) -> str:
-        """What a body stands on at first: `floor`, `air`, or the name of another body."""
-        return self._trajectory.bodies[body].support if body < len(self._trajectory.bodies) else "floor"
-
     def _landing(self, body: int) -> tuple[float, str] | None:
         """When it falls off what it stands on or, where that is asked, lands or leaves the image, and this in words.
 
         None where there is nothing to tell; infinity for never, which is told where it is asked.
         """
-        outcome, trajectory, on = self._outcome, self._trajectory, self._support(body)
+        outcome, trajectory, on = self._outcome, self._trajectory, self._supports[body]
         asked = None if outcome is None or body != self._subject else outcome.asked.relation
         does, does_not = EVENTS["leaves" if body == self._leaving else "lands"]
         if outcome is not None and body == self._leaving:
@@ -480,12 +470,12 @@ class _Facts:
 
     def _nothing_touched(self, body: int) -> str:
         """That it touches nothing but what it stood on, or what stood on it, all the time."""
-        nothing, on, landing = _NOTHING_MET["touches"], self._support(body), self._landing(body)
+        nothing, on, landing = _NOTHING_MET["touches"], self._supports[body], self._landing(body)
         if landing is not None and body != self._leaving and (on != "air" or landing[0] < math.inf):
             return f"{nothing} else"
         pairs = [(each.a, each.b) for each in self._trajectory.contacts]
         others = [self._names[b if a == body else a] for a, b in pairs if b is not None and body in (a, b)]
-        names = dict.fromkeys(named(name, "the") for name in (on, *others) if name not in NO_BODY)
+        names = dict.fromkeys(named(name, "the") for name in (on, *others) if name not in ("floor", "air"))
         return f"{nothing} but {' and '.join(names)}" if names else nothing
 
     def _missed(self, body: int, met: Sequence[Encounter]) -> list[str]:
@@ -501,8 +491,8 @@ class _Facts:
         if outcome.asked.partly and ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated:
             name = named(outcome.object, "the") if outcome.object else "something"  # less than an encounter tells of
             return [f"hides a part of {name}" if relation == "covers" else f"is partly hidden by {name}"]
-        if relation == "touches" and self._support(body) in meant:
-            return [f"is on {named(self._support(body), 'the')} from the start"]
+        if relation == "touches" and self._supports[body] in meant:
+            return [f"is on {named(self._supports[body], 'the')} from the start"]
         nothing = self._nothing_touched(body) if relation == "touches" else _NOTHING_MET[relation]
         return [f"{EVENTS[relation][1]} {' or '.join(named(each, 'the') for each in meant)}" if meant else nothing]
 

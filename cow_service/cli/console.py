@@ -54,11 +54,10 @@ def run_request(
     try:
         request = model.model_validate({"image": {"artifact": artifact.sha256}, **body})
     except ValidationError as error:
-        fields, known = field_errors(error.errors()), [*model.model_fields][2:]
+        fields, known = field_errors(error.errors()), ", ".join([*model.model_fields][2:])
         faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
-        is_unknown = any(fault["type"] == "extra_forbidden" for fault in error.errors())
-        remedy = f"--request takes these fields: {', '.join(known)}. A server's /docs says what each holds."
-        raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy if is_unknown else "") from error
+        remedy = f"--request takes these fields: {known}. A server's /docs says what each holds."
+        raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy * ("no such field" in faults)) from error
     result: Simulation | Answer
     with stages_shown(console) as show:
         if isinstance(request, AnswerRequest):
@@ -117,12 +116,9 @@ def print_stages(console: Console, simulation: Simulation) -> None:
         console.print(f"[dim]outcome[/]: {escape(outcome)}")
 
 
-RECORD, OTHER_FILES = "simulation.json", ("answer.json", "clip.gif", "clip.webp", "sheet.png")
-
-
 def _result_in(folder: Path) -> Simulation | None:
     try:
-        return Simulation.model_validate_json((folder / RECORD).read_bytes())
+        return Simulation.model_validate_json((folder / "simulation.json").read_bytes())
     except (OSError, ValueError):
         return None
 
@@ -130,7 +126,7 @@ def _result_in(folder: Path) -> Simulation | None:
 def default_folder(image: Path) -> Path:
     """`<name of the image>-cow`, or the first with a number behind it, without the result of another picture."""
     folder, number, sha256 = Path(f"{image.stem}-cow"), 1, hashlib.sha256(read_file(image)).hexdigest()
-    while (folder / RECORD).exists() and ((found := _result_in(folder)) is None or found.image.sha256 != sha256):
+    while (found := _result_in(folder)) is not None and found.image.sha256 != sha256:
         number += 1
         folder = Path(f"{image.stem}-cow-{number}")
     return folder
@@ -139,10 +135,9 @@ def default_folder(image: Path) -> Path:
 def save(service: Service, result: Simulation | Answer, out: Path, formats: Sequence[str]) -> list[str]:
     """Writes frames, video, overlay, the result as JSON and the clip in other formats; returns the names of files."""
     artifacts, documents, made = records.artifacts_of(result), records.documents_of(result), dict[str, Any]()
-    earlier = _result_in(out)
+    stale = ("simulation.json", "answer.json", "clip.gif", "clip.webp", "sheet.png")  # beside an earlier run's pictures
     with writable(out):
-        # What an earlier run wrote is not taken for a part of this one.
-        for name in () if earlier is None else (*records.artifacts_of(earlier), RECORD, *OTHER_FILES):
+        for name in () if (earlier := _result_in(out)) is None else (*records.artifacts_of(earlier), *stale):
             (out / name).unlink(missing_ok=True)
         for name, sha256 in artifacts.items():
             (out / name).write_bytes(service.artifacts.read(sha256))

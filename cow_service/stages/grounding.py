@@ -15,7 +15,6 @@ from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, Pl
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object
-from cow_service.vision.scene import Scene
 from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
@@ -156,6 +155,7 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     """
     run.check_canceled()
     scene, field = run.scene, field_of(pointer)
+    outside = f"lies outside the upright image of {scene.width} x {scene.height} px"
     if given.mask is not None:
         mask = _read_mask(run, given.mask, f"{pointer}/mask")
         scene.preset_mask(bbox_of(mask), lambda: mask)
@@ -165,16 +165,14 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
         clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
         wide, high = clipped[2] - clipped[0], clipped[3] - clipped[1]
         if wide < 2 or high < 2:
-            raise _outside(f"{pointer}/bbox", given.bbox, scene)
+            raise _misplaced(f"{pointer}/bbox", given.bbox, outside)
         if (share := wide * high / (scene.width * scene.height)) > MAX_SHARE:
-            detail = f"{list(given.bbox)} covers {share:.0%} of the image"
-            message = f"`{field}.bbox` {detail}: give the box of the object alone."
-            raise InvalidRequest(message, errors=(FieldError(f"{pointer}/bbox", detail),))
+            raise _misplaced(f"{pointer}/bbox", given.bbox, f"covers {share:.0%} of the image")
         beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
         return Place(clipped, warnings=() if clipped == given.bbox else (beyond,))
     x, y = given.point or (0.0, 0.0)
     if not (0 <= x < scene.width and 0 <= y < scene.height):
-        raise _outside(f"{pointer}/point", (x, y), scene)
+        raise _misplaced(f"{pointer}/point", (x, y), outside)
     cutout = scene.locate((x, y))
     if cutout.mask is None:
         return Place(cutout.bbox)
@@ -191,9 +189,10 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     return Place(cutout.bbox, cutout.mask, (warning,))
 
 
-def _outside(pointer: str, value: Sequence[float], scene: Scene) -> InvalidRequest:
-    detail = f"{list(value)} lies outside the upright image of {scene.width} x {scene.height} px."
-    return InvalidRequest(f"{detail} Give pixels, x right and y down.", errors=(FieldError(pointer, detail),))
+def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidRequest:
+    detail = f"{list(value)} {fault}."
+    message = f"`{field_of(pointer)}`: {detail} Give pixels of the object alone, x right and y down."
+    return InvalidRequest(message, errors=(FieldError(pointer, detail),))
 
 
 def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
