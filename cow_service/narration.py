@@ -210,6 +210,7 @@ SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the sid
 _KINDS: dict[str, records.EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
 _NOTHING_MET = {"touches": "touches nothing", "covers": "hides nothing", "covered": "is not hidden"}
 OF_TARGET: tuple[records.AskedRelation, ...] = ("tips", "moves")  # what is asked about does these
+OF_ITSELF: tuple[records.AskedRelation, ...] = ("leaves", "lands")  # nothing else is part of these
 # What the subject of each other relation does, and that it does not.
 EVENTS: dict[records.AskedRelation, tuple[str, str]] = {
     "touches": ("touches", "does not touch"),
@@ -322,12 +323,15 @@ class _Facts:
         self._trajectory = trajectory
         self._outcome = trajectory.outcome
         self._names = [mover, *(body.object for body in trajectory.bodies[1:])]
+        self._supports = [body.support for body in trajectory.bodies] or ["floor"]
         self._paths = {path.body: path for path in reversed(trajectory.paths)}
         # Which body it is whose encounter is asked about; None where nothing is asked or that body is not there.
         self._subject = None if self._outcome is None else 0
         if self._outcome is not None and self._outcome.subject is not None:
             others = enumerate(self._names[1:], 1)
             self._subject = next((index for index, name in others if name == self._outcome.subject), None)
+        asked = None if self._outcome is None else self._outcome.asked.relation
+        self._leaving = self._subject if asked == "leaves" else None
         self._asked = self._asked_about()
 
     def sentence(self) -> str:
@@ -348,17 +352,19 @@ class _Facts:
             told = self._told(0)
             return told[0].probability if told else None
         asked = outcome.asked
-        if asked.relation not in _KINDS or asked.within is not None or asked.partly or asked.every:
+        if asked.relation not in (*_KINDS, *OF_ITSELF) or asked.within is not None or asked.partly or asked.every:
             return None
-        met = None if first is None else first.object
-        kind = _KINDS[asked.relation]
+        met, kind = None if first is None else first.object, _KINDS.get(asked.relation)
+        landing = self._landing(self._subject or 0) if asked.relation in OF_ITSELF else None
+        happens = first is not None if landing is None else landing[0] < math.inf
         own = [e for e in self._trajectory.encounters if e.subject == self._subject and e.kind == kind]
         meant = {(each.body, each.object) for each in own if _has_happened(each) and self._is_meant(each.object)}
+        agrees = outcome.probability if asked.negated != happens else 1 - outcome.probability
         agreeing = {
-            "whether": outcome.probability if asked.negated == (first is None) else 1 - outcome.probability,
+            "whether": agrees,
             "how-many": outcome.probability if len(meant) == outcome.count else None,
             "which-first": outcome.probability if outcome.first == met else None,
-            "when": (outcome.probability if outcome.time is None else None) if first is None else first.probability,
+            "when": agrees,
         }
         return agreeing.get(asked.form)
 
@@ -402,10 +408,12 @@ class _Facts:
             parts = ["is carried over", "is let go", end]
         else:
             met, path = self._told(body), self._paths.get(body)
-            going = ["stays where it is"]
+            going, landing = ["stays where it is"], self._landing(body)
             if path is not None and _distance_moved(path) >= MOVED:
-                going = self._going(path, [self._time(each) for each in met if each.kind == "touches"])
-            parts = [*going, *(self._meeting(each) for each in met), *self._missed(body, met), *self._end(body, path)]
+                times = [self._time(each) for each in met if each.kind == "touches"]
+                going = self._going(path, times if landing is None or body == self._leaving else [0.0])
+            told = [*((self._time(each), self._meeting(each)) for each in met), *([landing] if landing else [])]
+            parts = [*going, *(words for _, words in sorted(told)), *self._missed(body, met), *self._end(body, path)]
         said = " and ".join(parts) if len(parts) < 3 else f"{', '.join(parts[:-1])} and {parts[-1]}"
         return f"{named(self._names[body], 'The')} {said}"
 
@@ -457,22 +465,56 @@ class _Facts:
             effect = "and pushes "
         return f"meets {effect}{name} after {time}{later}"
 
+    def _landing(self, body: int) -> tuple[float, str] | None:
+        """When it falls off what it stands on or, where that is asked, lands or leaves the image, and this in words.
+
+        None where there is nothing to tell; infinity for never, which is told where it is asked.
+        """
+        outcome, trajectory, on = self._outcome, self._trajectory, self._supports[body]
+        asked = None if outcome is None or body != self._subject else outcome.asked.relation
+        does, does_not = EVENTS["leaves" if body == self._leaving else "lands"]
+        if outcome is not None and body == self._leaving:
+            seen = self._paths[body].visible if body in self._paths else ()
+            later = outcome.time if ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated else None
+            time = seen.index(False) / trajectory.fps if False in seen else later or math.inf
+        elif on == "floor" or (on == "air" and asked != "lands"):
+            return None
+        else:
+            time = next((each.time for each in trajectory.contacts if each.a == body and each.b is None), math.inf)
+            if on != "air":
+                on = named(on, "the")
+                does, does_not = f"falls off {on} onto the floor", f"does not fall off {on}"
+        if time == math.inf:
+            return (time, does_not) if asked in OF_ITSELF else None
+        return time, f"{does} after {time:.1f} s{self._after_clip(time)}"
+
+    def _nothing_touched(self, body: int) -> str:
+        """That it touches nothing but what it stood on, or what stood on it, all the time."""
+        nothing, on, landing = _NOTHING_MET["touches"], self._supports[body], self._landing(body)
+        if landing is not None and body != self._leaving and (on != "air" or landing[0] < math.inf):
+            return f"{nothing} else"
+        pairs = [(each.a, each.b) for each in self._trajectory.contacts]
+        others = [self._names[b if a == body else a] for a, b in pairs if b is not None and body in (a, b)]
+        names = dict.fromkeys(named(name, "the") for name in (on, *others) if name not in ("floor", "air"))
+        return f"{nothing} but {' and '.join(names)}" if names else nothing
+
     def _missed(self, body: int, met: Sequence[Encounter]) -> list[str]:
         """That what is asked about does not happen, or that nothing is touched."""
         outcome = self._outcome
         if not self._trajectory.encounters_known:
             return []
         if outcome is None or outcome.asked.relation not in _KINDS or (outcome.asked.target and not outcome.object):
-            return [] if body or any(each.kind == "touches" for each in met) else [_NOTHING_MET["touches"]]
+            return [] if body or any(each.kind == "touches" for each in met) else [self._nothing_touched(body)]
         if self._subject != body or self._asked is not None:
             return []
         relation, meant = outcome.asked.relation, [outcome.object] if outcome.object else outcome.asked.among
         if outcome.asked.partly and ((outcome.probability or 0.0) >= 0.5) != outcome.asked.negated:
             name = named(outcome.object, "the") if outcome.object else "something"  # less than an encounter tells of
             return [f"hides a part of {name}" if relation == "covers" else f"is partly hidden by {name}"]
-        if not meant:
-            return [_NOTHING_MET[relation]]
-        return [f"{EVENTS[relation][1]} {' or '.join(named(each, 'the') for each in meant)}"]
+        if relation == "touches" and self._supports[body] in meant:
+            return [f"is on {named(self._supports[body], 'the')} from the start"]
+        nothing = self._nothing_touched(body) if relation == "touches" else _NOTHING_MET[relation]
+        return [f"{EVENTS[relation][1]} {' or '.join(named(each, 'the') for each in meant)}" if meant else nothing]
 
     def _end(self, body: int, path: Path | None) -> list[str]:
         """How it ends, where the clip shows it."""
@@ -481,7 +523,7 @@ class _Facts:
             return []
         last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1) if body == 0 else -1
         if not path.visible[last]:
-            return ["leaves the image"]
+            return [] if body == self._leaving else ["leaves the image"]
         if body != 0 or last == trajectory.num_frames - 1:
             return []
         met = [each.b for each in trajectory.contacts if each.a == body and each.time <= until]

@@ -583,7 +583,10 @@ def test_nothing_is_sure_of_what_is_not_as_it_is_called(service: Service, scene:
 @pytest.mark.parametrize("itself", ["the yellow ball", "itself", "the ball"])
 def test_nothing_meets_itself(service: Service, itself: str) -> None:
     question = f"If the yellow ball moves opposite to the direction of the arrow, will it hit {itself}?"
-    assert answered(service, example("ball-and-mug").image, question).not_sure
+    told = answered(service, example("ball-and-mug").image, question)
+    assert told.not_sure
+    assert any("cannot meet itself" in warning for warning in told.warnings)
+    assert not any("not understood" in warning for warning in told.warnings)
 
 
 def test_a_car_whose_way_is_not_known_is_not_guessed_about(service: Service) -> None:

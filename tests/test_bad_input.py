@@ -306,7 +306,7 @@ def test_base64_in_lines_is_taken(http: httpx.Client) -> None:
     [
         pytest.param({"question": "a" * 1_000_000}, "1000000 characters", id="question of 1 MB"),
         pytest.param({"question": "red\0ball"}, "NUL (U+0000) at position 3", id="question with NUL"),
-        pytest.param({"question": ""}, "at least 1 character", id="empty question"),
+        pytest.param({"question": ""}, 'is empty, got "". Ask such as', id="empty question"),
         pytest.param({"question": " \t\n\u00a0"}, "empty", id="blank question"),
         pytest.param({"question": "\u200b\u200c\u200d\u2060\ufeff"}, "5 blank or invisible", id="zero-width question"),
         pytest.param({"question": None}, "/question", id="null question"),

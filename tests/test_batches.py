@@ -494,7 +494,7 @@ def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> N
         ("\n[]", (), "line 2: it must be an object, got list"),
         ('{"image": "a.png", "question": "?", "votes": 99}', (), "line 1: /votes: "),
         ('{"question": "?"}\n\n{"image": "a.png"}', (), "line 3: `question` is missing"),
-        ('{"image": "a.png", "question": "?", "vote": 1}', (), "/vote: Extra inputs"),
+        ('{"image": "a.png", "question": "?", "vote": 1}', (), "/vote: there is no such field"),
         ('{"image": "a.png", "question": "?"}', ("--request", '{"num_frames": 1}'), "/num_frames"),
         ('{"image": "a.png", "question": "?"}', ("--request", "[]"), "--request must be an object"),
         ('{"image": "a.png", "question": "?", "baseline": true}', ("--kind", "simulate"), "/baseline"),

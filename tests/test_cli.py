@@ -70,6 +70,23 @@ def test_simulate_writes_frames_video_overlay_and_record(tmp_path: Path, picture
     assert not result.stderr
 
 
+def test_no_result_of_another_picture_is_written_over_and_no_old_frame_stays(tmp_path: Path, picture: Path) -> None:
+    short = ("--num-frames", "9", "--frames", "uniform", "--ensemble", "0", "--no-video", "--count")
+    assert cow(tmp_path, "simulate", str(picture), QUESTION, *short, "5").returncode == 0
+    (tmp_path / "toys-cow" / "notes.txt").touch()
+    assert cow(tmp_path, "simulate", str(picture), QUESTION, *short, "2").returncode == 0
+    names = {"frame_000.png", "frame_008.png", "overlay.jpg", "simulation.json"}
+    assert {path.name for path in (tmp_path / "toys-cow").iterdir()} == names | {"notes.txt"}
+    (tmp_path / "elsewhere").mkdir()
+    other = tmp_path / "elsewhere" / "toys.png"
+    other.write_bytes(png_bytes(ball(floor(), (150, 200), 50, (210, 20, 20))))
+    for _ in range(2):  # the second time it finds its own
+        result = cow(tmp_path, "simulate", str(other), "If the red ball moves right, what happens?", *short, "2")
+        assert "Wrote to toys-cow-2" in result.stdout
+    assert {path.name for path in (tmp_path / "toys-cow-2").iterdir()} == names
+    assert {path.name for path in tmp_path.glob("toys-cow*")} == {"toys-cow", "toys-cow-2"}
+
+
 def test_the_demo_needs_nothing(tmp_path: Path) -> None:
     result = cow(tmp_path, "demo")
     assert result.returncode == 0, result.stderr
@@ -162,6 +179,19 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         (["If the red ball moves forward, what?"], 1, "Here: --direction DX,DY."),
         ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
+        ([QUESTION, "--direction", "left"], 1, "such as -1,0 for to the left (x right, y down); got 'left'."),
+        (
+            [QUESTION, "--until", "never"],
+            2,
+            "'never' is not one of 'contact'. Choose one of these, or leave the option",
+        ),
+        (
+            [QUESTION, "--request", '{"foo": 1}'],
+            1,
+            "foo: there is no such field, got 1. --request takes these fields: ",
+        ),
+        ([QUESTION, "--request", "r.json"], 1, "Give an object: "),
+        ([""], 1, 'question: is empty, got "". Ask such as \'If the red ball moves'),
         ([QUESTION, "--distance", "-5"], 1, "motion.distance: Input should be greater than 0, got -5"),
         ([QUESTION, "--kind", "projectile"], 1, "needs a `direction`"),
         ([QUESTION, "--object", "x"], 1, "goes with --point, --box or --trajectory"),

@@ -33,6 +33,7 @@ import numpy as np
 import pytest
 from conftest import EXAMPLES, ROOT, new_environment
 from drawn import ball, block, floor
+from floors import TrueCamera
 from PIL import Image
 from sdk import DIGEST, JOB, SIMULATION, Connect, connect
 from servers import IMAGE, QUESTION, Served, data_url, eventually, slow
@@ -248,6 +249,18 @@ def test_objects_law_ensemble_and_camera_are_sent_right(client: Any) -> None:
             IMAGE, QUESTION, **SMALL | {"objects": [{"object": "cube", "mask": np.zeros((160, 240), bool)}]}
         )
     assert [field.pointer for field in caught.value.errors] == ["/objects/0/mask"]
+
+
+@pytest.mark.parametrize("kind", ["metres", "units"])
+def test_a_depth_map_is_an_array(client: Any, kind: str) -> None:
+    metres = TrueCamera(focal=240, size=(240, 160)).depth()
+    given = (
+        {"map": metres} if kind == "metres" else {"map": np.nan_to_num(1000 * metres).astype(np.uint16), "scale": 1e-3}
+    )
+    simulation = client.simulate(IMAGE, QUESTION, depth=given | {"focal": 240}, **SMALL)
+    assert simulation.trajectory.camera.source == "depth"
+    assert simulation.trajectory.camera.height == pytest.approx(1.5, rel=0.02)
+    assert simulation.trajectory.depth.valid == pytest.approx(np.isfinite(metres).mean(), abs=0.01)
 
 
 def test_batches_take_the_same_arguments(client: Any) -> None:

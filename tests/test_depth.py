@@ -145,7 +145,7 @@ class TestRequest:
         assert met.outcome is not None
         assert missed.outcome is not None
         assert met.outcome.probability is not None
-        assert met.outcome.probability > 0.9
+        assert met.outcome.probability > 0.7
         assert missed.outcome.probability is not None
         assert missed.outcome.probability < 0.1
 

@@ -89,6 +89,10 @@ CASES = {
         drawing(table(320, 600, 120, BROWN), ball(80, 20, RED, ON_TABLE), box(320, 60, 60, BLUE)),
         "If the red ball rolls to the right, will it hit the blue box?", "No",
     ),
+    "is asked to stay on a table": (
+        drawing(table(320, 600, 120, BROWN), ball(80, 20, RED, ON_TABLE)),
+        "If the red ball rolls to the right by 20 px, will it stay on the table?", "Yes",
+    ),
     "rolls down a slope": (
         drawing(slope(60, 330, 150, GREEN), ball(95, 18, RED, LEVEL - 133), box(500, 70, 80, BLUE)),
         "If the red ball is released, will it hit the blue box?", "Yes",
@@ -132,6 +136,17 @@ def test_what_is_released_on_a_slope_rolls_down_it_and_does_not_fly(service: Ser
     assert "green object" not in {each.object for each in trajectory.encounters}, "it lies there from the start"
     assert trajectory.outcome is not None
     assert trajectory.outcome.facts.startswith("The red ball rolls to the right")
+
+
+def test_a_fall_off_a_table_is_told_by_both_names(service: Service) -> None:
+    info = service.keep_image(png_bytes(drawing(table(200, 240, 120, BROWN), ball(250, 20, RED, ON_TABLE))))
+    question = "If the red ball rolls to the right, will it fall off the table?"
+    answer = service.answer(AnswerRequest.model_validate({"image": {"artifact": info.sha256}, "question": question}))
+    assert answer.simulation is not None
+    outcome = answer.simulation.trajectory.outcome
+    assert outcome is not None
+    assert "falls off the table onto the floor" in outcome.facts
+    assert answer.answer == "Yes"
 
 
 @pytest.mark.parametrize("below", [box(420, 120, 90, BLUE), slope(40, 240, 140, GREEN)], ids=["box", "slope"])

@@ -184,7 +184,7 @@ def test_a_noun_that_is_not_what_is_seen_is_warned_of() -> None:
     [
         ("The floor is slippery. If the red ball rolls right, will it hit the cube?", "'floor is slippery'"),
         ("If the red ball rolls wildly to the right, will it hit the cube?", "'wildly'"),
-        ("If the red ball rolls right past the blue cube, what happens?", "'past blue cube'"),
+        ("If the red ball rolls right past the blue cube, what happens?", "'past the blue cube'"),
     ],
 )
 def test_words_that_are_passed_over_are_named(question: str, words: str) -> None:

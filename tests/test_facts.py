@@ -65,6 +65,11 @@ THROWN = world(
     encounters=(touch(),),
     ensemble=100,
 )
+FALL, ROLLS = Asked(relation="lands"), body("ball", "sphere", "table")
+STANDS = Contact(a=0, b=1, time=0.0, point=(1.0, 1.0), impulse=0.1)
+FALLS = Contact(a=0, b=None, time=0.8, point=(1.0, 1.0), impulse=1.5)
+COUNTED = Asked(form="how-many", relation="touches")
+LEAVES = Asked(relation="leaves")
 
 
 @pytest.mark.parametrize(
@@ -110,6 +115,28 @@ THROWN = world(
                        outcome=outcome(Asked(form="how-many", relation="touches"), 0.8, None, count=2)),
          "The ball rolls to the right, meets the white cube after 1.1 s and meets the mug after 1.5 s; "
          "80 of 100 worlds agree."),
+        ("ball", world(bodies=(ROLLS, body("table")), contacts=(STANDS,), ensemble=100,
+                       outcome=outcome(COUNTED, 0.9, None, count=0)),
+         "The ball rolls to the right and touches nothing but the table; 90 of 100 worlds agree."),
+        ("ball", world(bodies=(ROLLS, body("table")), contacts=(STANDS, FALLS), ensemble=100,
+                       outcome=outcome(FALL, 0.9, None)),
+         "The ball rolls to the right, falls off the table onto the floor after 0.8 s and touches nothing else; "
+         "90 of 100 worlds agree."),
+        ("ball", world(bodies=(ROLLS, body("table"), CUBE), encounters=(touch(number=2),), contacts=(STANDS,),
+                       ensemble=100, outcome=outcome(FALL.model_copy(update={"negated": True}), 0.8, None)),
+         "The ball rolls to the right, meets the white cube after 1.1 s and does not fall off the table; "
+         "80 of 100 worlds agree."),
+        ("ball", world(bodies=(ROLLS, body("table")), contacts=(STANDS,),
+                       outcome=outcome(Asked(relation="touches", target="table"), 0.0, "table")),
+         "The ball rolls to the right and is on the table from the start."),
+        ("ball", world(bodies=(body("ball", "sphere", "air"),), contacts=(FALLS,), outcome=outcome(FALL, 1.0, None)),
+         "The ball flies to the right, lands on the floor after 0.8 s and touches nothing else."),
+        ("ball", world(paths=(path(leaves=True),), moving_until=1.8, ensemble=100, outcome=outcome(LEAVES, 0.7, None)),
+         "The ball rolls to the right, leaves the image after 1.6 s and touches nothing; 70 of 100 worlds agree."),
+        ("ball", world(ensemble=100, outcome=outcome(LEAVES, 0.1, None)),
+         "The ball rolls to the right, does not leave the image and touches nothing; 90 of 100 worlds agree."),
+        ("ball", world(ensemble=100, outcome=outcome(Asked(form="when", relation="touches", target="mug"), 0.1, "mug")),
+         "The ball rolls to the right and does not touch the mug; 90 of 100 worlds agree."),
     ],
 )  # fmt: skip
 def test_what_happens(mover: str, told: Trajectory, sentence: str) -> None:

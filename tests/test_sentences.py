@@ -40,6 +40,8 @@ def contradictions(motion: Motion, told: Trajectory) -> list[str]:
         moved = {each.body for each in told.paths}
         found += [f"{claim} {name}"] if claim == "meets and pushes" and met[name].body not in moved else []
     found += ["touches nothing"] if "touches nothing" in clause and met else []
+    touches = any(each.b is not None and 0 in (each.a, each.b) for each in told.contacts)
+    found += ["touches nothing"] if touches and re.search("touches nothing(?! but| else)", clause) else []
     states, (x, y) = told.path.states, told.path.points[-1]
     rest = re.search(r"comes to rest( on the floor)? after ([0-9.]+) s$", clause)
     if rest is not None and float(rest[2]) < (len(states) - 1) / told.fps:

@@ -66,7 +66,16 @@ def test_a_point_grounds_the_object_under_it(scene: Scene) -> None:
 
 def test_a_box_is_taken_as_it_is_and_clipped_to_the_image(scene: Scene) -> None:
     assert grounded(scene, bbox=(150, 150, 250, 250), object="ball").bbox == (150, 150, 250, 250)
-    assert grounded(scene, bbox=(-50, 150, 250, 250)).bbox == (0, 150, 250, 250)
+    beyond = ground(run(scene, grounding={"bbox": (-50, 150, 250, 250)}))
+    assert beyond.value.bbox == (0, 150, 250, 250)
+    assert any("[-50.0, 150.0, 250.0, 250.0] reaches beyond" in warning for warning in beyond.warnings)
+
+
+@pytest.mark.parametrize("bbox", [(0, 0, 640, 400), (-900, -900, 9000, 9000), (2, 2, 639, 399)])
+def test_a_box_all_over_the_image_is_refused(scene: Scene, bbox) -> None:
+    with pytest.raises(InvalidRequest, match=r"of the image\. Give pixels of the object alone") as caught:
+        grounded(scene, bbox=bbox)
+    assert caught.value.errors[0].pointer == "/grounding/bbox"
 
 
 @pytest.mark.parametrize("given", [{"point": (640, 10)}, {"point": (-1, 10)}, {"bbox": (700, 10, 800, 90)}])

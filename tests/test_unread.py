@@ -21,43 +21,46 @@ RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
 # Words that no rule reads, in the part that asks or moves; of the second group, beside it.
 TURNING = """
 If the ball rolls anywhere but left, does it hit the mug? | anywhere
-If the ball does not roll left but hops, does it hit the mug? | not
-If the ball rolls right around the mug, does it hit the cone? | around mug
+If the ball does not roll left but hops, does it hit the mug? | does not
+If the ball rolls right around the mug, does it hit the cone? | around the mug
 If the ball rolls right twice as fast, does it hit the mug? | twice as fast
-If the ball rolls right, does it hit the mug and the cube? | hit mug and cube
-If the ball rolls right, does it hit the mug before the cube? | hit mug before cube
-If the ball rolls right, will it hit the cone after 2 seconds? | hit cone after 2 seconds
+If the ball rolls right, does it hit the mug and the cube? | does it hit the mug and the cube
+If the ball rolls right, does it hit the mug before the cube? | does it hit the mug before the cube
+If the ball rolls right, will it hit the cone after 2 seconds? | will it hit the cone after 2 seconds
 If the ball rolls left for the first second, does it hit the mug? | for the first second
-If the ball rolls right, does it not hit both mugs? | not hit both mugs
+If the ball rolls right, does it not hit both mugs? | does it not hit both mugs
 The ball and the mug are on the table. If it rolls left, does it hit the cone? | it
-The ball moves right, but the mug is glued to the floor. Does the mug move? | mug is glued
-Replace the ball with the cube. If the mug slides left, does it hit the vase? | Replace ball with cube
-Unless the ball rolls right, does it hit the mug? | unless
-If the red ball hits the white ball, where will the white ball go? | hits white ball
-Only if the ball rolls right: will it touch the cube? | only
+The ball moves right, but the mug is glued to the floor. Does the mug move? | but the mug is glued
+Replace the ball with the cube. If the mug slides left, does it hit the vase? | Replace the ball with the cube
+Unless the ball rolls right, does it hit the mug? | Unless
+If the ball is able to roll right, does it hit the mug? | is able
+If the ball rolls right, won't it be able to hit the mug? | won't it be able to hit the mug
+If the ball rolls right, will the ball at least hit the mug? | at least hit the mug
+If the red ball hits the white ball, where will the white ball go? | hits the white ball
+Only if the ball rolls right: will it touch the cube? | Only
 The camera moves left. Does the ball hide the mug? | camera moves left
 If the ball goes right while the mug goes left by 30 pixels, will they collide? | by 30 pixels
 If the ball goes right while the mug goes left and then up, will they collide? | up
-If the ball and the mug both move right by 30 pixels, do they touch? | mug both
-If the ball rolls on the shelf to the left, does it hit the mug? | on shelf
-If the ball rolls off the shelf to the left, does it hit the mug? | off shelf
-If the ball rolls along the arrow, will it hit the mug on its way against the arrow? | hit mug on way against arrow
-Is the mug hit first by the ball if it rolls left? | hit first by ball
-Which mug is hit by the cone first if the ball rolls left? | mug is hit by cone first
-The ball rolls left and strikes the cube. Does the ball hit the mug? | strikes cube
-The ball rolls left and misses the cube. Does the cube hit the mug? | misses cube
-First shift the ball left by 90 px, in the air, and only then release it. Will it hit the mug? | in air
+If the ball and the mug both move right by 30 pixels, do they touch? | and the mug both
+If the ball rolls on the shelf to the left, does it hit the mug? | on the shelf
+If the ball rolls off the shelf to the left, does it hit the mug? | off the shelf
+If the ball rolls along the arrow, is it hit on its way against the arrow? | is it hit on its way against the arrow
+Is the mug hit first by the ball if it rolls left? | hit first by the ball
+Which mug is hit by the cone first if the ball rolls left? | mug is hit by the cone first
+The ball rolls left and strikes the cube. Does the ball hit the mug? | and strikes the cube
+The ball rolls left and misses the cube. Does the cube hit the mug? | and misses the cube
+First shift the ball left by 90 px, in the air, and only then release it. Will it hit the mug? | in the air
 Nobody throws the cube. If the ball rolls left, does it hit the mug? | cube
-If the ball rolls left by twice the width of the mug, does it hit the cube? | by twice width of mug
-If the ball rolls right, does it still hit the mug at the end? | still hit mug at end
-True or false? The mug is on the table. If the ball rolls left, it hits the mug. | true or false
-If the ball and the mug move to the left, do they meet? | mug move
-If the ball moves right and the blue cube to the left, will the ball hit the cube? | blue cube
-If the ball rolls left, once the ball has bumped into the cup, will the cup tip the cube? | bumped into cup
-If the ball is kicked into the air along the arrow, where will it land? | into air
-If the ball rolls left by half the image width, does it hit the mug? | by half image width
-If the ball rolls left until it leaves the picture, does it hit the mug? | until it leaves picture
-The ball flies on along its trail, the first of which is the leftmost. Does it hit the mug? | first of which is leftmost
+If the ball rolls left by twice the width of the mug, does it hit the cube? | by twice the width of the mug
+If the ball rolls right, does it still hit the mug at the end? | does it still hit the mug at the end
+True or false? The mug is on the table. If the ball rolls left, it hits the mug. | True or false
+If the ball and the mug move to the left, do they meet? | and the mug move
+If the ball moves right and the blue cube to the left, will the ball hit the cube? | and the blue cube
+If the ball rolls left, once the ball has bumped into the cup, will the cup tip the cube? | has bumped into the cup
+If the ball is kicked into the air along the arrow, where will it land? | into the air
+If the ball rolls left by half the image width, does it hit the mug? | by half the image width
+If the ball rolls left until it leaves the picture, does it hit the mug? | until it leaves the picture
+The ball flies on along its trail, the first of which is the leftmost. Is it hit? | first of which is the leftmost
 The ball rolls left, then it goes for 2 seconds. Does it hit the mug? | for 2 seconds
 """
 BESIDE = """
@@ -192,4 +195,5 @@ def test_misspelt_words_are_not_guessed(question: str) -> None:
 def test_no_sense_is_made_of_what_has_none(word: str) -> None:
     question = parse(f"If the red ball {word} left, does it hit the mug?")
     assert question.mover is not None
-    assert word in question.mover.text or word in unread(question).turning  # a noun nobody knows, or named as unread
+    named = " ".join(unread(question).turning).split()
+    assert word in question.mover.text or word in named  # a noun nobody knows, or named as unread

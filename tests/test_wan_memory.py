@@ -57,6 +57,11 @@ def test_it_is_what_the_loaded_parts_take(checkpoint: Path) -> None:
     assert need_of(profile_of(ATI, "exact"), parameters, 2).device == pytest.approx(taken, rel=0.03)
 
 
+def test_weights_that_are_missing_too_are_told(tmp_path: Path) -> None:
+    with pytest.raises(GeneratorUnavailable, match=r"run `cow models pull ati`.*`generator: cutout`"):
+        check_machine(ATI, "exact", here(tmp_path), torch.device("cpu"))
+
+
 def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """There is no GPU here: its size, and what it can do, are fakes."""
     monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)

@@ -1,5 +1,6 @@
 """What `simulate`, `answer`, `models` and `doctor` show: progress, results in a folder, tables."""
 
+import hashlib
 import platform
 import shutil
 import sys
@@ -53,9 +54,10 @@ def run_request(
     try:
         request = model.model_validate({"image": {"artifact": artifact.sha256}, **body})
     except ValidationError as error:
-        fields = field_errors(error.errors())
+        fields, known = field_errors(error.errors()), ", ".join([*model.model_fields][2:])
         faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
-        raise InvalidRequest(f"{faults}.", errors=fields) from error
+        remedy = f"--request takes these fields: {known}. A server's /docs says what each holds."
+        raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy * ("no such field" in faults)) from error
     result: Simulation | Answer
     with stages_shown(console) as show:
         if isinstance(request, AnswerRequest):
@@ -114,10 +116,29 @@ def print_stages(console: Console, simulation: Simulation) -> None:
         console.print(f"[dim]outcome[/]: {escape(outcome)}")
 
 
+def _result_in(folder: Path) -> Simulation | None:
+    try:
+        return Simulation.model_validate_json((folder / "simulation.json").read_bytes())
+    except (OSError, ValueError):
+        return None
+
+
+def default_folder(image: Path) -> Path:
+    """`<name of the image>-cow`, or the first with a number behind it, without the result of another picture."""
+    folder, number, sha256 = Path(f"{image.stem}-cow"), 1, hashlib.sha256(read_file(image)).hexdigest()
+    while (found := _result_in(folder)) is not None and found.image.sha256 != sha256:
+        number += 1
+        folder = Path(f"{image.stem}-cow-{number}")
+    return folder
+
+
 def save(service: Service, result: Simulation | Answer, out: Path, formats: Sequence[str]) -> list[str]:
     """Writes frames, video, overlay, the result as JSON and the clip in other formats; returns the names of files."""
     artifacts, documents, made = records.artifacts_of(result), records.documents_of(result), dict[str, Any]()
+    stale = ("simulation.json", "answer.json", "clip.gif", "clip.webp", "sheet.png")  # beside an earlier run's pictures
     with writable(out):
+        for name in () if (earlier := _result_in(out)) is None else (*records.artifacts_of(earlier), *stale):
+            (out / name).unlink(missing_ok=True)
         for name, sha256 in artifacts.items():
             (out / name).write_bytes(service.artifacts.read(sha256))
         for name, text in documents.items():

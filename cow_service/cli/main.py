@@ -40,7 +40,9 @@ def main(
 def simulate(
     image: options.Image,
     question: options.Question,
-    out: Annotated[Path | None, option("Folder for the results.", "--out", "-o", shown="./<image>-cow")] = None,
+    out: Annotated[
+        Path | None, option("Folder for the results.", "--out", "-o", shown="./<image>-cow, or -cow-2")
+    ] = None,
     video: Annotated[bool, option("Make the mp4.")] = True,
     formats: Annotated[
         list[options.Format] | None,
@@ -55,10 +57,10 @@ def simulate(
 
     They go into a folder, with simulation.json.
     """
-    from cow_service.cli.console import run_request  # noqa: PLC0415
+    from cow_service.cli.console import default_folder, run_request  # noqa: PLC0415
 
     body = {**request, "question": question, "video": video}
-    out = out or Path(f"{image.stem}-cow")
+    out = out or default_folder(image)
     with open_service() as service:
         simulation = run_request(service, "simulate", image, body, out, formats or (), as_json=as_json)
     if open_it and simulation is not None:

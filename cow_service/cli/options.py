@@ -27,6 +27,7 @@ HINTS = {  # what an error's remedy asks for as options, by the error's code
     "cannot-ground": _GIVE_PLACE,
     "object-not-found": _GIVE_PLACE,
     "cannot-read-direction": "Here: --direction DX,DY.",
+    "generator-unavailable": "Or here: --generator cutout (or COW_GENERATOR=cutout), without GPU and weights.",
 }
 
 
@@ -60,6 +61,11 @@ class Commands(TyperGroup):
             for field in (field for field in error.errors if field.detail not in error.detail):
                 typer.echo(printable(f"  {field.pointer}: {field.detail}"), err=True)
             raise typer.Exit(1) from error
+        except typer.BadParameter as error:
+            if "is not one of" in error.message:
+                kinds = error.message.removeprefix("Value error, ").rstrip(".")
+                error.message = f"{kinds}. Choose one of these, or leave the option out."
+            raise
         except Exception as error:
             from cow_service.settings import SettingsError  # noqa: PLC0415 - its import would slow down --help
 
@@ -254,7 +260,7 @@ def object_in(text: str | bytes, name: str) -> dict[str, Any]:
     try:
         given = json.loads(text)
     except ValueError as error:
-        raise InvalidRequest(f"{name} is not JSON: {error}.") from error
+        raise InvalidRequest(f'{name} is not JSON: {error}. Give an object: {{"name": value}}.') from error
     if not isinstance(given, dict):
         raise InvalidRequest(f"{name} must be an object, got {type(given).__name__}.")
     return given
@@ -266,10 +272,8 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count:
-        raise InvalidRequest(
-            f"{option} takes {count} numbers with commas between, such as {'10,20,90,140' if count == 4 else '10,20'}; "
-            f"got '{text}'."
-        )
+        example = {"--direction": "-1,0 for to the left (x right, y down)"}.get(option, "10,20,90,140"[: 4 * count - 3])
+        raise InvalidRequest(f"{option} takes {count} numbers with commas between, such as {example}; got '{text}'.")
     return values
 
 

@@ -63,7 +63,9 @@ def encounters_words(trajectory: records.Trajectory) -> str:
     for each in trajectory.encounters:
         sure = "" if each.probability is None else f" ({worlds(each.probability)})"
         met.append(f"{records.MEETINGS[each.kind]} {each.object} at {each.first_frame / trajectory.fps:.1f} s{sure}")
-    return ", ".join(met) or ("meets nothing" if trajectory.encounters_known else "encounters were not computed")
+    on = trajectory.bodies[0].support if trajectory.bodies else "floor"
+    nothing = "meets nothing" if on in ("floor", "air") else f"meets nothing but {on}, which it is on from the start"
+    return ", ".join(met) or (nothing if trajectory.encounters_known else "encounters were not computed")
 
 
 def contacts_words(trajectory: records.Trajectory) -> str:

@@ -20,7 +20,8 @@ Given = Mapping[str, Any]  # a record as a plain mapping, checked by the server
 class SimulateOptions(TypedDict, total=False):
     """All of `SimulateRequest` but image and question; docs/http.md and `cow_service.requests` say what each means.
 
-    `law` stands for `motion.law`. The `mask` of an object may be whatever an image may be, and an array of booleans.
+    `law` stands for `motion.law`. The `mask` of an object may be whatever an image may be, and an array of booleans;
+    the `map` of a `depth` may be that, too, an array of 16-bit integers, or one of metres, nan where nothing is known.
     """
 
     options: Sequence[str] | Sequence[requests.OptionRequest | Given] | None
@@ -31,6 +32,7 @@ class SimulateOptions(TypedDict, total=False):
     interventions: Sequence[requests.InterventionRequest | Given] | None
     asked: requests.AskedRequest | Given | None
     camera: requests.CameraRequest | Given | None
+    depth: requests.DepthRequest | Given | None
     law: Law | None
     ensemble: int | None
     reader: str | None

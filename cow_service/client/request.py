@@ -164,23 +164,34 @@ def request_fields(options: Mapping[str, Any]) -> dict[str, Any]:
             raise InvalidRequest(f"`motion.law` {detail}.", errors=(FieldError("/motion/law", detail),))
         fields["motion"] = {**motion, "law": law}
     if "grounding" in fields:
-        fields["grounding"] = _with_mask(fields["grounding"])
+        fields["grounding"] = _with_picture(fields["grounding"], "mask")
     if "objects" in fields:
-        fields["objects"] = [_with_mask(given) for given in fields["objects"]]
+        fields["objects"] = [_with_picture(given, "mask") for given in fields["objects"]]
+    if "depth" in fields:
+        fields["depth"] = _with_picture(fields["depth"], "map")
     return fields
 
 
-def _with_mask(place: Any) -> Any:
-    """The place with its mask as JSON has it; unchanged where it has none."""
-    mask = place.get("mask") if isinstance(place, Mapping) else getattr(place, "mask", None)
-    if mask is None:
-        return place
-    if getattr(getattr(mask, "dtype", None), "kind", "") == "b":
-        mask = mask.astype("uint8") * 255
-    sent = image_input(mask)
+def _with_picture(given: Any, name: str) -> Any:
+    """A record with the picture that a field holds as JSON has it; unchanged where it has none."""
+    picture = given.get(name) if isinstance(given, Mapping) else getattr(given, name, None)
+    if picture is None:
+        return given
+    kind, scale = getattr(getattr(picture, "dtype", None), "kind", ""), dict[str, float]()
+    if kind == "b":
+        picture = picture.astype("uint8") * 255
+    elif kind == "f":  # metres
+        known = picture == picture  # noqa: PLR0124 - what is no number differs from itself
+        unit = max(float(picture[known].max(initial=0.0)), 1e-6) / 65535
+        picture, scale = ((picture.clip(0) / unit).round() * known).astype("uint16"), {"scale": unit}
+    if str(getattr(picture, "dtype", "")) == "uint16":
+        from PIL import Image  # noqa: PLC0415
+
+        picture = _png(Image.fromarray(picture))
+    sent = image_input(picture)
     if isinstance(sent, bytes):
         sent = f"data:image/png;base64,{base64.b64encode(sent).decode()}"
-    return {**plain(place), "mask": sent}
+    return {**plain(given), **scale, name: sent}
 
 
 MINIMAL = "return=minimal"  # the preference of RFC 7240

@@ -36,7 +36,7 @@ NESTED = {
 }
 # Fields that are no arguments: `interventions` are `remove` and `place`, the rest is for programs.
 _LEFT_OUT = {
-    *("grounding", "motion", "frames", "interventions", "trajectory", "camera", "ensemble", "fps"),
+    *("grounding", "motion", "frames", "interventions", "trajectory", "camera", "depth", "ensemble", "fps"),
     *("generator_options", "priority", "webhook"),
 }
 _LEFT_OUT_OF = {"simulate": {"options"}, "answer": {"video"}}

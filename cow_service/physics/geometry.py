@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import CameraFit, axes_of
+from cow_service.physics.camera import HORIZON, CameraFit, axes_of
 from cow_service.records import BBox, DepthEstimate, Shape
 from cow_service.vision.masks import CroppedMask, eroded
 from cow_service.vision.types import Floats, Mask
@@ -36,6 +36,7 @@ LEAST_PIXELS = 24
 EDGE = 5  # px across: at outlines depths are those of neither side
 TRIM = 2.0  # percent of the points at either end that are left out
 FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
+TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
 AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
 ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
 ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
@@ -265,8 +266,8 @@ def measure(given: DepthMap, focal: float, floor: Floor, bodies: Sequence[SeenBo
     for body in bodies:
         off = None if body.is_flying else _floor_error(body, smooth, known & ~covered, focal, floor, given.deviation)
         depth, left = (smooth, 1.0) if off is None else (smooth / off, ALIKE)
-        one = _footprint(body, depth, known, focal, floor)
-        found.append(one and replace(one, deviation=SURE + left * given.deviation))
+        deviation = SURE + left * given.deviation
+        found.append(_footprint(body, depth, known, focal, floor, deviation))
     return tuple(found)
 
 
@@ -289,8 +290,10 @@ def _floor_error(
     return float(np.median(on_floor)) if len(on_floor) >= max(LEAST_PIXELS, 0.3 * len(off)) else None
 
 
-def _footprint(body: SeenBody, depth: Floats, known: Mask, focal: float, floor: Floor) -> Footprint | None:
-    """Of one body, by depths [H, W] and where they are known [H, W]."""
+def _footprint(
+    body: SeenBody, depth: Floats, known: Mask, focal: float, floor: Floor, deviation: float
+) -> Footprint | None:
+    """Of one body, by depths [H, W], where they are known [H, W], and how far they are off, relative."""
     mask, (height, width) = body.mask, depth.shape
     inner = eroded(np.pad(mask.patch, EDGE), EDGE)[EDGE:-EDGE, EDGE:-EDGE]
     inner = inner if np.count_nonzero(inner) >= LEAST_PIXELS else mask.patch
@@ -310,9 +313,13 @@ def _footprint(body: SeenBody, depth: Floats, known: Mask, focal: float, floor: 
         front = float(np.median(z[near] if near.any() else z))
         middle = front / max(1 - radius, 0.1)
         ray = _rays(np.array([(x0 + x1 - 1) / 2]), np.array([(y0 + y1 - 1) / 2]), width, height, focal)
+        # Where it may as well touch the floor it does: then the floor tells its depth more exactly.
+        sink = radius - float(ray[0] @ floor.axes[1])
+        if sink > HORIZON and abs(floor.height / sink / middle - 1) < TOUCHES + deviation:
+            middle = floor.height / sink
         across, up, ahead = floor.coordinates(ray * middle)[0].tolist()
         half = radius * middle
-        return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, 0.0, share)
+        return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, share)
     right, up, ahead = floor.coordinates(rays * z[:, None]).T
     bottom, top = (float(value) for value in np.percentile(up, (TRIM, 100 - TRIM)))
     sight = math.atan2(float(np.median(ahead)), float(np.median(right)))
@@ -347,7 +354,7 @@ def _footprint(body: SeenBody, depth: Floats, known: Mask, focal: float, floor: 
         yaw,
         bottom,
         seen,
-        0.0,
+        deviation,
         share,
     )
 

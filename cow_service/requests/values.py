@@ -82,6 +82,7 @@ MaskRef = Annotated[
 ]
 
 
+_OURS = {"extra_forbidden": "there is no such field", "string_too_short": "is empty"}  # by pydantic's type
 SHOWN_CHARACTERS = 80  # of what the caller sent
 _HIDDEN = ("function-", "constrained-", "is-instance")
 _UNION_BRANCHES = frozenset({"ImageArtifact", "ImageUrl", "str", "texts", "pairs"})
@@ -96,7 +97,10 @@ def field_errors(
         # Without the names of union branches and validators, which callers cannot see.
         parts = [p for p in item["loc"] if not str(p).startswith(_HIDDEN) and p not in _UNION_BRANCHES]
         pointer = placed("".join("/" + pointer_part(part) for part in parts))
-        fields.setdefault(pointer, FieldError(pointer, _with_value(str(item["msg"]), item["input"])))
+        detail = _with_value(_OURS.get(item["type"], str(item["msg"])), item["input"])
+        if "is empty" in detail and pointer.endswith("/question"):
+            detail += ". Ask such as 'If the red ball moves to the left, will it hit the vase?'"
+        fields.setdefault(pointer, FieldError(pointer, detail))
     return tuple(fields.values())
 
 

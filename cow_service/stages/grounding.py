@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
-from cow_service.narration import same_name
+from cow_service.narration import OF_ITSELF, OF_TARGET, same_name
 from cow_service.readers.base import GroundingReading, NamedChange, WordReader
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT
@@ -14,13 +14,12 @@ from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, Pl
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object
-from cow_service.vision.scene import Scene
 from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 WHITE = 128  # grey level from which a pixel of a mask is the object's
-MAX_MASK_SHARE = 0.95  # of the image: more is no object, but an image without a mask
+MAX_SHARE = 0.95  # of the image that a box or a mask covers: more is no object
 
 
 def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
@@ -81,6 +80,8 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
             f"Taken for drawn over the image though the question speaks of none: {places}. "
             "A generator that cleans cues takes them out; `generator_options.clean_cues: false` keeps them."
         )
+    if name := asked_of_itself(grounding):
+        warnings.append(f"A thing cannot meet itself, so what is asked of '{name}' is open: ask of another thing.")
     if request.asked is not None or source != "embedded":  # which warns of what it does not find
         known = [each.object for each in (mover, *others_of(grounding), *removed_of(grounding))]
         asked = grounding.asked
@@ -148,11 +149,12 @@ def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], 
 def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Place:
     """The place of an object; `pointer` is the JSON Pointer to `given`.
 
-    Raises `InvalidRequest` for a place outside the image and for a mask that is none of this image, and `CannotGround`
-    where what can be cut out around a point is no object.
+    Raises `InvalidRequest` for a place outside the image or all over it and for a mask that is none of this image, and
+    `CannotGround` where what can be cut out around a point is no object.
     """
     run.check_canceled()
     scene, field = run.scene, field_of(pointer)
+    outside = f"lies outside the upright image of {scene.width} x {scene.height} px"
     if given.mask is not None:
         mask = _read_mask(run, given.mask, f"{pointer}/mask")
         scene.preset_mask(bbox_of(mask), lambda: mask)
@@ -160,12 +162,16 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     if given.bbox is not None:
         x0, y0, x1, y1 = given.bbox
         clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
-        if clipped[2] - clipped[0] < 2 or clipped[3] - clipped[1] < 2:
-            raise _outside(f"{pointer}/bbox", given.bbox, scene)
-        return Place(clipped)
+        wide, high = clipped[2] - clipped[0], clipped[3] - clipped[1]
+        if wide < 2 or high < 2:
+            raise _misplaced(f"{pointer}/bbox", given.bbox, outside)
+        if (share := wide * high / (scene.width * scene.height)) > MAX_SHARE:
+            raise _misplaced(f"{pointer}/bbox", given.bbox, f"covers {share:.0%} of the image")
+        beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
+        return Place(clipped, warnings=() if clipped == given.bbox else (beyond,))
     x, y = given.point or (0.0, 0.0)
     if not (0 <= x < scene.width and 0 <= y < scene.height):
-        raise _outside(f"{pointer}/point", (x, y), scene)
+        raise _misplaced(f"{pointer}/point", (x, y), outside)
     cutout = scene.locate((x, y))
     if cutout.mask is None:
         return Place(cutout.bbox)
@@ -182,9 +188,10 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     return Place(cutout.bbox, cutout.mask, (warning,))
 
 
-def _outside(pointer: str, value: Sequence[float], scene: Scene) -> InvalidRequest:
-    detail = f"{list(value)} lies outside the upright image of {scene.width} x {scene.height} px."
-    return InvalidRequest(f"{detail} Give pixels, x right and y down.", errors=(FieldError(pointer, detail),))
+def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidRequest:
+    detail = f"{list(value)} {fault}."
+    message = f"`{field_of(pointer)}`: {detail} Give pixels of the object alone, x right and y down."
+    return InvalidRequest(message, errors=(FieldError(pointer, detail),))
 
 
 def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
@@ -211,7 +218,7 @@ def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
         raise refused(f"has {given_size} where the upright image has {size}")
     if not share:
         raise refused("is empty: no pixel is white")
-    if share > MAX_MASK_SHARE:
+    if share > MAX_SHARE:
         raise refused(f"covers {share:.0%} of the image: white, or transparent, is the object alone")
     return mask
 
@@ -299,6 +306,14 @@ def placed_mover(grounding: Grounding) -> Intervention | None:
     """The intervention that puts the grounded object somewhere; None where it stays or moves by itself."""
     placed = (each for each in grounding.interventions if each.kind == "place")
     return next((each for each in placed if is_same_object(each.object.bbox, grounding.bbox)), None)
+
+
+def asked_of_itself(grounding: Grounding) -> str | None:
+    """The thing of which it is asked whether it meets, hides or holds itself: none can."""
+    asked = grounding.asked
+    if asked is None or asked.target is None or asked.relation in (*OF_TARGET, *OF_ITSELF):
+        return None
+    return asked.target if same_name(asked.target, asked.subject or grounding.object) else None
 
 
 def others_of(grounding: Grounding) -> tuple[LocatedObject, ...]:

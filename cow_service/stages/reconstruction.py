@@ -19,7 +19,7 @@ from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import SimulateRequest
-from cow_service.stages.grounding import others_of, placed_mover, removed_of
+from cow_service.stages.grounding import asked_of_itself, others_of, placed_mover, removed_of
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Obstacle, Scene
@@ -226,7 +226,7 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequenc
     subjects = (0,) if asked.subject is None else named(asked.subject)
     targets = (None,) if asked.target is None else named(asked.target)
     among = [named(name) for name in asked.among]
-    if not subjects or not targets or not all(among):
+    if not subjects or not targets or not all(among) or asked_of_itself(situation.grounding):
         return None
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
     asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})

@@ -88,7 +88,11 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
     if problem := lacking(profile_of(manifest, name)):
         able = [other for other in manifest.profiles if not lacking(profile_of(manifest, other))]
         remedy = f"can run: {', '.join(able)} (COW_PROFILE)" if able else "can run none of its profiles"
-        raise GeneratorUnavailable(f"'{manifest.name}', profile '{name}': {problem} This machine {remedy}.")
+        pull = "" if parameters else f" Its weights are not all here either: run `cow models pull {manifest.name}`."
+        raise GeneratorUnavailable(
+            f"'{manifest.name}', profile '{name}': {problem} This machine {remedy}.{pull}",
+            remedy="Or give `generator: cutout`, which needs no GPU and no weights.",
+        )
 
 
 def _read_headers(folders: Mapping[str, Path]) -> tuple[dict[str, int], bool]:

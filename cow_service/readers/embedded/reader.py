@@ -115,12 +115,15 @@ class EmbeddedReader:
                 and not matching.is_kind_asked(each, question)
                 and changes.given_as(each, given.known) is None
             ]
-            asked, table = read_asked(question), None
-            if scene.side_view is not None and (phrase := noun_phrases.table_landed_on(question.items)) is not None:
+            asked, (phrase, before) = read_asked(question), noun_phrases.table_at_end(question.items)
+            lands = records.Asked(relation="lands") if asked is None else asked
+            if scene.side_view is not None and phrase is not None and lands.relation == "lands":
                 # Seen from the side, a table is a thing, and the floor is another.
                 table = matching.table_among([each for each in regions if each.bbox != bbox])
-                asked = None if table is None else records.Asked(relation="touches", target=phrase.text)
                 located += () if table is None else (LocatedObject(object=phrase.text, bbox=table.bbox),)
+                if before in {"on", "onto", "upon"} and not lands.negated:
+                    on_it = lands.model_copy(update={"relation": "touches", "target": phrase.text})
+                    asked = None if table is None else on_it
             boxes |= {mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (mover, *question.others) if each.text in boxes]
             doubts, doubtful = matching.noun_doubts(scene, things)

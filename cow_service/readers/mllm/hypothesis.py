@@ -4,13 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.media.overlay import named_strip
-from cow_service.narration import DOUBTS, EVENTS, OF_TARGET, bare_name, state_words
+from cow_service.narration import DOUBTS, EVENTS, OF_ITSELF, OF_TARGET, bare_name, state_words
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.replies import text_of
-from cow_service.records import MEETINGS, AskedRelation, Outcome, Simulation
+from cow_service.records import MEETINGS, Outcome, Simulation
 
 AS_IT_IS = "As it is"  # the name of the frames with nothing changed
-OF_ITSELF: tuple[AskedRelation, ...] = ("leaves", "lands")  # nothing else is part of these
 
 
 def pictures(imagined: Imagined) -> tuple[NDArray[np.uint8], ...]:

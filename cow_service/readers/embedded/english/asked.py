@@ -4,6 +4,7 @@ The question is taken at its word: one that has a word which no rule reads, wher
 read at all. A wrong yes is worse than "not sure".
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -220,6 +221,7 @@ _NEGATIVE = lex.NEGATIONS | lex.words("no none nothing neither nor unless except
 _ALL_OF_IT = lex.words("whole entire")  # "is the whole mug hidden": how much is hidden at most is not asked anywhere
 _ADVERBIALS = 8  # tries of one sentence, and words of one
 MAX_TEXT = 200  # characters of unread words that are named
+_WORD = re.compile(r"\w+(?:['’]\w+)*")  # "won't" is one, and two items
 
 
 @dataclass(frozen=True)
@@ -244,8 +246,9 @@ def unread(question: Question) -> Unread:
         told = any(at in covered or question.has_read(at) for at in sentence)
         only_described = not told and _describes(items[start:end])
         for run in _unread_runs(question, sentence, covered):
-            text = " ".join(item.phrase.text if item.phrase else " ".join(item.words) or item.key for item in run)
-            (beside if only_described else turning).append(text[:MAX_TEXT])
+            words = [w for w in _WORD.finditer(question.text) if w.end() > run[0].start and w.start() < run[-1].end]
+            said = question.text[words[0].start() : words[-1].end()]
+            (beside if only_described else turning).append(said[:MAX_TEXT])
     return Unread(tuple(dict.fromkeys(turning)), tuple(dict.fromkeys(beside)))
 
 
@@ -259,7 +262,7 @@ def _describes(sentence: Sequence[Item]) -> bool:
 
 
 def _unread_runs(question: Question, sentence: range, covered: frozenset[int]) -> Iterator[list[Item]]:
-    """The unread items, those together that stand together, without the words at both ends that only join others."""
+    """The unread items, those together that stand together, without words at the end that only join others."""
     items = question.items
     harmless = _harmless(question, sentence, covered)
 
@@ -280,10 +283,8 @@ def _unread_runs(question: Question, sentence: range, covered: frozenset[int]) -
         return at + 1 < sentence.stop and bool(question.motion.steps) and question.has_read(at + 1)
 
     for read, places in groupby(sentence, is_read):
-        run = list(dropwhile(lambda at: is_structure(at) or is_order(at), places))
-        while run and is_structure(run[-1]):
-            run.pop()
-        if run and not read:
+        run = [*dropwhile(is_structure, reversed([*places]))][::-1]
+        if not read and not all(is_structure(at) or is_order(at) for at in run):
             yield [items[at] for at in run]
 
 

@@ -72,15 +72,14 @@ class Clause:
         which_of_them = any(word.text == "them" for word in self.pronouns)
         kinds = {word.kind for word in self.subject}
         of_it = any(word.text == "it" for word in self.objects)
-        by_mover = self.mover_acted and not self.done_to and not kinds.isdisjoint({"M", "PRONOUN"})
-        too_much = negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"})
-        if too_much or which_of_them or (by_mover and not of_it and not things):  # "does the ball hit the ball?"
+        meets_itself = self.mover_acted and not (self.done_to or of_it) and not kinds.isdisjoint({"M", "PRONOUN"})
+        if which_of_them or negations > 1 or len(things) > 1 or (negations and form not in {"whether", "changes"}):
             return None
         if form == "which-first" and not things and not self.listed and "lands_on" in nodes:
             form = "where"  # "what does it land on?": on the floor, too
         of_another = form == "which-first" and bool(things)  # "which mug is hit by the cone first": not by the mover
         partly = self.relation in {"covers", "covered"} and not nodes.isdisjoint(_ANY_PART)
-        target = things[0] if things else None
+        target = things[0] if things else self.question.mover if meets_itself else None
         asking = Asking(form, self.relation, negations == 1, None, target, tuple(self.listed), partly)
         if self.several and not of_another:
             return self._of_several(asking)

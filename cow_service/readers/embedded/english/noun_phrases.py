@@ -253,11 +253,11 @@ def with_tables(found: Sequence[Item]) -> list[Item]:
     return kept
 
 
-def table_landed_on(found: Sequence[Item]) -> ObjectPhrase | None:
-    """The table of "will it land on the table", where a question ends so."""
-    ends = [item for item in found if item.phrase is not None][-1:]
-    on = key_at(found, found.index(ends[0]) - 1) if ends else ""
-    return ends[0].phrase if on in {"on", "onto", "upon"} and ends[0].phrase and ends[0].phrase.head in TABLES else None
+def table_at_end(found: Sequence[Item]) -> tuple[ObjectPhrase | None, str]:
+    """The table of "will it land on the table", where a question ends so, and the word before it."""
+    at = max((place for place, item in enumerate(found) if item.phrase is not None), default=-1)
+    phrase = found[at].phrase if found else None
+    return phrase if phrase is not None and phrase.head in TABLES else None, key_at(found, at - 1)
 
 
 def with_nouns(found: Sequence[Item]) -> list[Item]:

@@ -40,6 +40,7 @@ class Question:
     understood. `read` are the places in the text of the items that tell the motion and were understood.
     """
 
+    text: str
     mover: ObjectPhrase | None
     motion: MotionWords
     others: tuple[ObjectPhrase, ...]
@@ -69,8 +70,7 @@ def parse(question: str) -> Question:
     found = lex.tokens(text)
     beyond = ""
     if len(found) > MAX_WORDS:
-        text, rest = text[: found[MAX_WORDS].start], found[MAX_WORDS : MAX_WORDS + 7]
-        beyond = " ".join(each.key for each in rest)
+        text, beyond = text[: found[MAX_WORDS].start], " ".join(text[found[MAX_WORDS].start :].split()[:7])
     text = wording.without_openings(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
     arrow = any(token.key.startswith("arrow") for token in lex.tokens(text))
     found = noun_phrases.with_nouns(noun_phrases.with_tables(noun_phrases.items(text)))
@@ -96,6 +96,7 @@ def parse(question: str) -> Question:
     if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
         mover, told = put.object, replace(told, kind="place", verb="put")
     return Question(
+        text=text,
         mover=mover,
         motion=told,
         others=_others(found, mover, clause, changes, trail),
