@@ -21,11 +21,13 @@ from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion, Vector
 from cow_service.requests import CameraRequest, SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
+from cow_service.vision.edges import divide
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Obstacle, Scene
 from cow_service.vision.shadows import Shadow, find_shadow
 from cow_service.vision.side_view import SideView
+from cow_service.vision.types import Floats
 
 PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
@@ -112,6 +114,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     carried, before = placement_goals(situation, present)
     query = query_of(situation, bodies, carried)
     is_ball_in_air = bodies[0].shape == "sphere" and flies(bodies[0], motion)
+    standing, floor = standing_things(bodies, motion, situation.scene.segments)
     fit = camera_of(
         situation.size,
         motion.down,
@@ -119,7 +122,8 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         find_shadow(situation.scene, bodies[0].bbox) if is_ball_in_air else None,
         bodies[0].bbox,
         fixed_focal=situation.follows_path,
-        standing=standing_things(bodies, motion),
+        standing=standing,
+        floor=floor,
         radii=_height_in_radii(bodies[0], motion),
     )
     level = None if situation.side_view is None else situation.side_view.level
@@ -247,13 +251,15 @@ def camera_of(
     flying: BBox = (0, 0, 0, 0),
     fixed_focal: bool = False,
     standing: Sequence[Standing] = (),
+    floor: Floats | None = None,
     radii: Estimate | None = None,
 ) -> CameraFit:
     """The camera of an image of a size (width, height; px), by what stands on the floor and the shadow of what flies.
 
-    `fixed_focal` holds the focal length where it is; `radii` is what is said of the height of what flies, in its radii.
+    `floor` has segments [N, 4] (px) of what lies between things; `fixed_focal` holds the focal length where it is;
+    `radii` is what is said of the height of what flies, in its radii.
     """
-    fit, given = prior(math.atan2(*down)), given or CameraRequest.model_construct()
+    fit, given = prior(math.atan2(*down), max(size) / size[0]), given or CameraRequest.model_construct()
     mean, sigma = fit.mean.copy(), np.sqrt(np.diag(fit.covariance))
     if given.pitch is not None:
         mean[0], sigma[0] = math.radians(given.pitch), GIVEN_PITCH_SIGMA
@@ -267,7 +273,7 @@ def camera_of(
         mean[1], sigma[1] = math.log(FOCAL_WIDTHS), FIXED
     source = "request" if given.model_fields_set else fit.source
     fit = replace(fit, mean=mean, covariance=np.diag(sigma**2), source=source)
-    fit = narrowed(fit, standing, size)
+    fit = narrowed(fit, standing, size, floor)
     return fit if shadow is None else fit_shadow(fit, flying, shadow, size) or fit
 
 
@@ -281,17 +287,23 @@ def _height_in_radii(mover: SeenBody, motion: Motion) -> Estimate | None:
     return Estimate(value=1 + said.value / radius, deviation=said.deviation / radius)
 
 
-def standing_things(bodies: Sequence[SeenBody], motion: Motion) -> list[Standing]:
-    """What the bodies that stand on the floor show of the camera."""
-    return [
+def standing_things(
+    bodies: Sequence[SeenBody], motion: Motion, segments: Floats
+) -> tuple[list[Standing], Floats]:
+    """What the bodies that stand on the floor show of the camera, and segments [N, 4] (px) that lie between them."""
+    own, floor = divide(segments, [body.mask for body in bodies])
+    things = [
         Standing(
-            body.bbox,
+            body.core,
             rim=body.rim if body.shape == "cylinder" and body.is_form_known else None,
             is_cube=body.prior is not None and body.prior.equal_sided,
+            shape=body.shape if body.is_form_known else None,
+            segments=own[index],
         )
         for index, (body, on) in enumerate(zip(bodies, supports_of(bodies), strict=True))
         if on is None and not (body.is_flying if index else flies(body, motion))
     ]
+    return things, floor
 
 
 # --- what is put somewhere
