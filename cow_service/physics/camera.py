@@ -146,7 +146,8 @@ class CameraFit:
 def prior(roll: float = 0.0, aspect: float = 1.0) -> CameraFit:
     """What is known of the camera before anything is measured; `aspect` is the image's longer side in its widths."""
     (lowest, highest), (shortest, longest) = PITCHES, np.log(FOCALS)
-    mean = np.array([(lowest + highest) / 2, (shortest + longest) / 2 + math.log(aspect), math.log(HEIGHT_RADII), *SLANT])
+    middle = (lowest + highest) / 2, (shortest + longest) / 2 + math.log(aspect)
+    mean = np.array([*middle, math.log(HEIGHT_RADII), *SLANT])
     flat = (highest - lowest) / 2 / FLAT, (longest - shortest) / 2 / FLAT
     sigma = np.array([*flat, HEIGHT_SIGMA, *SLANT_SIGMA])
     return CameraFit(mean, np.diag(sigma**2), roll, ROLL_SIGMA, "prior")
@@ -230,7 +231,7 @@ def narrowed(
 
 
 def _far_end(floor: Floats, above: float, width: int) -> Floats | None:
-    """Middle [2] (px) of the uppermost long and level segment that lies above a height in the image; None without one."""
+    """Middle [2] (px) of the uppermost long and level segment above a height in the image; None without one."""
     middle, across = (floor[:, :2] + floor[:, 2:]) / 2, np.abs(floor[:, 2:] - floor[:, :2])
     is_end = (across[:, 0] > FAR_END * width) & (across[:, 1] < FAR_END_SLOPE * across[:, 0]) & (middle[:, 1] < above)
     return min(middle[is_end], key=lambda point: point[1], default=None)

@@ -68,13 +68,13 @@ class Views:
         # Of the small angles between segments the sines are taken.
         down = self.towards(segments.middle, -self.axes[:, None, 1])[:, 0]
         upright = UPRIGHT * _normal(_cross(segments.along, down), segments.sigma) + NEITHER / math.pi
-        cornered = self._explain_level(segments, upright) if bbox is None or shape in (None, "box") else None
-        if bbox is None or shape == "box":
-            assert cornered is not None
-            return WEIGHT * cornered
-        middle, half = ((bbox[0] + bbox[2]) / size[0] - 1) / 2, (bbox[2] - bbox[0]) / 2 / size[0]
-        round_ = self._explain_rims(segments, upright, down, middle, half)
-        return WEIGHT * (round_ if cornered is None else np.logaddexp(cornered, round_))
+        likely: list[Floats] = []
+        if bbox is None or shape in (None, "box"):
+            likely.append(self._explain_level(segments, upright))
+        if bbox is not None and shape != "box":
+            middle, half = ((bbox[0] + bbox[2]) / size[0] - 1) / 2, (bbox[2] - bbox[0]) / 2 / size[0]
+            likely.append(self._explain_rims(segments, upright, down, middle, half))
+        return WEIGHT * np.logaddexp.reduce(likely)
 
     def _explain_level(self, segments: Segments, upright: Floats) -> Floats:
         """As edges of a thing with square corners: upright [K, S], or level along one of two directions.
@@ -89,8 +89,8 @@ class Views:
         first /= np.linalg.norm(first, axis=2, keepdims=True) + 1e-12
         level = np.zeros((*first.shape[:2], len(x)))
         for directions in (first, np.cross(up, first)):
-            across = _cross(segments.along, self.towards(segments.middle, directions))
-            level += LEVEL / 2 * _normal(across, segments.sigma)
+            towards = self.towards(segments.middle, np.asarray(directions, np.float64))
+            level += LEVEL / 2 * _normal(_cross(segments.along, towards), segments.sigma)
         return _log_mean(np.log(level + upright[:, None]).sum(axis=2))
 
     def _explain_rims(self, segments: Segments, upright: Floats, down: Floats, middle: float, half: float) -> Floats:

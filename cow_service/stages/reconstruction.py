@@ -287,9 +287,7 @@ def _height_in_radii(mover: SeenBody, motion: Motion) -> Estimate | None:
     return Estimate(value=1 + said.value / radius, deviation=said.deviation / radius)
 
 
-def standing_things(
-    bodies: Sequence[SeenBody], motion: Motion, segments: Floats
-) -> tuple[list[Standing], Floats]:
+def standing_things(bodies: Sequence[SeenBody], motion: Motion, segments: Floats) -> tuple[list[Standing], Floats]:
     """What the bodies that stand on the floor show of the camera, and segments [N, 4] (px) that lie between them."""
     own, floor = divide(segments, [body.mask for body in bodies])
     things = [

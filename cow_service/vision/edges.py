@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ def find_segments(image: Image, drawn: Mask) -> Floats:
     longest = max(image.shape[:2])
     scale = min(1.0, WORKING_SIDE / longest)
     grey = cv2.cvtColor(scaled(image, scale), cv2.COLOR_RGB2GRAY)
-    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
+    found: Any = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     segments = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64).reshape(-1, 4) / scale
     lengths = lengths_of(segments)
     order = np.argsort(-lengths, kind="stable")
