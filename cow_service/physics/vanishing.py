@@ -68,7 +68,7 @@ class Views:
         # Of the small angles between segments the sines are taken.
         down = self.towards(segments.middle, -self.axes[:, None, 1])[:, 0]
         upright = UPRIGHT * _normal(_cross(segments.along, down), segments.sigma) + NEITHER / math.pi
-        likely: list[Floats] = []
+        likely = [np.full(len(self.focal), -math.log(math.pi) * len(segments.sigma))]  # of a thing of another form
         if bbox is None or shape in (None, "box"):
             likely.append(self._explain_level(segments, upright))
         if bbox is not None and shape != "box":
