@@ -16,6 +16,7 @@ from cow_service.vision.types import Floats
 
 DIRECTION_SIGMA = math.radians(0.7)  # of a segment, however long
 END_SIGMA = 0.0012  # of the image's longer side, of a segment's direction times its length
+APEX_SIGMA = math.radians(2.0)  # of a side of a cone against the way to the middle of its box's upper edge
 RIM_SIGMA = math.radians(4.0)  # of a segment that approximates an arc
 UPRIGHT, LEVEL, NEITHER = 0.3, 0.3, 0.4  # of the segments of a thing
 END_OF_RIM = 0.93  # of half a thing's width: beyond it a rim is too curved for segments
@@ -63,7 +64,7 @@ class Views:
     def explain(self, segments: Segments, bbox: BBox | None, shape: Shape | None, size: tuple[int, int]) -> Floats:
         """Log likelihood [K] of segments of a thing in a box (px), or of what has none, such as the floor.
 
-        Where its shape is not known, it is one with corners or a round one.
+        Where its shape is not known, any shape is as likely as another one.
         """
         # Of the small angles between segments the sines are taken.
         down = self.towards(segments.middle, -self.axes[:, None, 1])[:, 0]
@@ -72,8 +73,11 @@ class Views:
         if bbox is None or shape in (None, "box"):
             likely.append(self._explain_level(segments, upright))
         if bbox is not None and shape != "box":
-            middle, half = ((bbox[0] + bbox[2]) / size[0] - 1) / 2, (bbox[2] - bbox[0]) / 2 / size[0]
-            likely.append(self._explain_rims(segments, upright, down, middle, half))
+            box = (np.array(bbox).reshape(2, 2) - np.array(size) / 2) / size[0]  # its corners
+            arcs = self._arcs(segments, down, box)
+            for form, sides in (("cylinder", upright), ("cone", _slanted(segments, box))):
+                if shape in (None, form):
+                    likely.append(np.log(sides + arcs).sum(axis=1))
         return WEIGHT * np.logaddexp.reduce(likely)
 
     def _explain_level(self, segments: Segments, upright: Floats) -> Floats:
@@ -93,20 +97,28 @@ class Views:
             level += LEVEL / 2 * _normal(_cross(segments.along, towards), segments.sigma)
         return _log_mean(np.log(level + upright[:, None]).sum(axis=2))
 
-    def _explain_rims(self, segments: Segments, upright: Floats, down: Floats, middle: float, half: float) -> Floats:
-        """As edges of a round thing: upright [K, S], or of the near or far half of a level circle around its axis.
+    def _arcs(self, segments: Segments, down: Floats, box: Floats) -> Floats:
+        """Likelihoods [K, S] of segments as the near or far half of a level circle around the axis of a thing.
 
-        The axis is at `middle` and the thing reaches as far as `half` to either side. A circle is seen as an ellipse
-        whose axes have the ratio of the sine of the angle at which it is looked down on.
+        The thing fills a box with corners [2, 2]. A circle is seen as an ellipse whose axes have the ratio of the sine
+        of the angle at which it is looked down on; `down` [K, S, 2] leads to the vanishing point of what is upright.
         """
-        place = (segments.middle[:, 0] - middle) / half
+        place = (segments.middle[:, 0] - box[:, 0].mean()) / (box[1, 0] - box[0, 0]) * 2
         inner = np.clip(place, -END_OF_RIM, END_OF_RIM)
         slope = np.clip(self.sines_down(segments.middle), 0, 1) * inner / np.sqrt(1 - inner**2)
         sideways = _cross(segments.along, down)  # positive: to the right where the segment leads down
         downwards = segments.along[:, 0] * down[..., 0] + segments.along[:, 1] * down[..., 1]
         sigma = np.hypot(segments.sigma, RIM_SIGMA)
-        arcs = sum(_normal((downwards - sign * slope * sideways) / np.hypot(1, slope), sigma) for sign in (1, -1))
-        return np.log(upright + LEVEL / 2 * arcs * (np.abs(place) < END_OF_RIM)).sum(axis=1)
+        near, far = (_normal((downwards + side * sideways) / np.hypot(1, slope), sigma) for side in (slope, -slope))
+        return LEVEL / 2 * (near + far) * (np.abs(place) < END_OF_RIM)
+
+
+def _slanted(segments: Segments, box: Floats) -> Floats:
+    """Likelihoods [1, S] of segments as sides of a cone in a box with corners [2, 2], or as none of its edges."""
+    apex = np.array([box[:, 0].mean(), box[0, 1]])
+    way = apex - segments.middle
+    way /= np.linalg.norm(way, axis=1, keepdims=True) + 1e-12
+    return (UPRIGHT * _normal(_cross(segments.along, way), APEX_SIGMA) + NEITHER / math.pi)[None]
 
 
 def _cross(one: Floats, other: Floats) -> Floats:
@@ -114,7 +126,7 @@ def _cross(one: Floats, other: Floats) -> Floats:
     return one[:, 0] * other[..., 1] - one[:, 1] * other[..., 0]
 
 
-def _normal(value: Floats, sigma: Floats) -> Floats:
+def _normal(value: Floats, sigma: Floats | float) -> Floats:
     return np.exp(-0.5 * (value / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
 
 
