@@ -16,6 +16,7 @@ from cow_service.vision.types import Floats
 
 DIRECTION_SIGMA = math.radians(0.7)  # of a segment, however long
 END_SIGMA = 0.0012  # of the image's longer side, of a segment's direction times its length
+UPRIGHT_SIGMA = math.radians(2.5)  # of a side against the upright: things lean and taper, and pictures are cropped
 APEX_SIGMA = math.radians(2.0)  # of a side of a cone against the way to the middle of its box's upper edge
 RIM_SIGMA = math.radians(4.0)  # of a segment that approximates an arc
 UPRIGHT, LEVEL, NEITHER = 0.3, 0.3, 0.4  # of the segments of a thing
@@ -68,7 +69,8 @@ class Views:
         """
         # Of the small angles between segments the sines are taken.
         down = self.towards(segments.middle, -self.axes[:, None, 1])[:, 0]
-        upright = UPRIGHT * _normal(_cross(segments.along, down), segments.sigma) + NEITHER / math.pi
+        sigma = np.hypot(segments.sigma, UPRIGHT_SIGMA)
+        upright = UPRIGHT * _normal(_cross(segments.along, down), sigma) + NEITHER / math.pi
         likely = [np.full(len(self.focal), -math.log(math.pi) * len(segments.sigma))]  # of a thing of another form
         if bbox is None or shape in (None, "box"):
             likely.append(self._explain_level(segments, upright))
