@@ -11,11 +11,12 @@ from conftest import SCALE
 from floors import TrueCamera, outline
 
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.camera import MEASUREMENT_SIGMA, Standing, fit_shadow, narrowed, prior
+from cow_service.physics.camera import MEASUREMENT_SIGMA, CameraFit, Standing, fit_shadow, narrowed, prior
 from cow_service.physics.draws import ensemble
 from cow_service.physics.layout import Cameras
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion
+from cow_service.vision.edges import divide, find_segments
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
 
@@ -145,7 +146,7 @@ class TestNarrowed:
         pitch = np.degrees(np.arcsin(-cameras.axes[:, 1, 2]))
         widths = cameras.focal / SIZE[0]
         assert (pitch.min(), pitch.max()) == pytest.approx((0, 55), abs=1.5)
-        assert (widths.min(), widths.max()) == pytest.approx((0.6, 2.2), rel=0.05)
+        assert (widths.min(), widths.max()) == pytest.approx((0.45, 2.2), rel=0.05)
 
     @pytest.mark.parametrize("pitch", [12, 28, 45])
     @pytest.mark.parametrize("shape", ["cylinder", "cube"])
@@ -184,3 +185,91 @@ class TestNarrowed:
             shares = [shape.half_depth / shape.half_width for shape in shapes]
             assert min(shares) <= least
             assert max(shares) >= most
+
+
+GREY, DARK, LIGHT = (120, 118, 112), (150, 60, 40), (220, 120, 90)  # RGB of the floor, and of sides and tops
+
+
+def draw(image: np.ndarray, camera: TrueCamera, shape: str, foot: tuple[float, float], yaw: float) -> CroppedMask:
+    """Draws a thing 0.3 m wide that stands on the floor, with a lit top, and returns its mask."""
+    places = outline(shape, foot, 0.15, 0.35, yaw)
+    points = camera.seen(places)
+    ring = len(points) // 2
+    mask = np.zeros(image.shape[:2], np.uint8)
+
+    def fill(corners: np.ndarray, colour: tuple[int, int, int]) -> None:
+        hull = cv2.convexHull((16 * corners).astype(np.float32)).round().astype(np.int32)
+        cv2.fillConvexPoly(image, hull, colour, cv2.LINE_AA, 4)
+        cv2.fillConvexPoly(mask, hull, 1, shift=4)
+
+    fill(points, DARK)
+    if shape == "box":  # the nearest edge, between a lighter side and a darker one
+        near = int(np.hypot(*places[:4, [0, 2]].T).argmin())
+        side = [near, (near + 1) % 4, near + 4, (near + 1) % 4 + 4]
+        fill(points[side], (185, 85, 60))
+    fill(points[ring:], LIGHT)
+    return CroppedMask.of(mask > 0)
+
+
+def fit_drawn(camera: TrueCamera, shapes: tuple[str, ...], tiles: bool, rng: np.random.Generator) -> CameraFit:
+    """The fit to a picture of things of shapes that are not told, seen by a camera, and of a floor with tiles."""
+    width, height = camera.size
+    image = np.full((height, width, 3), GREY, np.uint8)
+    if tiles:
+        steps = np.linspace(-4, 4, 17)
+        for start, end in [((s, -4), (s, 4)) for s in steps] + [((-4, s), (4, s)) for s in steps]:
+            ends = np.linspace(start, end, 200) @ np.array([[0.8, 0.6], [-0.6, 0.8]]) + [0, 3]
+            seen = camera.seen(np.column_stack([ends[:, 0], np.zeros(200), ends[:, 1]])[ends[:, 1] > 0.8])
+            cv2.polylines(image, [(16 * seen).astype(np.int32)], False, (70, 70, 70), 2, cv2.LINE_AA, 4)
+    masks = []
+    for index, shape in enumerate(shapes):
+        point = width * (0.2 + 0.6 * index / (len(shapes) - 1)), height * rng.uniform(0.55, 0.8)
+        foot = camera.on_floor(point)
+        assert foot is not None
+        masks.append(draw(image, camera, shape, foot, rng.uniform(0, 1.5)))
+    own, floor = divide(find_segments(image, np.zeros((height, width), bool)), masks)
+    things = [Standing(mask.bbox, segments=segments) for mask, segments in zip(masks, own, strict=True)]
+    return narrowed(prior(0.0, max(camera.size) / width), things, camera.size, floor)
+
+
+class TestEdges:
+    @pytest.mark.parametrize("size", [(832, 480), (600, 800)])
+    @pytest.mark.parametrize(
+        ("shapes", "tiles", "most"),
+        [(("box", "cylinder", "box"), False, 3.0), (("cylinder",) * 3, False, 4.5), (("box", "cone"), True, 3.0)],
+    )
+    def test_pitch_and_focal_length_are_measured(
+        self, size: tuple[int, int], shapes: tuple[str, ...], tiles: bool, most: float
+    ) -> None:
+        rng = np.random.default_rng(7)
+        errors, deviations, sources = [], [], set[str]()
+        for pitch in (12, 20, 28, 36, 44):
+            camera = TrueCamera(pitch, 0.0, rng.uniform(0.6, 1.4) * max(size), 0.4 + 0.03 * pitch, size)
+            fit = fit_drawn(camera, shapes, tiles, rng)
+            errors.append(math.degrees(fit.mean[0]) - pitch)
+            sources.add(fit.source)
+            deviations.append(math.degrees(math.sqrt(fit.covariance[0, 0])))
+        assert np.abs(errors).mean() < most
+        assert (np.abs(errors) < 2.5 * np.array(deviations)).all()
+        assert np.mean(deviations) < 2 * most
+        assert "edges" in sources
+
+    def test_a_bare_floor_tells_nothing(self) -> None:
+        start = prior()
+        assert (
+            narrowed(start, [], SIZE, find_segments(np.full((400, 640, 3), 90, np.uint8), np.zeros((400, 640), bool)))
+            is start
+        )
+
+    def test_a_far_end_of_the_floor_is_below_the_horizon_and_not_far(self) -> None:
+        fit = narrowed(prior(), [Standing((300, 200, 340, 240))], SIZE, np.array([[0.0, 100.0, 640.0, 104.0]]))
+        above = math.degrees(math.atan2(98, 640 * math.exp(fit.mean[1])))
+        assert above < math.degrees(fit.mean[0]) < above + 20
+
+    def test_random_lines_leave_the_camera_in_doubt(self) -> None:
+        rng = np.random.default_rng(2)
+        for _ in range(10):
+            middle, turn, reach = rng.uniform(0, SIZE, (12, 2)), rng.uniform(0, np.pi, 12), rng.uniform(10, 60, (12, 1))
+            along = reach * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+            fit = narrowed(prior(), [], SIZE, np.hstack([middle - along, middle + along]))
+            assert math.degrees(math.sqrt(fit.covariance[0, 0])) > 5

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from cow_service.physics.bodies import SeenBody
-from cow_service.records import BBox, CameraEstimate, CameraSource, Estimate, Vector
+from cow_service.physics.vanishing import Segments, Views
+from cow_service.records import BBox, CameraEstimate, CameraSource, Estimate, Shape, Vector
 from cow_service.requests import CameraRequest
 from cow_service.vision.shadows import Shadow
 from cow_service.vision.types import Floats
@@ -108,12 +109,19 @@ def axes_of(pitch: Floats, roll: Floats) -> Floats:
 
 FOCAL_WIDTHS = 1.0  # focal length in image widths, where no floor is computed
 PITCHES = 0.0, math.radians(55)  # that pictures of things on a floor have
-FOCALS = 0.6, 2.2  # image widths
+FOCALS = 0.45, 2.2  # of the longer side of the image
 FLAT = math.sqrt(3)  # half the width of a uniform distribution, in its deviations
-GRID = 16  # pitches, and focal lengths, that are weighed
+GRID = 20, 10  # pitches, and focal lengths, that are weighed
+ROLLS = np.array([-1, 0, 1]) * math.sqrt(3), np.array([1, 4, 1]) / 6  # in deviations, and weights: moments of a normal
+SEEN_RIM = 0.8  # of the tops that look round: the others were seen amiss
 CUBE_SIGMA = 0.1  # of a cube's height in the image against its width
+CUBE_AMISS = 0.02  # likelihood of any height, where a cube was seen amiss
 TURNED = np.linspace(1.0, math.sqrt(2), 6)  # widths, in its side, of a cube whose yaw is not known
 OUT_OF_SIGHT = 50.0  # what a foot above the horizon costs: no such camera is left beside one without any
+FAR_END = 0.3  # of the image's width: a level line so long above all things is the far end of the floor, as a rule
+FAR_END_SLOPE = 0.35
+FAR_END_SIGMA, FAR_END_SEEN = 0.2, 0.75  # of the sine of the angle below the horizon; share of such lines that are it
+NARROWED = 0.5  # of the deviation of the pitch before: from here on it was measured
 ROLL_SIGMA = math.radians(1.0)
 HEIGHT_RADII, HEIGHT_SIGMA = 5.0, 0.6  # above the floor of what is in the air, in its radii; of the logarithm
 SLANT = (0.0, 0.1)  # of the light: right and ahead, per unit of height
@@ -122,7 +130,7 @@ SLANT_SIGMA = (0.5, 0.45)
 MEASUREMENT_SIGMA = (0.05, 0.05, 0.06, 0.08, 0.05)
 MAX_COST = 12.0  # squared deviations of the measurements in all: a patch that fits worse is not the ball's shadow
 GOOD_COST = 5.0  # a worse fit than this widens the deviations
-LOWEST, HIGHEST = np.array([0.05, -0.7, 0.0, -1.5, -1.5]), np.array([1.4, 0.7, 3.7, 1.5, 1.5])
+LOWEST, HIGHEST = np.array([0.05, -0.9, 0.0, -1.5, -1.5]), np.array([1.4, 1.2, 3.7, 1.5, 1.5])
 MAX_ITERATIONS = 20
 
 
@@ -137,10 +145,11 @@ class CameraFit:
     source: CameraSource
 
 
-def prior(roll: float = 0.0) -> CameraFit:
-    """What is known of the camera before anything is measured."""
+def prior(roll: float = 0.0, aspect: float = 1.0) -> CameraFit:
+    """What is known of the camera before anything is measured; `aspect` is the image's longer side in its widths."""
     (lowest, highest), (shortest, longest) = PITCHES, np.log(FOCALS)
-    mean = np.array([(lowest + highest) / 2, (shortest + longest) / 2, math.log(HEIGHT_RADII), *SLANT])
+    middle = (lowest + highest) / 2, (shortest + longest) / 2 + math.log(aspect)
+    mean = np.array([*middle, math.log(HEIGHT_RADII), *SLANT])
     flat = (highest - lowest) / 2 / FLAT, (longest - shortest) / 2 / FLAT
     sigma = np.array([*flat, HEIGHT_SIGMA, *SLANT_SIGMA])
     return CameraFit(mean, np.diag(sigma**2), roll, ROLL_SIGMA, "prior")
@@ -151,6 +160,11 @@ _FAR = np.array([0.0, math.log(20.0), math.log(HEIGHT_RADII), *SLANT])
 SIDE_VIEW = CameraFit(_FAR, 1e-12 * np.eye(5), roll=0.0, roll_sigma=0.0, source="side-view")
 
 
+def no_segments() -> Floats:
+    """No line segments [0, 4]."""
+    return np.zeros((0, 4))
+
+
 @dataclass(frozen=True)
 class Standing:
     """What one thing that stands on the floor shows of the camera."""
@@ -158,12 +172,16 @@ class Standing:
     bbox: BBox
     rim: tuple[float, float] | None = None  # of a round top: minor to major axis as seen, and its deviation
     is_cube: bool = False
+    shape: Shape | None = None  # where it is known
+    segments: Floats = field(default_factory=no_segments)  # ends [S, 4] (px) of its straight edges, longest first
 
     @staticmethod
-    def of(body: SeenBody) -> Standing:
-        """What a body shows."""
-        rim = body.rim if body.shape == "cylinder" and body.is_form_known else None
-        return Standing(body.bbox, rim, is_cube=body.prior is not None and body.prior.equal_sided)
+    def of(body: SeenBody, segments: Floats) -> Standing:
+        """What a body shows, with the segments [S, 4] (px) of its straight edges."""
+        shape = body.shape if body.is_form_known else None
+        rim = body.rim if shape == "cylinder" else None
+        is_cube = body.prior is not None and body.prior.equal_sided
+        return Standing(body.core, rim, is_cube, shape, segments)
 
 
 GIVEN_PITCH_SIGMA, GIVEN_ROLL_SIGMA = math.radians(1.0), math.radians(0.5)
@@ -184,7 +202,7 @@ def given_camera(
     `down` is where the vertical leads in the image; `focal` (px) is the focal length by what else tells it, which the
     request overrules; `fixed_focal` holds it where it is.
     """
-    fit, given = prior(math.atan2(*down)), given or CameraRequest.model_construct()
+    fit, given = prior(math.atan2(*down), max(size) / size[0]), given or CameraRequest.model_construct()
     mean, sigma = fit.mean.copy(), np.sqrt(np.diag(fit.covariance))
     if given.pitch is not None:
         mean[0], sigma[0] = math.radians(given.pitch), GIVEN_PITCH_SIGMA
@@ -203,14 +221,15 @@ def given_camera(
 def camera_of(
     fit: CameraFit,
     size: tuple[int, int],
-    standing: Sequence[SeenBody],
+    standing: Sequence[Standing],
+    lines: Floats,
     flying: SeenBody | None,
     metres_per_pixel: float,
     shadow: Shadow | None,
 ) -> CameraFit:
     """The camera by what stands on the floor and, of a mover that is in the air, by its height as said and its shadow.
 
-    `metres_per_pixel` holds at the mover.
+    `lines` are segments [N, 4] (px) that lie between things; `metres_per_pixel` holds at the mover.
     """
     said = None if flying is None or flying.prior is None else flying.prior.height
     if flying is not None and said is not None:
@@ -219,46 +238,71 @@ def camera_of(
         mean, covariance = fit.mean.copy(), fit.covariance.copy()
         mean[2], covariance[2, 2] = math.log(height), max(said.deviation / radius / height, LEAST_HEIGHT_SIGMA) ** 2
         fit = replace(fit, mean=mean, covariance=covariance)
-    fit = narrowed(fit, [Standing.of(body) for body in standing], size)
+    fit = narrowed(fit, standing, size, lines)
     return fit if shadow is None or flying is None else fit_shadow(fit, flying.bbox, shadow, size) or fit
 
 
-def narrowed(fit: CameraFit, things: Sequence[Standing], size: tuple[int, int]) -> CameraFit:
-    """The camera by what stands on the floor of an image of a size (width, height), px.
+def narrowed(
+    fit: CameraFit, things: Sequence[Standing], size: tuple[int, int], floor: Floats | None = None
+) -> CameraFit:
+    """The camera by what stands on the floor of an image of a size (width, height; px), and by lines of the floor.
 
     All feet lie below the horizon. A circle is seen as an ellipse whose axes have the ratio of the sine of the angle at
-    which it is looked down on; a cube shows the more of its top the larger that angle is.
+    which it is looked down on; a cube shows the more of its top the larger that angle is. Upright edges meet in one
+    vanishing point, the level edges of a thing in two on the horizon. `floor` has segments [N, 4] (px) beside things.
     """
-    if not things:
+    floor = no_segments() if floor is None else floor
+    if not things and not len(floor):
         return fit
-    steps = np.sqrt(np.diag(fit.covariance))[:2, None] * np.linspace(-FLAT, FLAT, GRID)
-    pitch, log_focal = (axis.ravel() for axis in np.meshgrid(*(fit.mean[:2, None] + steps), indexing="ij"))
-    up = axes_of(pitch, np.full(len(pitch), fit.roll))[:, 1]
-    boxes = np.array([thing.bbox for thing in things])
+    sigma = np.sqrt(np.diag(fit.covariance))[:2]
+    steps = [side * np.linspace(-FLAT, FLAT, count) for side, count in zip(sigma, GRID, strict=True)]
+    axes = fit.mean[0] + steps[0], fit.mean[1] + steps[1], fit.roll + fit.roll_sigma * ROLLS[0]
+    pitch, log_focal, roll = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
+    views = Views(np.exp(log_focal), axes_of(pitch, roll))
+    boxes = np.array([thing.bbox for thing in things]).reshape(-1, 4)
+    middle = (boxes[:, 0] + boxes[:, 2]) / 2
 
-    def sinks(height: Floats) -> Floats:
-        """Sines [K, N] of the angles at which rays through the boxes' middles at image heights [N] lead down."""
-        points = np.stack([(boxes[:, 0] + boxes[:, 2]) / 2, height], axis=1) - np.array(size) / 2
-        across = points / (np.exp(log_focal) * size[0])[:, None, None]
-        rays = np.concatenate([across, np.ones((*across.shape[:2], 1))], axis=2)
-        return -np.einsum("kni,ki->kn", rays, up) / np.linalg.norm(rays, axis=2)
+    def sinks(points: Floats) -> Floats:
+        """Sines [K, N] of the angles at which rays through image points [N, 2] (px) lead down."""
+        return views.sines_down((points - np.array(size) / 2) / size[0])
 
-    sine, at_top = sinks(boxes[:, 3]), sinks(boxes[:, 1])
-    fits = -OUT_OF_SIGHT * (sine < HORIZON).sum(axis=1).astype(np.float64)
+    sine, at_top = (sinks(np.stack([middle, boxes[:, edge]], axis=1)) for edge in (3, 1))
+    fits = np.tile(np.log(ROLLS[1]), math.prod(GRID)) - OUT_OF_SIGHT * (sine < HORIZON).sum(axis=1)
     for index, thing in enumerate(things):
         if thing.rim is not None:
-            fits -= 0.5 * ((at_top[:, index] - thing.rim[0]) / thing.rim[1]) ** 2
+            seen, deviation = thing.rim
+            off = (at_top[:, index] - seen) / deviation
+            fits += np.log(SEEN_RIM * np.exp(-0.5 * off**2) / (deviation * math.sqrt(2 * math.pi)) + 1 - SEEN_RIM)
         if thing.is_cube:
             x0, y0, x1, y1 = thing.bbox
-            seen = np.sqrt(1 - np.clip(sine[:, index], 0, 1) ** 2)[:, None] / TURNED + sine[:, index, None]
-            off = ((y1 - y0) / (x1 - x0) - seen) / CUBE_SIGMA
-            fits += np.log(np.exp(-0.5 * off**2).mean(axis=1) + 1e-9)
+            heights = np.sqrt(1 - np.clip(sine[:, index], 0, 1) ** 2)[:, None] / TURNED + sine[:, index, None]
+            off = ((y1 - y0) / (x1 - x0) - heights) / CUBE_SIGMA
+            fits += np.log(np.exp(-0.5 * off**2).mean(axis=1) + CUBE_AMISS)
+        if len(thing.segments) and thing.shape != "sphere":
+            fits += views.explain(Segments.of(thing.segments, size), thing.bbox, thing.shape, size)
+    if len(floor) > 1:
+        fits += views.explain(Segments.of(floor, size), None, None, size)
+    end = _far_end(floor, float(boxes[:, 3].min(initial=size[1])), size[0])
+    if end is not None:
+        down = sinks(end[None])[:, 0]
+        likely = np.exp(-0.5 * (down / FAR_END_SIGMA) ** 2) / (FAR_END_SIGMA * math.sqrt(math.pi / 2))
+        fits += np.log(FAR_END_SEEN * likely + 1 - FAR_END_SEEN) - OUT_OF_SIGHT * (down < 0)
     weight = np.exp(fits - fits.max())
     found = np.stack([pitch, log_focal])
     mean, covariance = fit.mean.copy(), fit.covariance.copy()
     mean[:2] = found @ weight / weight.sum()
-    covariance[:2, :2] = np.cov(found, aweights=weight, ddof=0) + np.diag(np.full(2, 1e-12))
-    return replace(fit, mean=mean, covariance=covariance)
+    # What lies between two steps is not told apart.
+    between = np.diag([float(step[1] - step[0]) ** 2 / 12 for step in steps])
+    covariance[:2, :2] = np.cov(found, aweights=weight, ddof=0) + between
+    is_measured = fit.source == "prior" and covariance[0, 0] < (NARROWED * sigma[0]) ** 2
+    return replace(fit, mean=mean, covariance=covariance, source="edges" if is_measured else fit.source)
+
+
+def _far_end(floor: Floats, above: float, width: int) -> Floats | None:
+    """Middle [2] (px) of the uppermost long and level segment above a height in the image; None without one."""
+    middle, across = (floor[:, :2] + floor[:, 2:]) / 2, np.abs(floor[:, 2:] - floor[:, :2])
+    is_end = (across[:, 0] > FAR_END * width) & (across[:, 1] < FAR_END_SLOPE * across[:, 0]) & (middle[:, 1] < above)
+    return min(middle[is_end], key=lambda point: point[1], default=None)
 
 
 def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, int]) -> CameraFit | None:

@@ -12,7 +12,7 @@ from cow_service.errors import CannotGround
 from cow_service.narration import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import SIDE_VIEW, camera_of, given_camera
+from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera
 from cow_service.physics.ensemble import BY_EVENTS, Query
 from cow_service.physics.geometry import DepthMap, measure_scene
 from cow_service.physics.placement import PlacementGoal
@@ -20,6 +20,7 @@ from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import asked_of_itself, others_of, placed_mover, removed_of
+from cow_service.vision.edges import divide
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Obstacle, Scene
@@ -126,9 +127,11 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     shadow = find_shadow(situation.scene, bodies[0].bbox) if bodies[0].shape == "sphere" and in_air[0] else None
     fit = given_camera(situation.size, motion.down, request.camera, situation.focal, situation.follows_path)
     if situation.depth is None or level is not None or situation.follows_path:
-        standing = [body for body, stands in zip(bodies, on_floor, strict=True) if stands]
+        own, lines = divide(situation.scene.segments, [body.mask for body in bodies])
+        parts = zip(bodies, own, on_floor, strict=True)
+        standing = [Standing.of(body, segments) for body, segments, stands in parts if stands]
         flying = bodies[0] if in_air[0] else None
-        fit = camera_of(fit, situation.size, standing, flying, motion.metres_per_pixel.value, shadow)
+        fit = camera_of(fit, situation.size, standing, lines, flying, motion.metres_per_pixel.value, shadow)
         measured = None
     else:
         fit, measured = measure_scene(situation.depth, fit, bodies)

@@ -15,6 +15,7 @@ from cow_service.errors import CannotReadDirection
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.contrast import View
+from cow_service.vision.edges import find_segments
 from cow_service.vision.faint import find_faint
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, dilated, is_among, is_same_object, without_holes
@@ -24,7 +25,7 @@ from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
-from cow_service.vision.types import Image, Mask
+from cow_service.vision.types import Floats, Image, Mask
 
 SHARP_SIDE = 2 * WORKING_SIDE  # px: in a larger image the outlines of regions are coarse, and are cut again
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
@@ -57,7 +58,7 @@ Found = TypeVar("Found")
 Measured = dict[str, Any]
 """Cached properties of a `Scene` by their names."""
 # Neither mover nor words decide them.
-OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "side_view", "_all_trails")
+OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "side_view", "_all_trails", "segments")
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +122,11 @@ class Scene:
     def side_view(self) -> SideView | None:
         """The drawing seen from the side that the image is; None for a picture that has depth."""
         return find_side_view(self._undrawn)
+
+    @cached_property
+    def segments(self) -> Floats:
+        """Ends [N, 4] (x, y, x, y; px) of straight edges, longest first; none for a drawing without depth."""
+        return np.zeros((0, 4)) if self.side_view else find_segments(self._undrawn, self.cues)
 
     @cached_property
     def _all_trails(self) -> tuple[Trail, ...]:
