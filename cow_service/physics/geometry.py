@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import HORIZON, CameraFit, axes_of
 from cow_service.records import BBox, DepthEstimate, Shape
 from cow_service.vision.masks import CroppedMask, eroded
@@ -146,20 +146,27 @@ class Measurement:
     scale: float | None  # metres per unit of the map; None: relative depth
 
 
-def measure_scene(given: DepthMap, fit: CameraFit, bodies: Sequence[SeenBody]) -> tuple[CameraFit, Measurement | None]:
-    """The camera and the bodies by a depth map, where the camera is known as `fit` says; None where it has no floor."""
+def measure_scene(
+    given: DepthMap, fit: CameraFit, bodies: Sequence[SeenBody], seen: Sequence[int | None]
+) -> tuple[CameraFit, Measurement | None]:
+    """The camera and the bodies by a depth map, where the camera is known as `fit` says; None where it has no floor.
+
+    `seen` is what the bodies stand on as the picture alone shows it.
+    """
     focal = math.exp(fit.mean[1]) * given.depth.shape[1]
     floor = find_floor(given, focal, [body.mask for body in bodies], fit.roll)
     if floor is None:
         return fit, None
     footprints = measure(given, focal, floor, bodies)
-    supports = tuple(_supports(bodies, footprints, given.deviation))
+    supports = tuple(_supports(bodies, footprints, seen, given.deviation))
     return camera_over(floor, fit), Measurement(floor, footprints, supports, given.deviation, focal, given.scale)
 
 
-def _supports(bodies: Sequence[SeenBody], footprints: Sequence[Footprint | None], deviation: float) -> list[int | None]:
+def _supports(
+    bodies: Sequence[SeenBody], footprints: Sequence[Footprint | None], seen: Sequence[int | None], deviation: float
+) -> list[int | None]:
     """What each body stands on: what is beneath its middle and ends where it begins; as seen, where that is unknown."""
-    found = supports_of(bodies)
+    found = list(seen)
     for index, (body, own) in enumerate(zip(bodies, footprints, strict=True)):
         if own is None or (body.prior is not None and body.prior.stands_on is not None):
             continue

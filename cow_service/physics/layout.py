@@ -34,7 +34,7 @@ TURN_SIGMA: dict[Cue, float] = {
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 TOWARDS_SIGMA = math.radians(2)  # of the heading of what moves towards another thing: it is aimed at its middle
-RISE, RISE_SIGMA = math.radians(20), math.radians(8)  # above the horizontal: how things are thrown
+RISE, RISE_SIGMA = math.radians(25), math.radians(15)  # above the horizontal: how things are thrown
 AIMED, AIM_SIGMA = 4.0, math.radians(9)  # how much likelier a heading to what stands there is, and how exact
 TURNS = np.linspace(-4, 4, 65)  # in deviations: turns out of the plane of the image that are weighed
 LOW = 0.08  # sine of the angle between a ray and a horizontal plane below which the plane through the foot is taken

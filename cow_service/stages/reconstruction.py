@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from cow_service.errors import CannotGround
-from cow_service.narration import place_words, same_name
+from cow_service.narration import OF_ITSELF, OF_TARGET, place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera
@@ -19,7 +19,7 @@ from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import SimulateRequest
-from cow_service.stages.grounding import asked_of_itself, others_of, placed_mover, removed_of
+from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.vision.edges import divide
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
@@ -117,7 +117,8 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     present = bodies[: 1 + len(situation.obstacles)]
     level = None if situation.side_view is None else situation.side_view.level
     in_air = [body.is_flying if index else body.flies(motion) for index, body in enumerate(bodies)]
-    on_floor = [on is None and not flies for on, flies in zip(supports_of(bodies, level), in_air, strict=True)]
+    supports = supports_of(bodies, level)
+    on_floor = [on is None and not flies for on, flies in zip(supports, in_air, strict=True)]
     query = query_of(situation, bodies, on_floor)
     carried, before = placement_goals(situation, present)
     if query is None and situation.grounding.asked is None and carried is not None:
@@ -125,16 +126,16 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         query = Query(Asked(relation="inside"), carried.targets[0])
     faint = situation.scene.faint_beside([body.bbox for body in bodies])
     shadow = find_shadow(situation.scene, bodies[0].bbox) if bodies[0].shape == "sphere" and in_air[0] else None
+    own, lines = divide(situation.scene.segments, [body.mask for body in bodies])
     fit = given_camera(situation.size, motion.down, request.camera, situation.focal, situation.follows_path)
     if situation.depth is None or level is not None or situation.follows_path:
-        own, lines = divide(situation.scene.segments, [body.mask for body in bodies])
         parts = zip(bodies, own, on_floor, strict=True)
         standing = [Standing.of(body, segments) for body, segments, stands in parts if stands]
         flying = bodies[0] if in_air[0] else None
         fit = camera_of(fit, situation.size, standing, lines, flying, motion.metres_per_pixel.value, shadow)
         measured = None
     else:
-        fit, measured = measure_scene(situation.depth, fit, bodies)
+        fit, measured = measure_scene(situation.depth, fit, bodies, supports)
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
@@ -229,7 +230,8 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequenc
     subjects = (0,) if asked.subject is None else named(asked.subject)
     targets = (None,) if asked.target is None else named(asked.target)
     among = [named(name) for name in asked.among]
-    if not subjects or not targets or not all(among) or asked_of_itself(situation.grounding):
+    is_of_itself = targets[:1] == subjects[:1] and asked.relation not in (*OF_TARGET, *OF_ITSELF)
+    if not subjects or not targets or not all(among) or is_of_itself:
         return None
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
     asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
