@@ -34,13 +34,15 @@ TURN_SIGMA: dict[Cue, float] = {
 }  # fmt: skip
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 TOWARDS_SIGMA = math.radians(2)  # of the heading of what moves towards another thing: it is aimed at its middle
-RISE, RISE_SIGMA = math.radians(25), math.radians(15)  # above the horizontal: how things are thrown
-AIMED, AIM_SIGMA = 4.0, math.radians(9)  # how much likelier a heading to what stands there is, and how exact
-TURNS = np.linspace(-4, 4, 65)  # in deviations: turns out of the plane of the image that are weighed
+RISE, RISE_SIGMA = math.radians(22), math.radians(12)  # above the horizontal: how things are thrown
+AIMED, AIM_SIGMA = 8.0, math.radians(9)  # how much likelier a heading to what stands there is, and how exact
+UNUSUAL = 0.1  # of the likeliest throw's weight: that of throws at any heading and of any steepness
+TURNS = np.linspace(-5, 5, 81)  # in deviations: turns out of the plane of the image that are weighed
 LOW = 0.08  # sine of the angle between a ray and a horizontal plane below which the plane through the foot is taken
 APART = 0.98  # of the distance of two bodies: together they are so wide at most
 VEHICLE_WIDTH = 0.5  # of a vehicle's length
 DEPTHS = 0.3, 2.0  # of an unknown thing, of its width
+BOX_DEPTHS = 0.4, 1.25  # of what is called a box, or by a word for one
 LEAST_SHRUNK = 0.5  # of its width: bodies that overlap more are left to the engine
 
 
@@ -270,6 +272,12 @@ def lay_out(
     return Layout(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
 
 
+def drawn_depths(body: SeenBody, draws: Floats) -> Floats:
+    """How deep a thing whose depth is not seen is along the line of sight [K], of its width."""
+    shallowest, deepest = np.log(BOX_DEPTHS if body.shape == "box" and body.is_form_known else DEPTHS)
+    return np.exp(shallowest + (deepest - shallowest) * quantiles(draws[:, COLUMN["deep"]]))
+
+
 @dataclass(frozen=True)
 class _Picture:
     """What the picture shows, as draws [K, P] have it."""
@@ -351,10 +359,9 @@ class _Picture:
 
     def depth_of(self, body: SeenBody, draws: Floats) -> Floats:
         """How deep a body is along the line of sight [K], of its width: nothing tells that of an unknown thing."""
-        if body.is_form_known or any(self.bodies[on] is body for on in self.supports if on is not None):
+        if body.is_depth_known or any(self.bodies[on] is body for on in self.supports if on is not None):
             return np.ones(len(draws))  # what carries something is deep enough for it
-        shallowest, deepest = np.log(DEPTHS)
-        return np.exp(shallowest + (deepest - shallowest) * quantiles(draws[:, COLUMN["deep"]]))
+        return drawn_depths(body, draws)
 
     def depth_share(self, cameras: Cameras) -> Floats:
         """How deep the mover is along the line of sight, of its width: a vehicle is longer along its heading."""
@@ -413,9 +420,7 @@ class _Measured(_Picture):
         centre = cameras.coordinates(cameras.rays(point) * (z * scale * error)[:, None])
         half, tall, deep = footprint.half_width * size, footprint.half_height * size, footprint.half_depth * size
         if not footprint.depth_seen:  # what lies behind is not seen: the body reaches further back than its pixels
-            shallowest, deepest = np.log(DEPTHS)
-            drawn = half * np.exp(shallowest + (deepest - shallowest) * quantiles(self.draws[:, COLUMN["deep"]]))
-            hidden = np.maximum(drawn - deep, 0.0)
+            hidden = np.maximum(half * drawn_depths(self.bodies[index], self.draws) - deep, 0.0)
             deep = deep + hidden
             back = np.array([-math.sin(footprint.yaw), 0.0, math.cos(footprint.yaw)])
             centre = centre + hidden[:, None] * back
@@ -526,7 +531,8 @@ def _thrown(
         weight = np.exp(-0.5 * TURNS**2)
         if motion.cue != "trail":  # along a trail it may have come to any point of its path
             rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
-            weight = weight * np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
+            usual = np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
+            weight = (weight + UNUSUAL) * (usual + UNUSUAL)  # some are thrown far into the picture, or steeply
         aimed = np.ones(count)
         for other in others:
             away = other.centre[0] - mover.centre[0]

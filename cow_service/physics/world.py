@@ -190,7 +190,7 @@ class _Draw:
             if body.yaw is not None:
                 side, turn = half, -body.yaw
                 deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
-            elif not seen.is_form_known:  # it shows its width, which nothing says is that of something round
+            elif not seen.is_depth_known:  # it shows its width, which nothing says is that of something round
                 shape, side, turn = "box", half, math.atan2(x, z)
                 deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
             rigid = RigidShape(
