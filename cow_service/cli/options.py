@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Callable, Generator
@@ -162,6 +163,10 @@ def request_body(
         ),
     ] = None,
     ensemble: Annotated[int, option("How many worlds the probabilities are counted in; 0: none.")] = 50,
+    depth: Annotated[Path | None, option("Depth map of the image: a grey PNG with 16 bits.", **EXISTING)] = None,
+    depth_scale: Annotated[
+        float | None, option("Metres per unit of the depth map.", shown="none: relative depth")
+    ] = None,
     trajectory: Annotated[Path | None, option("JSON with the `trajectory` of a request.", **EXISTING)] = None,
     fields: Annotated[
         str | None,
@@ -201,6 +206,11 @@ def request_body(
                 value = _numbers(f"--{option_name}", value, _NUMBERS[option_name])
             body.setdefault(record, {})[field] = value
     body["frames"]["max_side"] = max_side or None
+    if depth is not None:
+        png = base64.b64encode(read_file(depth)).decode()
+        body["depth"] = {"map": f"data:image/png;base64,{png}", "scale": depth_scale}
+    elif depth_scale is not None:
+        raise InvalidRequest("--depth-scale goes with --depth.")
     if trajectory is not None:
         body["trajectory"] = object_in(read_file(trajectory), trajectory.name)
     if body.get("grounding", {}).keys() == {"object"}:

@@ -326,7 +326,7 @@ def _footprint(
     y, x = np.nonzero(there)
     # The noise of single pixels would make a body larger: what is seen of it is smoothed, without what is around.
     inverse = np.where(there, 1 / np.where(there, depth[mask.rows, mask.columns], 1.0), 0.0)
-    z = (blurred(there.astype(np.float64)) / blurred(inverse))[y, x]
+    z = blurred(there.astype(np.float64))[y, x] / blurred(inverse)[y, x]
     y, x = y + mask.rows.start, x + mask.columns.start
     rays = _rays(x, y, width, height, focal)
     edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
