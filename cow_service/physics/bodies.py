@@ -52,7 +52,12 @@ class SeenBody:
     @property
     def start(self) -> Point:
         """Where its path begins, px: the point it was grounded at, else the middle of its box."""
-        return self.point or ((self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2)
+        return self.point or self.middle_point
+
+    @property
+    def middle_point(self) -> Point:
+        """The middle of its box, px."""
+        return (self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2
 
     @property
     def radius(self) -> float:

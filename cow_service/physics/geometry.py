@@ -328,59 +328,57 @@ def _footprint(
     inverse = np.where(there, 1 / np.where(there, depth[mask.rows, mask.columns], 1.0), 0.0)
     z = blurred(there.astype(np.float64))[y, x] / blurred(inverse)[y, x]
     y, x = y + mask.rows.start, x + mask.columns.start
-    rays = _rays(x, y, width, height, focal)
-    edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
     if body.shape == "sphere":
-        x0, y0, x1, y1 = body.bbox
-        radius = body.radius / focal
-        near = np.hypot(x + 0.5 - (x0 + x1) / 2, y + 0.5 - (y0 + y1) / 2) < body.radius / 3
+        near = np.hypot(x + 0.5 - body.middle_point[0], y + 0.5 - body.middle_point[1]) < body.radius / 3
         front = float(np.median(z[near] if near.any() else z))
-        middle = front / max(1 - radius, 0.1)
-        ray = _rays(np.array([(x0 + x1 - 1) / 2]), np.array([(y0 + y1 - 1) / 2]), width, height, focal)
-        # Where it may as well touch the floor it does: then the floor tells its depth more exactly.
-        sink = radius - float(ray[0] @ floor.axes[1])
-        if sink > HORIZON and abs(floor.height / sink / middle - 1) < TOUCHES + deviation:
-            middle = floor.height / sink
-        across, up, ahead = floor.coordinates(ray * middle)[0].tolist()
-        half = radius * middle
-        return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, share)
-    right, up, ahead = floor.coordinates(rays * z[:, None]).T
-    bottom, top = (float(value) for value in np.percentile(up, (TRIM, 100 - TRIM)))
-    sight = math.atan2(float(np.median(ahead)), float(np.median(right)))
-    from_above = (floor.height - top) / math.hypot(float(np.median(right)), float(np.median(ahead)), floor.height)
-    seen = from_above > FROM_ABOVE
-    if body.is_form_known and body.shape in ("cylinder", "cone"):
-        yaw = sight - math.pi / 2
-    else:
-        spots = np.stack([right, ahead], axis=1)
-        _, sides, degrees = cv2.minAreaRect(np.asarray(_core(spots), np.float32))
-        yaw = math.radians(degrees)
+        return _ball(body, front, (width, height), focal, floor, deviation, share)
+    points = floor.coordinates(_rays(x, y, width, height, focal) * z[:, None])
+    edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
+    return _upright(body, points, edge, floor, deviation, share)
+
+
+def _ball(
+    body: SeenBody, front: float, size: tuple[int, int], focal: float, floor: Floor, deviation: float, share: float
+) -> Footprint:
+    """Of a ball whose nearest point has a depth, in an image of a size (width, height; px)."""
+    radius, (x, y) = body.radius / focal, body.middle_point
+    depth = front / max(1 - radius, 0.1)
+    ray = _rays([x - 0.5], [y - 0.5], *size, focal)
+    # Where it may as well touch the floor it does: then the floor tells its depth more exactly.
+    sink = radius - float(ray[0] @ floor.axes[1])
+    if sink > HORIZON and abs(floor.height / sink / depth - 1) < TOUCHES + deviation:
+        depth = floor.height / sink
+    across, up, ahead = floor.coordinates(ray * depth)[0].tolist()
+    half = radius * depth
+    return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, share)
+
+
+def _upright(body: SeenBody, points: Floats, edge: float, floor: Floor, deviation: float, share: float) -> Footprint:
+    """Of a body with points [N, 3] over the floor, whose outline lost an edge."""
+    is_round = body.is_form_known and body.shape in ("cylinder", "cone")
+    right, ahead = (float(value) for value in np.median(points[:, [0, 2]], axis=0))
+    bottom, top = (float(value) for value in np.percentile(points[:, 1], (TRIM, 100 - TRIM)))
+    across = math.atan2(ahead, right) - math.pi / 2  # the direction across the line of sight
+    yaw = across
+    if not is_round:
+        _, sides, degrees = cv2.minAreaRect(np.asarray(_core(points[:, [0, 2]]), np.float32))
         # Of its two sides the one that lies across the line of sight.
-        yaw += math.pi / 2 * round((sight - math.pi / 2 - yaw) / (math.pi / 2))
-        yaw = yaw if max(sides) > 0 else sight - math.pi / 2
+        turned = math.radians(degrees)
+        yaw = turned + math.pi / 2 * round((across - turned) / (math.pi / 2)) if max(sides) > 0 else across
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    along = np.stack([right, ahead], axis=1) @ turn.T
-    (left, near), (far_right, far) = np.percentile(along, (TRIM, 100 - TRIM), axis=0)
-    half_width, half_depth = (far_right - left) / 2 + edge, (far - near) / 2
-    middle = np.array([(left + far_right) / 2, (near + far) / 2])
-    if body.is_form_known and body.shape in ("cylinder", "cone"):
-        half_depth, seen = half_width, True
-        middle[1] = near + half_width
-    x_, z_ = middle @ turn
-    low = max(0.0, bottom) if body.prior is not None and body.prior.stands_on == "air" else 0.0
-    tall = max((top + edge - low) / 2, 1e-6)
-    return Footprint(
-        body.shape if body.is_form_known else "box",
-        (float(x_), low + tall, float(z_)),
-        float(half_width),
-        float(half_depth),
-        tall,
-        yaw,
-        bottom,
-        seen,
-        deviation,
-        share,
-    )
+    low, high = np.percentile(points[:, [0, 2]] @ turn.T, (TRIM, 100 - TRIM), axis=0)
+    half_width, half_depth = ((high - low) / 2).tolist()
+    half_width += edge
+    if is_round:
+        half_depth = half_width
+        high[1] = low[1] + 2 * half_width
+    x, z = ((low + high) / 2 @ turn).tolist()
+    is_seen = (floor.height - top) / math.hypot(right, ahead, floor.height) > FROM_ABOVE
+    foot = max(0.0, bottom) if body.is_flying else 0.0
+    tall = max((top + edge - foot) / 2, 1e-6)
+    shape = body.shape if body.is_form_known else "box"
+    is_seen = is_seen or is_round
+    return Footprint(shape, (x, foot + tall, z), half_width, half_depth, tall, yaw, bottom, is_seen, deviation, share)
 
 
 def blurred(values: Floats) -> Floats:

@@ -15,7 +15,8 @@ from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
 from cow_service.physics.geometry import Measurement
-from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out, speed_factors
+from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out
+from cow_service.physics.lift import speed_factors
 from cow_service.physics.placement import (
     CARRIED,
     MOST_CARRIED,
