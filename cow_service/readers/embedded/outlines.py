@@ -33,6 +33,7 @@ ANY: Range = (0.0, 1.0)
 # Height over width, the share of its convex hull that it fills, then the widths in `BANDS` over the largest of them.
 OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "ball": ((0.9, 1.1), (0.97, 1.0), (0.6, 0.8), (0.85, 0.95), (0.95, 1.0), (0.9, 1.0), (0.55, 0.8)),
+    "egg": ((0.7, 1.5), (0.96, 1.0), (0.5, 0.85), (0.8, 0.97), (0.93, 1.0), (0.85, 1.0), (0.5, 0.85)),
     "bottle": ((1.8, 4.5), (0.86, 0.96), (0.1, 0.5), (0.3, 0.95), (0.7, 1.0), (0.85, 1.0), (0.75, 1.0)),
     "candle": ((1.4, 6.0), (0.92, 1.0), ANY, (0.93, 1.0), (0.93, 1.0), (0.9, 1.0), (0.8, 1.0)),
     "vase": ((1.3, 3.0), (0.7, 0.9), (0.5, 1.0), (0.4, 0.8), (0.3, 0.85), (0.8, 1.0), (0.4, 0.95)),
@@ -61,7 +62,13 @@ _FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALI
 # Rows that tell a thing for what it is (nearly anything can look like a box or a can), from this log ratio on.
 _TELLING, _CLEARLY = ("ball", "bottle", "bowl", "car", "cone", "mug", "vase"), 1.5
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
-_SAME = {"cube": {"cube", "box"}, "box": {"cube", "box"}, "mug": {"mug", "cylinder", "box"}}
+_SAME = {
+    "egg": {"egg", "ball", "box"},
+    "ball": {"ball", "egg", "box"},
+    "cube": {"cube", "box"},
+    "box": {"cube", "box"},
+    "mug": {"mug", "cylinder", "box"},
+}
 
 
 def form_of(noun: str | None) -> str | None:
@@ -102,7 +109,7 @@ def log_ratio(region: Region, form: str) -> float:
     measured, handle = _measures(region), _has_handle(region.mask.patch)
     densities = {
         name: _density(measured, name)
-        * (CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
+        * (0.5 if name == "egg" else CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
         * (HANDLES.get(name, NO_HANDLE) if handle else 1.0)  # one that is not seen may be behind the thing
         for name in (form, *rivals)
     }
@@ -119,10 +126,10 @@ def _density(measured: Sequence[float], form: str) -> float:
 
 
 def is_cut(region: Region) -> bool:
-    """Whether the image's border cuts a region: its outline is not known."""
+    """Whether the image's border cuts a region, or another hides a part of it: its outline is not known."""
     height, width = region.mask.shape
     x0, y0, x1, y1 = region.bbox
-    return x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
+    return region.is_hidden or x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
 
 
 def _misfit(measured: Sequence[float], form: str) -> float:
