@@ -360,7 +360,7 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
     contrast = 1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / SURE_CONTRAST
-    size = float(np.count_nonzero(part)) / SURE_AREA
+    size = float(np.count_nonzero(part)) / (SURE_AREA / 2 if is_disc else SURE_AREA)
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
     edges = max(sharp, 0.9) if is_disc else sharp
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
