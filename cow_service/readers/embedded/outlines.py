@@ -20,7 +20,7 @@ Range = tuple[float, float]
 
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
-CONTRADICTS = 7.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
+CONTRADICTS = 6.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
 UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
 FITS = 2.0  # misfit below which an outline is well described
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
@@ -38,7 +38,7 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "candle": ((1.4, 6.0), (0.92, 1.0), ANY, (0.93, 1.0), (0.93, 1.0), (0.9, 1.0), (0.8, 1.0)),
     "vase": ((1.3, 3.0), (0.7, 0.9), (0.5, 1.0), (0.4, 0.8), (0.3, 0.85), (0.8, 1.0), (0.4, 0.95)),
     "cone": ((0.8, 2.2), (0.94, 1.0), (0.0, 0.4), (0.2, 0.55), (0.4, 0.75), (0.6, 0.95), (0.8, 1.0)),
-    "cylinder": ((1.3, 3.5), (0.97, 1.0), (0.85, 1.0), (0.93, 1.0), (0.93, 1.0), (0.9, 1.0), (0.75, 1.0)),
+    "cylinder": ((1.15, 3.5), (0.97, 1.0), (0.65, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.75, 1.0)),
     "cube": ((0.85, 1.3), (0.97, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.93, 1.0), (0.5, 1.0)),
     "mug": ((0.9, 1.5), (0.84, 1.0), (0.6, 1.0), (0.7, 1.0), (0.75, 1.0), (0.7, 1.0), (0.5, 0.92)),
     "bowl": ((0.3, 1.0), (0.93, 1.0), (0.7, 1.0), (0.85, 1.0), (0.75, 1.0), (0.4, 0.85), (0.3, 0.75)),
