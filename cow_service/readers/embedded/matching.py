@@ -174,7 +174,7 @@ def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
     """By outline; one that the border cuts says less."""
     form = form_of(phrase.head)
     # A region is round where the noun names something round, and not where it does not.
-    can_be = not region.is_disc or form == "egg" or (form is None and phrase.head not in _SOLID)
+    can_be = not region.is_disc or (form is None and phrase.head not in _SOLID)
     if form == "ball":
         can_be = region.is_hidden or region.roundness >= (ROUND if phrase.colour is None else NOT_ROUND)
     if form is None or not can_be:

@@ -33,7 +33,6 @@ ANY: Range = (0.0, 1.0)
 # Height over width, the share of its convex hull that it fills, then the widths in `BANDS` over the largest of them.
 OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "ball": ((0.9, 1.1), (0.97, 1.0), (0.6, 0.8), (0.85, 0.95), (0.95, 1.0), (0.9, 1.0), (0.55, 0.8)),
-    "egg": ((0.7, 1.5), (0.96, 1.0), (0.5, 0.85), (0.8, 0.97), (0.93, 1.0), (0.85, 1.0), (0.5, 0.85)),
     "bottle": ((1.8, 4.5), (0.86, 0.96), (0.1, 0.5), (0.3, 0.95), (0.7, 1.0), (0.85, 1.0), (0.75, 1.0)),
     "candle": ((1.4, 6.0), (0.92, 1.0), ANY, (0.93, 1.0), (0.93, 1.0), (0.9, 1.0), (0.8, 1.0)),
     "vase": ((1.3, 3.0), (0.7, 0.9), (0.5, 1.0), (0.4, 0.8), (0.3, 0.85), (0.8, 1.0), (0.4, 0.95)),
@@ -54,7 +53,7 @@ _SIDE = 0.25  # of the width: so far from the middle is the hole inside a handle
 # The rows of the body beside a handle, at both ends, and those of the handle, as shares of the height.
 _UPPER, _LOWER, _BETWEEN = (0.06, 0.22), (0.72, 0.9), (0.2, 0.8)
 _ALIKE = {
-    "ball": "sphere orb marble basketball football baseball balloon globe",
+    "ball": "sphere orb egg marble basketball football baseball balloon globe",
     "mug": "cup", "cone": "pyramid", "cylinder": "can jar", "box": "block brick cuboid",
     "car": "bus truck van taxi lorry train",
 }  # fmt: skip
@@ -62,13 +61,7 @@ _FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALI
 # Rows that tell a thing for what it is (nearly anything can look like a box or a can), from this log ratio on.
 _TELLING, _CLEARLY = ("ball", "bottle", "bowl", "car", "cone", "mug", "vase"), 1.5
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
-_SAME = {
-    "egg": {"egg", "ball", "box"},
-    "ball": {"ball", "egg", "box"},
-    "cube": {"cube", "box"},
-    "box": {"cube", "box"},
-    "mug": {"mug", "cylinder", "box"},
-}
+_SAME = {"cube": {"cube", "box"}, "box": {"cube", "box"}, "mug": {"mug", "cylinder", "box"}}
 
 
 def form_of(noun: str | None) -> str | None:
@@ -109,7 +102,7 @@ def log_ratio(region: Region, form: str) -> float:
     measured, handle = _measures(region), _has_handle(region.mask.patch)
     densities = {
         name: _density(measured, name)
-        * (0.5 if name == "egg" else CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
+        * (CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
         * (HANDLES.get(name, NO_HANDLE) if handle else 1.0)  # one that is not seen may be behind the thing
         for name in (form, *rivals)
     }
