@@ -166,7 +166,8 @@ def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
     whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
     balls = np.logical_or.reduce([border & False, *(one.mask for one in whole_ones if one.is_disc)])
     whole_ones = [_without_rim(one, balls) for one in whole_ones]
-    regions = [one.region((height, width), _is_hidden(one, whole_ones)) for one in whole_ones]
+    each = zip(whole_ones, _hidden(whole_ones), strict=True)
+    regions = [one.region((height, width), is_hidden) for one, is_hidden in each]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -263,7 +264,7 @@ def _parts(view: View, component: Mask) -> list[Mask]:
     pale = component & (np.minimum(view.chroma_gap, view.chroma) < CHROMA_STEP) & (view.bright > -12)
     balls, taken = list[Mask](), np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
-        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 190):
+        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
             disc = as_disc(masks.dilated(patch, times=2), view.edges, view.edge_threshold, grow=EDGE_BAND)
             if disc is not None and not (disc & taken).any():
                 taken |= disc
@@ -329,11 +330,13 @@ def _without_rim(one: _Found, balls: Mask) -> _Found:
     return one if one.is_disc or 2 * kept.sum() < one.mask.sum() else replace(one, mask=kept)
 
 
-def _is_hidden(one: _Found, found: Sequence[_Found]) -> bool:
-    """Whether something of another colour, which ends lower in the image, lies along much of its outline."""
-    outline, low, colours = masks.outline_of(one.mask), masks.bbox_of(one.mask)[3], _names(one.lab)[1]
-    others = [each for each in found if masks.bbox_of(each.mask)[3] > low and not colours & _names(each.lab)[1]]
-    return any(np.mean(masks.dilated(each.mask, 5)[outline]) > HIDDEN for each in others)
+def _hidden(found: Sequence[_Found]) -> list[bool]:
+    """Of which of them much of the outline lies along one thing of another colour that ends lower in the image."""
+    things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
+    return [
+        any(low > own[0] and not colours & own[1] and near[outline].mean() > HIDDEN for low, colours, near in things)
+        for outline, own in zip((masks.outline_of(one.mask) for one in found), things, strict=True)
+    ]
 
 
 def _half_width(mask: Mask) -> float:

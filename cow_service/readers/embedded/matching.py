@@ -179,7 +179,7 @@ def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
         can_be = region.is_hidden or region.roundness >= (ROUND if phrase.colour is None else NOT_ROUND)
     if form is None or not can_be:
         return 0.0 if can_be else IMPOSSIBLE
-    return (CUT if is_cut(region) else 1.0) * min(SURE, max(LEAST, log_ratio(region, form)))
+    return (CUT if is_cut(region, form) else 1.0) * min(SURE, max(LEAST, log_ratio(region, form)))
 
 
 WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thing in it
