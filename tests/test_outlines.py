@@ -13,7 +13,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import parse_noun_phrase
 from cow_service.readers.embedded.matching import best_matches, match_one
-from cow_service.readers.embedded.outlines import is_unlike
+from cow_service.readers.embedded.outlines import form_of, is_unlike
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.regions import Region, find_regions
 
@@ -44,6 +44,21 @@ def test_two_that_are_seen_as_one_are_unlike_either() -> None:
     alone[150:240, 280:330] = GREEN
     (region,) = find_regions(jpeg(alone))
     assert not is_unlike(region, "cylinder")
+
+
+def test_half_of_a_thing_may_be_a_ball_but_no_vase() -> None:
+    image = block(ball(floor(), (300, 150), 32, PURPLE), (260, 145, 380, 290), GREEN)
+    region = next(each for each in find_regions(jpeg(image)) if each.is_hidden)
+    assert [is_unlike(region, noun) for noun in ("ball", "cylinder", "vase", "bottle")] == [False, False, True, True]
+
+
+@pytest.mark.parametrize(("noun", "is_odd"), [("cylinder", False), ("can", False), ("bottle", True), ("cone", True)])
+def test_a_squat_cylinder_seen_from_above_is_one(noun: str, is_odd: bool) -> None:
+    image = np.ascontiguousarray(floor())
+    rims = [cv2.ellipse2Poly(middle, (40, 26), 20, 0, 360, 5) for middle in ((310, 190), (285, 240))]
+    cv2.fillConvexPoly(image, cv2.convexHull(np.concatenate(rims)), GREEN, cv2.LINE_AA)
+    (region,) = find_regions(jpeg(image))
+    assert is_unlike(region, form_of(noun) or "") == is_odd
 
 
 def matches(regions: tuple[Region, ...], text: str) -> list[int]:
