@@ -333,7 +333,8 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
         # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
         head, looks, own = phrase.head or "", looks_like(region), form_of(phrase.head)
-        is_odd = own is not None and is_unlike(region, own)
+        # Where no colour tells that it is meant, its outline alone does.
+        is_odd = own is not None and (is_unlike(region, own) or (phrase.colour is None and looks not in (None, own)))
         is_other = is_odd if own is not None else shape_of(head) != shape_of(looks or "")
         colour = None if phrase.colour else like_a_colour(phrase.text)
         if colour is not None:
