@@ -355,8 +355,8 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
 
     Edges: the share of its outline, image border aside, that lies on edges; a disc was fitted to them. Contrast: its
     median distance from the surroundings in Lab over `SURE_CONTRAST`, but for a disc: a circle that fits is no chance.
-    Size: its area over `SURE_AREA`, of a disc over half of it (square roots of all). Border: 1 less half the share of its outline along the
-    image's border, beyond which it may go on.
+    Size: its area over `SURE_AREA`, of a disc over half of it (square roots of all). Border: 1 less half the share of
+    its outline along the image's border, beyond which it may go on.
     """
     outline = masks.outline_of(part)
     inner = outline & ~border
