@@ -47,6 +47,14 @@ def test_any_arrow_on_a_floor_is_measured(
     assert np.hypot(found[0].tip[0] - arrow.tip[0], found[0].tip[1] - arrow.tip[1]) < 3 + thickness
 
 
+def test_the_side_of_a_can_behind_a_ball_is_no_arrow() -> None:
+    """All of one dark blue that is seen of it: as broad at one end as a stubby arrow's head."""
+    image = np.ascontiguousarray(floor(grey=220))
+    corners = np.array([[300, 150], [336, 150], [336, 141], [350, 156], [336, 171], [336, 162], [300, 162]], np.int32)
+    cv2.fillPoly(image, [corners], (10, 15, 110), cv2.LINE_AA)
+    assert not Scene(jpeg(image)).arrows
+
+
 @pytest.mark.parametrize("style", ["open", "filled", "outlined"])
 @pytest.mark.parametrize("start", ["inside", "outside"])
 def test_an_arrow_at_its_object_is_measured(style: str, start: str) -> None:

@@ -38,6 +38,12 @@ def test_neither_a_floor_nor_a_shadow_nor_what_was_found_is_faint() -> None:
     assert Scene(jpeg(ball(floor(), (300, 180), 45, (200, 30, 30)))).faint == ()
 
 
+def test_a_tile_beside_a_thing_is_not_faint() -> None:
+    image = np.ascontiguousarray(floor(grey=170))
+    image[:, 250:254], image[190:194], image[300:304] = 130, 130, 130
+    assert Scene(jpeg(block(image, (360, 150, 460, 330), (20, 20, 20)))).faint == ()
+
+
 @pytest.mark.parametrize(("height", "in_way"), [(270, True), (370, False)])
 def test_an_answer_is_not_sure_where_the_way_leads_over_something_faint(
     service: Service, height: int, in_way: bool

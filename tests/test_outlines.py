@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,11 +13,13 @@ from drawn import Image, ball, block, floor, jpeg
 from cow_service.physics.bodies import SeenBody
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import parse_noun_phrase
-from cow_service.readers.embedded.matching import best_matches, match_one
-from cow_service.readers.embedded.outlines import is_unlike
+from cow_service.readers.embedded.matching import best_matches, match_one, noun_doubts
+from cow_service.readers.embedded.outlines import form_of, is_unlike
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.regions import Region, find_regions
+from cow_service.vision.scene import Scene
 
+DATA = Path(__file__).parent / "data"
 PURPLE, GREEN = (120, 60, 170), (50, 150, 50)
 HALF_WIDTHS = {  # at equal steps from the upper end
     "bottle": (8, 8, 14, 26, 26, 26, 26, 26),
@@ -44,6 +47,28 @@ def test_two_that_are_seen_as_one_are_unlike_either() -> None:
     alone[150:240, 280:330] = GREEN
     (region,) = find_regions(jpeg(alone))
     assert not is_unlike(region, "cylinder")
+
+
+def test_half_of_a_thing_may_be_a_ball_but_no_vase() -> None:
+    image = block(ball(floor(), (300, 150), 32, PURPLE), (260, 145, 380, 290), GREEN)
+    region = next(each for each in find_regions(jpeg(image)) if each.is_hidden)
+    assert [is_unlike(region, noun) for noun in ("ball", "cylinder", "vase", "bottle")] == [False, False, True, True]
+
+
+@pytest.mark.parametrize(("noun", "is_odd"), [("cylinder", False), ("can", False), ("bottle", True), ("cone", True)])
+def test_a_squat_cylinder_seen_from_above_is_one(noun: str, is_odd: bool) -> None:
+    image = np.ascontiguousarray(floor())
+    rims = [cv2.ellipse2Poly(middle, (40, 26), 20, 0, 360, 5) for middle in ((310, 190), (285, 240))]
+    cv2.fillConvexPoly(image, cv2.convexHull(np.concatenate(rims)), GREEN, cv2.LINE_AA)
+    (region,) = find_regions(jpeg(image))
+    assert is_unlike(region, form_of(noun) or "") == is_odd
+
+
+def test_without_a_colour_nothing_is_meant_that_looks_like_something_else() -> None:
+    scene = Scene(np.ascontiguousarray(cv2.imread(str(DATA / "wordings" / "bottles.jpg"))[..., ::-1]))
+    bottle = next(each for each in scene.regions if each.colour == "pink")
+    doubted = [bool(noun_doubts(scene, [(phrase_of(text), bottle.bbox)])[1]) for text in ("the candle", "the bottle")]
+    assert doubted == [True, False]
 
 
 def matches(regions: tuple[Region, ...], text: str) -> list[int]:

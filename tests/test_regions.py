@@ -82,6 +82,27 @@ def test_touching_objects_of_two_colours_are_two() -> None:
     assert all(region.roundness < 0.76 for region in regions)
 
 
+def test_what_looks_out_behind_something_is_a_thing_and_hidden() -> None:
+    image = block(ball(floor(), (300, 150), 32, RGB["orange"]), (260, 145, 380, 290), RGB["cyan"])
+    found = {region.colour: region for region in find_regions(jpeg(image))}
+    assert {colour: region.is_hidden for colour, region in found.items()} == {"orange": True, "cyan": False}
+    assert iou(found["cyan"].bbox, (260, 145, 380, 290)) > 0.9
+
+
+def test_something_black_between_two_things_is_no_wheel_of_the_larger() -> None:
+    image = block(floor(), (250, 110, 320, 180), RGB["green"])
+    image = block(block(image, (260, 180, 330, 240), RGB["black"]), (220, 238, 390, 370), RGB["orange"])
+    assert sorted(region.colour for region in find_regions(jpeg(image))) == ["black", "green", "orange"]
+
+
+def test_a_ball_with_a_hard_shadow_across_is_one() -> None:
+    image = np.ascontiguousarray(floor(grey=150) * np.array([0.9, 1.0, 1.15])).astype(np.uint8)
+    cv2.ellipse(image, (320, 180), (80, 70), 30, 0, 360, (240, 240, 240), -1, cv2.LINE_AA)
+    cv2.ellipse(image, (320, 180), (80, 70), 30, 0, 180, (60, 60, 60), -1, cv2.LINE_AA)
+    (region,) = find_regions(jpeg(image))
+    assert iou(region.bbox, (243, 106, 397, 254)) > 0.9
+
+
 @pytest.mark.parametrize("quality", [75, 90])
 def test_a_white_ball_on_a_white_table_is_one_of_two(quality: int) -> None:
     table = block(floor(grey=120), (200, 160, 380, 300), (205, 205, 205))
@@ -223,6 +244,7 @@ def test_colours_at_a_border_have_both_names_and_others_one() -> None:
     assert colour_names(55, 30, 52) == {"orange"}
     assert colour_names(45, 44, 47) >= {"red", "orange"}
     assert "green" not in colour_names(60, -3, 46)
+    assert colour_name(22, 35, -60) == "blue"  # saturated: hue 300, as that of a pale purple
 
 
 @pytest.mark.parametrize("name", ["ball-and-mug", "bottle-passes-cylinder", "thrown-ball", "car-forward"])

@@ -23,6 +23,7 @@ from cow_service.vision.types import Floats, Mask
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
 HEAD, HOLLOW_HEAD = 1.8, 1.3  # of the shaft's width: the least width of a head, and of a hollow drawing's
 MIN_HOLLOW_FIT = 0.88  # the same for a hollow drawing, whose head may be small
+SLENDER = 5.0  # of its shaft's width: an arrow without a rim is longer; the side of a can behind a ball is not
 CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
 
 
@@ -98,6 +99,8 @@ def fit_arrow(patch: Mask, hollow: bool) -> tuple[float, _Profile] | None:
             if profile is not None:
                 profile = _profile(points, profile.centre, profile.axis, least_head)
         if profile is None or not profile.is_arrow_like():
+            continue
+        if not hollow and len(profile.extent) < SLENDER * profile.thickness:
             continue
         fit = max(profile.overlap(patch, filled) for filled in (True, False))
         if fit >= least_fit and (best is None or fit > best[0]):

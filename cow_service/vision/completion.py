@@ -263,7 +263,7 @@ def white_sides(view: View, core: Mask) -> Mask:
     white = core & (view.bright > BRIGHT_STEP) & neutral
     _, labels, tops, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
     near_edges = dilated(view.edges > view.edge_threshold, 5)
-    lit_too = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) | white
+    lit_too = ((cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) & (view.chroma < 2 * CHROMA_STEP)) | white
     sides, surely_white = np.zeros(white.shape, bool), set[int]()
     for top, (x, y, w, h, area) in enumerate(tops.tolist()):
         around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)

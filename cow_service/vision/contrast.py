@@ -129,7 +129,7 @@ BROWN_LIGHTNESS = 42.0  # below it and muted, orange is called brown
 BROWN_CHROMA = 36.0
 RED_CHROMA = 34.0  # a paler red is called pink
 
-PURE_BLUE = (309.0, 2.2)  # degrees, chroma over L* + 16: Lab bends the hue of the purest blues towards purple
+PURE_BLUE = (309.0, 1.6)  # degrees, chroma over L* + 16: Lab bends the hue of the purest blues towards purple
 DARK_REDS = 42.0  # lightness below which people may call red or orange brown
 OLIVE = 60.0  # lightness below which people may call yellow green
 GREYS = (28.0, 80.0)  # lightness of what people may call grey: white in shade too

@@ -20,6 +20,7 @@ COVERED = 0.25  # of a patch, by things that were found: it is a part of one
 SOLID = 0.8  # of its convex hull that a patch fills
 PALER, TINTED = 1.2, 3.0  # Lab lightness above the floor on every side of it, and Lab units from its hue
 OUT_OF_TEXTURE = 2.0  # of the spread in lightness of the floor around it: less is texture
+NEAR, BEYOND = 5, 12  # px at the working size: the floor around it, and that beyond the joint beside a tile
 DARKEST = -5.0  # Lab lightness against the floor on any side: what is darker is a shadow or a gap
 
 
@@ -34,7 +35,11 @@ def find_faint(view: View, size: tuple[int, int], regions: Sequence[Region]) -> 
         area = np.count_nonzero(patch)
         if area < LEAST_AREA * taken.size or np.count_nonzero(taken[near] & patch) > COVERED * area:
             continue
-        steps = _steps(view.lab[near], patch)
+        y0, x0 = max(0, near[0].start - BEYOND), max(0, near[1].start - BEYOND)
+        wide = slice(y0, near[0].stop + BEYOND), slice(x0, near[1].stop + BEYOND)
+        whole = np.zeros(taken.shape, bool)
+        whole[near] = patch
+        steps = _steps(view.lab[wide], whole[wide], taken[wide])
         if steps is None:
             continue
         paler, tinted = steps
@@ -44,19 +49,21 @@ def find_faint(view: View, size: tuple[int, int], regions: Sequence[Region]) -> 
     return tuple(found)
 
 
-def _steps(lab: Floats32, patch: Mask) -> tuple[float, float] | None:
+def _steps(lab: Floats32, patch: Mask, taken: Mask) -> tuple[float, float] | None:
     """How much paler a patch [h, w] is than each quarter of the floor around it, and how far from its hue, at least.
 
-    None for a patch that is ragged, or beside which some quarter is not seen.
+    None for a patch that is ragged, or beside which some quarter is not seen. `taken` [h, w] are things.
     """
     whole = without_holes(dilated(patch))
     if np.count_nonzero(whole) < SOLID * np.count_nonzero(hull(whole)):
         return None
-    rows, columns = np.nonzero(dilated(whole, 11) & ~dilated(whole, 5))
-    quarter = 2 * (rows > rows.mean()) + (columns > columns.mean()) if len(rows) else rows
-    sides = [lab[rows[quarter == i], columns[quarter == i]] for i in range(4)]
-    if min(len(side) for side in sides) == 0:
-        return None
-    own = np.median(lab[patch], axis=0)
-    steps = own - np.array([np.median(side, axis=0) for side in sides])
-    return float(steps[:, 0].min()), float(np.hypot(steps[:, 1], steps[:, 2]).min())
+    own, steps = np.median(lab[patch], axis=0), list[Floats32]()
+    for around in (dilated(whole, 2 * NEAR + 1), dilated(whole, 2 * BEYOND + 1) & ~taken):
+        rows, columns = np.nonzero(around & ~dilated(whole, 5))
+        quarter = 2 * (rows > rows.mean()) + (columns > columns.mean()) if len(rows) else rows
+        sides = [lab[rows[quarter == i], columns[quarter == i]] for i in range(4)]
+        if min(len(side) for side in sides) == 0:
+            return None
+        steps += [own - np.median(side, axis=0) for side in sides]
+    lightness, *hue = np.array(steps).T
+    return float(lightness.min()), float(np.hypot(*hue).min())

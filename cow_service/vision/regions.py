@@ -53,10 +53,12 @@ ALONG_BORDER = 0.5  # of the height or width of something bright and pale that r
 MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
 CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
 SPLIT_HUE = 36.0  # degrees: another colour, hence another object
-OWN_AREA = 380  # px at the working size: a patch of another colour this large is no part of a thing
+FILLED, ELLIPSE = 0.9, 0.95  # of its hull that a part fills; of a hull and the ellipse of its outline that both share
+OWN_AREA = 250  # px at the working size: a patch of another colour this large is no part of a thing
 EDGE_BAND = 4.0  # px: half the width of an edge as it is measured
 MIN_REST = 0.05  # of a component: less is no part of its own
-OWN_WIDTH = 0.55  # of the broadest colour: black narrower than this is a neck or a wheel
+HIDDEN = 0.2  # of its outline, along which something else lies in front
+OWN_WIDTH = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
 TOP_AREA = 0.3  # of a region: a larger one above it is another object, not what stands on it
 DARK = 28.0  # lightness below which a part may be the underside of another
@@ -80,6 +82,7 @@ class Region:
     roundness: float  # 0..1, of the smallest circle around it: a disc has 1, a square 0.8, a bottle less than 0.5
     confidence: float  # 0..1: how sure it is that this is one separable thing with this outline; see `_confidence`
     is_disc: bool  # its outline was fitted by a circle: the mask is exact, segmenting it again would not improve it
+    is_hidden: bool = False  # by another region in front of it, in part: its outline tells little
 
     @property
     def bbox(self) -> BBox:
@@ -101,14 +104,15 @@ class _Found:
     confidence: float
     is_disc: bool
 
-    def region(self, size: tuple[int, int]) -> Region:
+    def region(self, size: tuple[int, int], is_hidden: bool) -> Region:
         """It as a region of the image (height and width)."""
         soft = self.mask.astype(np.float32)
         near = masks.window_of(self.mask, round(6 * MASK_SIGMA))
         if near is not None:
             soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
         mask = masks.enlarged(soft, size)
-        return Region(mask, *_names(self.lab), masks.roundness_of(mask.patch), self.confidence, self.is_disc)
+        roundness = masks.roundness_of(mask.patch)
+        return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
 
 
 def measure(image: Image) -> View:
@@ -161,7 +165,9 @@ def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
     whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
     balls = np.logical_or.reduce([border & False, *(one.mask for one in whole_ones if one.is_disc)])
-    regions = [_without_rim(one, balls).region((height, width)) for one in whole_ones]
+    whole_ones = [_without_rim(one, balls) for one in whole_ones]
+    each = zip(whole_ones, _hidden(whole_ones), strict=True)
+    regions = [one.region((height, width), is_hidden) for one, is_hidden in each]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
 
@@ -266,7 +272,18 @@ def _parts(view: View, component: Mask) -> list[Mask]:
     rest = _blobs(component & ~taken, MIN_REST * component.sum())
     if balls:  # what is left along the edge of a ball is blur
         rest = [blob for blob in rest if _half_width(blob) > EDGE_BAND]
-    return balls + [part for blob in rest for part in _coloured_parts(view, blob)]
+    parts = balls + [part for blob in rest for part in _coloured_parts(view, blob)]
+    whole = masks.hull(component) if len(parts) > 1 else component
+    is_one = len(parts) > 1 and np.count_nonzero(component) > FILLED * np.count_nonzero(whole) and _is_ellipse(whole)
+    return [whole] if is_one else parts  # a ball or an egg, and a shadow across it
+
+
+def _is_ellipse(mask: Mask) -> bool:
+    """Whether a mask [h, w] without holes is an ellipse, as a ball at the side of a wide view is."""
+    outline = np.argwhere(masks.outline_of(mask))[:, ::-1].astype(np.int32)
+    ellipse = np.zeros(mask.shape, np.uint8)
+    cv2.ellipse(ellipse, cv2.fitEllipse(outline), (1,), -1)
+    return float(np.count_nonzero(mask & (ellipse > 0)) / np.count_nonzero(mask | (ellipse > 0))) > ELLIPSE
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
@@ -289,7 +306,7 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
     black = neutral & (lab[..., 0] < BLACK_SHARE * view.around)
     dark = _blobs(black, min(0.35 * area, OWN_AREA))
-    broad = max((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
+    broad = min((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
     seeds.extend(_blobs(bright, min(0.3 * area, OWN_AREA)))
     seeds += [seed for seed in dark if _half_width(seed) > OWN_WIDTH * broad or seed.sum() > 0.35 * area]
     if len(seeds) <= 1:
@@ -313,6 +330,15 @@ def _without_rim(one: _Found, balls: Mask) -> _Found:
     return one if one.is_disc or 2 * kept.sum() < one.mask.sum() else replace(one, mask=kept)
 
 
+def _hidden(found: Sequence[_Found]) -> list[bool]:
+    """Of which of them much of the outline lies along one thing of another colour that ends lower in the image."""
+    things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
+    return [
+        any(low > own[0] and not colours & own[1] and near[outline].mean() > HIDDEN for low, colours, near in things)
+        for outline, own in zip((masks.outline_of(one.mask) for one in found), things, strict=True)
+    ]
+
+
 def _half_width(mask: Mask) -> float:
     """Radius (px) of the largest circle inside a mask [h, w]."""
     return float(cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
@@ -329,15 +355,15 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
 
     Edges: the share of its outline, image border aside, that lies on edges; a disc was fitted to them. Contrast: its
     median distance from the surroundings in Lab over `SURE_CONTRAST`, but for a disc: a circle that fits is no chance.
-    Size: its area over `SURE_AREA` (square roots of both). Border: 1 less half the share of its outline along the
-    image's border, beyond which it may go on.
+    Size: its area over `SURE_AREA`, of a disc over half of it (square roots of all). Border: 1 less half the share of
+    its outline along the image's border, beyond which it may go on.
     """
     outline = masks.outline_of(part)
     inner = outline & ~border
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
     contrast = 1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / SURE_CONTRAST
-    size = float(np.count_nonzero(part)) / SURE_AREA
+    size = float(np.count_nonzero(part)) / (SURE_AREA / 2 if is_disc else SURE_AREA)
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
     edges = max(sharp, 0.9) if is_disc else sharp
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
@@ -363,7 +389,7 @@ def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
     for i in sorted(kept, key=lambda i: -areas[i]):
         if i not in kept or found[i].is_disc:
             continue
-        small = [j for j in kept if areas[j] < TOP_AREA * areas[i] and not found[j].is_disc]
+        small = [j for j in kept if areas[j] < min(TOP_AREA * areas[i], OWN_AREA) and not found[j].is_disc]
         taken = np.zeros(edges.shape, bool)
         for j, other in kept.items():
             if j != i and j not in small:

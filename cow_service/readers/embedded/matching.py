@@ -176,10 +176,10 @@ def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
     # A region is round where the noun names something round, and not where it does not.
     can_be = not region.is_disc or (form is None and phrase.head not in _SOLID)
     if form == "ball":
-        can_be = region.roundness >= (ROUND if phrase.colour is None else NOT_ROUND)
+        can_be = region.is_hidden or region.roundness >= (ROUND if phrase.colour is None else NOT_ROUND)
     if form is None or not can_be:
         return 0.0 if can_be else IMPOSSIBLE
-    return (CUT if is_cut(region) else 1.0) * min(SURE, max(LEAST, log_ratio(region, form)))
+    return (CUT if is_cut(region, form) else 1.0) * min(SURE, max(LEAST, log_ratio(region, form)))
 
 
 WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thing in it
@@ -333,7 +333,8 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
         # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
         head, looks, own = phrase.head or "", looks_like(region), form_of(phrase.head)
-        is_odd = own is not None and is_unlike(region, own)
+        # Where no colour tells that it is meant, its outline alone does.
+        is_odd = own is not None and (is_unlike(region, own) or (phrase.colour is None and looks not in (None, own)))
         is_other = is_odd if own is not None else shape_of(head) != shape_of(looks or "")
         colour = None if phrase.colour else like_a_colour(phrase.text)
         if colour is not None:

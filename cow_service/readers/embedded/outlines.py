@@ -20,7 +20,7 @@ Range = tuple[float, float]
 
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
-CONTRADICTS = 7.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
+CONTRADICTS = 6.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
 UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
 FITS = 2.0  # misfit below which an outline is well described
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
@@ -37,7 +37,7 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "candle": ((1.4, 6.0), (0.92, 1.0), ANY, (0.93, 1.0), (0.93, 1.0), (0.9, 1.0), (0.8, 1.0)),
     "vase": ((1.3, 3.0), (0.7, 0.9), (0.5, 1.0), (0.4, 0.8), (0.3, 0.85), (0.8, 1.0), (0.4, 0.95)),
     "cone": ((0.8, 2.2), (0.94, 1.0), (0.0, 0.4), (0.2, 0.55), (0.4, 0.75), (0.6, 0.95), (0.8, 1.0)),
-    "cylinder": ((1.3, 3.5), (0.97, 1.0), (0.85, 1.0), (0.93, 1.0), (0.93, 1.0), (0.9, 1.0), (0.75, 1.0)),
+    "cylinder": ((1.15, 3.5), (0.97, 1.0), (0.65, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.75, 1.0)),
     "cube": ((0.85, 1.3), (0.97, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.93, 1.0), (0.5, 1.0)),
     "mug": ((0.9, 1.5), (0.84, 1.0), (0.6, 1.0), (0.7, 1.0), (0.75, 1.0), (0.7, 1.0), (0.5, 0.92)),
     "bowl": ((0.3, 1.0), (0.93, 1.0), (0.7, 1.0), (0.85, 1.0), (0.75, 1.0), (0.4, 0.85), (0.3, 0.75)),
@@ -53,13 +53,14 @@ _SIDE = 0.25  # of the width: so far from the middle is the hole inside a handle
 # The rows of the body beside a handle, at both ends, and those of the handle, as shares of the height.
 _UPPER, _LOWER, _BETWEEN = (0.06, 0.22), (0.72, 0.9), (0.2, 0.8)
 _ALIKE = {
-    "ball": "sphere orb marble basketball football baseball balloon globe",
+    "ball": "sphere orb egg marble basketball football baseball balloon globe",
     "mug": "cup", "cone": "pyramid", "cylinder": "can jar", "box": "block brick cuboid",
     "car": "bus truck van taxi lorry train",
 }  # fmt: skip
 _FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALIKE.items() for other in words(said)}
 # Rows that tell a thing for what it is (nearly anything can look like a box or a can), from this log ratio on.
 _TELLING, _CLEARLY = ("ball", "bottle", "bowl", "car", "cone", "mug", "vase"), 1.5
+_PLAIN = ("ball", "box", "cube", "cylinder")
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
 _SAME = {"cube": {"cube", "box"}, "box": {"cube", "box"}, "mug": {"mug", "cylinder", "box"}}
 
@@ -71,7 +72,7 @@ def form_of(noun: str | None) -> str | None:
 
 def is_unlike(region: Region, form: str) -> bool:
     """Whether an outline is not that of a row of `OUTLINES`: another one's, or that of a torn or half hidden thing."""
-    if is_cut(region):
+    if is_cut(region, form):
         return False
     is_box = form == "box"  # which may be flat, or as high as a tower
     measured = [0.0, *_measures(region)[1:]] if is_box else _measures(region)
@@ -80,7 +81,7 @@ def is_unlike(region: Region, form: str) -> bool:
 
 def looks_like(region: Region) -> str | None:
     """The noun of the one row of `OUTLINES` that an outline clearly is; None where it could be many things."""
-    if is_cut(region):
+    if region.is_hidden or is_cut(region, "ball"):
         return None
     ratio, form = max((log_ratio(region, form), form) for form in _TELLING)
     return form if ratio >= _CLEARLY else None
@@ -89,7 +90,7 @@ def looks_like(region: Region) -> str | None:
 def is_other_kind(region: Region, noun: str | None) -> bool:
     """Whether an outline is that of another kind of thing for certain, as it is not where it is torn or half hidden."""
     form = form_of(noun)
-    if form is None or is_cut(region):
+    if form is None or is_cut(region, form):
         return False
     measured = _measures(region)
     misfits = {name: _misfit(measured, name) for name in OUTLINES}
@@ -118,11 +119,14 @@ def _density(measured: Sequence[float], form: str) -> float:
     return (1 - ODD) * math.exp(-_misfit(measured, form)) / integral + ODD
 
 
-def is_cut(region: Region) -> bool:
-    """Whether the image's border cuts a region: its outline is not known."""
+def is_cut(region: Region, form: str) -> bool:
+    """Whether the outline under a row of `OUTLINES` is not known: the border cuts the region, or a thing hides a part.
+
+    What is half hidden is believed to be something plain, but nothing with an outline of its own, such as a vase.
+    """
     height, width = region.mask.shape
     x0, y0, x1, y1 = region.bbox
-    return x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
+    return (region.is_hidden and form in _PLAIN) or x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
 
 
 def _misfit(measured: Sequence[float], form: str) -> float:
