@@ -36,11 +36,16 @@ LEAST_PIXELS = 24
 EDGE = 5  # px across: at outlines depths are those of neither side
 TRIM = 2.0  # percent of the points at either end that are left out
 FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
+LEAST_TOP = 10  # px that a top half as deep as wide would fill: then, too
 TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
 AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
 ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
 ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
 FLAT = 0.015  # of its distance: what rises less above the floor is no body, but a mark or a shadow on it
+BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
+SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
+LEAST_PART = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
+AT_FOOT = 0.15  # of the distance of a body's foot: so far from it may begin what stands there
 
 
 @dataclass(frozen=True)
@@ -312,6 +317,9 @@ def _footprint(
     y, x = y + mask.rows.start, x + mask.columns.start
     z = depth[y, x].astype(np.float64)
     rays = _rays(x, y, width, height, focal)
+    if body.shape != "sphere":
+        own = _of_one_thing(body, floor.coordinates(rays * z[:, None]), depth.shape, focal, floor, deviation)
+        x, y, z, rays = x[own], y[own], z[own], rays[own]
     edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
     if body.shape == "sphere":
         x0, y0, x1, y1 = body.bbox
@@ -331,7 +339,9 @@ def _footprint(
     bottom, top = (float(value) for value in np.percentile(up, (TRIM, 100 - TRIM)))
     sight = math.atan2(float(np.median(ahead)), float(np.median(right)))
     from_above = (floor.height - top) / math.hypot(float(np.median(right)), float(np.median(ahead)), floor.height)
-    seen = from_above > FROM_ABOVE
+    near_end = float(np.percentile(np.hypot(right, ahead), TRIM))
+    behind = 1 / near_end - 1 / (near_end + float(np.ptp(np.percentile(right, (TRIM, 100 - TRIM)))) / 2)
+    seen = from_above > FROM_ABOVE or focal * (floor.height - top) * behind > LEAST_TOP
     if body.is_form_known and body.shape in ("cylinder", "cone"):
         yaw = sight - math.pi / 2
     else:
@@ -364,6 +374,34 @@ def _footprint(
         deviation,
         share,
     )
+
+
+def _of_one_thing(
+    body: SeenBody, points: Floats, size: tuple[int, ...], focal: float, floor: Floor, deviation: float
+) -> Mask:
+    """Which [N] of the points [N, 3] that the outline of a body shows are its own, in an image of a size (rows, columns).
+
+    An outline also holds what is seen through the gaps of a thing, and one that was cut by colour holds parts of what
+    stands in front or behind. Gaps in depth divide these: the body is the part where its foot is, else the largest one.
+    """
+    (x0, y0, x1, y1), away = body.bbox, np.hypot(points[:, 0], points[:, 2])
+    middle = float(np.median(away))
+    steps = 4  # of the gap
+    step = max(BREAK * max(x1 - x0, y1 - y0) * middle / focal, 3 * deviation * middle) / steps
+    place = (np.clip(away - away.min(), 0, FARTHEST * middle) / step).astype(int)
+    shares = np.bincount(place, minlength=steps) / len(away)
+    is_gap = np.convolve(np.convolve(shares, np.ones(steps), "valid") < SPARSE, np.ones(steps)) > 0.5
+    part = np.where(is_gap, 0, np.cumsum(np.diff(np.where(is_gap, 0, 1), prepend=0) > 0))[place]  # 0: in a gap
+    parts = [part == number for number in range(1, int(part.max(initial=0)) + 1)]
+    parts = [each for each in parts if each.mean() > LEAST_PART]
+    down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], size[1], size[0], focal)[0] @ floor.axes.T
+    foot = floor.height * math.hypot(down[0], down[2]) / max(down[1], HORIZON)
+
+    def fit(own: Mask) -> tuple[bool, int]:
+        begins = float(np.percentile(away[own], TRIM))
+        return abs(begins / foot - 1) < AT_FOOT + deviation, int(np.count_nonzero(own))
+
+    return max(parts, key=fit, default=np.ones(len(away), bool))
 
 
 def _core(spots: Floats) -> Floats:
