@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from stand_ins import TrueScene, motorcycle, read_truth, with_errors
+from stand_ins import TrueScene, read_truth, with_errors
 
 from cow_service.errors import CowError
 from cow_service.media.images import encode_png
@@ -78,13 +78,17 @@ def request_of(meta: dict[str, Any], truth: TrueScene, folder: Path, arm: dict[s
     return body
 
 
-def place_errors(truth: TrueScene, meta: dict[str, Any], bodies: Any) -> list[float]:
+def place_errors(meta: dict[str, Any], bodies: Any) -> list[float]:
     """How far off bodies are over the floor, of their distance, where the scene says where they stand."""
-    places: dict[str, list[float]] = meta.get("places", {})
+    if "world" not in meta or "world_from_camera" not in meta["camera"]:
+        return []
+    pose = np.array(meta["camera"]["world_from_camera"])
+    right, ahead = pose[:3, 0], pose[:3, 2] * np.array([1.0, 1.0, 0.0])
     found: list[float] = []
     for body in bodies:
-        if body.object in places and body.footprint is not None:
-            there = np.array(places[body.object])
+        if body.object in meta["world"] and body.footprint is not None:
+            away = np.array(meta["world"][body.object][0]) - pose[:3, 3]
+            there = np.array([away @ right, away @ ahead / np.linalg.norm(ahead)])
             found.append(float(np.linalg.norm(np.array(body.footprint.centre) - there) / np.linalg.norm(there)))
     return found
 
@@ -112,7 +116,7 @@ def measure(service: Service, folders: list[Path], name: str) -> tuple[list[dict
             row["depends_on"] = [] if told is None else list(told.depends_on)
             row["pitch_error"] = abs(trajectory.camera.pitch - (truth.camera.pitch or 0.0))
             row["source"] = trajectory.camera.source
-            row["place_errors"] = place_errors(truth, meta, trajectory.bodies)
+            row["place_errors"] = place_errors(meta, trajectory.bodies)
         rows.append(row)
     told = [
         (row["probability"], row["truth"] == "A")

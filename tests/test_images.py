@@ -114,6 +114,17 @@ def test_exif_orientation(orientation, kind):
     assert blue[0] < 80
 
 
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_the_focal_length_is_that_of_the_exif(kind, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769)[0xA405] = 50  # mm on 35 mm film, whose frame is 36 x 24 mm
+    decoded = decode(saved(Image.new("RGB", (360, 240)), kind, exif=exif))
+    assert decoded.info.focal == pytest.approx(500, rel=0.001)
+    assert decode(saved(Image.new("RGB", (360, 240)), kind)).info.focal is None
+
+
 def test_an_orientation_out_of_range_is_ignored():
     exif = Image.Exif()
     exif[0x0112] = 42

@@ -2,13 +2,15 @@
 
 Before pillow sees a file, everything that is not the picture is stripped: text, profiles, thumbnails. Nothing here
 needs them, and decoders spend on them without bound: compressed text grows a thousandfold, an EXIF directory may name
-the same bytes thousands of times, blocks are joined in quadratic time. Of EXIF only the orientation is read, here.
+the same bytes thousands of times, blocks are joined in quadratic time. Of EXIF the orientation and the focal length
+are read, here.
 """
 
 import base64
 import codecs
 import hashlib
 import io
+import math
 import re
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -51,7 +53,8 @@ _JPEG_ALONE = frozenset((0x00, 0x01, *range(0xD0, 0xD9)))  # without a length: s
 _JPEG_END, _JPEG_SCAN, _JPEG_APP1, _JPEG_ADOBE, _JPEG_COMMENT = 0xD9, 0xDA, 0xE1, 0xEE, 0xFE
 _JPEG_SCAN_START = b"\xff\xda"
 _EXIF = b"Exif\0\0"
-_ORIENTATION = 0x0112
+_ORIENTATION, _EXIF_DIRECTORY, _FOCAL_ON_FILM = 0x0112, 0x8769, 0xA405
+_FILM = math.hypot(36.0, 24.0)  # mm: the diagonal that focal lengths "on 35 mm film" refer to
 _WEBP_ANIMATED = 0x02  # flag of the first chunk (RFC 9649, section 2.7)
 _TIFF_INTEGERS = {3: 2, 4: 4}  # bytes of a SHORT and a LONG
 
@@ -109,22 +112,24 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     Raises `ImageTypeUnsupported` for other types and for animations, `ImageTooLarge` above `max_megapixels` (millions
     of pixels), and `ImageUnreadable` for damaged files and for sides under `MIN_SIDE` px.
     """
-    media_type, stripped, orientation = _read_header(data, max_megapixels)
+    media_type, stripped, exif = _read_header(data, max_megapixels)
     kind, opener = _OPENERS[media_type]
     with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
         _check_frames(kind, int(getattr(image, "n_frames", 1)))
         rgb = _to_rgb(image)
         if kind == "WebP":
-            orientation = _exif_orientation(image.info.get("exif", b""))
-    turn = _TRANSPOSE_TO_UPRIGHT.get(orientation)
+            exif = _read_exif(image.info.get("exif", b""))
+    turn = _TRANSPOSE_TO_UPRIGHT.get(exif.get(_ORIENTATION, UPRIGHT))
     pixels = np.asarray(rgb if turn is None else rgb.transpose(turn), np.uint8)
     height, width = pixels.shape[:2]
-    info = ImageInfo(width=width, height=height, sha256=hashlib.sha256(data).hexdigest())
+    on_film = exif.get(_FOCAL_ON_FILM, 0)
+    focal = on_film / _FILM * math.hypot(width, height) if on_film else None
+    info = ImageInfo(width=width, height=height, sha256=hashlib.sha256(data).hexdigest(), focal=focal)
     return DecodedImage(pixels, info, media_type)
 
 
-def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, int]:
-    """The media type, the file without what is not the picture, and its EXIF orientation, unless it is a WebP file."""
+def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, dict[int, int]]:
+    """The media type, the file without what is not the picture, and its EXIF values, unless it is a WebP file."""
     if not data:
         raise errors.ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
     media_type = media_type_of(data)
@@ -138,12 +143,12 @@ def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, int]:
             _check_size(*_webp_size(data), max_megapixels)
             if data[12:16] == b"VP8X" and data[20] & _WEBP_ANIMATED:
                 _check_frames(kind, data.count(b"ANMF"))
-            return media_type, data, UPRIGHT
-        stripped, orientation = _strip_png(data) if kind == "PNG" else _strip_jpeg(data)
+            return media_type, data, {}
+        stripped, exif = _strip_png(data) if kind == "PNG" else _strip_jpeg(data)
         with opener(io.BytesIO(stripped)) as image:  # of these two pillow reads the header alone, in Python
             _check_size(image.width, image.height, max_megapixels)
             _check_frames(kind, int(getattr(image, "n_frames", 1)))
-        return media_type, stripped, orientation
+        return media_type, stripped, exif
 
 
 @contextmanager
@@ -295,36 +300,36 @@ def _to_rgb(image: Image.Image) -> Image.Image:
     return image
 
 
-def _strip_png(data: bytes) -> tuple[bytes, int]:
-    """A PNG file without its ancillary chunks, except transparency and animation; and its EXIF orientation."""
+def _strip_png(data: bytes) -> tuple[bytes, dict[int, int]]:
+    """A PNG file without its ancillary chunks, except transparency and animation; and its EXIF values."""
     kept = [_PNG_SIGNATURE]
-    orientation = UPRIGHT
+    exif: dict[int, int] = {}
     at = len(_PNG_SIGNATURE)
     for _ in range(MAX_PNG_CHUNKS):
         head = data[at : at + 8]
         if len(head) < 8:  # truncated: the decoder reports it
-            return b"".join((*kept, head)), orientation
+            return b"".join((*kept, head)), exif
         end = at + 12 + int.from_bytes(head[:4])
         name = head[4:]
         if name in _PNG_KEPT:
             kept.append(data[at:end])
         elif name == b"eXIf":
-            orientation = _exif_orientation(data[at + 8 : end - 4])
+            exif = _read_exif(data[at + 8 : end - 4])
         if name == b"IEND":
-            return b"".join(kept), orientation
+            return b"".join(kept), exif
         at = end
     raise _overfull(f"a PNG file of more than {MAX_PNG_CHUNKS} chunks")
 
 
-def _strip_jpeg(data: bytes) -> tuple[bytes, int]:
-    """A JPEG file without application segments and comments, except Adobe's colours; and its EXIF orientation."""
+def _strip_jpeg(data: bytes) -> tuple[bytes, dict[int, int]]:
+    """A JPEG file without application segments and comments, except Adobe's colours; and its EXIF values."""
     kept = [data[:2]]
-    orientation = UPRIGHT
+    exif: dict[int, int] = {}
     at = 2
     for _ in range(MAX_JPEG_SEGMENTS):
         found = _JPEG_MARKER.search(data, at)
         if found is None:  # truncated: the decoder reports it
-            return b"".join(kept), orientation
+            return b"".join(kept), exif
         at, marker = found.end(), found[1][0]
         if marker in _JPEG_ALONE:
             continue
@@ -332,12 +337,12 @@ def _strip_jpeg(data: bytes) -> tuple[bytes, int]:
             rest = data[at - 2 :]
             if (scans := rest.count(_JPEG_SCAN_START)) > MAX_JPEG_SCANS:
                 raise _overfull(f"a JPEG file of {scans} scans, more than {MAX_JPEG_SCANS}")
-            return b"".join((*kept, rest)), orientation
+            return b"".join((*kept, rest)), exif
         end = at + int.from_bytes(data[at : at + 2])
         if marker == _JPEG_ADOBE or not (0xE0 <= marker <= 0xEF or marker == _JPEG_COMMENT):
             kept.append(data[at - 2 : end])
-        elif marker == _JPEG_APP1 and orientation == UPRIGHT and data.startswith(_EXIF, at + 2):
-            orientation = _exif_orientation(data[at + 2 : end])
+        elif marker == _JPEG_APP1 and not exif and data.startswith(_EXIF, at + 2):
+            exif = _read_exif(data[at + 2 : end])
         at = end
     raise _overfull(f"a JPEG file of more than {MAX_JPEG_SEGMENTS} segments")
 
@@ -347,23 +352,26 @@ def _overfull(what: str) -> errors.ImageUnreadable:
     return errors.ImageUnreadable(f"The image is {what}: save it anew with another program and send that.")
 
 
-def _exif_orientation(exif: bytes) -> int:
-    """The orientation (1 to 8) that an EXIF block names in its first directory; 1 where it names none."""
-    tiff = exif.removeprefix(_EXIF)
+def _read_exif(exif: bytes) -> dict[int, int]:
+    """By their tags, the orientation (1 to 8) and the focal length on 35 mm film (mm), where an EXIF block has them."""
+    tiff, found = exif.removeprefix(_EXIF), dict[int, int]()
     if tiff[:2] not in (b"II", b"MM"):
-        return UPRIGHT
+        return found
     order: Literal["little", "big"] = "little" if tiff[:2] == b"II" else "big"
 
     def number(at: int, size: int) -> int:
         return int.from_bytes(tiff[at : at + size], order)
 
-    start = number(4, 4)
-    for entry in range(start + 2, min(start + 2 + 12 * number(start, 2), len(tiff) - 11), 12):
-        tag, kind, count = number(entry, 2), number(entry + 2, 2), number(entry + 4, 4)
-        if tag == _ORIENTATION and count == 1 and kind in _TIFF_INTEGERS:
-            value = number(entry + 8, _TIFF_INTEGERS[kind])
-            return value if 1 <= value <= 8 else UPRIGHT
-    return UPRIGHT
+    def read(start: int, wanted: tuple[int, ...]) -> None:
+        for entry in range(start + 2, min(start + 2 + 12 * number(start, 2), len(tiff) - 11), 12):
+            tag, kind, count = number(entry, 2), number(entry + 2, 2), number(entry + 4, 4)
+            if tag in wanted and tag not in found and count == 1 and kind in _TIFF_INTEGERS:
+                found[tag] = number(entry + 8, _TIFF_INTEGERS[kind])
+
+    read(number(4, 4), (_ORIENTATION, _EXIF_DIRECTORY))
+    if _EXIF_DIRECTORY in found:
+        read(found.pop(_EXIF_DIRECTORY), (_FOCAL_ON_FILM,))
+    return found
 
 
 _DATA_URL = re.compile(r"data:(?P<type>[\w.+/-]*)(?:;[\w.+-]+=[^;,]*)*(?P<base64>;base64)?,", re.ASCII)

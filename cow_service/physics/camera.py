@@ -214,7 +214,7 @@ def given_camera(
         mean[1], sigma[1] = math.log(FOCAL_WIDTHS), FIXED
     if given.roll is not None:
         fit = replace(fit, roll=math.radians(given.roll), roll_sigma=GIVEN_ROLL_SIGMA)
-    source = "request" if given.model_fields_set else fit.source
+    source = "request" if given.model_fields_set else fit.source if focal is None else "exif"
     return replace(fit, mean=mean, covariance=np.diag(sigma**2), source=source)
 
 

@@ -34,6 +34,7 @@ SURE = 0.003  # of the depth: no map is more exact
 LEAST_SEEN = 0.3  # of a body's pixels: with fewer known depths it is not measured
 LEAST_PIXELS = 24
 EDGE = 5  # px across: at outlines depths are those of neither side
+SMOOTHED = 2.5  # px: standard deviation over which the depths of a body are averaged
 TRIM = 2.0  # percent of the points at either end that are left out
 FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
 LEAST_TOP = 10  # px that a top half as deep as wide would fill: then, too
@@ -41,7 +42,7 @@ TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the 
 AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
 ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
 ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
-FLAT = 0.015  # of its distance: what rises less above the floor is no body, but a mark or a shadow on it
+RAISED = 0.2  # of the pixels of a thing are nearer than the floor behind it
 BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
 SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
 LEAST_PART = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
@@ -186,6 +187,20 @@ def _supports(
     return found
 
 
+def rise_above(given: DepthMap, measured: Measurement, boxes: Sequence[BBox]) -> tuple[BBox, ...]:
+    """Those of some boxes (px) in which something rises above the floor: what is flat is a mark or a shadow on it."""
+    found: list[BBox] = []
+    for box in boxes:
+        x0, y0, x1, y1 = (int(edge) for edge in box)
+        depth = given.depth[y0 : y1 + 1, x0 : x1 + 1]
+        y, x = np.nonzero(np.isfinite(depth))
+        rays = _rays(x + x0, y + y0, given.depth.shape[1], given.depth.shape[0], measured.focal)
+        off = depth[y, x] * (rays @ -measured.floor.axes[1]) / measured.floor.height
+        if not len(y) or np.percentile(off, 100 * RAISED) < 1 - LEAST_TOLERANCE - measured.deviation:
+            found.append(box)
+    return tuple(found)
+
+
 def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], roll: float = 0.0) -> Floor | None:
     """The floor in a depth map of an image with that focal length (px), beside bodies; None where none is seen.
 
@@ -314,12 +329,16 @@ def _footprint(
     if share < LEAST_SEEN or np.count_nonzero(there) < LEAST_PIXELS:
         return None
     y, x = np.nonzero(there)
-    y, x = y + mask.rows.start, x + mask.columns.start
-    z = depth[y, x].astype(np.float64)
-    rays = _rays(x, y, width, height, focal)
     if body.shape != "sphere":
-        own = _of_one_thing(body, floor.coordinates(rays * z[:, None]), depth.shape, focal, floor, deviation)
-        x, y, z, rays = x[own], y[own], z[own], rays[own]
+        rays = _rays(x + mask.columns.start, y + mask.rows.start, width, height, focal)
+        spots = floor.coordinates(rays * depth[mask.rows, mask.columns][there][:, None])
+        there[y, x] = _of_one_thing(body, spots, (height, width), focal, floor, deviation)
+        y, x = np.nonzero(there)
+    # The noise of single pixels would make a body larger: what is seen of it is smoothed, without what is around.
+    inverse = np.where(there, 1 / np.where(there, depth[mask.rows, mask.columns], 1.0), 0.0)
+    z = blurred(there.astype(np.float64))[y, x] / blurred(inverse)[y, x]
+    y, x = y + mask.rows.start, x + mask.columns.start
+    rays = _rays(x, y, width, height, focal)
     edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
     if body.shape == "sphere":
         x0, y0, x1, y1 = body.bbox
@@ -402,6 +421,11 @@ def _of_one_thing(
         return abs(begins / foot - 1) < AT_FOOT + deviation, int(np.count_nonzero(own))
 
     return max(parts, key=fit, default=np.ones(len(away), bool))
+
+
+def blurred(values: Floats) -> Floats:
+    """Values [h, w] smoothed over a few pixels."""
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), SMOOTHED), np.float64)
 
 
 def _core(spots: Floats) -> Floats:

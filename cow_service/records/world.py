@@ -36,6 +36,7 @@ class ImageInfo(Record):
     width: int = Field(gt=0, description="Pixels.")
     height: int = Field(gt=0, description="Pixels.")
     sha256: Sha256
+    focal: float | None = Field(default=None, gt=0, description="Focal length by its EXIF, px; null: it has none.")
 
 
 Source = Literal["mllm", "embedded", "request"]

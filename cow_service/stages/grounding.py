@@ -48,7 +48,11 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in question.drawings_named]
     # The others, and what is changed of all of them.
     mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
-    beside = [each for each in given if not is_same_object(each.bbox, mover.bbox)]
+    # Two masks are two things, however much their boxes overlap.
+    has_mask = request.grounding is not None and request.grounding.mask is not None
+    beside = [
+        each for each in given if (has_mask and each.mask is not None) or not is_same_object(each.bbox, mover.bbox)
+    ]
     boxes = [each.bbox for each in beside]
     seen = (each for each in reading.others if not is_among(each.bbox, boxes))
     others = (*beside, *(each.model_copy(update={"source": each.source or source}) for each in seen))

@@ -17,7 +17,7 @@ from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import BBox, Grounding, Law, LocatedObject, Motion, MotionKind, Source, Vector
-from cow_service.requests import CameraRequest, MotionRequest, SimulateRequest
+from cow_service.requests import MotionRequest, SimulateRequest
 from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
@@ -74,7 +74,7 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     if motion.cue == "trail":
         with run.cpu():
             scene = run.scene_of(grounding, motion.cue)
-            motion = along_trail(scene, grounding, motion, request.camera, reading.speed is not None)
+            motion = along_trail(scene, grounding, motion, run, reading.speed is not None)
     # What nobody said: how fast a throw is, and the scale of lengths in metres.
     if motion.kind == "projectile" and not isinstance(reading.speed, Quantity) and not motion.trail:
         warnings.append(
@@ -173,7 +173,7 @@ def scale_of(
     told = {} if given is None else {"metres_per_pixel": given.value}
     things = [LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior), *grounding.others]
     width, height = run.image.info.width, run.image.info.height
-    fit, depth_map = given_camera((width, height), reading.down, run.request.camera), run.depth
+    fit, depth_map = given_camera((width, height), reading.down, run.request.camera, run.focal), run.depth
     mapped = None if depth_map is None else depth_map.metres_per_pixel(grounding.bbox, math.exp(fit.mean[1]) * width)
     if mapped is not None:
         told["the depth map"] = mapped
@@ -344,7 +344,7 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
 
 
 def along_trail(
-    scene: Scene, grounding: Grounding, motion: Motion, camera: CameraRequest | None, speed_given: bool
+    scene: Scene, grounding: Grounding, motion: Motion, run: Run[SimulateRequest], speed_given: bool
 ) -> Motion:
     """A motion read from a trail, with speed, direction and depth as the trail at the mover measures them."""
     trail = trail_of(scene.trails, grounding.bbox)
@@ -356,7 +356,7 @@ def along_trail(
     throw = None
     if motion.kind == "projectile":
         shadow, size = find_shadow(scene, grounding.bbox), (scene.width, scene.height)
-        fit = given_camera(size, motion.down, camera)
+        fit = given_camera(size, motion.down, run.request.camera, run.focal)
         fit = fit if shadow is None else fit_shadow(fit, grounding.bbox, shadow, size) or fit
         throw = fit_throw(trail.positions, fit, size)
     if throw is not None:

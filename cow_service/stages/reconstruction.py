@@ -14,12 +14,13 @@ from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, give
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera
 from cow_service.physics.ensemble import BY_EVENTS, Query
-from cow_service.physics.geometry import DepthMap, measure_scene
+from cow_service.physics.geometry import DepthMap, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion
 from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
+from cow_service.stages.run import Run
 from cow_service.vision.edges import divide
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
@@ -27,7 +28,6 @@ from cow_service.vision.scene import Obstacle, Scene
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.side_view import SideView
 
-FOCAL_DEVIATION = 0.03  # relative, of the focal length that comes with a depth map
 PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
 HIDDEN = 0.25  # of the columns of a body: with so many ending at another one, its foot is hidden
@@ -44,13 +44,13 @@ class Situation:
     obstacles: Sequence[Obstacle]
     removed: Sequence[Obstacle] = ()
     depth: DepthMap | None = None
+    focal: Estimate | None = None  # px, by what else than the request tells it
 
     @staticmethod
-    def of(
-        scene: Scene, grounding: Grounding, motion: Motion, request: SimulateRequest, depth: DepthMap | None = None
-    ) -> Situation:
+    def of(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: Motion) -> Situation:
         """With the obstacles that the scene shows."""
-        return Situation(scene, grounding, motion, request, *obstacles_of(scene, grounding), depth)
+        obstacles, removed = obstacles_of(scene, grounding)
+        return Situation(scene, grounding, motion, run.request, obstacles, removed, run.depth, run.focal)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -71,12 +71,6 @@ class Situation:
     def side_view(self) -> SideView | None:
         """The drawing without depth that the image is, unless its mover follows a path through space."""
         return None if self.follows_path else self.scene.side_view
-
-    @property
-    def focal(self) -> Estimate | None:
-        """The focal length (px) that a depth map was made with."""
-        known = None if self.depth is None else self.depth.focal
-        return None if known is None else Estimate(value=known, deviation=FOCAL_DEVIATION * known)
 
     @cached_property
     def located(self) -> tuple[LocatedObject, ...]:
@@ -136,6 +130,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         measured = None
     else:
         fit, measured = measure_scene(situation.depth, fit, bodies, supports)
+        faint = faint if measured is None else rise_above(situation.depth, measured, faint)
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}

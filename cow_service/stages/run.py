@@ -21,7 +21,7 @@ from cow_service.media.images import DecodedImage, decode_depth, decode_own
 from cow_service.observability.logging import rfc3339
 from cow_service.physics.geometry import DepthMap
 from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
-from cow_service.records import Artifact, BBox, Cue, Grounding, ReaderInfo, Record, Usage
+from cow_service.records import Artifact, BBox, Cue, Estimate, Grounding, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, ImageArtifact, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
@@ -64,6 +64,7 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
     return options
 
 
+MAPPED_DEVIATION, EXIF_DEVIATION = 0.06, 0.08  # relative, of focal lengths: pictures with EXIF may be cropped
 ALMOST_DONE = 0.999  # of a stage whose end has not been reported
 
 Request_co = TypeVar("Request_co", bound=SimulateRequest, covariant=True)
@@ -187,6 +188,14 @@ class Run(Generic[Request_co]):
             raise _no_depth("is empty: every pixel is 0, which says that nothing is known")
         depth = np.where(values > 0, values.astype(np.float64), np.nan)
         return DepthMap(depth, given.scale, given.deviation, given.focal)
+
+    @property
+    def focal(self) -> Estimate | None:
+        """The focal length (px) that the depth map was made with, else the one of the image's EXIF."""
+        mapped, exif = None if self.depth is None else self.depth.focal, self.image.info.focal
+        if mapped is not None:
+            return Estimate(value=mapped, deviation=MAPPED_DEVIATION * mapped)
+        return None if exif is None else Estimate(value=exif, deviation=EXIF_DEVIATION * exif)
 
     @cached_property
     def question(self) -> QuestionReading:

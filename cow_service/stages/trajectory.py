@@ -22,7 +22,7 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
         scene = run.scene_of(grounding, motion.cue)
-        trajectory = simulate_world(Situation.of(scene, grounding, motion, run.request, run.depth))
+        trajectory = simulate_world(Situation.of(run, scene, grounding, motion))
     return StageResult(value=trajectory, warnings=warnings_of(run.request, grounding, trajectory))
 
 

@@ -301,7 +301,7 @@ class Scene:
             body_area, whole, near = np.count_nonzero(body), without_holes(body), dilated(body, 7)
             obstacles: list[Obstacle] = []
             for other in named:
-                if not is_same_object(other.bbox, mover):
+                if other.mask is not None or not is_same_object(other.bbox, mover):
                     region = None if other.mask is not None else self.region_of(other.bbox)
                     mask = CroppedMask.of(self.silhouette(other.bbox)) if region is None else region.mask
                     found = region is not None and region.bbox == other.bbox  # here, not by the request or a reader
