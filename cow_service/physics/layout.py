@@ -20,13 +20,17 @@ from cow_service.records import BBox, Cue, Motion, Shape
 from cow_service.vision.types import Floats
 
 MEASURED_SIGMA = 0.03  # of a body's size by its depth: of the logarithm
+GOLDEN = math.pi * (3 - math.sqrt(5))  # radians between the mixtures of draws that two bodies take
 ORDER = 17  # how far the draws of one body's depth are from those of the next
 SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
 FOOT_SIGMA = 0.02  # of a body's height in the image: where it meets the floor
+LEAST_FOOT = 0.002  # of the longer side of the image: no box is more exact
+CUT = 0.3  # of the height of a body whose lower end the border of the image cuts off: how far that reaches beyond it
 SLIMMEST, TALLEST = 0.2, 12.0  # half heights, in half widths
 NEAREST, FARTHEST = 0.05, 40.0  # depths, in those of the first body: what seems to lie elsewhere is put there
 BOX_SIDE = 0.82  # of the seen width of a box whose yaw is not known: its side
-HUNG = 4.0  # how much likelier it hangs over that than where the camera's priors have it
+HUNG, MAYBE_HUNG = 4.0, 0.5  # how much likelier it hangs over that than where the camera's priors have it; in clutter
+MAYBE_SIGMA = 0.8  # of the logarithm, further, of the height of what may stand on a thing that was not told apart
 HUNG_SIGMA = 0.3  # of the mover's half width: how far ahead of the other it is
 # Degrees, one standard deviation of a direction in the image, by where it was read.
 TURN_SIGMA: dict[Cue, float] = {
@@ -148,7 +152,11 @@ def above(
         z = height / np.maximum(sink, HORIZON)
         half = z * radius / cameras.focal
         return LiftedBody(shape, cameras.coordinates(rays * z[:, None]), half, half, True)
-    foot = y1 + FOOT_SIGMA * (y1 - y0) * draws[:, COLUMN["foot"]]
+    off = draws[:, COLUMN["foot"]]
+    if y1 > cameras.height_px - 1:
+        foot = y1 + CUT * (y1 - y0) * np.abs(off)
+    else:
+        foot = y1 + max(FOOT_SIGMA * (y1 - y0), LEAST_FOOT * max(cameras.width, cameras.height_px)) * off
     rays = cameras.rays(np.stack([np.full(len(foot), (x0 + x1) / 2), foot], axis=1))
     if not (-rays[0, 1] > HORIZON and height[0] > 0):  # the likeliest ray meets the plane at no sane distance
         return None
@@ -291,6 +299,8 @@ class _Picture:
                 return cameras, [self.body_at(i, cameras, depth, share if i == 0 else None) for i in range(len(bodies))]
         ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
         height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
+        if not mover.stands_out and (mover.prior is None or mover.prior.height is None):
+            height *= np.exp(MAYBE_SIGMA * draws[:, COLUMN["let_go_ahead"]])
         under = self.below() if motion.kind == "fall" else None
         if under is not None:
             below = self.standing(under, cameras.at_height(np.ones(len(draws))), draws)
@@ -302,7 +312,7 @@ class _Picture:
                 in_radii = 2 * (aligned[0] + ball.centre[0, 1]) / (ball.half_width[0] + ball.half_height[0])
                 if in_radii > 0:
                     off = (np.log(in_radii) - fit.mean[2]) / np.sqrt(fit.covariance[2, 2])
-                    weight = HUNG * np.exp(-0.5 * off**2)
+                    weight = (HUNG if mover.stands_out else MAYBE_HUNG) * np.exp(-0.5 * off**2)
                     is_over = quantiles(draws[:, COLUMN["depth"]]) < weight / (1 + weight)
                     height = np.where(is_over, aligned, height)
         cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
@@ -342,6 +352,9 @@ class _Picture:
         body, on = self.bodies[index], self.supports[index]
         if depth_share is None:
             depth_share = self.depth_of(body, draws)
+        # Errors of two feet have nothing to do with one another.
+        draws, feet = draws.copy(), draws[:, [COLUMN["foot"], COLUMN["let_go_right"]]]
+        draws[:, COLUMN["foot"]] = feet @ [math.cos(GOLDEN * index), math.sin(GOLDEN * index)]
         plane = np.zeros(len(draws))
         if on is not None:
             support = above(cameras, self.bodies[on].core, self.bodies[on].shape, draws, plane)

@@ -197,6 +197,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
             confidence=seen.confidence,
             prior=said,
             point=None if bodies else grounding.point,
+            stands_out=region is not None or situation.side_view is not None,
         )
         if said is not None and said.shape is not None:
             body = replace(body, shape=said.shape)
