@@ -1,4 +1,4 @@
-"""Asks what-if questions of photographs, with boxes drawn by hand: how often is there a verdict, and is one sure and wrong?
+"""Asks what-if questions of photographs, with boxes drawn by hand: are there verdicts, and is one sure and wrong?
 
     python benchmarks/photographs.py [DIR ...] [--json FILE]
 
@@ -15,7 +15,6 @@ import importlib.util
 import json
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,9 @@ BOXES: dict[str, dict[str, BBox]] = {
         "yellow bottle": (399, 51, 420, 93), "red bin": (522, 181, 618, 253), "blue can": (453, 68, 474, 88),
     },
     "coffee.png": {"cup": (172, 18, 410, 309), "saucer": (77, 66, 480, 388), "spoon": (326, 66, 425, 327)},
-    "astronaut.png": {"astronaut": (20, 15, 362, 512), "helmet": (277, 344, 512, 512), "space shuttle": (355, 0, 473, 290)},
+    "astronaut.png": {
+        "astronaut": (20, 15, 362, 512), "helmet": (277, 344, 512, 512), "space shuttle": (355, 0, 473, 290),
+    },
     "camera.png": {"man": (0, 63, 332, 512), "tripod": (229, 186, 408, 512), "tower": (411, 117, 433, 194)},
     "rocket.jpg": {"rocket": (305, 126, 340, 406), "tower": (437, 123, 478, 420)},
     "coins.png": {"top left coin": (22, 33, 68, 75), "large coin": (315, 155, 380, 219)},
@@ -44,36 +45,36 @@ BOXES: dict[str, dict[str, BBox]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Question:
-    """One question of a picture; `objects` are the moving one, and the others that are given."""
-
-    picture: str
-    text: str
-    objects: tuple[str, ...]
-    truth: bool | None
-
-
-MOTORCYCLE, COFFEE = "motorcycle_left.png", "coffee.png"
-QUESTIONS = (
-    Question(MOTORCYCLE, "If the motorcycle slides to the right, will it hit the shelf?", ("motorcycle", "shelf", "bench"), False),
-    Question(MOTORCYCLE, "If the motorcycle slides to the left, will it hit the bench?", ("motorcycle", "bench", "shelf"), False),
-    Question(MOTORCYCLE, "If the bench is pushed towards the motorcycle, will it hit it?", ("bench", "motorcycle", "shelf"), True),
-    Question(MOTORCYCLE, "If the bench slides to the right, will it hit the motorcycle?", ("bench", "motorcycle"), False),
-    Question(MOTORCYCLE, "If the yellow bottle falls, will it land on the motorcycle?", ("yellow bottle", "motorcycle", "shelf"), False),
-    Question(MOTORCYCLE, "If the blue can slides to the left, will it hit the yellow bottle?", ("blue can", "yellow bottle", "shelf"), True),
-    Question(MOTORCYCLE, "If the red bin slides to the left, will it hit the motorcycle?", ("red bin", "motorcycle", "shelf"), False),
-    Question(COFFEE, "If the cup slides to the left, will it fall off the saucer?", ("cup", "saucer", "spoon"), True),
-    Question(COFFEE, "If the cup slides to the right, will it hit the spoon?", ("cup", "saucer", "spoon"), True),
-    Question(COFFEE, "If the spoon slides to the right, will it hit the cup?", ("spoon", "cup", "saucer"), False),
-    Question("astronaut.png", "If the space shuttle falls, will it land on the helmet?", ("space shuttle", "helmet", "astronaut"), False),
-    Question("astronaut.png", "If the space shuttle slides to the left, will it hit the astronaut?", ("space shuttle", "astronaut"), False),
-    Question("camera.png", "If the man walks to the right, will he hit the tower?", ("man", "tower", "tripod"), False),
-    Question("camera.png", "If the man walks to the right, will he hit the tripod?", ("man", "tripod"), True),
-    Question("rocket.jpg", "If the rocket falls over to the right, will it hit the tower?", ("rocket", "tower"), None),
-    Question("coins.png", "If the top left coin slides to the right, will it hit the large coin?", ("top left coin", "large coin"), False),
-    Question("bear.jpg", "If the bear walks to the right, will it hit the rock?", ("bear", "rock"), None),
-)  # fmt: skip
+# What is asked; what moves, then the others that are given; the truth.
+QUESTIONS: dict[str, tuple[tuple[str, str, bool | None], ...]] = {
+    "motorcycle_left.png": (
+        ("If the motorcycle slides to the right, will it hit the shelf?", "motorcycle, shelf, bench", False),
+        ("If the motorcycle slides to the left, will it hit the bench?", "motorcycle, bench, shelf", False),
+        ("If the bench is pushed towards the motorcycle, will it hit it?", "bench, motorcycle, shelf", True),
+        ("If the bench slides to the right, will it hit the motorcycle?", "bench, motorcycle", False),
+        ("If the yellow bottle falls, will it land on the motorcycle?", "yellow bottle, motorcycle, shelf", False),
+        ("If the blue can slides to the left, will it hit the yellow bottle?", "blue can, yellow bottle, shelf", True),
+        ("If the red bin slides to the left, will it hit the motorcycle?", "red bin, motorcycle, shelf", False),
+    ),
+    "coffee.png": (
+        ("If the cup slides to the left, will it fall off the saucer?", "cup, saucer, spoon", True),
+        ("If the cup slides to the right, will it hit the spoon?", "cup, saucer, spoon", True),
+        ("If the spoon slides to the right, will it hit the cup?", "spoon, cup, saucer", False),
+    ),
+    "astronaut.png": (
+        ("If the space shuttle falls, will it land on the helmet?", "space shuttle, helmet, astronaut", False),
+        ("If the space shuttle slides to the left, will it hit the astronaut?", "space shuttle, astronaut", False),
+    ),
+    "camera.png": (
+        ("If the man walks to the right, will he hit the tower?", "man, tower, tripod", False),
+        ("If the man walks to the right, will he hit the tripod?", "man, tripod", True),
+    ),
+    "rocket.jpg": (("If the rocket falls over to the right, will it hit the tower?", "rocket, tower", None),),
+    "coins.png": (
+        ("If the top left coin slides to the right, will it hit the large coin?", "top left coin, large coin", False),
+    ),
+    "bear.jpg": (("If the bear walks to the right, will it hit the rock?", "bear, rock", None),),
+}  # fmt: skip
 
 
 def find_pictures(folders: list[Path]) -> dict[str, Path]:
@@ -84,15 +85,21 @@ def find_pictures(folders: list[Path]) -> dict[str, Path]:
     return {name: folder / name for folder in reversed(folders) for name in BOXES if (folder / name).is_file()}
 
 
-def ask(service: Service, question: Question, picture: Path) -> dict[str, Any]:
+def ask(service: Service, picture: Path, question: str, names: str, truth: bool | None) -> dict[str, Any]:
     """The verdict on a question, and the camera that it was seen with."""
     mime = "jpeg" if picture.suffix == ".jpg" else "png"
-    boxes = [{"object": name, "bbox": BOXES[question.picture][name]} for name in question.objects]
+    boxes = [{"object": name, "bbox": BOXES[picture.name][name]} for name in names.split(", ")]
     body = {
         "image": f"data:image/{mime};base64,{base64.b64encode(picture.read_bytes()).decode()}",
-        "question": question.text, "video": False, "grounding": boxes[0], "objects": boxes[1:],
+        "question": question, "video": False, "grounding": boxes[0], "objects": boxes[1:],
     }  # fmt: skip
-    row: dict[str, Any] = {**asdict(question), "probability": None, "sure": False}
+    row: dict[str, Any] = {
+        "picture": picture.name,
+        "question": question,
+        "truth": truth,
+        "probability": None,
+        "sure": False,
+    }
     try:
         result = service.simulate(SimulateRequest.model_validate(body))
     except CowError as error:
@@ -122,7 +129,7 @@ def main() -> int:
     arguments = parser.parse_args()
     pictures = find_pictures(arguments.folders)
     with tempfile.TemporaryDirectory() as data, Service(Settings(data_dir=Path(data))) as service:
-        rows = [ask(service, each, pictures[each.picture]) for each in QUESTIONS if each.picture in pictures]
+        rows = [ask(service, pictures[name], *each) for name in pictures for each in QUESTIONS[name]]
     table = Table("picture", "question", "truth", "p", "sure", "depends on", "camera")
     for row in rows:
         camera = f"{row['pitch']:.0f} ± {row['pitch_deviation']:.0f} {row['source']}" if "pitch" in row else ""
@@ -130,11 +137,11 @@ def main() -> int:
         if is_sure_and_wrong(row):
             probability += " wrong"
         told = str(row["truth"]), probability, str(row["sure"]), " ".join(row.get("depends_on", ())), camera
-        table.add_row(row["picture"], row["text"], *told)
+        table.add_row(row["picture"], row["question"], *told)
     console = Console(width=200)
     console.print(table)
     for row in rows:
-        console.print(row["text"], *(f"\n  - {warning}" for warning in row["warnings"]))
+        console.print(row["question"], *(f"\n  - {warning}" for warning in row["warnings"]))
     verdicts = sum(row["probability"] is not None for row in rows)
     console.print(f"{len(rows)} questions, {verdicts} verdicts, {sum(map(is_sure_and_wrong, rows))} sure and wrong")
     if arguments.json is not None:

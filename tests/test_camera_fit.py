@@ -13,7 +13,7 @@ from floors import TrueCamera, outline
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import MEASUREMENT_SIGMA, CameraFit, Standing, fit_shadow, narrowed, prior
 from cow_service.physics.draws import ensemble
-from cow_service.physics.layout import Cameras
+from cow_service.physics.lift import Cameras
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion
 from cow_service.vision.edges import divide, find_segments

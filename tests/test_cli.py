@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from drawn import ball, block, floor, png_bytes
+from floors import TrueCamera, depth_png
 from PIL import Image, ImageSequence
 from typer.testing import CliRunner
 
@@ -195,6 +196,7 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         ([QUESTION, "--distance", "-5"], 1, "motion.distance: Input should be greater than 0, got -5"),
         ([QUESTION, "--kind", "projectile"], 1, "needs a `direction`"),
         ([QUESTION, "--object", "x"], 1, "goes with --point, --box or --trajectory"),
+        ([QUESTION, "--depth-scale", "0.001"], 1, "--depth-scale goes with --depth"),
         ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: ati, cutout,"),
         ([QUESTION, "--option", "steps"], 1, "--option takes NAME=VALUE"),
         ([QUESTION, "--option", "steps=4"], 1, "/generator_options/steps"),
@@ -280,6 +282,16 @@ def test_a_setting_that_is_not_json_is_named(tmp_path: Path) -> None:
     assert result.returncode == 2
     assert "COW_CHECKPOINTS is not JSON" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_a_depth_map_is_a_file(tmp_path: Path, picture: Path) -> None:
+    (tmp_path / "depth.png").write_bytes(depth_png(TrueCamera().depth()))
+    given = ("--depth", "depth.png", "--depth-scale", "0.001", "--num-frames", "9", "--out", "out")
+    result = cow(tmp_path, "simulate", str(picture), QUESTION, *given)
+    assert result.returncode == 0, result.stderr
+    told = Simulation.model_validate_json((tmp_path / "out" / "simulation.json").read_text()).trajectory
+    assert told.camera is not None
+    assert (told.camera.source, round(told.camera.height, 1)) == ("depth", 1.5)
 
 
 def test_options_have_the_defaults_of_the_fields() -> None:

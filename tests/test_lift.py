@@ -16,7 +16,8 @@ from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.events import seen_paths
-from cow_service.physics.layout import BOX_SIDE, Cameras, above, in_the_air, lay_out
+from cow_service.physics.layout import BOX_SIDE, lay_out
+from cow_service.physics.lift import Cameras, above, in_the_air
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import MetresPerPixel, Motion, ObjectPrior
 from cow_service.vision.masks import CroppedMask

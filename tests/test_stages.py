@@ -284,7 +284,7 @@ def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> N
     x0, y0, x1, y1 = grounded(scene, **POINT).bbox
     radius, gravity = (x1 - x0 + y1 - y0) / 4, thrown.gravity[1]
     assert thrown.speed**2 / (gravity * radius) == pytest.approx(1.8**2 / (9.81 * 0.15))
-    assert (thrown.law, thrown.speed_deviation, thrown.depth_deviation) == ("contact", 0.28, 30)
+    assert (thrown.law, thrown.speed_deviation, thrown.depth_deviation) == ("contact", 0.28, 20)
     assert moved(scene, direction=(1, 0), kind="projectile", depth=0.0).depth_deviation == 0, "its depth is given"
     ballistic = moved(scene, direction=(1, 0), kind="projectile", law="ballistic")
     assert (ballistic.law, ballistic.speed) == ("ballistic", pytest.approx(0.26 * 640))
@@ -306,7 +306,7 @@ def test_what_a_reader_leaves_open_of_a_motion(scene: Scene) -> None:
     slow = read_as(scene, MotionReading("linear", (1, 0), "text", speed="slow"))
     assert (slow.speed, slow.speed_deviation) == (pytest.approx(0.13 * 640), 0.25)
     thrown = read_as(scene, MotionReading("projectile", (1, 0), "text", down=(0.6, 0.8)))
-    assert (thrown.down, thrown.depth_deviation) == ((0.6, 0.8), 30)
+    assert (thrown.down, thrown.depth_deviation) == ((0.6, 0.8), 20)
     fast = read_as(scene, MotionReading("projectile", (1, 0), "text", speed="fast", depth_deviation=30.0))
     assert (fast.speed / thrown.speed, fast.depth_deviation) == (pytest.approx(2), 30)
     assert read_as(scene, fall := MotionReading("fall", None, "gravity")).speed_deviation == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Callable, Generator
@@ -162,6 +163,10 @@ def request_body(
         ),
     ] = None,
     ensemble: Annotated[int, option("How many worlds the probabilities are counted in; 0: none.")] = 50,
+    depth: Annotated[Path | None, option("Depth map of the image: a grey PNG with 16 bits.", **EXISTING)] = None,
+    depth_scale: Annotated[
+        float | None, option("Metres per unit of the depth map.", shown="none: relative depth")
+    ] = None,
     trajectory: Annotated[Path | None, option("JSON with the `trajectory` of a request.", **EXISTING)] = None,
     fields: Annotated[
         str | None,
@@ -201,6 +206,8 @@ def request_body(
                 value = _numbers(f"--{option_name}", value, _NUMBERS[option_name])
             body.setdefault(record, {})[field] = value
     body["frames"]["max_side"] = max_side or None
+    if depth is not None or depth_scale is not None:
+        body["depth"] = _depth_map(depth, depth_scale)
     if trajectory is not None:
         body["trajectory"] = object_in(read_file(trajectory), trajectory.name)
     if body.get("grounding", {}).keys() == {"object"}:
@@ -275,6 +282,13 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
         example = {"--direction": "-1,0 for to the left (x right, y down)"}.get(option, "10,20,90,140"[: 4 * count - 3])
         raise InvalidRequest(f"{option} takes {count} numbers with commas between, such as {example}; got '{text}'.")
     return values
+
+
+def _depth_map(path: Path | None, scale: float | None) -> dict[str, object]:
+    """The `depth` of a request, by the file of a map."""
+    if path is None:
+        raise InvalidRequest("--depth-scale goes with --depth.")
+    return {"map": f"data:image/png;base64,{base64.b64encode(read_file(path)).decode()}", "scale": scale}
 
 
 def _placement(text: str) -> dict[str, object]:

@@ -44,9 +44,21 @@ class SeenBody:
     point: Point | None = None  # px: of the mover, the one it was grounded at
 
     @property
+    def is_depth_known(self) -> bool:
+        """Whether its shape tells how deep it is along the line of sight: bricks and boxes have any depth."""
+        said = self.prior
+        is_any_box = said is not None and said.shape == "box" and not (said.equal_sided or said.elongated)
+        return self.is_form_known and not is_any_box
+
+    @property
     def start(self) -> Point:
         """Where its path begins, px: the point it was grounded at, else the middle of its box."""
-        return self.point or ((self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2)
+        return self.point or self.middle_point
+
+    @property
+    def middle_point(self) -> Point:
+        """The middle of its box, px."""
+        return (self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2
 
     @property
     def radius(self) -> float:

@@ -300,8 +300,10 @@ def narrowed(
 
 
 def _doubted(logs: Floats) -> Floats:
-    """Log likelihoods [K] of the edges of one thing, where they may fit a camera by chance: masts taper, things lean."""
-    return np.logaddexp(logs + math.log(1 - BY_CHANCE), logs.max() + math.log(np.exp(logs - logs.max()).mean() * BY_CHANCE))
+    """Log likelihoods [K] of the edges of a thing, which may fit a camera by chance: masts taper, and things lean."""
+    return np.logaddexp(
+        logs + math.log(1 - BY_CHANCE), logs.max() + math.log(np.exp(logs - logs.max()).mean() * BY_CHANCE)
+    )
 
 
 def _far_end(floor: Floats, above: float, width: int) -> Floats | None:

@@ -154,6 +154,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
     answer, _ = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
     agrees = np.array([found == answer for found in answers])
     misread = np.zeros(len(agrees), bool) if events.misread is None else events.misread
+    misplaced: list[Doubt] = ["place"] if misread.mean() > MATTERS else []
     probability = shown = float(np.where(misread, 0.5, agrees).mean())  # what was misread tells neither way
     times = _happens(query, events)
     times = times[np.isfinite(times)]
@@ -164,7 +165,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
         probability=shown,
         sure=probability >= SURE,
         robust=probability >= ROBUST,
-        depends_on=tuple(dict.fromkeys([*(["place"] if misread.mean() > MATTERS else []), *_depends_on(agrees, draws)]))[:MOST_NAMED],
+        depends_on=tuple(dict.fromkeys([*misplaced, *_depends_on(agrees, draws)]))[:MOST_NAMED],
         first=answer if asked.form in FIRST_MET and answer >= 0 else None,
         count=answer if asked.form == "how-many" else None,
         time=float(np.median(times)) if len(times) else None,

@@ -37,16 +37,16 @@ EDGE = 5  # px across: at outlines depths are those of neither side
 SMOOTHED = 2.5  # px: standard deviation over which the depths of a body are averaged
 TRIM = 2.0  # percent of the points at either end that are left out
 FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
-LEAST_TOP = 10  # px that a top half as deep as wide would fill: then, too
 TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
 AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
 ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
 ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
-RAISED = 0.2  # of the pixels of a thing are nearer than the floor behind it
 BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
 SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
 LEAST_PART = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
 AT_FOOT = 0.15  # of the distance of a body's foot: so far from it may begin what stands there
+LEAST_TOP = 4  # edges that outlines lose: a top that would fill more if it were half as deep as wide shows its depth
+RAISED = 0.2  # of the pixels of a thing are nearer than the floor behind it
 
 
 @dataclass(frozen=True)
@@ -332,73 +332,72 @@ def _footprint(
     if body.shape != "sphere":
         rays = _rays(x + mask.columns.start, y + mask.rows.start, width, height, focal)
         spots = floor.coordinates(rays * depth[mask.rows, mask.columns][there][:, None])
-        there[y, x] = _of_one_thing(body, spots, (height, width), focal, floor, deviation)
+        there[y, x] = _of_one_thing(body, spots, (width, height), focal, floor, deviation)
         y, x = np.nonzero(there)
     # The noise of single pixels would make a body larger: what is seen of it is smoothed, without what is around.
     inverse = np.where(there, 1 / np.where(there, depth[mask.rows, mask.columns], 1.0), 0.0)
     z = blurred(there.astype(np.float64))[y, x] / blurred(inverse)[y, x]
     y, x = y + mask.rows.start, x + mask.columns.start
-    rays = _rays(x, y, width, height, focal)
-    edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
     if body.shape == "sphere":
-        x0, y0, x1, y1 = body.bbox
-        radius = body.radius / focal
-        near = np.hypot(x + 0.5 - (x0 + x1) / 2, y + 0.5 - (y0 + y1) / 2) < body.radius / 3
+        near = np.hypot(x + 0.5 - body.middle_point[0], y + 0.5 - body.middle_point[1]) < body.radius / 3
         front = float(np.median(z[near] if near.any() else z))
-        middle = front / max(1 - radius, 0.1)
-        ray = _rays(np.array([(x0 + x1 - 1) / 2]), np.array([(y0 + y1 - 1) / 2]), width, height, focal)
-        # Where it may as well touch the floor it does: then the floor tells its depth more exactly.
-        sink = radius - float(ray[0] @ floor.axes[1])
-        if sink > HORIZON and abs(floor.height / sink / middle - 1) < TOUCHES + deviation:
-            middle = floor.height / sink
-        across, up, ahead = floor.coordinates(ray * middle)[0].tolist()
-        half = radius * middle
-        return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, share)
-    right, up, ahead = floor.coordinates(rays * z[:, None]).T
-    bottom, top = (float(value) for value in np.percentile(up, (TRIM, 100 - TRIM)))
-    sight = math.atan2(float(np.median(ahead)), float(np.median(right)))
-    from_above = (floor.height - top) / math.hypot(float(np.median(right)), float(np.median(ahead)), floor.height)
-    near_end = float(np.percentile(np.hypot(right, ahead), TRIM))
-    behind = 1 / near_end - 1 / (near_end + float(np.ptp(np.percentile(right, (TRIM, 100 - TRIM)))) / 2)
-    seen = from_above > FROM_ABOVE or focal * (floor.height - top) * behind > LEAST_TOP
-    if body.is_form_known and body.shape in ("cylinder", "cone"):
-        yaw = sight - math.pi / 2
-    else:
-        spots = np.stack([right, ahead], axis=1)
-        _, sides, degrees = cv2.minAreaRect(np.asarray(_core(spots), np.float32))
-        yaw = math.radians(degrees)
+        return _ball(body, front, (width, height), focal, floor, deviation, share)
+    points = floor.coordinates(_rays(x, y, width, height, focal) * z[:, None])
+    edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
+    return _upright(body, points, edge, floor, deviation, share)
+
+
+def _ball(
+    body: SeenBody, front: float, size: tuple[int, int], focal: float, floor: Floor, deviation: float, share: float
+) -> Footprint:
+    """Of a ball whose nearest point has a depth, in an image of a size (width, height; px)."""
+    radius, (x, y) = body.radius / focal, body.middle_point
+    depth = front / max(1 - radius, 0.1)
+    ray = _rays([x - 0.5], [y - 0.5], *size, focal)
+    # Where it may as well touch the floor it does: then the floor tells its depth more exactly.
+    sink = radius - float(ray[0] @ floor.axes[1])
+    if sink > HORIZON and abs(floor.height / sink / depth - 1) < TOUCHES + deviation:
+        depth = floor.height / sink
+    across, up, ahead = floor.coordinates(ray * depth)[0].tolist()
+    half = radius * depth
+    return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, share)
+
+
+def _upright(body: SeenBody, points: Floats, edge: float, floor: Floor, deviation: float, share: float) -> Footprint:
+    """Of a body with points [N, 3] over the floor, whose outline lost an edge."""
+    is_round = body.is_form_known and body.shape in ("cylinder", "cone")
+    right, ahead = (float(value) for value in np.median(points[:, [0, 2]], axis=0))
+    bottom, top = (float(value) for value in np.percentile(points[:, 1], (TRIM, 100 - TRIM)))
+    across = math.atan2(ahead, right) - math.pi / 2  # the direction across the line of sight
+    yaw = across
+    if not is_round:
+        _, sides, degrees = cv2.minAreaRect(np.asarray(_core(points[:, [0, 2]]), np.float32))
         # Of its two sides the one that lies across the line of sight.
-        yaw += math.pi / 2 * round((sight - math.pi / 2 - yaw) / (math.pi / 2))
-        yaw = yaw if max(sides) > 0 else sight - math.pi / 2
+        turned = math.radians(degrees)
+        yaw = turned + math.pi / 2 * round((across - turned) / (math.pi / 2)) if max(sides) > 0 else across
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    along = np.stack([right, ahead], axis=1) @ turn.T
-    (left, near), (far_right, far) = np.percentile(along, (TRIM, 100 - TRIM), axis=0)
-    half_width, half_depth = (far_right - left) / 2 + edge, (far - near) / 2
-    middle = np.array([(left + far_right) / 2, (near + far) / 2])
-    if body.is_form_known and body.shape in ("cylinder", "cone"):
-        half_depth, seen = half_width, True
-        middle[1] = near + half_width
-    x_, z_ = middle @ turn
-    low = max(0.0, bottom) if body.prior is not None and body.prior.stands_on == "air" else 0.0
-    tall = max((top + edge - low) / 2, 1e-6)
-    return Footprint(
-        body.shape if body.is_form_known else "box",
-        (float(x_), low + tall, float(z_)),
-        float(half_width),
-        float(half_depth),
-        tall,
-        yaw,
-        bottom,
-        seen,
-        deviation,
-        share,
-    )
+    low, high = np.percentile(points[:, [0, 2]] @ turn.T, (TRIM, 100 - TRIM), axis=0)
+    half_width, half_depth = ((high - low) / 2).tolist()
+    half_width += edge
+    if is_round:
+        half_depth = half_width
+        high[1] = low[1] + 2 * half_width
+    x, z = ((low + high) / 2 @ turn).tolist()
+    distance = math.hypot(right, ahead, floor.height)
+    near_end = float(np.percentile(np.hypot(points[:, 0], points[:, 2]), TRIM))
+    recedes = distance * (1 / near_end - 1 / (near_end + half_width))  # of a top half as deep as wide
+    is_seen = (floor.height - top) / distance > FROM_ABOVE or (floor.height - top) * recedes > LEAST_TOP * edge
+    foot = max(0.0, bottom) if body.is_flying else 0.0
+    tall = max((top + edge - foot) / 2, 1e-6)
+    shape = body.shape if body.is_form_known else "box"
+    is_seen = is_seen or is_round
+    return Footprint(shape, (x, foot + tall, z), half_width, half_depth, tall, yaw, bottom, is_seen, deviation, share)
 
 
 def _of_one_thing(
-    body: SeenBody, points: Floats, size: tuple[int, ...], focal: float, floor: Floor, deviation: float
+    body: SeenBody, points: Floats, size: tuple[int, int], focal: float, floor: Floor, deviation: float
 ) -> Mask:
-    """Which [N] of the points [N, 3] that the outline of a body shows are its own, in an image of a size (rows, columns).
+    """Which [N] of the points [N, 3] in the outline of a body are its own; `size` is the image's (width, height; px).
 
     An outline also holds what is seen through the gaps of a thing, and one that was cut by colour holds parts of what
     stands in front or behind. Gaps in depth divide these: the body is the part where its foot is, else the largest one.
@@ -413,7 +412,7 @@ def _of_one_thing(
     part = np.where(is_gap, 0, np.cumsum(np.diff(np.where(is_gap, 0, 1), prepend=0) > 0))[place]  # 0: in a gap
     parts = [part == number for number in range(1, int(part.max(initial=0)) + 1)]
     parts = [each for each in parts if each.mean() > LEAST_PART]
-    down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], size[1], size[0], focal)[0] @ floor.axes.T
+    down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], *size, focal)[0] @ floor.axes.T
     foot = floor.height * math.hypot(down[0], down[2]) / max(down[1], HORIZON)
 
     def fit(own: Mask) -> tuple[bool, int]:

@@ -291,9 +291,11 @@ def classify(
         clearance = (free - 2 * half) / max(free, 1e-3 * half)
     here, overlaps = released[body], clearance < 0
     for other in (*lying[:body], *lying[body + 1 :]):
-        away = math.hypot(*(here.position[i] - other.position[i] for i in (0, 2)))
+        right, ahead = (here.position[i] - other.position[i] for i in (0, 2))
+        away = max(math.hypot(right, ahead), 1e-9)
+        reach = _reach(here, right / away, ahead / away) + _reach(other, right / away, ahead / away)
         level = abs(here.position[1] - other.position[1]) < here.half_height + other.half_height
-        overlaps |= level and away < here.half_width + other.half_width - OVERLAPPING * here.half_width
+        overlaps |= level and away < reach - OVERLAPPING * here.half_width
     if overlaps:
         return "overlaps", clearance, math.nan
     tips = released[body].shape != "sphere" and _upright(run.turns[body, -1]) < TIPPED

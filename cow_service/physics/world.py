@@ -15,7 +15,8 @@ from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import RigidShape, WorldRun, run_worlds
 from cow_service.physics.geometry import Measurement
-from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out, speed_factors
+from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out
+from cow_service.physics.lift import speed_factors
 from cow_service.physics.placement import (
     CARRIED,
     MOST_CARRIED,
@@ -190,7 +191,7 @@ class _Draw:
             if body.yaw is not None:
                 side, turn = half, -body.yaw
                 deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
-            elif not seen.is_form_known:  # it shows its width, which nothing says is that of something round
+            elif not seen.is_depth_known:  # it shows its width, which nothing says is that of something round
                 shape, side, turn = "box", half, math.atan2(x, z)
                 deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
             rigid = RigidShape(

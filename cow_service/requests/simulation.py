@@ -216,7 +216,7 @@ class MotionRequest(Record):
     )
     depth_deviation: Annotated[Finite, Field(ge=0, le=90)] | None = Field(
         default=None,
-        description="See `Motion.depth_deviation`; by default 30 for a throw without `depth`, else 0: what is given is "
+        description="See `Motion.depth_deviation`; by default 20 for a throw without `depth`, else 0: what is given is "
         "taken as it is.",
     )
     speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(

@@ -26,7 +26,7 @@ from cow_service.vision.shadows import find_shadow
 from cow_service.vision.trails import trail_of
 
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
-THROW_DEPTH_DEVIATION = 30.0  # degrees: words and arrows tell a throw's heading in the image alone
+THROW_DEPTH_DEVIATION = 20.0  # degrees: words and arrows tell a throw's heading in the image alone
 SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.28}  # of the logarithm of a default speed
 SPEED_FACTORS: dict[SpeedWord, float] = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
 SCALE_DEVIATION = 0.25  # of the logarithm of metres per pixel, where nobody gave them
