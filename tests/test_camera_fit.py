@@ -266,6 +266,12 @@ class TestEdges:
         above = math.degrees(math.atan2(98, 640 * math.exp(fit.mean[1])))
         assert above < math.degrees(fit.mean[0]) < above + 20
 
+    def test_one_mast_is_no_measurement(self) -> None:
+        """Its sides lean to each other as uprights do that are looked down on, and it may as well taper."""
+        ends = [[300 + s * x, 60.0, 300 + s * x * 0.72, 380.0] for s in (-1, 1) for x in (60.0, 50.0, 40.0)]
+        fit = narrowed(prior(), [Standing((240.0, 60.0, 360.0, 380.0), segments=np.array(ends))], SIZE)
+        assert math.degrees(math.sqrt(fit.covariance[0, 0])) > 0.5 * math.degrees(math.sqrt(prior().covariance[0, 0]))
+
     def test_random_lines_leave_the_camera_in_doubt(self) -> None:
         rng = np.random.default_rng(2)
         for _ in range(10):

@@ -105,6 +105,18 @@ class TestFootprints:
         assert one is not None
         assert one.centre[2] == pytest.approx(CAMERA.on_floor((220, 290))[1], rel=0.02)  # type: ignore[index]
 
+    def test_what_is_seen_through_a_thing_or_beside_it_is_no_part_of_it(self) -> None:
+        depth = CAMERA.depth([NEAR])
+        found = find_floor(DepthMap(depth, 1.0, 0.01, 640), 640, [body(NEAR).mask])
+        assert found is not None
+        for columns in (slice(215, 225), slice(212, 240)):  # a gap of a quarter; most of a box that was cut badly
+            seen = depth.copy()
+            seen[NEAR[1] : NEAR[3], columns] = 2 * np.nanmin(depth[NEAR[1] : NEAR[3], NEAR[0] : NEAR[2]])
+            one = measure(DepthMap(seen, 1.0, 0.01, 640), 640, found, [body(NEAR, is_form_known=False)])[0]
+            assert one is not None
+            assert one.centre[2] == pytest.approx(CAMERA.on_floor((220, 290))[1], rel=0.03)  # type: ignore[index]
+            assert one.half_depth < 0.2 * one.half_height
+
     def test_of_a_hole_nothing_is_told(self) -> None:
         depth = CAMERA.depth([NEAR])
         depth[NEAR[1] : NEAR[3], NEAR[0] : NEAR[2]] = np.nan

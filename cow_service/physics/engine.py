@@ -78,13 +78,6 @@ class RigidShape:
         low, top = self.position[1] - self.half_height, other.position[1] + other.half_height
         return abs(low - top) < RESTS * min(self.half_height, other.half_height)
 
-    def is_under(self, other: RigidShape) -> bool:
-        """Whether the middle of another body lies over it."""
-        right, ahead = other.position[0] - self.position[0], other.position[2] - self.position[2]
-        along = right * math.cos(self.yaw) - ahead * math.sin(self.yaw)
-        across = right * math.sin(self.yaw) + ahead * math.cos(self.yaw)
-        return abs(along) < self.half_width and abs(across) < self.half_depth
-
     def holds_middle_of(self, other: RigidShape) -> bool:
         """Whether the middle of another body lies inside it, if it stands upright."""
         right, up, ahead = (there - here for there, here in zip(other.position, self.position, strict=True))

@@ -154,7 +154,9 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
     answer, _ = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
     agrees = np.array([found == answer for found in answers])
     misread = np.zeros(len(agrees), bool) if events.misread is None else events.misread
-    misplaced: list[Doubt] = ["place"] if misread.mean() > MATTERS else []
+    depends: list[Doubt] = list(_depends_on(agrees, draws))
+    if misread.mean() > MATTERS:
+        depends = ["place", *(doubt for doubt in depends if doubt != "place")]
     probability = shown = float(np.where(misread, 0.5, agrees).mean())  # what was misread tells neither way
     times = _happens(query, events)
     times = times[np.isfinite(times)]
@@ -165,7 +167,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
         probability=shown,
         sure=probability >= SURE,
         robust=probability >= ROBUST,
-        depends_on=tuple(dict.fromkeys([*misplaced, *_depends_on(agrees, draws)]))[:MOST_NAMED],
+        depends_on=tuple(depends[:MOST_NAMED]),
         first=answer if asked.form in FIRST_MET and answer >= 0 else None,
         count=answer if asked.form == "how-many" else None,
         time=float(np.median(times)) if len(times) else None,

@@ -251,12 +251,13 @@ def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats,
 
 def _is_misread(shapes: Sequence[RigidShape], run: WorldRun, layout: Layout) -> bool:
     """Whether the mover of a world began where no picture shows one: inside another body, or beside what carries it."""
-    mover, supports = shapes[0], layout.supports
+    mover, on, supports = shapes[0], layout.supports[0], layout.supports
     if mover.is_ghostly or layout.put or not mover.is_active or any(shape.pieces for shape in shapes):
         return False  # drawings show what touches
-    on = supports[0]
-    if on is not None and not shapes[on].is_under(mover):
-        return True
+    if on is not None:
+        away = np.array(mover.position) - shapes[on].position
+        if math.hypot(away[0], away[2]) > max(shapes[on].half_width, shapes[on].half_depth):
+            return True
     met = {each.b for each in run.meetings if each.a == 0 and each.b is not None and each.time < AT_START}
     return any(each != on and supports[each] != 0 for each in met)
 

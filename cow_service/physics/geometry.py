@@ -384,9 +384,9 @@ def _upright(body: SeenBody, points: Floats, edge: float, floor: Floor, deviatio
         high[1] = low[1] + 2 * half_width
     x, z = ((low + high) / 2 @ turn).tolist()
     distance = math.hypot(right, ahead, floor.height)
-    near_end = float(np.percentile(np.hypot(points[:, 0], points[:, 2]), TRIM))
-    recedes = distance * (1 / near_end - 1 / (near_end + half_width))  # of a top half as deep as wide
-    is_seen = (floor.height - top) / distance > FROM_ABOVE or (floor.height - top) * recedes > LEAST_TOP * edge
+    near = max(float(low[1]), edge)
+    shown = (floor.height - top) * (distance / near - distance / (near + half_width))  # of a top half as deep as wide
+    is_seen = (floor.height - top) / distance > FROM_ABOVE or shown > LEAST_TOP * edge
     foot = max(0.0, bottom) if body.is_flying else 0.0
     tall = max((top + edge - foot) / 2, 1e-6)
     shape = body.shape if body.is_form_known else "box"
@@ -402,9 +402,8 @@ def _of_one_thing(
     An outline also holds what is seen through the gaps of a thing, and one that was cut by colour holds parts of what
     stands in front or behind. Gaps in depth divide these: the body is the part where its foot is, else the largest one.
     """
-    (x0, y0, x1, y1), away = body.bbox, np.hypot(points[:, 0], points[:, 2])
+    (x0, y0, x1, y1), away, steps = body.bbox, np.hypot(points[:, 0], points[:, 2]), 4  # of a gap
     middle = float(np.median(away))
-    steps = 4  # of the gap
     step = max(BREAK * max(x1 - x0, y1 - y0) * middle / focal, 3 * deviation * middle) / steps
     place = (np.clip(away - away.min(), 0, FARTHEST * middle) / step).astype(int)
     shares = np.bincount(place, minlength=steps) / len(away)

@@ -18,7 +18,7 @@ from cow_service.vision.types import Floats
 
 SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
 FOOT_SIGMA = 0.02  # of a body's height in the image: where it meets the floor
-LEAST_FOOT = 0.002  # of the longer side of the image: no box is more exact
+LEAST_FOOT = 0.002  # of the width of the image: no box is more exact
 CUT = 0.3  # of the height of a body that the lower border of the image cuts off: how far it reaches beyond
 SLIMMEST, TALLEST = 0.2, 12.0  # half heights, in half widths
 
@@ -138,11 +138,8 @@ def above(
         z = height / np.maximum(sink, HORIZON)
         half = z * radius / cameras.focal
         return LiftedBody(shape, cameras.coordinates(rays * z[:, None]), half, half, True)
-    off = draws[:, COLUMN["foot"]]
-    if y1 > cameras.height_px - 1:
-        foot = y1 + CUT * (y1 - y0) * np.abs(off)
-    else:
-        foot = y1 + max(FOOT_SIGMA * (y1 - y0), LEAST_FOOT * max(cameras.width, cameras.height_px)) * off
+    off, sigma = draws[:, COLUMN["foot"]], max(FOOT_SIGMA * (y1 - y0), LEAST_FOOT * cameras.width)
+    foot = y1 + (sigma * off if y1 <= cameras.height_px - 1 else CUT * (y1 - y0) * np.abs(off))
     rays = cameras.rays(np.stack([np.full(len(foot), (x0 + x1) / 2), foot], axis=1))
     if not (-rays[0, 1] > HORIZON and height[0] > 0):  # the likeliest ray meets the plane at no sane distance
         return None

@@ -192,7 +192,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
     for seen in (first, *situation.obstacles, *situation.removed):
         thing = located.get(seen.bbox) if bodies else mover
         said, region = None if thing is None else thing.prior, scene.region_of(seen.bbox)
-        if carrier is not None and same_name(seen.name, carried):
+        if carrier and same_name(seen.name, carried) and (said is None or said.stands_on is None):
             said = (said or ObjectPrior()).model_copy(update={"stands_on": carrier})
         body = SeenBody(
             name=seen.name,
