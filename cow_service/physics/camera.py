@@ -121,7 +121,6 @@ OUT_OF_SIGHT = 50.0  # what a foot above the horizon costs: no such camera is le
 FAR_END = 0.3  # of the image's width: a level line so long above all things is the far end of the floor, as a rule
 FAR_END_SLOPE = 0.35
 FAR_END_SIGMA, FAR_END_SEEN = 0.2, 0.75  # of the sine of the angle below the horizon; share of such lines that are it
-BY_CHANCE = 0.2  # of the things whose edges fit some camera: they fit another one than that of the image
 NARROWED = 0.5  # of the deviation of the pitch before: from here on it was measured
 ROLL_SIGMA = math.radians(1.0)
 HEIGHT_RADII, HEIGHT_SIGMA = 5.0, 0.6  # above the floor of what is in the air, in its radii; of the logarithm
@@ -280,9 +279,9 @@ def narrowed(
             off = ((y1 - y0) / (x1 - x0) - heights) / CUBE_SIGMA
             fits += np.log(np.exp(-0.5 * off**2).mean(axis=1) + CUBE_AMISS)
         if len(thing.segments) and thing.shape != "sphere":
-            fits += _doubted(views.explain(Segments.of(thing.segments, size), thing.bbox, thing.shape, size))
+            fits += views.explain(Segments.of(thing.segments, size), thing.bbox, thing.shape, size)
     if len(floor) > 1:
-        fits += _doubted(views.explain(Segments.of(floor, size), None, None, size))
+        fits += views.explain(Segments.of(floor, size), None, None, size)
     end = _far_end(floor, float(boxes[:, 3].min(initial=size[1])), size[0])
     if end is not None:
         down = sinks(end[None])[:, 0]
@@ -297,13 +296,6 @@ def narrowed(
     covariance[:2, :2] = np.cov(found, aweights=weight, ddof=0) + between
     is_measured = fit.source == "prior" and covariance[0, 0] < (NARROWED * sigma[0]) ** 2
     return replace(fit, mean=mean, covariance=covariance, source="edges" if is_measured else fit.source)
-
-
-def _doubted(logs: Floats) -> Floats:
-    """Log likelihoods [K] of the edges of a thing, which may fit a camera by chance: masts taper, and things lean."""
-    return np.logaddexp(
-        logs + math.log(1 - BY_CHANCE), logs.max() + math.log(np.exp(logs - logs.max()).mean() * BY_CHANCE)
-    )
 
 
 def _far_end(floor: Floats, above: float, width: int) -> Floats | None:

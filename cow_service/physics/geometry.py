@@ -414,11 +414,11 @@ def _of_one_thing(
     down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], *size, focal)[0] @ floor.axes.T
     foot = floor.height * math.hypot(down[0], down[2]) / max(down[1], HORIZON)
 
-    def fit(own: Mask) -> tuple[bool, int]:
-        begins = float(np.percentile(away[own], TRIM))
-        return abs(begins / foot - 1) < AT_FOOT + deviation, int(np.count_nonzero(own))
-
-    return max(parts, key=fit, default=np.ones(len(away), bool))
+    begins = [float(np.percentile(away[each], TRIM)) for each in parts]
+    fits = [
+        (abs(start / foot - 1) < AT_FOOT + deviation, each.sum()) for start, each in zip(begins, parts, strict=True)
+    ]
+    return parts[fits.index(max(fits))] if parts else np.ones(len(away), bool)
 
 
 def blurred(values: Floats) -> Floats:
