@@ -64,7 +64,7 @@ class Views:
         return np.stack([x, y], axis=-1) / (np.sqrt(x * x + y * y) + 1e-12)[..., None]
 
     def explain(self, segments: Segments, bbox: BBox | None, shape: Shape | None, size: tuple[int, int]) -> Floats:
-        """Log likelihood [K] of segments of a thing in a box (px), or of what has none, such as the floor; to a constant.
+        """Log likelihood [K], to a constant, of segments of a thing in a box (px), or of what has none, as the floor.
 
         Where its shape is not known, any shape is as likely as another one.
         """
