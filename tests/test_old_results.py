@@ -51,7 +51,7 @@ def test_the_spec_of_an_older_version_is_read() -> None:
     request = {"image": {"artifact": "0" * 64}, "question": "?", "motion": {"direction": [1, 0]}}
     spec = JobSpec(kind="simulate", request=request, reader="embedded", generator="cutout", created_at=str(uuid4()))
     asked = spec.parsed()
-    assert (asked.law, asked.ensemble, spec.masks) == ("contact", 50, [])
+    assert (asked.law, asked.ensemble, spec.attached) == ("contact", 50, [])
     assert asked.stated_motion is not None
     assert asked.stated_motion.stated_kind == "linear"
 

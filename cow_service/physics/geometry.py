@@ -40,6 +40,8 @@ FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it
 TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
 AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
 ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
+GRAIN = 6  # over such a part of the width of an image the errors of depth maps change altogether
+BENT = 0.5  # of its width: with so much doubt of how deep a body is, the map does not tell
 ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
 BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
 SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
@@ -120,6 +122,7 @@ class Footprint:
     bottom: float  # height of its lowest pixels above the floor
     depth_seen: bool  # its top shows how deep it is; else it may be deeper
     deviation: float  # of its depth, relative
+    bend: float  # one standard deviation of how much deeper or less deep the errors of the map make it
     share: float  # of its pixels whose depth is known
 
     @property
@@ -294,7 +297,7 @@ def measure(given: DepthMap, focal: float, floor: Floor, bodies: Sequence[SeenBo
         off = None if body.is_flying else _floor_error(body, smooth, known & ~covered, focal, floor, given.deviation)
         depth, left = (smooth, 1.0) if off is None else (smooth / off, ALIKE)
         deviation = SURE + left * given.deviation
-        found.append(_footprint(body, depth, known, focal, floor, deviation))
+        found.append(_footprint(body, depth, known, focal, floor, deviation, given.deviation))
     return tuple(found)
 
 
@@ -318,9 +321,12 @@ def _floor_error(
 
 
 def _footprint(
-    body: SeenBody, depth: Floats, known: Mask, focal: float, floor: Floor, deviation: float
+    body: SeenBody, depth: Floats, known: Mask, focal: float, floor: Floor, deviation: float, map_deviation: float
 ) -> Footprint | None:
-    """Of one body, by depths [H, W], where they are known [H, W], and how far they are off, relative."""
+    """Of one body, by depths [H, W], where they are known [H, W], and how far off these are, relative.
+
+    `deviation` is that of the body's own depth, which may be known better than all of the map (`map_deviation`).
+    """
     mask, (height, width) = body.mask, depth.shape
     inner = eroded(np.pad(mask.patch, EDGE), EDGE)[EDGE:-EDGE, EDGE:-EDGE]
     inner = inner if np.count_nonzero(inner) >= LEAST_PIXELS else mask.patch
@@ -344,7 +350,9 @@ def _footprint(
         return _ball(body, front, (width, height), focal, floor, deviation, share)
     points = floor.coordinates(_rays(x, y, width, height, focal) * z[:, None])
     edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
-    return _upright(body, points, edge, floor, deviation, share)
+    # The error of the map is another one at the other side of a body, the more the wider that is seen.
+    bend = map_deviation * float(np.median(z)) * (body.bbox[2] - body.bbox[0]) / (width / GRAIN)
+    return _upright(body, points, edge, floor, deviation, bend, share)
 
 
 def _ball(
@@ -360,10 +368,12 @@ def _ball(
         depth = floor.height / sink
     across, up, ahead = floor.coordinates(ray * depth)[0].tolist()
     half = radius * depth
-    return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, share)
+    return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, 0.0, share)
 
 
-def _upright(body: SeenBody, points: Floats, edge: float, floor: Floor, deviation: float, share: float) -> Footprint:
+def _upright(
+    body: SeenBody, points: Floats, edge: float, floor: Floor, deviation: float, bend: float, share: float
+) -> Footprint:
     """Of a body with points [N, 3] over the floor, whose outline lost an edge."""
     is_round = body.is_form_known and body.shape in ("cylinder", "cone")
     right, ahead = (float(value) for value in np.median(points[:, [0, 2]], axis=0))
@@ -379,19 +389,23 @@ def _upright(body: SeenBody, points: Floats, edge: float, floor: Floor, deviatio
     low, high = np.percentile(points[:, [0, 2]] @ turn.T, (TRIM, 100 - TRIM), axis=0)
     half_width, half_depth = ((high - low) / 2).tolist()
     half_width += edge
-    if is_round:
-        half_depth = half_width
+    is_cube = body.prior is not None and body.prior.equal_sided
+    if is_round or is_cube:
+        half_depth, bend = half_width, 0.0
         high[1] = low[1] + 2 * half_width
+    elif bend > BENT * 2 * half_width:  # how deep it is cannot be told from the error
+        half_depth = 0.0
     x, z = ((low + high) / 2 @ turn).tolist()
     distance = math.hypot(right, ahead, floor.height)
     near = max(float(low[1]), edge)
     shown = (floor.height - top) * (distance / near - distance / (near + half_width))  # of a top half as deep as wide
     is_seen = (floor.height - top) / distance > FROM_ABOVE or shown > LEAST_TOP * edge
     foot = max(0.0, bottom) if body.is_flying else 0.0
-    tall = max((top + edge - foot) / 2, 1e-6)
+    tall = half_width if is_cube else max((top + edge - foot) / 2, 1e-6)
     shape = body.shape if body.is_form_known else "box"
-    is_seen = is_seen or is_round
-    return Footprint(shape, (x, foot + tall, z), half_width, half_depth, tall, yaw, bottom, is_seen, deviation, share)
+    is_seen = (is_seen or is_round or is_cube) and half_depth > 0
+    centre = x, foot + tall, z
+    return Footprint(shape, centre, half_width, half_depth, tall, yaw, bottom, is_seen, deviation, bend, share)
 
 
 def _of_one_thing(

@@ -285,6 +285,7 @@ class _Measured(_Picture):
         size = scale * error * np.exp(MEASURED_SIGMA * self.draws[:, COLUMN["size"]])
         centre = cameras.coordinates(cameras.rays(point) * (z * scale * error)[:, None])
         half, tall, deep = footprint.half_width * size, footprint.half_height * size, footprint.half_depth * size
+        deep = np.maximum(deep + footprint.bend / 2 * scale * self.draws[:, COLUMN["base"]], SLIMMEST / 2 * half)
         if not footprint.depth_seen:  # what lies behind is not seen: the body reaches further back than its pixels
             hidden = np.maximum(half * drawn_depths(self.bodies[index], self.draws) - deep, 0.0)
             deep = deep + hidden

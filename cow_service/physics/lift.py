@@ -192,9 +192,9 @@ def velocity_towards(
         return np.zeros((len(draws), 3))
     speed = motion.speed * motion.metres_per_pixel.value * speed_factors(motion, draws, speed_name)
     turn = np.radians(TURN_SIGMA[motion.cue]) * draws[:, COLUMN["turn"]]
-    cosine, sine = np.cos(turn), np.sin(turn)
-    dx, dy = motion.direction
-    direction = np.stack([cosine * dx - sine * dy, sine * dx + cosine * dy], axis=1)
+    # Words such as "to the right" say how it goes over the floor: seen at a low angle, a little in the image is a lot.
+    is_over_floor = motion.cue == "text" and mover.stands and motion.kind == "linear" and not motion.rises
+    direction = _turned(np.tile(motion.direction, (len(draws), 1)), np.zeros_like(turn) if is_over_floor else turn)
     if goal is not None and (mover.stands or motion.kind == "projectile"):
         way = _towards(mover, goal, motion, draws)
     elif motion.kind == "projectile":
@@ -203,9 +203,16 @@ def velocity_towards(
         way = _in_plane(mover, cameras, direction, np.full(len(draws), math.asin(motion.depth)))
     elif mover.stands:
         way = along_floor(mover, motion, cameras, direction)
+        way[:, [0, 2]] = _turned(way[:, [0, 2]], turn if is_over_floor else np.zeros_like(turn))
     else:
         way = _out_of_image(motion, cameras, direction)
     return way * speed[:, None]
+
+
+def _turned(vectors: Floats, angles: Floats) -> Floats:
+    """Vectors [K, 2] turned by angles [K] (radians), from the first axis to the second."""
+    cosine, sine, (x, y) = np.cos(angles), np.sin(angles), vectors.T
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
 
 
 def velocity_in_side_view(
