@@ -266,6 +266,22 @@ class TestEdges:
         above = math.degrees(math.atan2(98, 640 * math.exp(fit.mean[1])))
         assert above < math.degrees(fit.mean[0]) < above + 20
 
+    def test_edges_of_clutter_rarely_pass_for_a_measurement(self) -> None:
+        """Each thing has edges in two directions, such as those of another camera, or of what leans and tapers."""
+        rng, measured = np.random.default_rng(3), 0
+        for _ in range(60):
+            things: list[Standing] = []
+            for _ in range(int(rng.integers(2, 7))):
+                corner, sides = rng.uniform([0, 100], [400, 250]), rng.uniform(60, 150, 2)
+                count = int(rng.integers(3, 12))
+                turn = rng.choice(rng.uniform(0, math.pi, 2), count) + rng.normal(0, 0.03, count)
+                along = np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.sort(rng.uniform(8, 40, count))[::-1, None]
+                middle = corner + sides * rng.uniform(0, 1, (count, 2))
+                bbox = (*corner.tolist(), *(corner + sides).tolist())
+                things.append(Standing(bbox, segments=np.hstack([middle - along, middle + along])))
+            measured += narrowed(prior(), things, SIZE).source == "edges"
+        assert measured < 21
+
     def test_random_lines_leave_the_camera_in_doubt(self) -> None:
         rng = np.random.default_rng(2)
         for _ in range(10):

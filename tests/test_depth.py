@@ -105,6 +105,28 @@ class TestFootprints:
         assert one is not None
         assert one.centre[2] == pytest.approx(CAMERA.on_floor((220, 290))[1], rel=0.02)  # type: ignore[index]
 
+    def test_what_is_seen_through_a_thing_or_beside_it_is_no_part_of_it(self) -> None:
+        depth = CAMERA.depth([NEAR])
+        found = find_floor(DepthMap(depth, 1.0, 0.01, 640), 640, [body(NEAR).mask])
+        assert found is not None
+        for columns in (slice(215, 225), slice(212, 240)):  # a gap of a quarter; most of a box that was cut badly
+            seen = depth.copy()
+            seen[NEAR[1] : NEAR[3], columns] = 2 * np.nanmin(depth[NEAR[1] : NEAR[3], NEAR[0] : NEAR[2]])
+            one = measure(DepthMap(seen, 1.0, 0.01, 640), 640, found, [body(NEAR, is_form_known=False)])[0]
+            assert one is not None
+            assert one.centre[2] == pytest.approx(CAMERA.on_floor((220, 290))[1], rel=0.03)  # type: ignore[index]
+            assert one.half_depth < 0.2 * one.half_height
+
+    def test_a_wide_thing_that_is_looked_down_on_a_little_shows_how_deep_it_is(self) -> None:
+        camera = TrueCamera(pitch=10, focal=640)
+        for box, shows in (((120, 140, 520, 300), True), ((300, 140, 340, 300), False)):
+            given_ = DepthMap(camera.depth([box]), 1.0, 0.01, 640)
+            found = find_floor(given_, 640, [body(box).mask])
+            assert found is not None
+            one = measure(given_, 640, found, [body(box, is_form_known=False)])[0]
+            assert one is not None
+            assert one.depth_seen == shows
+
     def test_of_a_hole_nothing_is_told(self) -> None:
         depth = CAMERA.depth([NEAR])
         depth[NEAR[1] : NEAR[3], NEAR[0] : NEAR[2]] = np.nan

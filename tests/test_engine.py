@@ -64,6 +64,11 @@ class TestOneBody:
         assert np.abs(found.velocities[0] - [1.2, 0, 0.4])[:, [0, 2]].max() < 2e-3
         assert found.positions[0, -1] == pytest.approx([6.0, height, 2.0], abs=0.01)
 
+    def test_what_is_large_and_glides_slowly_goes_on(self) -> None:
+        body = replace(rigid("box", height=0.4, velocity=(0.25, 0, 0), starts=True, glides=True), half_width=0.64)
+        found = run(body, frames=81)
+        assert found.positions[0, -1, 0] == pytest.approx(0.25 * 5, abs=0.02)
+
     def test_a_ball_that_glides_rolls(self) -> None:
         found = run(rigid(velocity=(1.0, 0, 0), starts=True, glides=True), frames=5)
         angle = 2 * np.arccos(np.clip(np.abs(found.turns[0, :, 3]), 0, 1))

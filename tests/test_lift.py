@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.draws import ensemble, likeliest
-from cow_service.physics.events import seen_paths
+from cow_service.physics.events import find_world_events, seen_paths
 from cow_service.physics.layout import BOX_SIDE, lay_out
 from cow_service.physics.lift import Cameras, above, in_the_air
 from cow_service.physics.world import WorldInput, run_world
@@ -306,3 +306,41 @@ class TestSupports:
             )
             assert all(np.isfinite(placed.centre).all() for placed in scene.bodies)
         assert supports_of([itself]) == [None]
+
+
+def laid_out(*bodies: SeenBody, kind: str = "static"):
+    """Fifty draws of bodies, seen by a camera that is known."""
+    camera = known(TrueCamera(pitch=20, focal=640))
+    return lay_out(bodies, motion(kind), camera, (640, 400), ensemble(50))
+
+
+def test_feet_of_small_things_are_off_by_pixels_of_their_own() -> None:
+    one, other = laid_out(body((300, 180, 312, 192)), body((340, 180, 352, 192))).bodies
+    off = one.centre[:, 2] / other.centre[:, 2]
+    assert np.std(off) > 0.01
+    assert abs(np.mean(off) - 1) < 0.02
+
+
+def test_what_the_lower_border_cuts_off_may_reach_far_beyond_it() -> None:
+    whole, cut = (laid_out(body((300, 250, 360, y))).bodies[0].centre for y in (395, 400))
+    assert np.ptp(np.log(cut[:, 2] / cut[:, 1])) > 3 * np.ptp(np.log(whole[:, 2] / whole[:, 1]))
+
+
+def test_what_falls_in_clutter_may_have_stood_behind_what_is_seen_below_it() -> None:
+    below = body((300, 300, 360, 360), name="below")
+    apart = []
+    for stands_out in (True, False):
+        mover = replace(body((310, 100, 350, 140), "sphere"), stands_out=stands_out)
+        falling, under = laid_out(mover, below, kind="fall").bodies
+        apart.append(np.mean(np.abs(falling.centre[:, 2] - under.centre[:, 2]) > 2 * under.half_width))
+    assert apart[1] > apart[0] + 0.2
+
+
+def test_a_world_that_begins_with_the_mover_inside_another_body_is_misread() -> None:
+    mover, inside = body((300, 200, 340, 240), name="mover"), body((280, 180, 360, 245), name="around")
+    way = motion("linear", (1.0, 0.0), 100.0)
+    for other, least, most in ((inside, 0.5, 1.0), (body((500, 180, 560, 245)), 0.0, 0.0)):
+        world = WorldInput((mover, other), way, known(TrueCamera(pitch=20, focal=640)), (640, 400), 17, 16.0)
+        misread = find_world_events(run_world(world, ensemble(50)), world.bodies, ensemble(50), (640, 400)).misread
+        assert misread is not None
+        assert least <= misread.mean() <= most

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,14 @@ def test_probability_and_sureness_of_whether(value: float, sure: bool) -> None:
     missed = decided(asked(negated=True), 2, events(touches={2: share(value), 1: 0.5}))
     assert missed.probability == pytest.approx(1 - value)
     assert missed.sure == sure
+
+
+def test_worlds_that_were_misread_tell_neither_way() -> None:
+    for value, told in ((0.0, 0.3), (1.0, 0.7)):
+        found = replace(events(touches={2: share(value)}), misread=np.arange(COUNT) < 0.6 * COUNT)
+        answer = decided(asked(), 2, found)
+        assert answer.probability == pytest.approx(told)
+        assert answer.depends_on[:1] == ("place",)
 
 
 def test_it_is_sure_from_the_stated_share_on() -> None:

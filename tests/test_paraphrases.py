@@ -20,6 +20,7 @@ will it clear the vase without touching it? | will it miss the vase?
 the vase or the cube, which one does it crash into? | which does it hit first, the vase or the cube?
 does it fall off the edge of the table? | will it land on the floor?
 does it stay on the table? | will it not land on the floor?
+does it stay on top of the vase? | will it not fall off the vase?
 does it make any difference to what it hits? | does the outcome change?
 """
 OTHER = """
@@ -28,6 +29,7 @@ is there no chance that it hits the vase?
 is there a moment when it doesn't hide the vase?
 will it almost hit the vase?
 will it be in front of the vase or behind it?
+will it roll over the edge of the vase?
 does it avoid clearing the vase?
 """
 
@@ -43,3 +45,9 @@ def test_a_paraphrase_asks_the_same(pair: str) -> None:
 @pytest.mark.parametrize("question", OTHER.strip().splitlines())
 def test_what_would_change_the_meaning_is_not_passed_over(question: str) -> None:
     assert read_asked(parse(MOVES + question)) is None
+
+
+def test_what_something_falls_off_is_where_it_was() -> None:
+    said, plain = (parse(f"If the red ball falls{off}, will it hit the vase?") for off in (" off the shelf", ""))
+    assert read_asked(said) == read_asked(plain) is not None
+    assert said.motion.kind == plain.motion.kind

@@ -39,6 +39,7 @@ class SeenBody:
     elongated: bool = False  # a vehicle: longer along its heading than across
     equal_sided: bool = False  # a cube: as wide as high
     is_form_known: bool = True  # its shape was seen or said; else how deep it is, is not known
+    stands_out: bool = True  # it was told from its surroundings: nothing else is seen to carry it
     taper: float = 1.0  # its width at its lower end, of that at its upper end
     point: Point | None = None  # px: of the mover, the one it was grounded at
 

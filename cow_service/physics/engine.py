@@ -247,6 +247,7 @@ class _Engine:
         if body.is_active:
             x, y, z = (v * self.scale for v in body.velocity)
             builder = builder.linvel((x, y, z)).ccd_enabled(not body.ghost).soft_ccd_prediction(FORESEEN)
+            builder = builder.can_sleep(not body.glides)  # what glides slowly would stop
             if body.glides and body.shape == "sphere":  # it rolls
                 radius = body.half_width * self.scale
                 builder = builder.angvel((z / radius, 0.0, -x / radius))

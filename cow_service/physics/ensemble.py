@@ -151,8 +151,13 @@ def _verdicts(query: Query, sure: Sequence[bool], worlds: Sequence[ObservedWorld
 def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
     """The answer of an ensemble with draws [K, P]."""
     asked, answers = query.asked, answers_of(query, events)
-    answer, count = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
-    probability = shown = count / len(answers)
+    answer, _ = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
+    agrees = np.array([found == answer for found in answers])
+    misread = np.zeros(len(agrees), bool) if events.misread is None else events.misread
+    depends: list[Doubt] = list(_depends_on(agrees, draws))
+    if misread.mean() > MATTERS:
+        depends = ["place", *(doubt for doubt in depends if doubt != "place")]
+    probability = shown = float(np.where(misread, 0.5, agrees).mean())  # what was misread tells neither way
     times = _happens(query, events)
     times = times[np.isfinite(times)]
     if asked.form in ("whether", "when"):  # that what is asked happens, or, where it is negated, does not
@@ -162,7 +167,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
         probability=shown,
         sure=probability >= SURE,
         robust=probability >= ROBUST,
-        depends_on=_depends_on(np.array([found == answer for found in answers]), draws),
+        depends_on=tuple(depends[:MOST_NAMED]),
         first=answer if asked.form in FIRST_MET and answer >= 0 else None,
         count=answer if asked.form == "how-many" else None,
         time=float(np.median(times)) if len(times) else None,

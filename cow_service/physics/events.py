@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import RigidShape, WorldRun
+from cow_service.physics.engine import AT_START, RigidShape, WorldRun
+from cow_service.physics.layout import Layout
 from cow_service.physics.world import Worlds
 from cow_service.records import Encounter, EncounterKind
 from cow_service.vision.masks import CroppedMask
@@ -210,6 +211,7 @@ class WorldEvents:
     landed: Floats  # [K, B] s: when it first meets the floor
     placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
     order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
+    misread: Mask | None = None  # [K]: the mover began inside another body, or beside what carries it
 
 
 def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats, size: tuple[int, int]) -> WorldEvents:
@@ -243,7 +245,21 @@ def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats,
         landed=landed,
         placed=None if worlds.placements is None else worlds.placements.times,
         order=order,
+        misread=np.array([_is_misread(*world, worlds.layout) for world in zip(shapes, runs, strict=True)]),
     )
+
+
+def _is_misread(shapes: Sequence[RigidShape], run: WorldRun, layout: Layout) -> bool:
+    """Whether the mover of a world began where no picture shows one: inside another body, or beside what carries it."""
+    mover, on, supports = shapes[0], layout.supports[0], layout.supports
+    if mover.is_ghostly or layout.put or not mover.is_active or any(shape.pieces for shape in shapes):
+        return False  # drawings show what touches
+    if on is not None:
+        away = np.array(mover.position) - shapes[on].position
+        if math.hypot(away[0], away[2]) > max(shapes[on].half_width, shapes[on].half_depth):
+            return True
+    met = {each.b for each in run.meetings if each.a == 0 and each.b is not None and each.time < AT_START}
+    return any(each != on and supports[each] != 0 for each in met)
 
 
 def encounters(

@@ -43,6 +43,11 @@ ALIKE = 0.3  # of the error of a depth that is left where that of the floor besi
 GRAIN = 6  # over such a part of the width of an image the errors of depth maps change altogether
 BENT = 0.5  # of its width: with so much doubt of how deep a body is, the map does not tell
 ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
+BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
+SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
+LEAST_PART = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
+AT_FOOT = 0.15  # of the distance of a body's foot: so far from it may begin what stands there
+LEAST_TOP = 4  # edges that outlines lose: a top that would fill more if it were half as deep as wide shows its depth
 RAISED = 0.2  # of the pixels of a thing are nearer than the floor behind it
 
 
@@ -330,6 +335,11 @@ def _footprint(
     if share < LEAST_SEEN or np.count_nonzero(there) < LEAST_PIXELS:
         return None
     y, x = np.nonzero(there)
+    if body.shape != "sphere":
+        rays = _rays(x + mask.columns.start, y + mask.rows.start, width, height, focal)
+        spots = floor.coordinates(rays * depth[mask.rows, mask.columns][there][:, None])
+        there[y, x] = _of_one_thing(body, spots, (width, height), focal, floor, deviation)
+        y, x = np.nonzero(there)
     # The noise of single pixels would make a body larger: what is seen of it is smoothed, without what is around.
     inverse = np.where(there, 1 / np.where(there, depth[mask.rows, mask.columns], 1.0), 0.0)
     z = blurred(there.astype(np.float64))[y, x] / blurred(inverse)[y, x]
@@ -386,13 +396,43 @@ def _upright(
     elif bend > BENT * 2 * half_width:  # how deep it is cannot be told from the error
         half_depth = 0.0
     x, z = ((low + high) / 2 @ turn).tolist()
-    is_seen = (floor.height - top) / math.hypot(right, ahead, floor.height) > FROM_ABOVE
+    distance = math.hypot(right, ahead, floor.height)
+    near = max(float(low[1]), edge)
+    shown = (floor.height - top) * (distance / near - distance / (near + half_width))  # of a top half as deep as wide
+    is_seen = (floor.height - top) / distance > FROM_ABOVE or shown > LEAST_TOP * edge
     foot = max(0.0, bottom) if body.is_flying else 0.0
     tall = half_width if is_cube else max((top + edge - foot) / 2, 1e-6)
     shape = body.shape if body.is_form_known else "box"
     is_seen = (is_seen or is_round or is_cube) and half_depth > 0
     centre = x, foot + tall, z
     return Footprint(shape, centre, half_width, half_depth, tall, yaw, bottom, is_seen, deviation, bend, share)
+
+
+def _of_one_thing(
+    body: SeenBody, points: Floats, size: tuple[int, int], focal: float, floor: Floor, deviation: float
+) -> Mask:
+    """Which [N] of the points [N, 3] in the outline of a body are its own; `size` is the image's (width, height; px).
+
+    An outline also holds what is seen through the gaps of a thing, and one that was cut by colour holds parts of what
+    stands in front or behind. Gaps in depth divide these: the body is the part where its foot is, else the largest one.
+    """
+    (x0, y0, x1, y1), away, steps = body.bbox, np.hypot(points[:, 0], points[:, 2]), 4  # of a gap
+    middle = float(np.median(away))
+    step = max(BREAK * max(x1 - x0, y1 - y0) * middle / focal, 3 * deviation * middle) / steps
+    place = (np.clip(away - away.min(), 0, FARTHEST * middle) / step).astype(int)
+    shares = np.bincount(place, minlength=steps) / len(away)
+    is_gap = np.convolve(np.convolve(shares, np.ones(steps), "valid") < SPARSE, np.ones(steps)) > 0.5
+    part = np.where(is_gap, 0, np.cumsum(np.diff(np.where(is_gap, 0, 1), prepend=0) > 0))[place]  # 0: in a gap
+    parts = [part == number for number in range(1, int(part.max(initial=0)) + 1)]
+    parts = [each for each in parts if each.mean() > LEAST_PART]
+    down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], *size, focal)[0] @ floor.axes.T
+    foot = floor.height * math.hypot(down[0], down[2]) / max(down[1], HORIZON)
+
+    begins = [float(np.percentile(away[each], TRIM)) for each in parts]
+    fits = [
+        (abs(start / foot - 1) < AT_FOOT + deviation, each.sum()) for start, each in zip(begins, parts, strict=True)
+    ]
+    return parts[fits.index(max(fits))] if parts else np.ones(len(away), bool)
 
 
 def blurred(values: Floats) -> Floats:

@@ -30,10 +30,14 @@ from cow_service.records import Motion
 from cow_service.vision.types import Floats
 
 MEASURED_SIGMA = 0.03  # of a body's size by its depth: of the logarithm
+GOLDEN = math.pi * (3 - math.sqrt(5))  # radians between the mixtures of draws that two bodies take
 ORDER = 17  # how far the draws of one body's depth are from those of the next
 NEAREST, FARTHEST = 0.05, 40.0  # depths, in those of the first body: what seems to lie elsewhere is put there
 BOX_SIDE = 0.82  # of the seen width of a box whose yaw is not known: its side
-HUNG = 4.0  # how much likelier it hangs over that than where the camera's priors have it
+HUNG, MAYBE_HUNG = 4.0, 0.5  # how much likelier it hangs over that than where the camera's priors have it; in clutter
+MAYBE_OFF = (
+    1.3  # deviations of the height of what, in clutter, may stand on a thing that nobody named: added to its own
+)
 HUNG_SIGMA = 0.3  # of the mover's half width: how far ahead of the other it is
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 APART = 0.98  # of the distance of two bodies: together they are so wide at most
@@ -156,6 +160,8 @@ class _Picture:
                 return cameras, [self.body_at(i, cameras, depth, share if i == 0 else None) for i in range(len(bodies))]
         ball = in_the_air(cameras.at_height(np.zeros(len(draws))), mover.bbox, mover.shape, depth)
         height = np.exp(parameters[:, 2]) * (ball.half_width + ball.half_height) / 2 - ball.centre[:, 1]
+        if not mover.stands_out:
+            height *= np.exp(MAYBE_OFF * math.sqrt(fit.covariance[2, 2]) * draws[:, COLUMN["let_go_ahead"]])
         under = self.below() if motion.kind == "fall" else None
         if under is not None:
             below = self.standing(under, cameras.at_height(np.ones(len(draws))), draws)
@@ -167,7 +173,7 @@ class _Picture:
                 in_radii = 2 * (aligned[0] + ball.centre[0, 1]) / (ball.half_width[0] + ball.half_height[0])
                 if in_radii > 0:
                     off = (np.log(in_radii) - fit.mean[2]) / np.sqrt(fit.covariance[2, 2])
-                    weight = HUNG * np.exp(-0.5 * off**2)
+                    weight = (HUNG if mover.stands_out else MAYBE_HUNG) * np.exp(-0.5 * off**2)
                     is_over = quantiles(draws[:, COLUMN["depth"]]) < weight / (1 + weight)
                     height = np.where(is_over, aligned, height)
         cameras = cameras.at_height(np.maximum(height, 0.02 * depth))
@@ -207,6 +213,9 @@ class _Picture:
         body, on = self.bodies[index], self.supports[index]
         if depth_share is None:
             depth_share = self.depth_of(body, draws)
+        # Errors of two feet have nothing to do with one another.
+        draws, feet = draws.copy(), draws[:, [COLUMN["foot"], COLUMN["let_go_right"]]]
+        draws[:, COLUMN["foot"]] = feet @ [math.cos(GOLDEN * index), math.sin(GOLDEN * index)]
         plane = np.zeros(len(draws))
         if on is not None:
             support = above(cameras, self.bodies[on].core, self.bodies[on].shape, draws, plane)

@@ -18,6 +18,8 @@ from cow_service.vision.types import Floats
 
 SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
 FOOT_SIGMA = 0.02  # of a body's height in the image: where it meets the floor
+LEAST_FOOT = 0.002  # of the width of the image: no box is more exact
+CUT = 0.3  # of the height of a body that the lower border of the image cuts off: how far it reaches beyond
 SLIMMEST, TALLEST = 0.2, 12.0  # half heights, in half widths
 
 # Degrees, one standard deviation of a direction in the image, by where it was read.
@@ -136,7 +138,8 @@ def above(
         z = height / np.maximum(sink, HORIZON)
         half = z * radius / cameras.focal
         return LiftedBody(shape, cameras.coordinates(rays * z[:, None]), half, half, True)
-    foot = y1 + FOOT_SIGMA * (y1 - y0) * draws[:, COLUMN["foot"]]
+    off, sigma = draws[:, COLUMN["foot"]], max(FOOT_SIGMA * (y1 - y0), LEAST_FOOT * cameras.width)
+    foot = y1 + (sigma * off if y1 <= cameras.height_px - 1 else CUT * (y1 - y0) * np.abs(off))
     rays = cameras.rays(np.stack([np.full(len(foot), (x0 + x1) / 2), foot], axis=1))
     if not (-rays[0, 1] > HORIZON and height[0] > 0):  # the likeliest ray meets the plane at no sane distance
         return None

@@ -22,6 +22,7 @@ RIM_SIGMA = math.radians(4.0)  # of a segment that approximates an arc
 UPRIGHT, LEVEL, NEITHER = 0.3, 0.3, 0.4  # of the segments of a thing
 END_OF_RIM = 0.93  # of half a thing's width: beyond it a rim is too curved for segments
 MOST_SEGMENTS = 10  # of one thing: the longest; what is costly grows with their square
+BY_CHANCE = 0.2  # of the things whose edges fit some camera: masts taper and things lean, so that they fit another one
 WEIGHT = 0.7  # of the evidence: an edge is often seen as several segments
 
 
@@ -63,7 +64,7 @@ class Views:
         return np.stack([x, y], axis=-1) / (np.sqrt(x * x + y * y) + 1e-12)[..., None]
 
     def explain(self, segments: Segments, bbox: BBox | None, shape: Shape | None, size: tuple[int, int]) -> Floats:
-        """Log likelihood [K] of segments of a thing in a box (px), or of what has none, such as the floor.
+        """Log likelihood [K], to a constant, of segments of a thing in a box (px), or of what has none, as the floor.
 
         Where its shape is not known, any shape is as likely as another one.
         """
@@ -80,7 +81,9 @@ class Views:
             for form, sides in (("cylinder", upright), ("cone", _slanted(segments, box))):
                 if shape in (None, form):
                     likely.append(np.log(sides + arcs).sum(axis=1))
-        return WEIGHT * np.logaddexp.reduce(likely)
+        logs = WEIGHT * np.logaddexp.reduce(likely)
+        found = np.exp(logs - logs.max())
+        return np.log((1 - BY_CHANCE) * found + BY_CHANCE * found.mean())
 
     def _explain_level(self, segments: Segments, upright: Floats) -> Floats:
         """As edges of a thing with square corners: upright [K, S], or level along one of two directions.

@@ -17,7 +17,7 @@ from cow_service.physics.ensemble import BY_EVENTS, Query
 from cow_service.physics.geometry import DepthMap, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
-from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion
+from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion, ObjectPrior
 from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.stages.run import Run
@@ -184,9 +184,16 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
     located = {each.bbox: each for each in situation.located}
     mover = LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior, source=grounding.source)
     first = Obstacle(mover.object, mover.bbox, CroppedMask.of(scene.silhouette(mover.bbox)))
+    # What is asked to fall off a thing stands on it.
+    asked, carrier, carried = grounding.asked, None, ""
+    if asked is not None and asked.relation == "lands" and situation.motion.kind == "linear":
+        carrier = next((each.object for each in situation.located if same_name(each.object, asked.target or "")), None)
+        carried = asked.subject or grounding.object
     for seen in (first, *situation.obstacles, *situation.removed):
         thing = located.get(seen.bbox) if bodies else mover
         said, region = None if thing is None else thing.prior, scene.region_of(seen.bbox)
+        if carrier and same_name(seen.name, carried) and (said is None or said.stands_on is None):
+            said = (said or ObjectPrior()).model_copy(update={"stands_on": carrier})
         body = SeenBody(
             name=seen.name,
             bbox=seen.bbox,
@@ -197,6 +204,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
             confidence=seen.confidence,
             prior=said,
             point=None if bodies else grounding.point,
+            stands_out=region is not None or situation.side_view is not None,
         )
         if said is not None and said.shape is not None:
             body = replace(body, shape=said.shape)
