@@ -163,14 +163,7 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
     if abs(path - clip) * request.fps > 1.5:
         happens = "its rest is not shown" if path > clip else "from its end on the object stays where it is"
         found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
-    if trajectory.depth is not None and not trajectory.depth.is_of_scene:
-        if trajectory.depth.floor is not None:
-            why = f"knows no depth where '{grounding.object}' is"
-        elif trajectory.camera is not None and trajectory.camera.source == "side-view":
-            why = "was given for a drawing that is seen from the side"
-        else:
-            why = "shows no floor that things could stand on"
-        found.append(f"The depth map {why}: nothing is answered from it. Leave `depth` out, or give another map.")
+    found += _of_depth(request, grounding, trajectory)
     found += [
         f"Something may stand at ({(left + right) / 2:.0f}, {bottom:.0f}) that is too faint to tell: no world has it."
         for left, _, right, bottom in trajectory.faint
@@ -199,8 +192,36 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
     return tuple(found)
 
 
+def _of_depth(request: SimulateRequest, grounding: Grounding, trajectory: Trajectory) -> list[str]:
+    """What a caller should know of how the depth map of a request was used, in sentences."""
+    camera, depth = trajectory.camera, trajectory.depth
+    if request.depth is None or camera is None:
+        return []
+    if depth is None:
+        return ["The depth map was not used: the path is given, or that of the ballistic law."]
+    if not depth.is_of_scene:
+        if depth.floor is not None:
+            why = f"does not show '{grounding.object}' where the image does, as something that rises above the floor"
+        elif camera.source == "side-view":
+            why = "was given for a drawing that is seen from the side"
+        else:
+            why = "shows no floor that things could stand on"
+        return [f"The depth map {why}: nothing is answered from it. Leave `depth` out, or give another map."]
+    told = [
+        f"The depth map does not show '{body.object}' where the image does, as something that rises above the floor."
+        for body in trajectory.bodies
+        if body.footprint is not None and body.footprint.seen == 0
+    ]
+    pitch = None if request.camera is None else request.camera.pitch
+    if pitch is not None and abs(camera.pitch - pitch) > APART:
+        seen = f"the floor of the depth map is looked down on by {camera.pitch:.0f}: the map is taken"
+        told.append(f"`camera.pitch` is {pitch:g} degrees, but {seen}.")
+    return told
+
+
 MAX_NAME = 60  # characters
 BOUNCE = 0.15  # m/s of a meeting with the floor, from which it is a bounce
+APART = 3.0  # degrees between two pitches of one camera
 MOVED = 0.01  # m that a body is displaced, from which it is said to move
 STILL = 0.05  # m/s: what is slower is at rest
 ROLLED_ON = 0.25  # s after its last bounce, from which it is said to have rolled on

@@ -140,7 +140,8 @@ class Service:
             if media_type_of(data) != "image/png":
                 detail = "is no PNG"
                 raise errors.InvalidRequest(
-                    f"`{errors.field_of(pointer)}` {detail}.", errors=(errors.FieldError(pointer, detail),)
+                    f"`{errors.field_of(pointer)}` {detail}: save it as one.",
+                    errors=(errors.FieldError(pointer, detail),),
                 )
             return digest(data, "image/png")
 

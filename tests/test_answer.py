@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from conftest import EXAMPLES, all_scenes, example
-from drawn import ball, block, floor
+from drawn import ball, block, floor, png_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -534,6 +534,18 @@ def answered(service: Service, image: bytes, question: str, **body) -> Answer:
     kept = service.keep_image(image)
     request = {"image": {"artifact": kept.sha256}, "question": question, "video": False} | body
     return service.answer(AnswerRequest.model_validate(request))
+
+
+def test_to_stay_where_it_is_put_is_to_end_there(service: Service) -> None:
+    image = block(block(floor(640, 400), (120, 220, 320, 320), (40, 60, 200)), (420, 260, 470, 320), (40, 160, 60))
+    question = "If the green cube is put onto the blue block, will it stay there?"
+    told = answered(service, png_bytes(image), question, options=["Yes", "No"])
+    assert told.simulation is not None
+    outcome = told.simulation.trajectory.outcome
+    assert outcome is not None
+    assert (outcome.asked.relation, outcome.asked.negated) == ("inside", False)
+    assert told.answer == "A" or told.not_sure
+    assert "stays on top" in outcome.facts
 
 
 @pytest.mark.soak

@@ -285,7 +285,7 @@ def test_a_setting_that_is_not_json_is_named(tmp_path: Path) -> None:
 
 
 def test_a_depth_map_is_a_file(tmp_path: Path, picture: Path) -> None:
-    (tmp_path / "depth.png").write_bytes(depth_png(TrueCamera().depth()))
+    (tmp_path / "depth.png").write_bytes(depth_png(TrueCamera().depth([(110, 160, 190, 240), (430, 160, 510, 250)])))
     given = ("--depth", "depth.png", "--depth-scale", "0.001", "--num-frames", "9", "--out", "out")
     result = cow(tmp_path, "simulate", str(picture), QUESTION, *given)
     assert result.returncode == 0, result.stderr

@@ -253,7 +253,7 @@ def test_objects_law_ensemble_and_camera_are_sent_right(client: Any) -> None:
 
 @pytest.mark.parametrize("kind", ["metres", "units"])
 def test_a_depth_map_is_an_array(client: Any, kind: str) -> None:
-    metres = TrueCamera(focal=240, size=(240, 160)).depth()
+    metres = TrueCamera(focal=240, size=(240, 160)).depth([(42, 62, 78, 98), (170, 60, 205, 98)])
     given = (
         {"map": metres} if kind == "metres" else {"map": np.nan_to_num(1000 * metres).astype(np.uint16), "scale": 1e-3}
     )

@@ -86,7 +86,9 @@ class TestFootprints:
         found = find_floor(given_, 640, [body(each).mask for each in boards])
         assert found is not None
         for box, one in zip(
-            boards, measure(given_, 640, found, [body(each, is_form_known=False) for each in boards]), strict=True
+            boards,
+            measure(given_, 640, found, [body(each, is_form_known=False) for each in boards], [False] * len(boards)),
+            strict=True,
         ):
             there = CAMERA.on_floor(((box[0] + box[2]) / 2, box[3]))
             assert one is not None
@@ -101,7 +103,7 @@ class TestFootprints:
         given_ = DepthMap(depth, 1.0, 0.05, 640)
         found = find_floor(given_, 640, [body(NEAR).mask])
         assert found is not None
-        one = measure(given_, 640, found, [body(NEAR, is_form_known=False)])[0]
+        one = measure(given_, 640, found, [body(NEAR, is_form_known=False)], [False])[0]
         assert one is not None
         assert one.centre[2] == pytest.approx(CAMERA.on_floor((220, 290))[1], rel=0.02)  # type: ignore[index]
 
@@ -112,7 +114,7 @@ class TestFootprints:
         for columns in (slice(215, 225), slice(212, 240)):  # a gap of a quarter; most of a box that was cut badly
             seen = depth.copy()
             seen[NEAR[1] : NEAR[3], columns] = 2 * np.nanmin(depth[NEAR[1] : NEAR[3], NEAR[0] : NEAR[2]])
-            one = measure(DepthMap(seen, 1.0, 0.01, 640), 640, found, [body(NEAR, is_form_known=False)])[0]
+            one = measure(DepthMap(seen, 1.0, 0.01, 640), 640, found, [body(NEAR, is_form_known=False)], [False])[0]
             assert one is not None
             assert one.centre[2] == pytest.approx(CAMERA.on_floor((220, 290))[1], rel=0.03)  # type: ignore[index]
             assert one.half_depth < 0.2 * one.half_height
@@ -123,9 +125,20 @@ class TestFootprints:
             given_ = DepthMap(camera.depth([box]), 1.0, 0.01, 640)
             found = find_floor(given_, 640, [body(box).mask])
             assert found is not None
-            one = measure(given_, 640, found, [body(box, is_form_known=False)])[0]
+            one = measure(given_, 640, found, [body(box, is_form_known=False)], [False])[0]
             assert one is not None
             assert one.depth_seen == shows
+
+    def test_what_hangs_in_the_air_does_not_reach_down_to_the_floor(self) -> None:
+        depth, box = CAMERA.depth(), (300, 100, 340, 140)
+        depth[100:140, 300:340] = 2.0
+        given_ = DepthMap(depth, 1.0, 0.01, 640)
+        found = find_floor(given_, 640, [body(box).mask])
+        assert found is not None
+        one = measure(given_, 640, found, [body(box, is_form_known=False)], [True])[0]
+        assert one is not None
+        assert 2 * one.half_height == pytest.approx(2.0 * 40 / 640, rel=0.2)
+        assert one.centre[1] == pytest.approx(CAMERA.height - 2.0 * math.sin(math.radians(28 - 7)), abs=0.1)
 
     def test_of_a_hole_nothing_is_told(self) -> None:
         depth = CAMERA.depth([NEAR])
@@ -133,7 +146,7 @@ class TestFootprints:
         given_ = DepthMap(depth, 1.0, 0.01, 640)
         found = find_floor(given_, 640, [body(NEAR).mask])
         assert found is not None
-        assert measure(given_, 640, found, [body(NEAR)]) == (None,)
+        assert measure(given_, 640, found, [body(NEAR)], [False]) == (None,)
 
 
 @pytest.fixture(scope="module")
@@ -146,8 +159,8 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 PICTURE = ball(block(floor(*SIZE), NEAR, (40, 60, 200)), (80, 270), 20, (200, 30, 30))
 
 
-def simulate(service: Service, depth: Floats | bytes, **also: Any) -> Simulation:
-    png = depth if isinstance(depth, bytes) else depth_png(depth)
+def simulate(service: Service, map_: Floats | bytes, **also: Any) -> Simulation:
+    png = map_ if isinstance(map_, bytes) else depth_png(map_)
     body = {
         "image": "data:image/png;base64," + base64.b64encode(png_bytes(PICTURE)).decode(),
         "question": QUESTION,
@@ -162,7 +175,9 @@ class TestRequest:
     def test_the_same_picture_has_the_answer_that_its_depth_gives(self, service: Service) -> None:
         met = simulate(service, CAMERA.depth([BALL, NEAR])).trajectory
         far = CAMERA.depth([BALL])
-        far[NEAR[1] : NEAR[3], NEAR[0] : NEAR[2]] = 1.6 * far[NEAR[3], NEAR[0]]  # it hangs far behind that place
+        far[NEAR[1] : NEAR[3], NEAR[0] : NEAR[2]] = (
+            0.6 * far[NEAR[3], NEAR[0]]
+        )  # it hangs before that place, near the camera
         missed = simulate(service, far).trajectory
         assert met.outcome is not None
         assert missed.outcome is not None
@@ -189,10 +204,39 @@ class TestRequest:
         assert block_.footprint.covariance is not None
         assert block_.footprint.seen == pytest.approx(1, abs=0.05)
 
-    @pytest.mark.parametrize("fault", ["no floor", "no mover"])
+    def test_a_path_without_contacts_does_not_use_it(self, service: Service) -> None:
+        found = simulate(service, CAMERA.depth([BALL, NEAR]), motion={"law": "ballistic"})
+        assert found.trajectory.depth is None
+        assert found.trajectory.outcome is not None
+        assert found.trajectory.outcome.probability is not None
+        assert any("depth map was not used" in warning for warning in found.warnings)
+
+    def test_a_pitch_that_the_map_contradicts_is_told(self, service: Service) -> None:
+        found = simulate(service, CAMERA.depth([BALL, NEAR]), camera={"pitch": 60})
+        assert found.trajectory.camera is not None
+        assert found.trajectory.camera.pitch == pytest.approx(28, abs=0.5)
+        assert any("`camera.pitch` is 60 degrees" in warning for warning in found.warnings)
+
+    def test_nothing_is_sure_where_the_map_shows_floor_instead_of_the_target(self, service: Service) -> None:
+        found = simulate(service, CAMERA.depth([BALL]))
+        assert found.trajectory.outcome is not None
+        assert not found.trajectory.outcome.sure
+        assert "depth" in found.trajectory.outcome.depends_on
+        assert any("does not show 'blue block'" in warning for warning in found.warnings)
+
+    def test_a_relative_map_may_not_be_shifted(self, service: Service) -> None:
+        depth = CAMERA.depth([BALL, NEAR])
+        shifted = depth_png((depth - np.nanmin(depth)) / np.nanmax(depth), 1e-4)
+        given_ = {"map": "data:image/png;base64," + base64.b64encode(shifted).decode()}
+        with pytest.raises(InvalidRequest, match="without an offset"):
+            simulate(service, depth, depth=given_)
+
+    @pytest.mark.parametrize("fault", ["no floor", "no mover", "another scene"])
     def test_a_map_that_does_not_show_the_scene_gives_no_answer(self, service: Service, fault: str) -> None:
         depth = np.full((400, 640), 3.0)
-        if fault == "no mover":
+        if fault == "another scene":
+            depth = CAMERA.depth([FAR])
+        elif fault == "no mover":
             depth = CAMERA.depth([NEAR])
             depth[BALL[1] : BALL[3], BALL[0] : BALL[2]] = np.nan
         found = simulate(service, depth)

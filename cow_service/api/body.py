@@ -64,6 +64,9 @@ class RawBody:
     image: bytes | None = None
 
 
+MAX_PART_BYTES = 64 * 2**20  # of `request`, which may hold masks and a depth map; the whole body has a limit of its own
+
+
 class _FormParser(MultiPartParser):
     """Records whether the last boundary arrived: fields cut off before it must not count as omitted."""
 
@@ -93,7 +96,7 @@ async def receive(request: Request) -> RawBody:
         )
     try:
         async with aclosing(request.stream()) as stream:
-            parser = _FormParser(request.headers, stream, max_files=3, max_fields=8)
+            parser = _FormParser(request.headers, stream, max_files=3, max_fields=8, max_part_size=MAX_PART_BYTES)
             form = await parser.parse()
     except (MultiPartException, ValueError) as error:
         reason = error.message if isinstance(error, MultiPartException) else error

@@ -164,9 +164,7 @@ def request_body(
     ] = None,
     ensemble: Annotated[int, option("How many worlds the probabilities are counted in; 0: none.")] = 50,
     depth: Annotated[Path | None, option("Depth map of the image: a grey PNG with 16 bits.", **EXISTING)] = None,
-    depth_scale: Annotated[
-        float | None, option("Metres per unit of the depth map.", shown="none: relative depth")
-    ] = None,
+    depth_scale: Annotated[float | None, option("Metres per unit of the depth map.", shown="not known")] = None,
     trajectory: Annotated[Path | None, option("JSON with the `trajectory` of a request.", **EXISTING)] = None,
     fields: Annotated[
         str | None,
@@ -217,7 +215,10 @@ def request_body(
                 "--object goes with --point, --box or --trajectory; else the question names the object."
             )
         body["grounding"]["point"] = points[0]
-    return body | object_in(fields or "{}", "--request")
+    more = object_in(fields or "{}", "--request")
+    if isinstance(more.get("depth"), dict):  # beside the file of the map, its focal length or deviation
+        more["depth"] = body.get("depth", {}) | more["depth"]
+    return body | more
 
 
 def with_request_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -180,10 +180,19 @@ def _with_picture(given: Any, name: str) -> Any:
     kind, scale = getattr(getattr(picture, "dtype", None), "kind", ""), dict[str, float]()
     if kind == "b":
         picture = picture.astype("uint8") * 255
-    elif kind == "f":  # metres
-        known = picture == picture  # noqa: PLR0124 - what is no number differs from itself
-        unit = max(float(picture[known].max(initial=0.0)), 1e-6) / 65535
-        picture, scale = ((picture.clip(0) / unit).round() * known).astype("uint16"), {"scale": unit}
+    elif kind == "f" and name == "map":  # metres; infinity and what is no number are not known
+        if plain(given).get("scale") is not None:
+            detail = "is an array of metres, which takes no `scale`: leave it out, or give 16-bit integers"
+            raise InvalidRequest(f"`depth.map` {detail}.", errors=(FieldError("/depth/scale", detail),))
+        metres = picture.astype("float64")
+        known = abs(metres) < MOST_METRES
+        metres[~known] = 0.0
+        unit = max(float(metres.max(initial=0.0)), 1e-3) / 65535
+        picture, scale = (metres.clip(0) / unit).round().astype("uint16"), {"scale": unit}
+    shape, dtype = tuple(getattr(picture, "shape", ())), str(getattr(picture, "dtype", "uint16"))
+    if name == "map" and (dtype != "uint16" or len(shape) not in (0, 2)):
+        detail = f"is an array {shape} of {dtype}; give (height, width) of metres, or of 16-bit integers without a sign"
+        raise InvalidRequest(f"`depth.map` {detail}.", errors=(FieldError("/depth/map", detail),))
     if str(getattr(picture, "dtype", "")) == "uint16":
         from PIL import Image  # noqa: PLC0415
 
@@ -193,6 +202,8 @@ def _with_picture(given: Any, name: str) -> Any:
         sent = f"data:image/png;base64,{base64.b64encode(sent).decode()}"
     return {**plain(given), **scale, name: sent}
 
+
+MOST_METRES = 1000.0  # of a depth map: what lies beyond is as good as unknown, and would coarsen all the rest
 
 MINIMAL = "return=minimal"  # the preference of RFC 7240
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")

@@ -123,7 +123,7 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     pixels = np.asarray(rgb if turn is None else rgb.transpose(turn), np.uint8)
     height, width = pixels.shape[:2]
     on_film = exif.get(_FOCAL_ON_FILM, 0)
-    focal = on_film / _FILM * math.hypot(width, height) if on_film else None
+    focal = on_film / _FILM * math.hypot(width, height) if 5 <= on_film <= 2000 else None  # mm, of any lens
     info = ImageInfo(width=width, height=height, sha256=hashlib.sha256(data).hexdigest(), focal=focal)
     return DecodedImage(pixels, info, media_type)
 
@@ -183,7 +183,7 @@ def decode_depth(data: bytes, *, max_megapixels: float) -> NDArray[np.uint16]:
     kind, opener = _OPENERS[media_type]
     with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
         if not image.mode.startswith("I"):
-            detail = f"The picture has the colours {image.mode}, not grey with 16 bits per pixel: save it as such."
+            detail = "It has colours, or 8 bits per pixel, not grey with 16 bits: save it as such."
             raise errors.ImageTypeUnsupported(detail)
         return np.asarray(image).astype(np.uint16)
 

@@ -187,6 +187,7 @@ class Standing:
 GIVEN_PITCH_SIGMA, GIVEN_ROLL_SIGMA = math.radians(1.0), math.radians(0.5)
 GIVEN_FOCAL_SIGMA = 0.02  # of the logarithm
 LEAST_HEIGHT_SIGMA = 0.05  # of the logarithm of a height that is said
+SHORTEST, LONGEST = -2.0, 3.0  # logarithms of focal lengths in widths that a camera can have
 FIXED = 1e-6  # deviation of a focal length that must not vary
 
 
@@ -210,6 +211,7 @@ def given_camera(
         mean[1], sigma[1] = math.log(focal.value / size[0]), focal.deviation / focal.value
     if given.focal is not None:
         mean[1], sigma[1] = math.log(given.focal / size[0]), GIVEN_FOCAL_SIGMA
+    mean[1] = min(max(mean[1], SHORTEST), LONGEST)
     if fixed_focal:
         mean[1], sigma[1] = math.log(FOCAL_WIDTHS), FIXED
     if given.roll is not None:

@@ -20,6 +20,7 @@ from cow_service.vision.types import Floats, Mask
 EVERY = 2  # frames of its clock between those that are recorded of the ensemble
 TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
 SURE = 0.7  # share of the worlds from which an answer is given
+SURE_OF_GUESS = 0.85  # the same of a throw whose heading out of the plane of the image nobody tells
 ROBUST = 0.9
 MATTERS = 0.2  # correlation with the outcome from which a parameter is named
 MOST_NAMED = 3
@@ -38,6 +39,7 @@ class Query:
     subject: int = 0  # who does it
     among: tuple[int, ...] = ()  # the things that are meant; empty: any
     is_decidable: bool = True  # by worlds
+    sure_from: float = SURE  # share of the worlds from which an answer is given
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
         shown = 1 - happens if asked.negated else happens
     return Decided(
         probability=shown,
-        sure=probability >= SURE,
+        sure=probability >= query.sure_from,
         robust=probability >= ROBUST,
         depends_on=tuple(depends[:MOST_NAMED]),
         first=answer if asked.form in FIRST_MET and answer >= 0 else None,
@@ -183,7 +185,7 @@ def decide_change(query: Query, changed: WorldEvents, factual: WorldEvents, draw
     probability = max(share, 1 - share)
     return Decided(
         probability=1 - share if query.asked.negated else share,
-        sure=probability >= SURE,
+        sure=probability >= query.sure_from,
         robust=probability >= ROBUST,
         depends_on=_depends_on(differs == (share >= 0.5), draws),
     )

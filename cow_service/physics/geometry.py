@@ -19,12 +19,12 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import HORIZON, CameraFit, axes_of
 from cow_service.records import BBox, DepthEstimate, Shape
 from cow_service.vision.masks import CroppedMask, eroded
-from cow_service.vision.types import Floats, Mask
+from cow_service.vision.types import Floats, Floats32, Mask
 
 SAMPLES = 6000  # pixels that the floor is sought in
 TRIES = 300  # planes through three of them
 LEVEL = math.radians(20)  # the floor rolls no more than that against the vertical that is assumed
-STEEPEST, FLATTEST = math.radians(85), math.radians(-10)  # pitches at which a floor is a floor
+STEEPEST, FLATTEST = math.radians(79), math.radians(-10)  # pitches at which a floor is a floor
 LEAST_TOLERANCE = 0.01  # of the depth: how far a pixel of the floor may lie off its plane
 BELOW = 3.0  # how much more a pixel that would lie under the floor counts than one on it
 LEAST_FLOOR = 0.1  # of the pixels that show no body: the floor has at least so many
@@ -61,23 +61,20 @@ class DepthMap:
     focal: float | None  # px; None: it is not known
 
     def metres_per_pixel(self, bbox: BBox, focal: float) -> float | None:
-        """At what is in the middle of a box (px); None where nobody knows it.
-
-        `focal` (px) is taken where the map has no focal length of its own.
-        """
+        """At what is in the middle of a box (px), for a focal length (px); None where nobody knows it."""
         x0, y0, x1, y1 = bbox
         across, down = (x1 - x0) / 4, (y1 - y0) / 4
         inner = self.depth[int(y0 + down) : math.ceil(y1 - down), int(x0 + across) : math.ceil(x1 - across)]
-        if self.scale is None or np.isfinite(inner).mean() < LEAST_SEEN:
+        if self.scale is None or not inner.size or np.isfinite(inner).mean() < LEAST_SEEN:
             return None
-        return float(np.nanmedian(inner)) * self.scale / (self.focal or focal)
+        return float(np.nanmedian(inner)) * self.scale / focal
 
     def estimate(self, fit: CameraFit, measured: Measurement | None) -> DepthEstimate:
         """The record of it, with what was measured in it, if anything was."""
         mover = None if measured is None else measured.footprints[0]
         return DepthEstimate(
             scale=self.scale,
-            focal=self.focal or math.exp(fit.mean[1]) * self.depth.shape[1],
+            focal=math.exp(fit.mean[1]) * self.depth.shape[1],
             valid=float(np.isfinite(self.depth).mean()),
             deviation=self.deviation,
             floor=None if measured is None else measured.floor.share,
@@ -156,17 +153,17 @@ class Measurement:
 
 
 def measure_scene(
-    given: DepthMap, fit: CameraFit, bodies: Sequence[SeenBody], seen: Sequence[int | None]
+    given: DepthMap, fit: CameraFit, bodies: Sequence[SeenBody], seen: Sequence[int | None], in_air: Sequence[bool]
 ) -> tuple[CameraFit, Measurement | None]:
     """The camera and the bodies by a depth map, where the camera is known as `fit` says; None where it has no floor.
 
-    `seen` is what the bodies stand on as the picture alone shows it.
+    `seen` is what the bodies stand on as the picture alone shows it; `in_air` are those that stand nowhere.
     """
     focal = math.exp(fit.mean[1]) * given.depth.shape[1]
     floor = find_floor(given, focal, [body.mask for body in bodies], fit.roll)
     if floor is None:
-        return fit, None
-    footprints = measure(given, focal, floor, bodies)
+        return (fit if fit.source == "request" else replace(fit, source="prior")), None
+    footprints = measure(given, focal, floor, bodies, in_air)
     supports = tuple(_supports(bodies, footprints, seen, given.deviation))
     return camera_over(floor, fit), Measurement(floor, footprints, supports, given.deviation, focal, given.scale)
 
@@ -179,7 +176,7 @@ def _supports(
     for index, (body, own) in enumerate(zip(bodies, footprints, strict=True)):
         if own is None or (body.prior is not None and body.prior.stands_on is not None):
             continue
-        allowed = ON_TOP * 2 * own.half_height + deviation / 2 * own.distance
+        allowed = ON_TOP * (own.top - own.bottom) + deviation / 2 * own.distance
         under = {
             other: abs(own.bottom - each.top)
             for other, each in enumerate(footprints)
@@ -214,11 +211,11 @@ def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], rol
     covered = np.zeros((height, width), bool)
     for body in bodies:
         body.add_to(covered)
-    step = max(1, math.isqrt(height * width // SAMPLES))
-    chosen = np.argwhere((~covered & np.isfinite(given.depth))[step // 2 :: step, step // 2 :: step]) * step + step // 2
-    if len(chosen) < LEAST_PIXELS:
+    free = np.flatnonzero(~covered & np.isfinite(given.depth))
+    if len(free) < LEAST_PIXELS:
         return None
     rng = np.random.default_rng(0)  # the same map must give the same floor
+    chosen = np.stack(np.unravel_index(free[rng.integers(0, len(free), SAMPLES)], (height, width)), axis=1)
     depth = given.depth[tuple(chosen.T)]
     near = depth < FARTHEST * np.percentile(depth, 5)
     chosen, depth = chosen[near], depth[near]
@@ -284,25 +281,28 @@ def camera_over(floor: Floor, fit: CameraFit) -> CameraFit:
     return replace(fit, mean=mean, covariance=covariance, roll=floor.roll, roll_sigma=floor.sigma[1], source="depth")
 
 
-def measure(given: DepthMap, focal: float, floor: Floor, bodies: Sequence[SeenBody]) -> tuple[Footprint | None, ...]:
-    """The footprints of bodies; None of one whose depth is not known."""
+def measure(
+    given: DepthMap, focal: float, floor: Floor, bodies: Sequence[SeenBody], in_air: Sequence[bool]
+) -> tuple[Footprint | None, ...]:
+    """The footprints of bodies, of which some are in the air; None of one whose depth is not known."""
     known, covered = np.isfinite(given.depth), np.zeros(given.depth.shape, bool)
     for body in bodies:
         body.mask.add_to(covered)
     filled = np.where(known, given.depth, 0.0).astype(np.float32)
-    smooth = np.asarray(cv2.medianBlur(filled, EDGE), np.float64)
+    smooth = np.asarray(cv2.medianBlur(filled, EDGE), np.float32)
     known &= smooth > 0
-    found = list[Footprint | None]()
-    for body in bodies:
-        off = None if body.is_flying else _floor_error(body, smooth, known & ~covered, focal, floor, given.deviation)
-        depth, left = (smooth, 1.0) if off is None else (smooth / off, ALIKE)
-        deviation = SURE + left * given.deviation
-        found.append(_footprint(body, depth, known, focal, floor, deviation, given.deviation))
+    size, free, found = (known.shape[1], known.shape[0]), known & ~covered, list[Footprint | None]()
+    for body, flies in zip(bodies, in_air, strict=True):
+        off = None if flies else _floor_error(body, smooth, free, focal, floor, given.deviation)
+        deviation = SURE + (1.0 if off is None else ALIKE) * given.deviation
+        view = _View(body, flies, size, focal, floor, deviation, given.deviation)
+        flat = _is_flat(view, smooth, known, off or 1.0)
+        found.append(None if flat else _footprint(view, smooth, known, off or 1.0))
     return tuple(found)
 
 
 def _floor_error(
-    body: SeenBody, depth: Floats, free: Mask, focal: float, floor: Floor, deviation: float
+    body: SeenBody, depth: Floats32, free: Mask, focal: float, floor: Floor, deviation: float
 ) -> float | None:
     """How far the depths [H, W] of the free pixels [H, W] around the foot of a body are off the floor, as a factor.
 
@@ -320,14 +320,47 @@ def _floor_error(
     return float(np.median(on_floor)) if len(on_floor) >= max(LEAST_PIXELS, 0.3 * len(off)) else None
 
 
-def _footprint(
-    body: SeenBody, depth: Floats, known: Mask, focal: float, floor: Floor, deviation: float, map_deviation: float
-) -> Footprint | None:
-    """Of one body, by depths [H, W], where they are known [H, W], and how far off these are, relative.
+@dataclass(frozen=True)
+class _View:
+    """One body as a depth map shows it."""
 
-    `deviation` is that of the body's own depth, which may be known better than all of the map (`map_deviation`).
+    body: SeenBody
+    flies: bool
+    size: tuple[int, int]  # px, of the image: width and height
+    focal: float  # px
+    floor: Floor
+    deviation: float  # relative, of its depth, which may be known better than all of the map
+    map_deviation: float
+
+
+def _is_flat(view: _View, depth: Floats32, known: Mask, off: float) -> bool:
+    """Whether the map shows floor where a body rises above it, or hangs over it: it is one of another scene.
+
+    A body that is too low to be told from the floor is not.
     """
-    mask, (height, width) = body.mask, depth.shape
+    body, (width, height) = view.body, view.size
+    (x0, y0, x1, y1), mask = body.bbox, body.mask
+    middle = slice(int(y0 + (y1 - y0) / 4), math.ceil((y0 + y1) / 2))
+    rows = slice(max(middle.start, mask.rows.start), min(middle.stop, mask.rows.stop))
+    inside = mask.patch[rows.start - mask.rows.start : rows.stop - mask.rows.start] & known[rows, mask.columns]
+    y, x = np.nonzero(inside)
+    if len(y) < LEAST_PIXELS:
+        return False
+    lower = -view.floor.axes[1]
+    rays = _rays(x + mask.columns.start, y + rows.start, width, height, view.focal)
+    sink = rays @ lower / view.floor.height  # of what lies on the floor, one over the depth
+    ratio = depth[rows, mask.columns][inside] / off * sink
+    foot = float(_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], width, height, view.focal)[0] @ lower) / view.floor.height
+    tolerance = LEAST_TOLERANCE + view.deviation
+    # How much nearer than the floor behind it what stands upright at the foot of the body would be.
+    rises = 1.0 if view.flies else 1 - float(np.median(sink)) / max(foot, 1e-9)
+    return rises > 2 * tolerance and float(np.percentile(ratio, 100 * RAISED)) > 1 - min(tolerance, rises / 3)
+
+
+def _footprint(view: _View, depth: Floats32, known: Mask, off: float) -> Footprint | None:
+    """Of one body, by depths [H, W] that are too large by a factor, and where they are known [H, W]."""
+    body, focal, floor, (width, height) = view.body, view.focal, view.floor, view.size
+    mask = body.mask
     inner = eroded(np.pad(mask.patch, EDGE), EDGE)[EDGE:-EDGE, EDGE:-EDGE]
     inner = inner if np.count_nonzero(inner) >= LEAST_PIXELS else mask.patch
     there = inner & known[mask.rows, mask.columns]
@@ -335,46 +368,45 @@ def _footprint(
     if share < LEAST_SEEN or np.count_nonzero(there) < LEAST_PIXELS:
         return None
     y, x = np.nonzero(there)
+    depth = depth[mask.rows, mask.columns] / np.float32(off)
     if body.shape != "sphere":
         rays = _rays(x + mask.columns.start, y + mask.rows.start, width, height, focal)
-        spots = floor.coordinates(rays * depth[mask.rows, mask.columns][there][:, None])
-        there[y, x] = _of_one_thing(body, spots, (width, height), focal, floor, deviation)
+        spots = floor.coordinates(rays * depth[there][:, None])
+        there[y, x] = _of_one_thing(view, spots)
         y, x = np.nonzero(there)
     # The noise of single pixels would make a body larger: what is seen of it is smoothed, without what is around.
-    inverse = np.where(there, 1 / np.where(there, depth[mask.rows, mask.columns], 1.0), 0.0)
+    inverse = np.where(there, 1 / np.where(there, depth, 1.0), 0.0)
     z = blurred(there.astype(np.float64))[y, x] / blurred(inverse)[y, x]
     y, x = y + mask.rows.start, x + mask.columns.start
     if body.shape == "sphere":
         near = np.hypot(x + 0.5 - body.middle_point[0], y + 0.5 - body.middle_point[1]) < body.radius / 3
         front = float(np.median(z[near] if near.any() else z))
-        return _ball(body, front, (width, height), focal, floor, deviation, share)
+        return _ball(view, front, share)
     points = floor.coordinates(_rays(x, y, width, height, focal) * z[:, None])
     edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
     # The error of the map is another one at the other side of a body, the more the wider that is seen.
-    bend = map_deviation * float(np.median(z)) * (body.bbox[2] - body.bbox[0]) / (width / GRAIN)
-    return _upright(body, points, edge, floor, deviation, bend, share)
+    bend = view.map_deviation * float(np.median(z)) * (body.bbox[2] - body.bbox[0]) / (width / GRAIN)
+    return _upright(view, points, edge, bend, share)
 
 
-def _ball(
-    body: SeenBody, front: float, size: tuple[int, int], focal: float, floor: Floor, deviation: float, share: float
-) -> Footprint:
-    """Of a ball whose nearest point has a depth, in an image of a size (width, height; px)."""
-    radius, (x, y) = body.radius / focal, body.middle_point
+def _ball(view: _View, front: float, share: float) -> Footprint:
+    """Of a ball whose nearest point has a depth."""
+    floor, radius, (x, y) = view.floor, view.body.radius / view.focal, view.body.middle_point
     depth = front / max(1 - radius, 0.1)
-    ray = _rays([x - 0.5], [y - 0.5], *size, focal)
+    ray = _rays([x - 0.5], [y - 0.5], *view.size, view.focal)
     # Where it may as well touch the floor it does: then the floor tells its depth more exactly.
     sink = radius - float(ray[0] @ floor.axes[1])
-    if sink > HORIZON and abs(floor.height / sink / depth - 1) < TOUCHES + deviation:
+    may_lie = not view.flies and sink > HORIZON
+    if may_lie and abs(floor.height / sink / depth - 1) < TOUCHES + view.deviation:
         depth = floor.height / sink
     across, up, ahead = floor.coordinates(ray * depth)[0].tolist()
     half = radius * depth
-    return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, deviation, 0.0, share)
+    return Footprint("sphere", (across, up, ahead), half, half, half, 0.0, up - half, True, view.deviation, 0.0, share)
 
 
-def _upright(
-    body: SeenBody, points: Floats, edge: float, floor: Floor, deviation: float, bend: float, share: float
-) -> Footprint:
+def _upright(view: _View, points: Floats, edge: float, bend: float, share: float) -> Footprint:
     """Of a body with points [N, 3] over the floor, whose outline lost an edge."""
+    body, floor, deviation = view.body, view.floor, view.deviation
     is_round = body.is_form_known and body.shape in ("cylinder", "cone")
     right, ahead = (float(value) for value in np.median(points[:, [0, 2]], axis=0))
     bottom, top = (float(value) for value in np.percentile(points[:, 1], (TRIM, 100 - TRIM)))
@@ -400,7 +432,7 @@ def _upright(
     near = max(float(low[1]), edge)
     shown = (floor.height - top) * (distance / near - distance / (near + half_width))  # of a top half as deep as wide
     is_seen = (floor.height - top) / distance > FROM_ABOVE or shown > LEAST_TOP * edge
-    foot = max(0.0, bottom) if body.is_flying else 0.0
+    foot = bottom if view.flies else 0.0
     tall = half_width if is_cube else max((top + edge - foot) / 2, 1e-6)
     shape = body.shape if body.is_form_known else "box"
     is_seen = (is_seen or is_round or is_cube) and half_depth > 0
@@ -408,15 +440,14 @@ def _upright(
     return Footprint(shape, centre, half_width, half_depth, tall, yaw, bottom, is_seen, deviation, bend, share)
 
 
-def _of_one_thing(
-    body: SeenBody, points: Floats, size: tuple[int, int], focal: float, floor: Floor, deviation: float
-) -> Mask:
-    """Which [N] of the points [N, 3] in the outline of a body are its own; `size` is the image's (width, height; px).
+def _of_one_thing(view: _View, points: Floats) -> Mask:
+    """Which [N] of the points [N, 3] in the outline of a body are its own.
 
     An outline also holds what is seen through the gaps of a thing, and one that was cut by colour holds parts of what
     stands in front or behind. Gaps in depth divide these: the body is the part where its foot is, else the largest one.
     """
-    (x0, y0, x1, y1), away, steps = body.bbox, np.hypot(points[:, 0], points[:, 2]), 4  # of a gap
+    floor, focal, deviation, steps = view.floor, view.focal, view.deviation, 4  # of a gap
+    (x0, y0, x1, y1), away = view.body.bbox, np.hypot(points[:, 0], points[:, 2])
     middle = float(np.median(away))
     step = max(BREAK * max(x1 - x0, y1 - y0) * middle / focal, 3 * deviation * middle) / steps
     place = (np.clip(away - away.min(), 0, FARTHEST * middle) / step).astype(int)
@@ -425,7 +456,7 @@ def _of_one_thing(
     part = np.where(is_gap, 0, np.cumsum(np.diff(np.where(is_gap, 0, 1), prepend=0) > 0))[place]  # 0: in a gap
     parts = [part == number for number in range(1, int(part.max(initial=0)) + 1)]
     parts = [each for each in parts if each.mean() > LEAST_PART]
-    down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], *size, focal)[0] @ floor.axes.T
+    down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], *view.size, focal)[0] @ floor.axes.T
     foot = floor.height * math.hypot(down[0], down[2]) / max(down[1], HORIZON)
 
     begins = [float(np.percentile(away[each], TRIM)) for each in parts]

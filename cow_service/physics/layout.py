@@ -253,13 +253,16 @@ class _Measured(_Picture):
         """The cameras above the measured floor, and the bodies."""
         floor, footprints = self.measured.floor, self.measured.footprints
         depth, found = cameras.focal * self.motion.metres_per_pixel.value, dict[int, LiftedBody]()
-        if footprints[0] is None:
+        # With another focal length the same map has another floor: upright things are less high in it, and the camera.
+        narrower = (self.measured.focal / cameras.focal) ** math.cos(floor.pitch) ** 2
+        height = floor.height * narrower * np.exp(floor.sigma[2] * self.draws[:, COLUMN["height"]])
+        if (metres := self.measured.scale) is not None:
+            cameras = cameras.at_height(height * metres)
+        elif footprints[0] is None:
             cameras, (found[0], *_) = super().placed(cameras, parameters, fit)
-        elif (metres := self.measured.scale) is not None:
-            cameras = cameras.at_height(np.full(len(depth), floor.height * metres))
         else:  # it has no unit: what is said or guessed of the mover's size fixes the scale
-            cameras = cameras.at_height(floor.height * depth / float(floor.position(footprints[0].centre)[2]))
-        scale = cameras.height / floor.height
+            cameras = cameras.at_height(height * depth / float(floor.position(footprints[0].centre)[2]))
+        scale = cameras.height / height
 
         def place(index: int) -> LiftedBody:
             """A body, after what it stands on."""
@@ -284,7 +287,8 @@ class _Measured(_Picture):
         error = np.exp(footprint.deviation * np.roll(self.draws[:, COLUMN["foot"]], ORDER * index))
         size = scale * error * np.exp(MEASURED_SIGMA * self.draws[:, COLUMN["size"]])
         centre = cameras.coordinates(cameras.rays(point) * (z * scale * error)[:, None])
-        half, tall, deep = footprint.half_width * size, footprint.half_height * size, footprint.half_depth * size
+        seen = size * self.measured.focal / cameras.focal  # across the line of sight
+        half, tall, deep = footprint.half_width * seen, footprint.half_height * seen, footprint.half_depth * size
         deep = np.maximum(deep + footprint.bend / 2 * scale * self.draws[:, COLUMN["base"]], SLIMMEST / 2 * half)
         if not footprint.depth_seen:  # what lies behind is not seen: the body reaches further back than its pixels
             hidden = np.maximum(half * drawn_depths(self.bodies[index], self.draws) - deep, 0.0)
@@ -293,7 +297,7 @@ class _Measured(_Picture):
             centre = centre + hidden[:, None] * back
         if plane is not None:  # from there to its top
             tall = (
-                np.maximum(footprint.top * size - plane, SLIMMEST * half) / 2 if footprint.shape != "sphere" else tall
+                np.maximum(footprint.top * seen - plane, SLIMMEST * half) / 2 if footprint.shape != "sphere" else tall
             )
             centre[:, 1] = plane + tall
         yaw = None if footprint.shape == "sphere" else footprint.yaw
@@ -326,6 +330,9 @@ def _apart(placed: list[LiftedBody]) -> list[LiftedBody]:
 def _reach(body: LiftedBody, way: Floats) -> Floats:
     """Half the extent [K] of a body over the floor in the directions [K, 2]."""
     sight = body.centre[:, [0, 2]] / np.maximum(np.linalg.norm(body.centre[:, [0, 2]], axis=1), 1e-9)[:, None]
+    if body.yaw is not None:
+        sight = np.array([[-math.sin(body.yaw), math.cos(body.yaw)]])
+        sight = np.repeat(sight, len(way), axis=0)
     along = np.einsum("ki,ki->k", way, sight) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
     return body.half_width * np.sqrt(1 + (body.depth_share**2 - 1) * along**2)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cow_service.physics.camera import FLAT, HORIZON, CameraFit, axes_of
+from cow_service.physics.camera import FLAT, HORIZON, LONGEST, SHORTEST, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN, quantiles
 from cow_service.records import BBox, Cue, Motion, Shape
 from cow_service.vision.types import Floats
@@ -53,7 +53,7 @@ class Cameras:
         parameters = fit.mean + normal @ np.linalg.cholesky(fit.covariance).T
         roll = fit.roll + fit.roll_sigma * draws[:, COLUMN["roll"]]
         pitch = np.clip(parameters[:, 0], -1.4, 1.4)
-        focal = np.exp(np.clip(parameters[:, 1], -2, 3)) * size[0]
+        focal = np.exp(np.clip(parameters[:, 1], SHORTEST, LONGEST)) * size[0]
         return Cameras(*size, focal, axes_of(pitch, roll), np.ones(len(draws))), parameters
 
     def at_height(self, height: Floats) -> Cameras:

@@ -59,7 +59,7 @@ def record_trajectory(
     worlds, light = shown.worlds, shown.worlds.layout.light
     camera = shown.record_camera()
     placement = None
-    if worlds.placements is not None:
+    if worlds.placements is not None and (world.depth is None or world.depth.is_of_scene):
         others = None if shown.ensemble is None else shown.ensemble.placements
         placement = _placement(world.bodies[0].name, worlds.placements, others)
     placed = shown.record_placed()

@@ -163,7 +163,7 @@ def _quantity(value: float | None, unit: Literal["px", "px/s"]) -> Quantity | No
 def scale_of(
     run: Run[SimulateRequest], grounding: Grounding, reading: MotionReading
 ) -> tuple[records.MetresPerPixel | None, list[str]]:
-    """Metres per pixel at the mover, and doubts: as given, else by a depth map in metres, else by sizes that are given,
+    """Metres per pixel at the mover, and doubts: by a depth map in metres, else as given, else by sizes that are given,
     else as read of it or others.
 
     What stands elsewhere on the floor is nearer or farther, by the camera as far as it is known. None where nobody
@@ -174,9 +174,11 @@ def scale_of(
     things = [LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior), *grounding.others]
     width, height = run.image.info.width, run.image.info.height
     fit, depth_map = given_camera((width, height), reading.down, run.request.camera, run.focal), run.depth
-    mapped = None if depth_map is None else depth_map.metres_per_pixel(grounding.bbox, math.exp(fit.mean[1]) * width)
+    mapped = None
+    if depth_map is not None and run.request.law == "contact" and run.request.trajectory is None:
+        mapped = depth_map.metres_per_pixel(grounding.bbox, math.exp(fit.mean[1]) * width)
     if mapped is not None:
-        told["the depth map"] = mapped
+        told["the depth map, which is taken"] = mapped
     camera = FloorCamera(width, height, math.exp(fit.mean[1]) * width, float(fit.mean[0]), fit.roll, 1.0)
     depths = camera.floor_points(np.array([((x0 + x1) / 2, y1) for x0, _, x1, y1 in (each.bbox for each in things)]))
     sizes: list[tuple[float, float, bool]] = []  # log of the metres per pixel at the mover, deviation, taken as exact
@@ -195,7 +197,7 @@ def scale_of(
     if told and max(told.values()) > MOST_APART * min(told.values()):
         said = ", ".join(f"{value:.4g} by {name}" for name, value in told.items())
         doubts = [f"What is said of sizes disagrees by more than a factor of two, in metres per pixel: {said}."]
-    if mapped is not None and (given is None or given.source != "request"):
+    if mapped is not None:
         return records.MetresPerPixel(value=mapped, source="depth"), doubts
     exact = [each for each in sizes if each[2]]
     if (given is not None and (given.source == "request" or not exact)) or not sizes:

@@ -13,7 +13,7 @@ from cow_service.narration import OF_ITSELF, OF_TARGET, place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera
-from cow_service.physics.ensemble import BY_EVENTS, Query
+from cow_service.physics.ensemble import BY_EVENTS, SURE, SURE_OF_GUESS, Query
 from cow_service.physics.geometry import DepthMap, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
@@ -129,16 +129,16 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         fit = camera_of(fit, situation.size, standing, lines, flying, motion.metres_per_pixel.value, shadow)
         measured = None
     else:
-        fit, measured = measure_scene(situation.depth, fit, bodies, supports)
+        fit, measured = measure_scene(situation.depth, fit, bodies, supports, in_air)
         faint = faint if measured is None else rise_above(situation.depth, measured, faint)
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
     # What else moves has a way and a speed of its own, and no end but what it meets.
-    own = ("kind", "direction", "depth", "towards", "speed", "speed_deviation")
+    fields = ("kind", "direction", "depth", "towards", "speed", "speed_deviation")
     alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": (), "rises": False}
     others = {
-        index: motion.model_copy(update=alone | {name: getattr(each, name) for name in own})
+        index: motion.model_copy(update=alone | {name: getattr(each, name) for name in fields})
         for each in motion.others
         for index, body in enumerate(bodies)
         if index and not situation.follows_path and body.bbox == each.object.bbox
@@ -159,7 +159,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         placed_before=before,
         level=level,
         measured=measured,
-        depth=None if situation.depth is None else situation.depth.estimate(fit, measured),
+        depth=None if situation.depth is None or situation.follows_path else situation.depth.estimate(fit, measured),
         faint=faint,
     )
     if not situation.follows_path:
@@ -220,9 +220,11 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
 
 def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequence[bool]) -> Query | None:
     """What is asked of bodies; None where nothing is, or one that is named was not found under that name."""
-    asked = situation.grounding.asked
+    asked, motion = situation.grounding.asked, situation.motion
     if asked is None:
         return None
+    if situation.carried is not None and asked.relation == "moves":  # whether it stays where it is put
+        asked = asked.model_copy(update={"relation": "inside", "negated": not asked.negated, "target": None})
 
     def named(words: str) -> tuple[int, ...]:
         if same_name(words, situation.grounding.object):
@@ -238,7 +240,9 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequenc
         return None
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
     asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
-    query = Query(asked, targets[0], subjects[0], known)
+    is_guess = motion.kind == "projectile" and motion.cue != "trail" and motion.towards is None
+    sure_from = SURE_OF_GUESS if is_guess and motion.depth_deviation > 0 else SURE
+    query = Query(asked, targets[0], subjects[0], known, sure_from=sure_from)
     if situation.carried is not None and asked.relation == "inside":
         return query
     # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.

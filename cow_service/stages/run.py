@@ -64,6 +64,7 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
     return options
 
 
+LEAST_NEAREST = 0.05  # of the usual depth: relative maps that begin nearer were shifted
 MAPPED_DEVIATION, EXIF_DEVIATION = 0.06, 0.08  # relative, of focal lengths: pictures with EXIF may be cropped
 ALMOST_DONE = 0.999  # of a stage whose end has not been reported
 
@@ -179,13 +180,18 @@ class Run(Generic[Request_co]):
         try:
             data = self.backends.artifacts.read(given.map.artifact)
             values = decode_depth(data, max_megapixels=image.width * image.height / 1e6)
+        except errors.ImageTooLarge as error:
+            raise _no_depth(f"is larger than the upright image of {image.width} x {image.height} px") from error
         except UNREADABLE as error:
-            raise _no_depth(f"cannot be read: {error.detail}") from error
+            raise _no_depth(f"cannot be read: {error.detail.rstrip('.')}") from error
         if values.shape != (image.height, image.width):
             size = f"{values.shape[1]} x {values.shape[0]} px"
             raise _no_depth(f"has {size} where the upright image has {image.width} x {image.height} px")
         if not values.any():
             raise _no_depth("is empty: every pixel is 0, which says that nothing is known")
+        nearest, usual = (float(value) for value in np.percentile(values[values > 0], (1, 50)))
+        if given.scale is None and nearest < LEAST_NEAREST * usual:
+            raise _no_depth("begins at the camera itself: depths must be proportional to distances, without an offset")
         depth = np.where(values > 0, values.astype(np.float64), np.nan)
         return DepthMap(depth, given.scale, given.deviation, given.focal)
 

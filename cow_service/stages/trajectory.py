@@ -73,6 +73,8 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
         doubts.append("identity")
     if any(bodies[body].confidence < CLEAR for body in matter):
         doubts.append("outline")
+    if world.measured is not None and not all(world.measured.footprints[body] for body in matter):
+        doubts.append("depth")
     if moves_over(result, world.faint):
         doubts.append("faint")
     if doubts:
