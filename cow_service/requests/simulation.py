@@ -312,7 +312,7 @@ class DepthRequest(Record):
     )
     scale: Annotated[Finite, Field(ge=1e-9, le=1e6)] | None = Field(
         default=None,
-        description="Metres per unit of the map; null: the unit is not known, but values are proportional to distances.",
+        description="Metres per unit of the map; null: it is not known, and values are proportional to distances.",
     )
     focal: Annotated[Finite, Field(ge=1, le=1_000_000)] | None = Field(
         default=None, description="Focal length that the map was made with, px; by default the camera's."
