@@ -20,6 +20,7 @@ def start(page: Page) -> None:
 
 def answer(page: Page) -> None:
     drop(page, picture(7))
+    expect(page.locator("#question")).to_have_value("")  # the question about the picture before is gone
     ask(page, QUESTION)
     result(page)
     page.locator("details").evaluate_all("all => all.forEach((details) => { details.open = true; })")
