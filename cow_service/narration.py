@@ -254,6 +254,7 @@ DOUBTS: dict[records.Doubt, str] = {  # what an outcome depends on
     "outline": "where the outlines of things run",
     "identity": "whether the things are those that the question names",
     "faint": "whether something stands in the way that is too faint to tell",
+    "depth": "whether the depth map shows what matters",
 }
 
 

@@ -19,7 +19,7 @@ from cow_service.errors import InvalidRequest
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.geometry import DepthMap, find_floor, measure
 from cow_service.records import Simulation
-from cow_service.requests import SimulateRequest
+from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.vision.masks import CroppedMask
@@ -223,6 +223,18 @@ class TestRequest:
         assert not found.trajectory.outcome.sure
         assert "depth" in found.trajectory.outcome.depends_on
         assert any("does not show 'blue block'" in warning for warning in found.warnings)
+
+    @pytest.mark.parametrize("shown", [[BALL], []])
+    def test_the_answer_says_that_the_map_is_at_fault(self, service: Service, shown: list[Any]) -> None:
+        depth = "data:image/png;base64," + base64.b64encode(depth_png(CAMERA.depth(shown))).decode()
+        body = {
+            "image": "data:image/png;base64," + base64.b64encode(png_bytes(PICTURE)).decode(),
+            "question": QUESTION,
+            "depth": {"map": depth, "scale": 0.001, "focal": 640},
+        }
+        told = service.answer(AnswerRequest.model_validate(body))
+        assert told.not_sure
+        assert any("the depth map does not show what matters" in warning for warning in told.warnings)
 
     def test_a_relative_map_may_not_be_shifted(self, service: Service) -> None:
         depth = CAMERA.depth([BALL, NEAR])

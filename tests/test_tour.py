@@ -57,7 +57,7 @@ def test_every_cell_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
     told = capsys.readouterr().out
     for line in (
         "mug -> Yes",
-        "throw -> not sure",
+        "throw -> Yes",
         "car -> not sure\n  nothing was imagined: ",
         "again: grounding, motion",
     ):

@@ -1,7 +1,7 @@
 """The likeliest world, and the ensemble of worlds around it: what is shown, what is answered, and how sure that is.
 
-The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, and robust
-where it has at least `ROBUST` of them.
+The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, or
+`SURE_OF_MISS` where a throw meets nothing, and robust where it has at least `ROBUST` of them.
 """
 
 from collections import Counter
@@ -20,7 +20,9 @@ from cow_service.vision.types import Floats, Mask
 EVERY = 2  # frames of its clock between those that are recorded of the ensemble
 TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
 SURE = 0.7  # share of the worlds from which an answer is given
-SURE_OF_GUESS = 0.85  # the same of a throw whose heading out of the plane of the image nobody tells
+# The same of a throw whose heading out of the plane of the image nobody tells, where it meets nothing: a wrong guess of
+# the heading makes worlds miss, and hardly ever hit.
+SURE_OF_MISS = 0.85
 ROBUST = 0.9
 MATTERS = 0.2  # correlation with the outcome from which a parameter is named
 MOST_NAMED = 3
@@ -39,7 +41,7 @@ class Query:
     subject: int = 0  # who does it
     among: tuple[int, ...] = ()  # the things that are meant; empty: any
     is_decidable: bool = True  # by worlds
-    sure_from: float = SURE  # share of the worlds from which an answer is given
+    sure_of_miss: float = SURE  # share of the worlds from which it is answered that nothing happens
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
         shown = 1 - happens if asked.negated else happens
     return Decided(
         probability=shown,
-        sure=probability >= query.sure_from,
+        sure=probability >= (query.sure_of_miss if answer <= 0 else SURE),
         robust=probability >= ROBUST,
         depends_on=tuple(depends[:MOST_NAMED]),
         first=answer if asked.form in FIRST_MET and answer >= 0 else None,
@@ -185,7 +187,7 @@ def decide_change(query: Query, changed: WorldEvents, factual: WorldEvents, draw
     probability = max(share, 1 - share)
     return Decided(
         probability=1 - share if query.asked.negated else share,
-        sure=probability >= query.sure_from,
+        sure=probability >= query.sure_of_miss,
         robust=probability >= ROBUST,
         depends_on=_depends_on(differs == (share >= 0.5), draws),
     )

@@ -12,8 +12,8 @@ from cow_service.errors import CannotGround
 from cow_service.narration import OF_ITSELF, OF_TARGET, place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera
-from cow_service.physics.ensemble import BY_EVENTS, SURE, SURE_OF_GUESS, Query
+from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera, no_segments
+from cow_service.physics.ensemble import BY_EVENTS, SURE, SURE_OF_MISS, Query
 from cow_service.physics.geometry import DepthMap, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
@@ -119,18 +119,22 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         # Nothing is asked but whether it gets there: shown is what it does in most worlds.
         query = Query(Asked(relation="inside"), carried.targets[0])
     faint = situation.scene.faint_beside([body.bbox for body in bodies])
-    shadow = find_shadow(situation.scene, bodies[0].bbox) if bodies[0].shape == "sphere" and in_air[0] else None
-    own, lines = divide(situation.scene.segments, [body.mask for body in bodies])
+    depth = None if level is not None or situation.follows_path else situation.depth
+    is_ball_in_air = bodies[0].shape == "sphere" and in_air[0]
+    shadow = find_shadow(situation.scene, bodies[0].bbox) if depth is None and is_ball_in_air else None
+    own, lines = (
+        divide(situation.scene.segments, [body.mask for body in bodies]) if depth is None else ([], no_segments())
+    )
     fit = given_camera(situation.size, motion.down, request.camera, situation.focal, situation.follows_path)
-    if situation.depth is None or level is not None or situation.follows_path:
+    measured = None
+    if depth is None:
         parts = zip(bodies, own, on_floor, strict=True)
         standing = [Standing.of(body, segments) for body, segments, stands in parts if stands]
         flying = bodies[0] if in_air[0] else None
         fit = camera_of(fit, situation.size, standing, lines, flying, motion.metres_per_pixel.value, shadow)
-        measured = None
     else:
-        fit, measured = measure_scene(situation.depth, fit, bodies, supports, in_air)
-        faint = faint if measured is None else rise_above(situation.depth, measured, faint)
+        fit, measured = measure_scene(depth, fit, bodies, supports, in_air)
+        faint = faint if measured is None else rise_above(depth, measured, faint)
     # What something is put into is as wide at its lower end as its opening was measured.
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
@@ -241,8 +245,8 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequenc
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
     asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
     is_guess = motion.kind == "projectile" and motion.cue != "trail" and motion.towards is None
-    sure_from = SURE_OF_GUESS if is_guess and motion.depth_deviation > 0 else SURE
-    query = Query(asked, targets[0], subjects[0], known, sure_from=sure_from)
+    sure_of_miss = SURE_OF_MISS if is_guess and motion.depth_deviation > 0 else SURE
+    query = Query(asked, targets[0], subjects[0], known, sure_of_miss=sure_of_miss)
     if situation.carried is not None and asked.relation == "inside":
         return query
     # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.

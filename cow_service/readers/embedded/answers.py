@@ -191,6 +191,7 @@ NOT_IDENTIFIED = (
 )
 NOT_CLEAR = "Not sure, because a thing that matters was not seen clearly; the warnings say which."
 TOO_FAINT = "Not sure, because something may stand in the way that is too faint to tell; the warnings say where."
+NOT_IN_MAP = "Not sure, because the depth map does not show what matters; the warnings say why."
 TOO_CLOSE = "Not sure: the probability of {what} is {probability:.2f}{depends}."
 
 
@@ -235,6 +236,8 @@ def why_not_sure(outcome: Outcome) -> str:
     """What keeps the world from an answer, in one sentence; empty where it gives one."""
     if outcome.asked.target is not None and outcome.object is None:
         return NOT_FOUND
+    if "depth" in outcome.depends_on:
+        return NOT_IN_MAP
     if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
         return NOT_TOLD
     if outcome.sure:

@@ -33,6 +33,7 @@ export const DOUBTS = {
   friction: "how slippery the floor is",
   identity: "whether these are the things that you mean",
   faint: "whether something stands in the way that is too faint to tell",
+  depth: "whether the depth map shows what matters",
 };
 
 /** An answer in words. */
