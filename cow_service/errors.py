@@ -22,6 +22,7 @@
     │   └── ObjectNotFound         object-not-found         422
     ├── CannotReadDirection        cannot-read-direction    422
     ├── ReaderUnavailable          reader-unavailable       503
+    ├── PerceptionUnavailable      perception-unavailable   503
     ├── MllmBadReply               mllm-bad-reply           502
     ├── MllmUnavailable            mllm-unavailable         503
     ├── GeneratorUnavailable       generator-unavailable    503
@@ -205,6 +206,10 @@ class CannotReadDirection(CowError, code="cannot-read-direction", status=422):
 
 class ReaderUnavailable(CowError, code="reader-unavailable", status=503):
     """The reader cannot run on this server."""
+
+
+class PerceptionUnavailable(CowError, code="perception-unavailable", status=503):
+    """A model that the server sees with cannot run: it is missing, damaged, or does not fit into memory."""
 
 
 class MllmBadReply(CowError, code="mllm-bad-reply", status=502):

@@ -70,6 +70,8 @@ class Settings(BaseSettings):
     """Reader where a request names none; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"
     """Generator where a request names none."""
+    perception: str = Field(default="none", min_length=1)
+    """Models that see: none, cpu, gpu, or names that `cow models` lists, one of each kind, with commas between."""
     max_image_megapixels: float = Field(default=25, gt=0, le=500)
     """Largest image taken, in millions of pixels."""
     max_body_mb: float = Field(default=32, gt=0, le=4096)

@@ -70,8 +70,9 @@ class Manifest(Record):
     """One backend or model as described by `models/<name>.yaml`."""
 
     name: str
-    role: Literal["reader", "generator", "mllm"] = Field(
-        description="Which registry it belongs to; an `mllm` is what the readers `mllm` and `local` ask."
+    role: Literal["reader", "generator", "mllm", "segmenter", "detector", "depth", "inpainter"] = Field(
+        description="Which registry it belongs to; an `mllm` is what the readers `mllm` and `local` ask, the last four "
+        "are what the service sees with."
     )
     summary: str
     licence: str

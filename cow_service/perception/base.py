@@ -1,0 +1,220 @@
+"""The Protocols of what sees with models, and the choice of a server. Stages know this file, never an implementation.
+
+Images are RGB [H, W, 3], uint8; boxes and points are pixels of them.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any, Literal, Protocol, cast
+
+import cv2
+import numpy as np
+
+from cow_service.errors import PerceptionUnavailable
+from cow_service.records import BBox, Point
+from cow_service.registry import Registry
+from cow_service.settings import Settings, SettingsError
+from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.weights.manifests import find_manifest
+
+PerceptionKind = Literal["segmenter", "detector", "depth", "inpainter"]
+GROUPS: dict[PerceptionKind, str] = {
+    "segmenter": "cow_service.segmenters",
+    "detector": "cow_service.detectors",
+    "depth": "cow_service.depth_estimators",
+    "inpainter": "cow_service.inpainters",
+}
+SETS: dict[str, tuple[str, ...]] = {  # by the value of COW_PERCEPTION; all of them under permissive licences
+    "none": (),
+    "cpu": ("sam2-tiny", "grounding-dino-tiny", "moge-2-small"),
+    "gpu": ("sam2-large", "grounding-dino-base", "moge-2-large"),
+}
+MOST_EMBEDDINGS = 8  # images whose embedding is kept: some 16 MB each of a large model
+ImageKey = tuple[str | None, str]
+"""Whose image it is, and its SHA-256: nobody learns by the time it takes what others look at."""
+
+
+@dataclass(frozen=True)
+class Prompt:
+    """Where a thing is: a point on it, or a box around it."""
+
+    point: Point | None = None
+    bbox: BBox | None = None
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A mask that a segmenter proposes."""
+
+    logits: Floats32  # [h, w] over the whole image, at the model's own size; above 0 where the thing is
+    score: float  # 0..1: how good the model takes it to be
+
+    @property
+    def mask(self) -> Mask:
+        """[h, w] at the model's own size."""
+        return self.logits > 0
+
+    def share(self, width: int, height: int) -> Floats32:
+        """[height, width]: how much of each pixel of the image is the thing's, 0..1."""
+        # Logits, not shares, are enlarged: those of a clear edge would give stairs.
+        large = cv2.resize(self.logits, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(1 / (1 + np.exp(-np.clip(large, -30, 30))), np.float32)
+
+
+class Segmenter(Protocol):
+    """Cuts things out. Safe to use from several threads, as all of these are."""
+
+    fingerprint: str
+    """All that decides what it finds: model, revision, options. So of all of these."""
+
+    def embed(self, image: Image) -> Any:
+        """What it knows of an image before it is asked for a thing: computed once, used for every prompt."""
+        ...
+
+    def segment(self, embedding: Any, prompts: Sequence[Prompt]) -> tuple[tuple[Segment, ...], ...]:
+        """For each prompt some candidates, the best first: a point may mean a part or the whole."""
+        ...
+
+
+@dataclass(frozen=True)
+class Detection:
+    """A thing that a detector found for a phrase."""
+
+    phrase: str  # one of those that were asked for
+    bbox: BBox
+    score: float  # 0..1
+
+
+class Detector(Protocol):
+    """Finds things by their names."""
+
+    fingerprint: str
+
+    def detect(self, image: Image, phrases: Sequence[str]) -> tuple[Detection, ...]:
+        """The things that the phrases name, best first; a phrase may have none or several."""
+        ...
+
+
+@dataclass(frozen=True)
+class DepthReading:
+    """How far away what an image shows is."""
+
+    depth: Floats  # [h, w] over the whole image, along the optical axis; nan where nothing is known
+    scale: float | None  # metres per unit; None: relative, proportional to distances
+    focal: float | None  # px of the image; None where the model does not tell
+    deviation: float  # relative, one standard deviation
+
+
+class DepthEstimator(Protocol):
+    """Estimates depth, and maybe the focal length."""
+
+    fingerprint: str
+
+    def estimate(self, image: Image, focal: float | None) -> DepthReading:
+        """`focal` (px) is that of the image's EXIF, where it has one."""
+        ...
+
+
+class Inpainter(Protocol):
+    """Paints the background behind what is taken out."""
+
+    fingerprint: str
+
+    def fill(self, image: Image, hole: Mask, progress: Callable[[float], None]) -> Image:
+        """The image with other pixels inside the hole [H, W], and the same outside.
+
+        `progress` hears 0 to 1, and may raise `Canceled`.
+        """
+        ...
+
+
+class Perception:
+    """The models that a server sees with, loaded when they are first needed. Safe to use from several threads."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Raises `SettingsError` for names that nobody has, and for two of one kind."""
+        self._registries: dict[PerceptionKind, Registry[Any]] = {
+            kind: Registry(group, PerceptionUnavailable, settings) for kind, group in GROUPS.items()
+        }
+        self.names: dict[PerceptionKind, str] = self._chosen(settings.perception)
+        self._embeddings: OrderedDict[tuple[str, ImageKey], Any] = OrderedDict()
+        self._lock = Lock()
+
+    def _chosen(self, wanted: str) -> dict[PerceptionKind, str]:
+        chosen: dict[PerceptionKind, str] = {}
+        for name in SETS.get(wanted, tuple(each.strip() for each in wanted.split(","))):
+            kind = next((kind for kind, registry in self._registries.items() if name in registry.names()), None)
+            if kind is None or kind in chosen:
+                known = ", ".join((*SETS, *(name for _, name in self.installed())))
+                fault = "is no such model" if kind is None else f"is a second {kind} beside {chosen[kind]!r}"
+                raise SettingsError(f"Bad settings: COW_PERCEPTION: {name!r} {fault}: there are {known}.")
+            chosen[kind] = name
+        return chosen
+
+    def installed(self) -> list[tuple[PerceptionKind, str]]:
+        """All that may be chosen, by kind and name."""
+        return [(kind, name) for kind, registry in self._registries.items() for name in registry.names()]
+
+    def load(self, kind: PerceptionKind) -> Any | None:
+        """The model of a kind, None where the server has none. Raises `PerceptionUnavailable`."""
+        if kind not in self.names:
+            return None
+        name = self.names[kind]
+        manifest = find_manifest(name)
+        if manifest is not None and (missing := manifest.missing_modules()):
+            raise PerceptionUnavailable(
+                f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
+            )
+        return self._registries[kind].get(name)
+
+    @property
+    def segmenter(self) -> Segmenter | None:
+        """None where the server has none; so of the others. Raises `PerceptionUnavailable`."""
+        return cast(Segmenter | None, self.load("segmenter"))
+
+    @property
+    def detector(self) -> Detector | None:
+        """See `segmenter`."""
+        return cast(Detector | None, self.load("detector"))
+
+    @property
+    def depth(self) -> DepthEstimator | None:
+        """See `segmenter`."""
+        return cast(DepthEstimator | None, self.load("depth"))
+
+    @property
+    def inpainter(self) -> Inpainter | None:
+        """See `segmenter`."""
+        return cast(Inpainter | None, self.load("inpainter"))
+
+    def identity(self, kinds: Sequence[PerceptionKind]) -> dict[str, str]:
+        """What decides the work of the models of some kinds, as far as the server has them."""
+        return {kind: model.fingerprint for kind in kinds if (model := self.load(kind)) is not None}
+
+    def segment(self, image: Image, key: ImageKey, prompts: Sequence[Prompt]) -> tuple[tuple[Segment, ...], ...]:
+        """Candidates for each prompt, from one embedding of the image. The server must have a segmenter."""
+        segmenter = self.segmenter
+        assert segmenter is not None, "asked for only where there is a segmenter"
+        named = segmenter.fingerprint, key
+        with self._lock:
+            known = named in self._embeddings
+            embedding = self._embeddings.get(named)
+        if not known:
+            embedding = segmenter.embed(image)
+        with self._lock:
+            self._embeddings[named] = embedding
+            self._embeddings.move_to_end(named)
+            while len(self._embeddings) > MOST_EMBEDDINGS:
+                self._embeddings.popitem(last=False)
+        return segmenter.segment(embedding, prompts) if prompts else ()
+
+    def close(self) -> None:
+        """Lets go of the models."""
+        for registry in self._registries.values():
+            registry.close()
+        with self._lock:
+            self._embeddings.clear()

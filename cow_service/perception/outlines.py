@@ -1,0 +1,109 @@
+"""Outlines that can be trusted: those on which two prompts agree. One alone may be a scrap of a thing."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cow_service.perception.base import Prompt, Segment
+from cow_service.records import BBox, Point
+from cow_service.vision.masks import bbox_of, iou
+from cow_service.vision.types import Floats32, Mask
+
+AGREE = 0.8  # IoU from which two masks are one
+LEAST_SCORE = 0.5  # of a candidate
+FILLS = 0.5  # IoU of the box that was given and that of its mask: less is a part of it, or something else
+RIVAL = 0.05  # of the score: a candidate that is so close to the best is meant as well
+MOST_SHARE = 0.95  # of the image: more is no thing
+
+Ask = Callable[[Sequence[Prompt]], tuple[tuple[Segment, ...], ...]]
+"""Asks the segmenter about one image."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What a segmenter takes for a thing."""
+
+    share: Floats32  # [H, W]: how much of each pixel is the thing's, 0..1
+    score: float
+    is_sure: bool  # two prompts agree on it
+
+    @property
+    def mask(self) -> Mask:
+        """[H, W]."""
+        return self.share > 0.5
+
+    @property
+    def bbox(self) -> BBox:
+        """Tight, px."""
+        return bbox_of(self.mask)
+
+
+def outlines_in(ask: Ask, size: tuple[int, int], boxes: Sequence[BBox]) -> list[Outline | None]:
+    """What is in each box of an image (width, height); None where nothing fills it.
+
+    It is sure where the point deepest inside of its mask gives the same mask again.
+    """
+    best = [_first(found) for found in ask([Prompt(bbox=box) for box in boxes])]
+    again = iter(ask([Prompt(point=_inmost(each.mask, size)) for each in best if each is not None]))
+    outlines: list[Outline | None] = []
+    for box, segment in zip(boxes, best, strict=True):
+        if segment is None:
+            outlines.append(None)
+            continue
+        agrees = any(_overlap(segment.mask, other.mask) >= AGREE for other in next(again))
+        outline = Outline(segment.share(*size), segment.score, agrees)
+        outlines.append(outline if outline.mask.any() and iou(outline.bbox, box) >= FILLS else None)
+    return outlines
+
+
+def outlines_at(ask: Ask, size: tuple[int, int], point: Point) -> list[Outline]:
+    """The things that a point of an image (width, height) may mean, best first; empty where no two prompts agree.
+
+    More than one are things within each other that are about as good; else the first alone is meant.
+    """
+    (candidates,) = ask([Prompt(point=point)])
+    possible = [each for each in candidates if _first((each,)) is not None]
+    width, height = size
+    scaled = [_scaled_box(each.mask, size) for each in possible]
+    again = ask([Prompt(bbox=box) for box in scaled])
+    agreed = [
+        each
+        for each, found in zip(possible, again, strict=True)
+        if (best := _first(found)) is not None and _overlap(each.mask, best.mask) >= AGREE
+    ]
+    agreed.sort(key=lambda each: -each.score)
+    chosen: list[Segment] = []
+    for each in agreed:
+        if all(_overlap(each.mask, other.mask) < AGREE for other in chosen):
+            chosen.append(each)
+    close = [each for each in chosen if each.score >= chosen[0].score - RIVAL]
+    outlines = [Outline(each.share(width, height), each.score, True) for each in close]
+    return [each for each in outlines if each.mask.any()]
+
+
+def _first(candidates: Sequence[Segment]) -> Segment | None:
+    """The best of some candidates that is good enough to be a thing."""
+    for each in sorted(candidates, key=lambda each: -each.score):
+        if each.score >= LEAST_SCORE and 0 < each.mask.mean() <= MOST_SHARE:
+            return each
+    return None
+
+
+def _overlap(a: Mask, b: Mask) -> float:
+    return float(np.count_nonzero(a & b) / max(1, np.count_nonzero(a | b)))
+
+
+def _inmost(mask: Mask, size: tuple[int, int]) -> Point:
+    """The point, px of the image, that lies deepest inside of a mask [h, w] that is not empty."""
+    depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    y, x = np.unravel_index(int(depth.argmax()), depth.shape)
+    return (float(x) + 0.5) * size[0] / mask.shape[1], (float(y) + 0.5) * size[1] / mask.shape[0]
+
+
+def _scaled_box(mask: Mask, size: tuple[int, int]) -> BBox:
+    """The tight box, px of the image, of a mask [h, w]."""
+    x0, y0, x1, y1 = bbox_of(mask)
+    across, down = size[0] / mask.shape[1], size[1] / mask.shape[0]
+    return x0 * across, y0 * down, x1 * across, y1 * down
