@@ -1,10 +1,19 @@
 """The pipeline: what happens to a request, stage by stage. The only file that names the stages in order."""
 
-from cow_service.errors import Canceled, CowError, DeviceFailed, InvalidRequest, MllmUnavailable, ReaderUnavailable
+from cow_service.errors import (
+    Canceled,
+    CowError,
+    DeviceFailed,
+    InvalidRequest,
+    MllmUnavailable,
+    PerceptionUnavailable,
+    ReaderUnavailable,
+)
 from cow_service.readers.options import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question, ask_first, gate_of
+from cow_service.stages.depth import estimate_depth
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
 from cow_service.stages.keys import Verdicts
@@ -12,7 +21,7 @@ from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
 
-SIMULATION_STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation")
+SIMULATION_STAGES: tuple[Stage, ...] = ("grounding", "depth", "motion", "trajectory", "generation")
 
 
 def simulate(run: Run[SimulateRequest]) -> Simulation:
@@ -23,6 +32,8 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     """
     run.check_request()
     grounding = run.stage("grounding", ground)
+    if run.wants_depth:
+        run.take_depth(run.stage("depth", estimate_depth).depth)
     motion = run.stage("motion", read_motion, grounding, run.hints)
     trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
     clip = run.stage("generation", generate, grounding, motion, trajectory)
@@ -86,7 +97,7 @@ def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, CowError | Non
     """The simulation, or the error for which there is none. Raises what leaves no answer either."""
     try:
         return simulate(run), None
-    except (InvalidRequest, Canceled, MllmUnavailable, ReaderUnavailable, DeviceFailed):
+    except (InvalidRequest, Canceled, MllmUnavailable, ReaderUnavailable, PerceptionUnavailable, DeviceFailed):
         raise  # the last: another process may be able to imagine
     except CowError as error:
         return None, error

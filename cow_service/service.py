@@ -18,15 +18,26 @@ from cow_service.media.artifacts import ArtifactStore, DiskArtifacts, RetryPolic
 from cow_service.media.images import check, decode, decode_data_url
 from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
+from cow_service.perception.base import Perception
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
 from cow_service.readers.chat import ChatReader
-from cow_service.records import Answer, Artifact, BackendInfo, Models, Simulation
+from cow_service.records import Answer, Artifact, BackendInfo, Look, Models, Simulation
 from cow_service.registry import Registry
-from cow_service.requests import AnswerRequest, ImageArtifact, ImageRef, ImageUrl, PlaceRequest, SimulateRequest
+from cow_service.requests import (
+    AnswerRequest,
+    ImageArtifact,
+    ImageRef,
+    ImageUrl,
+    LookRequest,
+    PlaceRequest,
+    SimulateRequest,
+)
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages import run as runs
+from cow_service.stages.looking import look
 from cow_service.vision.scene import SeenImages
+from cow_service.vision.types import Image
 from cow_service.weights.manifests import find_manifest, load_manifests
 from cow_service.weights.repositories import ready
 
@@ -54,6 +65,7 @@ class Service:
         self.metrics = Metrics()
         self._image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)
+        self.perception = Perception(settings)
         self.readers: Registry[Reader] = Registry("cow_service.readers", errors.ReaderUnavailable, settings)
         self._generator_limits = {point.name: point for point in entry_points(group="cow_service.generator_limits")}
         self.generators: Registry[Generator] = Registry("cow_service.generators", errors.GeneratorUnavailable, settings)
@@ -109,6 +121,7 @@ class Service:
             words=lambda: cast(WordReader, self.readers.get(WORD_READER)),
             generator=partial(self._generator, generator),
             artifacts=self.artifacts,
+            perception=self.perception,
             cpu=self.cpu,
             device=partial(self._device, generator),
         )
@@ -197,11 +210,36 @@ class Service:
             runs.check_request(limits, request)
         return reader, name
 
+    def look(self, request: LookRequest, owner: str | None = None, image: bytes | None = None) -> Look:
+        """What the server's models see in an image; nothing is kept but in memory.
+
+        `image`: the bytes of the request's image, where they came apart from it. An image by its SHA-256 is one that
+        `owner` looked at before. Raises `PerceptionUnavailable`, `InvalidRequest`, `ArtifactNotFound` for an image that
+        is not in memory any more, and the errors of `fetch` and `images.decode`.
+        """
+        known = request.image if isinstance(request.image, ImageArtifact) and image is None else None
+
+        def pixels() -> Image:
+            if known is not None:
+                raise errors.ArtifactNotFound("The image is not in memory any more: send it again.")
+            return decode(data, max_megapixels=self.settings.max_image_megapixels).pixels
+
+        data = b"" if known is not None else image or self.fetch(request.image)
+        sha256 = hashlib.sha256(data).hexdigest() if known is None else known.artifact
+        words = cast(WordReader, self.readers.get(WORD_READER))
+        nouns = words.read_question(request.question).nouns if request.question is not None else ()
+        with self.cpu.held(runs.priority_of(0, runs.now()), lambda: None):
+            return look(self.perception, (owner, sha256), pixels, request, nouns)
+
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
         return Models(
             readers=tuple(self._describe("reader", name) for name in self.readers.names()),
             generators=tuple(self._describe("generator", name) for name in self.generators.names()),
+            perception=tuple(
+                self._describe(kind, name).model_copy(update={"kind": kind})
+                for kind, name in self.perception.installed()
+            ),
             mllms=tuple(name for name, manifest in load_manifests().items() if manifest.role == "mllm"),
         )
 
@@ -223,12 +261,15 @@ class Service:
         """Lets go of what its backends hold open, such as connections."""
         self.readers.close()
         self.generators.close()
+        self.perception.close()
 
     def check(self) -> None:
         """Raises the `CowError` that would keep the default request from succeeding."""
         self.artifacts.check()
         self._reader(self.settings.reader)
         self._generator(self.settings.generator)
+        for kind in self.perception.names:
+            self.perception.load(kind)
 
     def _device(self, name: str) -> PrioritySemaphore:
         """Held while a generator works: one of its own where it has a device or a limit, else that of the CPU."""
@@ -257,7 +298,8 @@ class Service:
 
     def _describe(self, role: str, name: str) -> BackendInfo:
         manifest = find_manifest(name)
-        default = name == (self.settings.reader if role == "reader" else self.settings.generator)
+        roles = {"reader": self.settings.reader, "generator": self.settings.generator, **self.perception.names}
+        default = name == roles.get(role)
         if manifest is None:
             return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
         modules = manifest.missing_modules()

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.media.artifacts import DiskArtifacts
 from cow_service.media.images import DecodedImage, encode_png
+from cow_service.perception.base import Perception
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import ImageInfo
 from cow_service.requests import SimulateRequest
+from cow_service.settings import Settings
 from cow_service.stages.run import Backends, Run
 
 _FOLDER = tempfile.TemporaryDirectory(prefix="cow-tests-")  # of artifacts, until the process ends
@@ -30,8 +32,7 @@ def run_of(pixels: NDArray[np.uint8], reader=unexpected, generator=unexpected, *
     sha256 = hashlib.sha256(encode_png(pixels)).hexdigest()
     image = DecodedImage(pixels, ImageInfo(width=pixels.shape[1], height=pixels.shape[0], sha256=sha256), "image/png")
     cpu = PrioritySemaphore(1)
-    backends = Backends(
-        "reader", reader, EmbeddedReader, generator, DiskArtifacts(Path(_FOLDER.name)), cpu, lambda: cpu
-    )
+    artifacts, perception = DiskArtifacts(Path(_FOLDER.name)), Perception(Settings())
+    backends = Backends("reader", reader, EmbeddedReader, generator, artifacts, perception, cpu, lambda: cpu)
     asked = SimulateRequest.model_validate({"image": {"artifact": sha256}, "question": "?", **request})
     return Run(asked, image, backends)

@@ -20,7 +20,7 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from cow_service.api.problems import invalid
 from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody, pointer_part, shortened
-from cow_service.requests import SimulateRequest
+from cow_service.requests import LookRequest, SimulateRequest
 from cow_service.requests.values import SHOWN_CHARACTERS
 
 FORM_FIELDS = ("image", "question", "request")
@@ -30,10 +30,10 @@ MAX_OBJECTS = 100_000  # of a JSON text; each is checked in Python
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _NAMES = {list: "an array", str: "a string", int: "a number", float: "a number", bool: "a boolean", type(None): "null"}
 
-Body = TypeVar("Body", bound=SimulateRequest)
+Body = TypeVar("Body", bound=SimulateRequest | LookRequest)
 
 
-def body_of(model: type[SimulateRequest]) -> dict[str, Any]:
+def body_of(model: type[SimulateRequest | LookRequest]) -> dict[str, Any]:
     """The request body of an operation that takes this record, for the OpenAPI document."""
     form = {
         "type": "object",

@@ -16,7 +16,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request, Response
 from starlette.datastructures import Headers
 
-from cow_service.api.body import Body, parse, receive
+from cow_service.api.body import parse, receive
 from cow_service.api.middleware.access import charge
 from cow_service.api.middleware.body_limit import release_body
 from cow_service.errors import Canceled, CowError, FieldError, InvalidRequest, JobNotFound, StorageUnavailable
@@ -24,8 +24,8 @@ from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobSpec, JobState
 from cow_service.observability import logging as context
-from cow_service.records import TERMINAL, JobKind
-from cow_service.requests import ImageArtifact, SimulateRequest
+from cow_service.records import TERMINAL, JobKind, Look
+from cow_service.requests import ImageArtifact, LookRequest, SimulateRequest
 from cow_service.service import is_url
 from cow_service.stages.run import now
 
@@ -165,7 +165,7 @@ class Submitter:
         self._bodies = FairThreads(MAX_CONCURRENT_BODIES)
         self._fetches = FairThreads(MAX_CONCURRENT_FETCHES)
 
-    async def run(self, request: Request, kind: JobKind, model: type[Body]) -> Response:
+    async def run(self, request: Request, kind: JobKind, model: type[SimulateRequest]) -> Response:
         """The job's result, or the job itself where the caller does not want to wait so long.
 
         Raises what is wrong with the request, and what the job fails with.
@@ -188,6 +188,15 @@ class Submitter:
             return json_response(result, headers=submission.headers)
         shorter = await to_thread.run_sync(minimize, result)
         return json_response(shorter, headers=MINIMAL_APPLIED | submission.headers)
+
+    async def look(self, request: Request) -> Look:
+        """What the models of this process see. Raises as `Service.look`."""
+        owner, raw = owner_of(request), await receive(request)
+
+        def see() -> Look:
+            return self.engine.service.look(parse(raw, LookRequest), owner, raw.image)
+
+        return await self.in_thread(owner, see)
 
     def submission(self, request: Request, kind: JobKind) -> Submission:
         """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""

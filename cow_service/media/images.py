@@ -15,7 +15,7 @@ import re
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import cv2
 import numpy as np
@@ -188,8 +188,8 @@ def decode_depth(data: bytes, *, max_megapixels: float) -> NDArray[np.uint16]:
         return np.asarray(image).astype(np.uint16)
 
 
-def encode_png(pixels: NDArray[np.uint8] | NDArray[np.bool_], *, level: int = 1) -> bytes:
-    """Encode [H, W, 3] RGB, [H, W] grey or an [H, W] boolean mask (one bit per pixel) as PNG.
+def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.bool_], *, level: int = 1) -> bytes:
+    """Encode [H, W, 3] RGB, [H, W] grey of 8 or 16 bits or an [H, W] boolean mask (one bit per pixel) as PNG.
 
     `level` is zlib's, 0 (none) to 9 (smallest). Raises `ValueError` for other shapes.
     """
@@ -201,7 +201,7 @@ def encode_png(pixels: NDArray[np.uint8] | NDArray[np.bool_], *, level: int = 1)
     # One filter for all rows: trying each takes twice as long. Runs alone: other matches are rarer than they cost.
     options += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH]
     options += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
-    return _encoded(".png", pixels.astype(np.uint8, copy=False), options)
+    return _encoded(".png", cast(NDArray[np.uint8], pixels), options)
 
 
 def encode_jpeg(pixels: NDArray[np.uint8]) -> bytes:

@@ -132,6 +132,19 @@ class Inpainter(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Embedded:
+    """An image that a segmenter has looked at."""
+
+    segmenter: Segmenter
+    embedding: Any
+    size: tuple[int, int]  # width and height, px
+
+    def segment(self, prompts: Sequence[Prompt]) -> tuple[tuple[Segment, ...], ...]:
+        """Candidates for each prompt."""
+        return self.segmenter.segment(self.embedding, prompts) if prompts else ()
+
+
 class Perception:
     """The models that a server sees with, loaded when they are first needed. Safe to use from several threads."""
 
@@ -141,15 +154,16 @@ class Perception:
             kind: Registry(group, PerceptionUnavailable, settings) for kind, group in GROUPS.items()
         }
         self.names: dict[PerceptionKind, str] = self._chosen(settings.perception)
-        self._embeddings: OrderedDict[tuple[str, ImageKey], Any] = OrderedDict()
+        self._embeddings: OrderedDict[ImageKey, Embedded] = OrderedDict()
         self._lock = Lock()
 
     def _chosen(self, wanted: str) -> dict[PerceptionKind, str]:
         chosen: dict[PerceptionKind, str] = {}
+        kinds: dict[str, PerceptionKind] = {name: kind for kind, name in self.installed()}
         for name in SETS.get(wanted, tuple(each.strip() for each in wanted.split(","))):
-            kind = next((kind for kind, registry in self._registries.items() if name in registry.names()), None)
+            kind = kinds.get(name)
             if kind is None or kind in chosen:
-                known = ", ".join((*SETS, *(name for _, name in self.installed())))
+                known = ", ".join((*SETS, *kinds))
                 fault = "is no such model" if kind is None else f"is a second {kind} beside {chosen[kind]!r}"
                 raise SettingsError(f"Bad settings: COW_PERCEPTION: {name!r} {fault}: there are {known}.")
             chosen[kind] = name
@@ -195,22 +209,21 @@ class Perception:
         """What decides the work of the models of some kinds, as far as the server has them."""
         return {kind: model.fingerprint for kind in kinds if (model := self.load(kind)) is not None}
 
-    def segment(self, image: Image, key: ImageKey, prompts: Sequence[Prompt]) -> tuple[tuple[Segment, ...], ...]:
-        """Candidates for each prompt, from one embedding of the image. The server must have a segmenter."""
+    def embed(self, key: ImageKey, image: Callable[[], Image]) -> Embedded:
+        """What the segmenter knows of an image, which is asked for only where it is new. There must be a segmenter."""
         segmenter = self.segmenter
         assert segmenter is not None, "asked for only where there is a segmenter"
-        named = segmenter.fingerprint, key
         with self._lock:
-            known = named in self._embeddings
-            embedding = self._embeddings.get(named)
-        if not known:
-            embedding = segmenter.embed(image)
+            found = self._embeddings.get(key)
+        if found is None:
+            pixels = image()
+            found = Embedded(segmenter, segmenter.embed(pixels), (pixels.shape[1], pixels.shape[0]))
         with self._lock:
-            self._embeddings[named] = embedding
-            self._embeddings.move_to_end(named)
+            self._embeddings[key] = found
+            self._embeddings.move_to_end(key)
             while len(self._embeddings) > MOST_EMBEDDINGS:
                 self._embeddings.popitem(last=False)
-        return segmenter.segment(embedding, prompts) if prompts else ()
+        return found
 
     def close(self) -> None:
         """Lets go of the models."""

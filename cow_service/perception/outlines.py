@@ -1,12 +1,12 @@
 """Outlines that can be trusted: those on which two prompts agree. One alone may be a scrap of a thing."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from cow_service.perception.base import Prompt, Segment
+from cow_service.perception.base import Embedded, Prompt, Segment
 from cow_service.records import BBox, Point
 from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.types import Floats32, Mask
@@ -16,9 +16,6 @@ LEAST_SCORE = 0.5  # of a candidate
 FILLS = 0.5  # IoU of the box that was given and that of its mask: less is a part of it, or something else
 RIVAL = 0.05  # of the score: a candidate that is so close to the best is meant as well
 MOST_SHARE = 0.95  # of the image: more is no thing
-
-Ask = Callable[[Sequence[Prompt]], tuple[tuple[Segment, ...], ...]]
-"""Asks the segmenter about one image."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +37,13 @@ class Outline:
         return bbox_of(self.mask)
 
 
-def outlines_in(ask: Ask, size: tuple[int, int], boxes: Sequence[BBox]) -> list[Outline | None]:
-    """What is in each box of an image (width, height); None where nothing fills it.
+def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
+    """What is in each box; None where nothing fills it.
 
     It is sure where the point deepest inside of its mask gives the same mask again.
     """
-    best = [_first(found) for found in ask([Prompt(bbox=box) for box in boxes])]
-    again = iter(ask([Prompt(point=_inmost(each.mask, size)) for each in best if each is not None]))
+    size, best = image.size, [_first(found) for found in image.segment([Prompt(bbox=box) for box in boxes])]
+    again = iter(image.segment([Prompt(point=_inmost(each.mask, size)) for each in best if each is not None]))
     outlines: list[Outline | None] = []
     for box, segment in zip(boxes, best, strict=True):
         if segment is None:
@@ -58,16 +55,14 @@ def outlines_in(ask: Ask, size: tuple[int, int], boxes: Sequence[BBox]) -> list[
     return outlines
 
 
-def outlines_at(ask: Ask, size: tuple[int, int], point: Point) -> list[Outline]:
-    """The things that a point of an image (width, height) may mean, best first; empty where no two prompts agree.
+def outlines_at(image: Embedded, point: Point) -> list[Outline]:
+    """The things that a point may mean, best first; empty where no two prompts agree.
 
     More than one are things within each other that are about as good; else the first alone is meant.
     """
-    (candidates,) = ask([Prompt(point=point)])
+    (candidates,) = image.segment([Prompt(point=point)])
     possible = [each for each in candidates if _first((each,)) is not None]
-    width, height = size
-    scaled = [_scaled_box(each.mask, size) for each in possible]
-    again = ask([Prompt(bbox=box) for box in scaled])
+    again = image.segment([Prompt(bbox=_scaled_box(each.mask, image.size)) for each in possible])
     agreed = [
         each
         for each, found in zip(possible, again, strict=True)
@@ -79,7 +74,7 @@ def outlines_at(ask: Ask, size: tuple[int, int], point: Point) -> list[Outline]:
         if all(_overlap(each.mask, other.mask) < AGREE for other in chosen):
             chosen.append(each)
     close = [each for each in chosen if each.score >= chosen[0].score - RIVAL]
-    outlines = [Outline(each.share(width, height), each.score, True) for each in close]
+    outlines = [Outline(each.share(*image.size), each.score, True) for each in close]
     return [each for each in outlines if each.mask.any()]
 
 

@@ -55,6 +55,15 @@ class CallLog:
 
 
 @dataclass(frozen=True)
+class SeenThing:
+    """What the models of the server found for a noun."""
+
+    noun: str  # as it was asked for
+    mask: Mask  # [H, W]
+    score: float  # of the detector
+
+
+@dataclass(frozen=True)
 class ReaderInput:
     """What every call of a reader is given. Readers keep nothing of it from one call to the next."""
 
@@ -67,6 +76,7 @@ class ReaderInput:
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = lambda: None  # to be called while waiting; raises `Canceled`
     cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant
+    find: Callable[[Sequence[str]], tuple[SeenThing, ...]] | None = None  # by nouns, with `cpu` held; None: no detector
 
 
 class OtherMotionHint(Record):
@@ -116,6 +126,7 @@ class QuestionReading:
     asked: records.Asked | None = None  # null where the reader cannot tell from the words alone
     changes: tuple[NamedChange, ...] = ()  # what is taken away or put somewhere
     trail_named: bool = False  # the question speaks of a trail
+    nouns: tuple[str, ...] = ()  # of the things that it names, each once
     drawings_named: frozenset[str] = frozenset()  # "arrow" and "box", where the question speaks of one
 
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from cow_service.records.world import Artifact, Grounding, ImageInfo, Motion, Record, Sha256, Trajectory
+from cow_service.records.world import Artifact, BBox, Grounding, ImageInfo, Motion, Record, Sha256, Trajectory
 
 FramePolicy = Literal["initial", "uniform", "events"]
 
@@ -260,7 +260,8 @@ class BackendInfo(Record):
     """A reader or generator: what it is, what it needs, whether it is ready."""
 
     name: str
-    default: bool = Field(description="Used where a request names none.")
+    kind: Literal["reader", "generator", "segmenter", "detector", "depth", "inpainter"] | None = None
+    default: bool = Field(description="Used where a request names none; of models that see: used by the server.")
     ready: bool | None = Field(description="Null where nothing is known of it before it is used.")
     needs: tuple[str, ...] = Field(default=(), description="Python modules that it uses.")
     summary: str
@@ -281,7 +282,30 @@ class Models(Record):
 
     readers: tuple[BackendInfo, ...]
     generators: tuple[BackendInfo, ...]
+    perception: tuple[BackendInfo, ...] = Field(default=(), description="Models that the service can see with.")
     mllms: tuple[str, ...] = Field(default=(), description="Manifests of multimodal LLMs: what `COW_MLLM` may name.")
+
+
+class SeenObject(Record):
+    """A thing that the models of the server see."""
+
+    bbox: BBox = Field(description="[x0, y0, x1, y1], px.")
+    mask: str | None = Field(
+        description="data:image/png;base64,...: white where it is; null where its outline is not certain."
+    )
+    score: float = Field(ge=0, le=1, description="How sure the model is of it.")
+    name: str | None = Field(default=None, description="The noun under which it was looked for.")
+
+
+class Look(Record):
+    """What `POST /look` returns."""
+
+    image: Sha256 = Field(description="Of the image: later looks may name it as artifact while it is kept in memory.")
+    width: int
+    height: int
+    things: tuple[SeenObject, ...] = Field(
+        description="Best first. At a point, several are things within each other; none: no two looks agree."
+    )
 
 
 JobKind = Literal["simulate", "answer"]

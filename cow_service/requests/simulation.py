@@ -74,6 +74,24 @@ class GroundingRequest(PlaceRequest):
     object: ObjectWords | None = Field(default=None, description="What it is called.")
 
 
+class LookRequest(Record):
+    """What the models of the server see in an image: at a point, in a box, or of the things that a question names.
+
+    Without any of them the image is only made ready for points and boxes.
+    """
+
+    image: ImageRef
+    point: tuple[Finite, Finite] | None = Field(default=None, description="[x, y], px of the upright image.")
+    bbox: tuple[Finite, Finite, Finite, Finite] | None = Field(default=None, description="[x0, y0, x1, y1], px.")
+    question: Words | None = Field(default=None, min_length=1, max_length=4000)
+
+    @model_validator(mode="after")
+    def _one_place(self) -> LookRequest:
+        if (self.bbox is not None) + (self.point is not None) + (self.question is not None) > 1:
+            raise ValueError("give one of `point`, `bbox` and `question`")
+        return self
+
+
 class ObjectRequest(PlaceRequest):
     """Another object of the image, by its box, its mask, or a point on it."""
 
@@ -544,4 +562,4 @@ class AnswerRequest(SimulateRequest):
     votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer is taken.")
 
 
-Stage = Literal["gating", "grounding", "motion", "trajectory", "generation", "answering"]
+Stage = Literal["gating", "grounding", "depth", "motion", "trajectory", "generation", "answering"]

@@ -2,18 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
 from cow_service.narration import OF_ITSELF, OF_TARGET, same_name
-from cow_service.readers.base import GroundingReading, NamedChange, WordReader
+from cow_service.perception.outlines import Outline, outlines_at, outlines_in
+from cow_service.readers.base import GroundingReading, NamedChange, SeenThing, WordReader
 from cow_service.readers.options import plain
-from cow_service.readers.remedies import GIVE_OBJECT
+from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, ObjectPrior
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object
+from cow_service.vision.segmentation import mask_from_bbox
 from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
@@ -37,7 +40,11 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     if reading is None:
         empty, changed = run.reader_input("grounding"), request.changed_names
         sought = tuple(name for name in changed if not any(same_name(name, each.object) for each in given))
-        reading = run.reader.ground(replace(empty, known=given, sought=sought))
+        find = partial(_find, run) if "detector" in run.backends.perception.names else None
+        reading = run.reader.ground(replace(empty, known=given, sought=sought, find=find))
+        if run.can_segment:
+            with run.cpu():
+                reading = _outlined(run, reading)
     # What the image shows, now that it is known what moves.
     shows_trail = question.trail_named or (reading.hints is not None and reading.hints.cue == "trail")
     with run.cpu():
@@ -96,7 +103,8 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
             for name in named
             if name is not None and not any(same_name(name, each) for each in known)
         ]
-    artifacts = (mask.sha256, *(each.mask.sha256 for each in beside if each.mask is not None))
+    things = (*others_of(grounding), *removed_of(grounding))
+    artifacts = (mask.sha256, *(each.mask.sha256 for each in things if each.mask is not None))
     return StageResult(value=grounding, warnings=tuple(warnings), artifacts=artifacts, hints=reading.hints)
 
 
@@ -110,6 +118,7 @@ class Place:
     bbox: BBox  # px, inside the image
     mask: Mask | None = None  # [H, W], where it does not follow from the box
     warnings: tuple[str, ...] = ()
+    is_doubtful: bool = False  # no two looks at it agree on its outline
 
 
 def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], GroundingReading | None, list[str]]:
@@ -132,7 +141,13 @@ def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], 
         mask = None if place.mask is None else run.backends.artifacts.put(encode_png(place.mask), "image/png")
         objects.append(
             LocatedObject(
-                object=each.object, bbox=place.bbox, role=each.role, mask=mask, prior=each.prior, source="request"
+                object=each.object,
+                bbox=place.bbox,
+                role=each.role,
+                mask=mask,
+                prior=each.prior,
+                source="request",
+                is_doubtful=place.is_doubtful,
             )
         )
         warnings += place.warnings
@@ -146,6 +161,7 @@ def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], 
         warnings=places[-1].warnings,
         changes=() if request.interventions else run.question.changes,
         asked=run.question.asked,
+        is_doubtful=places[-1].is_doubtful,
     )
     return tuple(objects), reading, warnings
 
@@ -172,24 +188,109 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
         if (share := wide * high / (scene.width * scene.height)) > MAX_SHARE:
             raise _misplaced(f"{pointer}/bbox", given.bbox, f"covers {share:.0%} of the image")
         beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
-        return Place(clipped, warnings=() if clipped == given.bbox else (beyond,))
+        warnings = () if clipped == given.bbox else (beyond,)
+        return _outlined_box(run, clipped, field, warnings) if run.can_segment else Place(clipped, warnings=warnings)
     x, y = given.point or (0.0, 0.0)
     if not (0 <= x < scene.width and 0 <= y < scene.height):
         raise _misplaced(f"{pointer}/point", (x, y), outside)
+    # The first point of a path says less of the mover than a point that is given for it.
+    may_guess = pointer == "/grounding" and run.request.grounding is None
+    if run.can_segment:
+        found = outlines_at(run.embedded(), (x, y))
+        if len(found) == 1 or (found and may_guess):
+            scene.preset_mask(found[0].bbox, lambda: found[0].mask)
+            return Place(found[0].bbox, found[0].mask)
+        fault = f"{len(found)} things within each other lie there." if found else "no two looks at it agree."
+        if not may_guess:
+            raise _not_cut_out(f"The object at the point [{x:.0f}, {y:.0f}] is not clear: {fault}", pointer)
     cutout = scene.locate((x, y))
     if cutout.mask is None:
         return Place(cutout.bbox)
-    # The first point of a path says less of the mover than a point that is given for it.
-    may_guess = pointer == "/grounding" and run.request.grounding is None
     if cutout.fault is not None and not may_guess:
-        detail = f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {cutout.fault}"
-        raise CannotGround(
-            f"{detail}. Give its box as `{field}.bbox`, or its outline as `{field}.mask`.",
-            errors=(FieldError(f"{pointer}/point", detail),),
-        )
+        raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {cutout.fault}.", pointer)
     box = ", ".join(f"{value:.0f}" for value in cutout.bbox)
     warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
     return Place(cutout.bbox, cutout.mask, (warning,))
+
+
+def _not_cut_out(detail: str, pointer: str) -> CannotGround:
+    field = field_of(pointer)
+    return CannotGround(
+        f"{detail} Give its box as `{field}.bbox`, or its outline as `{field}.mask`.",
+        errors=(FieldError(f"{pointer}/point", detail),),
+    )
+
+
+def _outlined_box(run: Run[SimulateRequest], bbox: BBox, field: str, warnings: tuple[str, ...]) -> Place:
+    """What the segmenter sees in a box that the request gives; where it is not sure of it, nothing else is."""
+    (outline,) = outlines_in(run.embedded(), [bbox])
+    if outline is None or not outline.is_sure:
+        doubt = f"No two looks at what is in `{field}.bbox` agree on its outline: give it as `{field}.mask`."
+        return Place(bbox, None if outline is None else outline.mask, (*warnings, doubt), is_doubtful=True)
+    run.scene.preset_mask(outline.bbox, lambda: outline.mask)
+    return Place(outline.bbox, outline.mask, warnings)
+
+
+def _find(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, ...]:
+    """What the detector finds for some nouns, outlined as well as can be. To be called with `cpu` held."""
+    detector, scene = run.backends.perception.detector, run.scene
+    assert detector is not None, "asked for only where there is a detector"
+    found = detector.detect(run.image.pixels, nouns) if nouns else ()
+    outlines: list[Outline | None] = [None] * len(found)
+    if run.can_segment:
+        outlines = outlines_in(run.embedded(), [each.bbox for each in found])
+    masks = (
+        mask_from_bbox(scene.clean, each.bbox) if outline is None else outline.mask
+        for each, outline in zip(found, outlines, strict=True)
+    )
+    return tuple(SeenThing(each.phrase, mask, each.score) for each, mask in zip(found, masks, strict=True))
+
+
+def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> GroundingReading:
+    """The reading with its things outlined by the segmenter. To be called with `cpu` held.
+
+    Raises `CannotGround` where no two looks agree on the outline of the mover: a scrap of it would be moved. Of others
+    on which none agree, nothing is sure.
+    """
+    changed = [thing for each in reading.interventions for thing in (each.object, *each.targets)]
+    located = [each for each in (*reading.others, *changed) if each.mask is None]
+    boxes = dict.fromkeys((reading.bbox, *(each.bbox for each in located)))
+    outlines = dict(zip(boxes, outlines_in(run.embedded(), list(boxes)), strict=True))
+    own, doubted = outlines[reading.bbox], list[str]()
+    if own is None or not own.is_sure:
+        box = ", ".join(f"{value:.0f}" for value in reading.bbox)
+        raise CannotGround(
+            f"'{reading.object}' was looked for in [{box}], and no two looks at what is there agree on its outline.",
+            remedy=GIVE_PLACE,
+        )
+
+    def outlined(thing: LocatedObject) -> LocatedObject:
+        outline = outlines.get(thing.bbox) if thing.mask is None else None
+        if thing.mask is not None or is_same_object(thing.bbox, reading.bbox):
+            return thing
+        if outline is None or not outline.is_sure:
+            doubted.append(thing.object)
+            return thing.model_copy(update={"is_doubtful": True})
+        mask = run.backends.artifacts.put(encode_png(outline.mask), "image/png")
+        return thing.model_copy(update={"bbox": outline.bbox, "mask": mask})
+
+    others = tuple(outlined(each) for each in reading.others)
+    interventions = tuple(
+        each.model_copy(update={"object": outlined(each.object), "targets": tuple(map(outlined, each.targets))})
+        for each in reading.interventions
+    )
+    doubts = [
+        f"No two looks at '{name}' agree on its outline: give it in `objects`, with its `mask`."
+        for name in dict.fromkeys(doubted)
+    ]
+    return replace(
+        reading,
+        bbox=own.bbox,
+        mask=own.mask,
+        others=others,
+        interventions=interventions,
+        warnings=(*reading.warnings, *doubts),
+    )
 
 
 def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidRequest:

@@ -7,17 +7,18 @@ multimodal LLM reads: its reading of the image may be taken by other jobs, its a
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
 from pydantic import BaseModel
 
 from cow_service import __version__, records
+from cow_service.perception.base import PerceptionKind
 from cow_service.readers.base import MotionHints
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Clip, Grounding, Motion, ReaderInfo, Record, Simulation, Trajectory, Usage, Verdict
-from cow_service.requests import SimulateRequest, Stage
+from cow_service.requests import DepthRequest, SimulateRequest, Stage
 
 Value = TypeVar("Value")
 
@@ -40,6 +41,12 @@ class Verdicts(Record):
     baseline: Verdict | None = None
 
 
+class EstimatedDepth(Record):
+    """The value of the stage `depth`: what a depth model makes of the image, as a caller would give it."""
+
+    depth: DepthRequest | None  # null where nothing of it can be used
+
+
 class FirstAnswers(Record):
     """The value of the gate: the answer from the image alone, and how many votes it was asked for with."""
 
@@ -50,6 +57,7 @@ class FirstAnswers(Record):
 RESULT_TYPES: dict[Stage, type[StageResult[Any]]] = {
     "gating": StageResult[FirstAnswers],
     "grounding": StageResult[Grounding],
+    "depth": StageResult[EstimatedDepth],
     "motion": StageResult[Motion],
     "trajectory": StageResult[Trajectory],
     "generation": StageResult[Clip],
@@ -64,7 +72,7 @@ def digest_of(value: BaseModel | Mapping[str, Any]) -> str:
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 12  # of stored results; raised where what a stage means or stores changes
+FORMAT = 13  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,7 @@ class KeyFields:
     always: tuple[str, ...] = ()  # ... together with these, which decide in either case
     prompt: str | None = None  # whose version decides, too
     votes: str | None = None  # the field that says how many answers are drawn, of the stages that draw answers
+    perception: tuple[PerceptionKind, ...] = ()  # kinds of models that decide, where the server has them
     read_with: str | None = None  # a stage: where the reader reads for it, too, it says no less of this one
 
 
@@ -97,6 +106,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         "reader",
         set_by_request=("place",),
         always=("question", "asked", "objects", "interventions"),
+        perception=("detector", "segmenter"),
         # The reader is asked the same of the place; hints for the motion are not used where the request gives it.
         read_with="motion",
     ),
@@ -107,8 +117,9 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         always=("law", "motion", "camera", "depth"),
         prompt="motion-sentence",
     ),
+    "depth": KeyFields((), perception=("depth",)),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),
-    "generation": KeyFields(("clip_seed", "frames", "video"), "generator"),
+    "generation": KeyFields(("clip_seed", "frames", "video"), "generator", perception=("inpainter",)),
     "answering": KeyFields(("question", "seed", "options", "votes", "baseline", "imagine"), "reader", votes="votes"),
 }
 # Of a simulation its id and times do not decide an answer.
@@ -123,12 +134,14 @@ def key_of(
     identity_of: Callable[[BackendRole], Mapping[str, Any] | None],
     repeats_answers: Callable[[int], bool],
     heeds_seed: Callable[[], bool] = lambda: True,
+    perceives: Callable[[Sequence[PerceptionKind]], Mapping[str, str]] = lambda kinds: {},
 ) -> StageKey:
     """The key of a stage's result. `inputs` are the results of stages before it.
 
     `identity_of` a backend is all that decides its work, as JSON values, or None where it does not say; it is asked
     only where the table names a backend. `repeats_answers` is that of the reader, asked where answers are drawn;
-    `heeds_seed` where it reads: of rules, a request with another seed finds the same.
+    `heeds_seed` where it reads: of rules, a request with another seed finds the same. `perceives` says what decides
+    the work of the server's models of some kinds.
     """
     decided = KEY_FIELDS[stage]
     parts: dict[str, Any] = {
@@ -140,6 +153,8 @@ def key_of(
         "prompt": None if decided.prompt is None else load_prompt(decided.prompt).version,
         "always": {name: _plain(getattr(request, name)) for name in decided.always},
     }
+    if decided.perception and (models := perceives(decided.perception)):
+        parts["perception"] = dict(models)
     given = {name: _plain(value) for name in decided.set_by_request if (value := getattr(request, name)) is not None}
     if given:
         return StageKey(digest_of(parts | {"given": given}))

@@ -19,10 +19,11 @@ from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, RetryPolicy, try_once
 from cow_service.media.images import DecodedImage, decode_depth, decode_own
 from cow_service.observability.logging import rfc3339
+from cow_service.perception.base import Embedded, Perception
 from cow_service.physics.geometry import DepthMap
 from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
 from cow_service.records import Artifact, BBox, Cue, Estimate, Grounding, ReaderInfo, Record, Usage
-from cow_service.requests import AnswerRequest, ImageArtifact, SimulateRequest, Stage
+from cow_service.requests import AnswerRequest, DepthRequest, ImageArtifact, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
 from cow_service.vision.types import Mask
@@ -114,6 +115,7 @@ class Backends:
     words: Callable[[], WordReader]  # of the request, whichever reader looks at the image
     generator: Callable[[], Generator]
     artifacts: ArtifactStore
+    perception: Perception
     cpu: PrioritySemaphore
     device: Callable[[], PrioritySemaphore]  # of the generator: its own, or `cpu`
 
@@ -169,6 +171,29 @@ class Run(Generic[Request_co]):
 
     def _stored_mask(self, mask: Artifact) -> Mask:
         return decode_own(self.backends.artifacts.read(mask.sha256))[..., 0] > 0
+
+    @property
+    def can_segment(self) -> bool:
+        """Whether the server has a segmenter."""
+        return "segmenter" in self.backends.perception.names
+
+    def embedded(self) -> Embedded:
+        """The image as the segmenter sees it; the server must have one. To be called with `cpu` held."""
+        self.check_canceled()
+        key = self._image_key[0], self.image.info.sha256
+        return self.backends.perception.embed(key, lambda: self.image.pixels)
+
+    @property
+    def wants_depth(self) -> bool:
+        """Whether a depth model is to be asked: the server has one, and the request leaves it the depth."""
+        request = self.request
+        is_free = request.depth is None and request.trajectory is None and request.law == "contact"
+        return is_free and "depth" in self.backends.perception.names
+
+    def take_depth(self, depth: DepthRequest | None) -> None:
+        """Goes on as if the request had given that depth map."""
+        self.request = self.request.model_copy(update={"depth": depth})
+        self.__dict__.pop("depth", None)
 
     @cached_property
     def depth(self) -> DepthMap | None:
@@ -264,6 +289,7 @@ class Run(Generic[Request_co]):
             self._identity,
             self.repeats_answers,
             lambda: bool(getattr(self.reader, "heeds_seed", True)),
+            self.backends.perception.identity,
         )
         try:
             result, reused = self.step(name, key, compute)
@@ -364,7 +390,7 @@ class Run(Generic[Request_co]):
 
     def warnings(self, *stages: Stage) -> tuple[str, ...]:
         """The warnings of some stages."""
-        return tuple(warning for stage in stages for warning in self.results[stage].warnings)
+        return tuple(warning for stage in stages if stage in self.results for warning in self.results[stage].warnings)
 
     def _identity(self, backend: BackendRole) -> dict[str, Any] | None:
         """All that decides the work of a backend; None where one of another package does not say."""

@@ -83,6 +83,7 @@ class Region:
     confidence: float  # 0..1: how sure it is that this is one separable thing with this outline; see `_confidence`
     is_disc: bool  # its outline was fitted by a circle: the mask is exact, segmenting it again would not improve it
     is_hidden: bool = False  # by another region in front of it, in part: its outline tells little
+    called: frozenset[str] = frozenset()  # the nouns under which a detector found it
 
     @property
     def bbox(self) -> BBox:
@@ -237,6 +238,13 @@ def drawn_region(image: Image, shape: CroppedMask) -> Region:
     roundness = masks.roundness_of(shape.patch)
     names = _names(masks.lab_of(image[shape.rows, shape.columns][shape.patch][None])[0])
     return Region(shape, *names, roundness, confidence=1.0, is_disc=roundness > DISC)
+
+
+def found_region(image: Image, mask: Mask, called: frozenset[str]) -> Region:
+    """What models found in an RGB image [H, W, 3]: its mask [H, W], and what they call it."""
+    shape = CroppedMask.of(mask)
+    names = _names(masks.lab_of(image[shape.rows, shape.columns][shape.patch][None])[0])
+    return Region(shape, *names, masks.roundness_of(shape.patch), confidence=1.0, is_disc=False, called=called)
 
 
 def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:

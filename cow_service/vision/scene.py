@@ -19,7 +19,16 @@ from cow_service.vision.edges import find_segments
 from cow_service.vision.faint import find_faint
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, dilated, is_among, is_same_object, without_holes
-from cow_service.vision.regions import WORKING_SIDE, Region, disc_region, drawn_region, find_regions, measure, region_of
+from cow_service.vision.regions import (
+    WORKING_SIDE,
+    Region,
+    disc_region,
+    drawn_region,
+    find_regions,
+    found_region,
+    measure,
+    region_of,
+)
 from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
 from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
@@ -57,6 +66,7 @@ class Cutout:
 Found = TypeVar("Found")
 Measured = dict[str, Any]
 """Cached properties of a `Scene` by their names."""
+PART_OF = 0.5  # of its area: what lies in a thing that was outlined is no thing of its own
 # Neither mover nor words decide them.
 OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "side_view", "_all_trails", "segments")
 
@@ -275,6 +285,21 @@ class Scene:
         """Gives the mask that an earlier run segmented for a box; it may have been segmented from a point instead."""
         self._preset[bbox] = mask
 
+    def with_found(self, things: Sequence[tuple[Mask, frozenset[str]]]) -> Scene:
+        """The same with things that models found, by mask [H, W] and the nouns they are called by, as regions.
+
+        What lies in one of them for the most part is no region of its own.
+        """
+        other = self.changed(self.image, self.clean)
+        found = [found_region(self.clean, *thing) for thing in things]
+        own = [
+            region
+            for region in self.regions
+            if all(region.mask.shared_with(mask) <= PART_OF * region.mask.area for mask, _ in things)
+        ]
+        other.__dict__["regions"] = tuple(sorted((*found, *own), key=lambda region: -region.mask.area))
+        return other
+
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
         other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
@@ -307,6 +332,7 @@ class Scene:
                     found = region is not None and region.bbox == other.bbox  # here, not by the request or a reader
                     confidence = region.confidence if region is not None and found else 1.0
                     obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
+            outlined = [self.silhouette(other.bbox) for other in named if other.mask is not None]
             for region in self.regions:
                 area = region.mask.area
                 if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
@@ -314,6 +340,8 @@ class Scene:
                 if area < OWN_SHARE * body_area and region.mask.shared_with(near):
                     continue
                 if is_among(region.bbox, (other.bbox for other in obstacles)):
+                    continue
+                if any(region.mask.shared_with(mask) > PART_OF * area for mask in outlined):
                     continue
                 doubtful = region.confidence < DOUBTFUL
                 larger = [other.mask for other in obstacles if doubtful and area < OWN_SHARE * other.mask.area]

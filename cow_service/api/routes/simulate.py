@@ -1,4 +1,4 @@
-"""`POST /simulate` and `POST /answer`."""
+"""`POST /simulate`, `POST /answer` and `POST /look`."""
 
 from typing import Any
 
@@ -8,8 +8,8 @@ from cow_service import errors
 from cow_service.api.body import body_of
 from cow_service.api.problems import documented
 from cow_service.api.submission import JobSubmitter
-from cow_service.records import Answer, Job, Simulation
-from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.records import Answer, Job, Look, Simulation
+from cow_service.requests import AnswerRequest, LookRequest, SimulateRequest
 
 _ELSEWHERE = (  # errors of the server as a whole, and of other operations
     errors.CowError, errors.InternalError, errors.NotFound, errors.MethodNotAllowed, errors.Unauthorized,
@@ -17,6 +17,11 @@ _ELSEWHERE = (  # errors of the server as a whole, and of other operations
     errors.DownloadUnavailable, errors.NotReady,
 )  # fmt: skip
 FAILURES = tuple(kind for kind in errors.kinds().values() if kind not in _ELSEWHERE)
+LOOK_FAILURES = (
+    errors.PerceptionUnavailable, errors.InvalidRequest, errors.MalformedBody, errors.BodyTypeUnsupported,
+    errors.BodyTooLarge, errors.BodyTooSlow, errors.ImageUnreadable, errors.ImageTooLarge, errors.ImageTypeUnsupported,
+    errors.ImageUrlNotAllowed, errors.ImageUrlUnreachable, errors.ArtifactNotFound,
+)  # fmt: skip
 ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
         "model": Job,
@@ -85,3 +90,19 @@ async def answer(request: Request, submitter: JobSubmitter) -> Response:
     A simulation that fails does not lose the answer: it is then given from the image alone, and `warnings` says so.
     """
     return await submitter.run(request, "answer", AnswerRequest)
+
+
+@router.post(
+    "/look",
+    response_model=Look,
+    tags=["simulation"],
+    summary="See what is at a place of an image",
+    responses=documented(*LOOK_FAILURES),
+    openapi_extra={"requestBody": body_of(LookRequest)},
+)
+async def look(request: Request, submitter: JobSubmitter) -> Look:
+    """Outlines what the models of the server see at a point, in a box, or of what a question names. Makes no job.
+
+    A server without such models answers `perception-unavailable`.
+    """
+    return await submitter.look(request)

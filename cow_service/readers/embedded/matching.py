@@ -8,9 +8,17 @@ import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.readers.base import SeenThing
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, like_a_colour, words
-from cow_service.readers.embedded.english.noun_phrases import TABLES, Kind, kind_of, may_name, shape_of
+from cow_service.readers.embedded.english.noun_phrases import (
+    TABLES,
+    Kind,
+    kind_of,
+    may_name,
+    parse_noun_phrase,
+    shape_of,
+)
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.outlines import (
     form_of,
@@ -25,6 +33,7 @@ from cow_service.records import BBox, LocatedObject
 from cow_service.vision.masks import is_same_object
 from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene
+from cow_service.vision.types import Mask
 
 LEAD = 0.25  # of the mean size of the regions: so far ahead of the next one in place
 LARGER = 1.2  # ratio of areas to the next one
@@ -113,6 +122,7 @@ SHARED = -3.0  # log ratio of a region with two names of the same kind
 ROUND = 0.76  # roundness from which a region passes for a ball; a cube has about 0.7
 NOT_ROUND = 0.6  # roundness below which nothing passes for a ball, even half hidden
 MAX_OTHERS = 5  # names that are assigned beside one: the work grows fast with their number
+CALLED, NOT_CALLED = 3.0, -2.0  # log ratios where a detector found the noun: of what it calls so, of the rest
 IMPOSSIBLE = -math.inf
 NOWHERE = -1  # place of the region of a name that has none
 
@@ -159,6 +169,7 @@ def _best(names: Sequence[ObjectPhrase], rows: Sequence[Row], taken: tuple[tuple
 
 def _row(regions: Sequence[Region], phrase: ObjectPhrase) -> Row:
     row: Row = []
+    is_found = any(phrase.noun in region.called for region in regions)
     for region in regions:
         if phrase.colour is None:
             colour = 0.0
@@ -166,7 +177,8 @@ def _row(regions: Sequence[Region], phrase: ObjectPhrase) -> Row:
             colour = EXACT
         else:
             colour = NEAR if phrase.colour in region.colours else IMPOSSIBLE
-        row.append(_shape_ratio(region, phrase) + colour)
+        said = (CALLED if phrase.noun in region.called else NOT_CALLED) if is_found else 0.0
+        row.append(_shape_ratio(region, phrase) + colour + said)
     return row
 
 
@@ -182,6 +194,7 @@ def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
     return (CUT if is_cut(region, form) else 1.0) * min(SURE, max(LEAST, log_ratio(region, form)))
 
 
+SAME = 0.7  # IoU from which two masks are one thing's
 WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thing in it
 
 
@@ -320,6 +333,34 @@ def is_kind_asked(phrase: ObjectPhrase, question: Question) -> bool:
     """Whether a phrase is that of a kind asked about, and of no one thing."""
     asked = read_asked(question)
     return asked is not None and any(kind_of(name) and name.endswith(phrase.text.lower()) for name in asked.among)
+
+
+def nouns_of(question: Question, sought: Sequence[str] = ()) -> tuple[str, ...]:
+    """The nouns of the things that a question names, and of further words, each once."""
+    changed = (each for change in question.interventions for each in (change.object, *change.targets))
+    asked = read_asked(question)
+    kinds = (kind_of(name) for name in (() if asked is None else asked.among))
+    named = (question.mover, *question.others, *changed, *map(parse_noun_phrase, sought))
+    phrases = [each for each in named if each is not None]
+    phrases += [each.place.of for each in phrases if each.place is not None and each.place.of is not None]
+    phrases += [kind.phrase for kind in kinds if kind is not None]
+    return tuple(dict.fromkeys(each.noun for each in phrases if each.noun and each.is_thing))
+
+
+def with_found(scene: Scene, found: Sequence[SeenThing]) -> Scene:
+    """The scene with what models found by its nouns; one thing under two of them is one thing."""
+    things: list[tuple[Mask, frozenset[str]]] = []
+    for seen in found:
+        twin = next((at for at, (mask, _) in enumerate(things) if _overlap(mask, seen.mask) > SAME), None)
+        if twin is None:
+            things.append((seen.mask, frozenset((seen.noun,))))
+        else:
+            things[twin] = things[twin][0], things[twin][1] | {seen.noun}
+    return scene.with_found(things)
+
+
+def _overlap(a: Mask, b: Mask) -> float:
+    return float(np.count_nonzero(a & b) / max(1, np.count_nonzero(a | b)))
 
 
 def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tuple[list[str], frozenset[BBox]]:

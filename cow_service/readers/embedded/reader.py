@@ -54,7 +54,8 @@ class EmbeddedReader:
             for change in read.interventions
         )
         drawings = frozenset(each for each in ("arrow", "box") if each in words)
-        return base.QuestionReading(read_asked(read), tuple(named), read.motion.trail is not None, drawings)
+        trail_named, nouns = read.motion.trail is not None, matching.nouns_of(read)
+        return base.QuestionReading(read_asked(read), tuple(named), trail_named, nouns, drawings)
 
     def read_name(self, name: str) -> ObjectPrior:
         """By its noun."""
@@ -91,6 +92,8 @@ class EmbeddedReader:
         with given.cpu():
             changes.check_changes(question)
             scene, assumed = motions.scene_of_mover(given.scene, question)
+            if given.find is not None and scene.side_view is None:
+                scene = matching.with_found(scene, given.find(matching.nouns_of(question, given.sought)))
             removed = changes.find_removed(scene, question, given.known)
             regions = changes.without(scene.regions, [change.object.bbox for change in removed])
             bbox = _mover(scene, regions, question, mover)
@@ -214,7 +217,12 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
             f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. Seen in all: {seen}.",
             remedy=GIVE_PLACE,
         )
-    if phrase.colour is None and not matching.is_known(phrase) and len(scene.regions) > 1:
+    if (
+        phrase.colour is None
+        and not matching.is_known(phrase)
+        and len(scene.regions) > 1
+        and phrase.noun not in fitting[0].called
+    ):
         raise CannotGround(
             f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
             f"Seen: {seen}.",

@@ -1,0 +1,60 @@
+"""A look at an image with the server's models, apart from any job: for callers who choose a thing by hand."""
+
+import base64
+from collections.abc import Callable, Sequence
+
+from cow_service.errors import FieldError, InvalidRequest, PerceptionUnavailable
+from cow_service.media.images import encode_png
+from cow_service.perception.base import ImageKey, Perception
+from cow_service.perception.outlines import Outline, outlines_at, outlines_in
+from cow_service.records import BBox, Look, SeenObject
+from cow_service.requests import LookRequest
+from cow_service.vision.types import Image
+
+
+def look(
+    perception: Perception, key: ImageKey, image: Callable[[], Image], request: LookRequest, nouns: Sequence[str]
+) -> Look:
+    """What is at the point or in the box of a request, or is called by one of the nouns of its question.
+
+    `image` is asked for where the segmenter does not know it yet, and where nouns are looked for.
+    Raises `PerceptionUnavailable`, `InvalidRequest` for a place outside the image, and what `image` raises.
+    """
+    needed = ("segmenter",) if request.question is None else ("segmenter", "detector")
+    lacking = [kind for kind in needed if kind not in perception.names]
+    if lacking:
+        raise PerceptionUnavailable(
+            f"This server has no {' and no '.join(lacking)}: it is started with COW_PERCEPTION=none or without one."
+        )
+    embedded = perception.embed(key, image)
+    width, height = embedded.size
+    things: list[SeenObject] = []
+    if request.point is not None:
+        _check_inside((*request.point, *request.point), embedded.size, "point")
+        things = [_seen(each.bbox, each) for each in outlines_at(embedded, request.point)]
+    elif request.bbox is not None:
+        _check_inside(request.bbox, embedded.size, "bbox")
+        things = [_seen(each.bbox, each) for each in outlines_in(embedded, [request.bbox]) if each is not None]
+    elif nouns and (detector := perception.detector) is not None:
+        found = detector.detect(image(), nouns)
+        outlines = outlines_in(embedded, [each.bbox for each in found])
+        for each, outline in zip(found, outlines, strict=True):
+            box = each.bbox if outline is None else outline.bbox
+            things.append(_seen(box, outline).model_copy(update={"name": each.phrase, "score": each.score}))
+    return Look(image=key[1], width=width, height=height, things=tuple(things))
+
+
+def _seen(bbox: BBox, outline: Outline | None) -> SeenObject:
+    mask = None
+    if outline is not None and outline.is_sure:
+        mask = f"data:image/png;base64,{base64.b64encode(encode_png(outline.mask)).decode()}"
+    return SeenObject(bbox=bbox, mask=mask, score=0.0 if outline is None else outline.score)
+
+
+def _check_inside(bbox: BBox, size: tuple[int, int], field: str) -> None:
+    x0, y0, x1, y1 = bbox
+    if not (0 <= x0 <= x1 <= size[0] and 0 <= y0 <= y1 <= size[1]):
+        detail = f"lies outside the upright image of {size[0]} x {size[1]} px"
+        raise InvalidRequest(
+            f"`{field}` {detail}: give pixels of it, x right and y down.", errors=(FieldError(f"/{field}", detail),)
+        )
