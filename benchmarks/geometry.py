@@ -25,10 +25,11 @@ import cv2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from stand_ins import TrueScene, read_truth, with_errors
+from stand_ins import TrueModels, TrueScene, read_truth, with_errors
 
 from cow_service.errors import CowError
 from cow_service.media.images import encode_png
+from cow_service.perception.base import Perception
 from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -41,6 +42,11 @@ ARMS: dict[str, dict[str, Any] | None] = {
     "masks, depth 3%": {"level": 0.03},
     "masks, depth 5%, focal -10%": {"level": 0.05, "focal_factor": 0.9},
     "masks, depth 8%, focal +5%": {"level": 0.08, "focal_factor": 1.05},
+}
+SEEN: dict[str, dict[str, Any]] = {  # the picture alone, which the server sees with models
+    "models see": {},
+    "models see, 10% missed, 10% false": {"missed": 0.1, "false": 0.1},
+    "models see, 10% missed, 10% false, depth 3%": {"missed": 0.1, "false": 0.1, "depth_level": 0.03},
 }
 LEAST_DEVIATION = 0.01  # what a caller would say of a map that is nearly true
 SURE = 0.8  # a wrong answer told with more is the worst
@@ -98,7 +104,8 @@ def measure(service: Service, folders: list[Path], name: str) -> tuple[list[dict
     rows: list[dict[str, Any]] = []
     for seed, folder in enumerate(folders):
         meta, truth = json.loads((folder / "meta.json").read_text()), read_truth(folder)
-        body = request_of(meta, truth, folder, ARMS[name], seed)
+        body = request_of(meta, truth, folder, ARMS.get(name), seed)
+        service.perception = TrueModels(truth, seed=seed, **SEEN[name]) if name in SEEN else Perception(Settings())
         started = time.process_time()
         row: dict[str, Any] = {"scene": folder.name, "arm": name, "truth": meta["answer"]}
         try:
@@ -145,7 +152,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("folders", type=Path, nargs="*")
     parser.add_argument("--limit", type=int, default=None, help="scenes of each folder")
-    parser.add_argument("--arm", action="append", choices=list(ARMS), help="only these; may be given several times")
+    parser.add_argument("--arm", action="append", choices=[*ARMS, *SEEN], help="only these; may be given several times")
     parser.add_argument("--motorcycle", action="store_true", help="the photograph of scikit-image, too")
     parser.add_argument("--json", type=Path, default=None, help="write rows and summaries here")
     arguments = parser.parse_args()
@@ -153,7 +160,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as data, Service(Settings(data_dir=Path(data))) as service:
         for each in arguments.folders:
             folders = sorted(path.parent for path in each.rglob("meta.json"))[: arguments.limit]
-            for name in arguments.arm or ARMS:
+            for name in arguments.arm or (*ARMS, *SEEN):
                 rows, summary = measure(service, folders, name)
                 results.append({"scenes": each.name, "arm": name, "summary": summary, "rows": rows})
                 if len(table.columns) == 2:

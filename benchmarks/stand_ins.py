@@ -3,6 +3,8 @@
     scene = read_truth(Path("cow-scenes/sample/truth/collision/Collision_Level_1_0"))
     depth, focal = with_errors(scene.depth, scene.camera.focal, level=0.05, focal_factor=0.9, seed=1)
 
+    service.perception = TrueModels(scene, missed=0.1, false=0.1, seed=1)
+
 A folder has image.jpg, ids.png, meta.json, and depth either as depth.png (made by `cow-scenes`: 16-bit grey, 0 is
 unknown, `camera.depth_scale` metres per unit) or as depth.npz (`depth`, metres). Depth is measured along the optical
 axis. Pixels: x right, y down, and the centre of the first pixel is at (0.5, 0.5).
@@ -12,6 +14,7 @@ from __future__ import annotations
 
 import importlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +22,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cow_service.perception.base import DepthReading, Detection, Perception, PerceptionKind, Prompt, Segment
 from cow_service.records import BBox
+from cow_service.settings import Settings
 from cow_service.vision.masks import SAME_OBJECT_IOU, bbox_of, iou
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
@@ -121,6 +126,97 @@ def with_errors(
     field = _smooth_field(random.normal(size=GRID), depth.shape[1], depth.shape[0])
     white = 1 + WHITE * random.normal(size=depth.shape)
     return np.asarray(depth * np.exp(level * field) * white, np.float32), focal * focal_factor
+
+
+SAYS = 8.0  # logit inside of a mask, and less that outside
+SURE_SCORE, PART_SCORE, SCRAP_SCORE = 0.95, 0.8, 0.6  # of the whole thing, of a part of it, of nothing in particular
+
+
+class TrueModels(Perception):
+    """Models that see a scene as it is, but for errors of a known size: to be set as `Service.perception`.
+
+    The detector misses a share of what it is asked for, and gives as many false boxes: on another thing, or where
+    nothing is. The segmenter outlines what fills a box, and what is at a point beside a part of it; elsewhere its masks
+    are scraps, no two alike. `depth_level` is that of `with_errors`; None: there is no depth model.
+    """
+
+    def __init__(
+        self, scene: TrueScene, missed: float = 0.0, false: float = 0.0, depth_level: float | None = None, seed: int = 0
+    ) -> None:
+        super().__init__(Settings())
+        self._scene, self._missed, self._false, self._level, self._seed = scene, missed, false, depth_level, seed
+        self.names: dict[PerceptionKind, str] = {"segmenter": "true-segmenter", "detector": "true-detector"}
+        if depth_level is not None:
+            self.names["depth"] = "true-depth"
+        self.fingerprint = f"{scene.name} {missed} {false} {depth_level} {seed}"
+
+    def load(self, kind: PerceptionKind) -> TrueModels | TrueSegmenter | None:
+        """Itself: it is all of them, but for the segmenter."""
+        if kind not in self.names:
+            return None
+        return TrueSegmenter(self._scene, self.fingerprint) if kind == "segmenter" else self
+
+    def detect(self, image: Image, phrases: Sequence[str]) -> tuple[Detection, ...]:
+        """See `Detector`. A phrase means the things whose names end in its last word."""
+        random, found = np.random.default_rng(self._seed), list[Detection]()
+        for phrase in phrases:
+            meant = [each for each in self._scene.things if each.name.split()[-1] == phrase.split()[-1]]
+            for each in meant:
+                if random.random() >= self._missed and each.mask.any():
+                    found.append(Detection(phrase, bbox_of(each.mask), 0.8))
+            if random.random() < self._false:
+                height, width = image.shape[:2]
+                x, y = random.uniform(0, 0.8) * width, random.uniform(0.3, 0.8) * height
+                box = x, y, x + 0.15 * width, min(height, y + 0.15 * width)
+                others = [each for each in self._scene.things if each not in meant and each.mask.any()]
+                if others and random.random() < 0.5:
+                    box = bbox_of(others[int(random.integers(len(others)))].mask)
+                found.append(Detection(phrase, box, 0.5))
+        return tuple(found)
+
+    def estimate(self, image: Image, focal: float | None) -> DepthReading:
+        """See `DepthEstimator`."""
+        level = self._level or 0.0
+        depth, told = with_errors(self._scene.depth, self._scene.camera.focal, level, seed=self._seed)
+        return DepthReading(depth.astype(np.float64), 1.0, told, max(0.01, level))
+
+
+@dataclass(frozen=True)
+class TrueSegmenter:
+    """Outlines the things of a scene as they are."""
+
+    scene: TrueScene
+    fingerprint: str
+
+    def embed(self, image: Image) -> None:
+        """See `Segmenter`."""
+
+    def segment(self, embedding: None, prompts: Sequence[Prompt]) -> tuple[tuple[Segment, ...], ...]:
+        """See `Segmenter`."""
+        return tuple(self._at(prompt) for prompt in prompts)
+
+    def _at(self, prompt: Prompt) -> tuple[Segment, ...]:
+        things = [each for each in self.scene.things if each.mask.any()]
+        shape, scrap = self.scene.depth.shape, np.zeros(self.scene.depth.shape, np.uint8)
+        if prompt.bbox is not None:
+            x0, y0, x1, y1 = prompt.bbox
+            best = max(things, key=lambda each: iou(bbox_of(each.mask), (x0, y0, x1, y1)), default=None)
+            if best is not None and iou(bbox_of(best.mask), (x0, y0, x1, y1)) > 0.5:
+                return (_segment(best.mask, SURE_SCORE),)
+            middle, axes = (round((x0 + x1) / 2), round((y0 + y1) / 2)), (round((x1 - x0) / 2), round((y1 - y0) / 2))
+            cv2.ellipse(scrap, middle, axes, 0, 0, 360, 1, -1)
+            return (_segment(scrap > 0, SCRAP_SCORE),)
+        assert prompt.point is not None, "a prompt has a box or a point"
+        x, y = (int(min(max(value, 0), most - 1)) for value, most in zip(prompt.point, shape[::-1], strict=True))
+        under = next((each for each in things if each.mask[y, x]), None)
+        cv2.circle(scrap, (x, y), max(4, shape[1] // 60), 1, -1)
+        if under is None:
+            return (_segment(scrap > 0, SCRAP_SCORE),)
+        return _segment(under.mask, SURE_SCORE), _segment((scrap > 0) & under.mask, PART_SCORE)
+
+
+def _segment(mask: Mask, score: float) -> Segment:
+    return Segment(np.where(mask, SAYS, -SAYS).astype(np.float32), score)
 
 
 def points_of(depth: Floats32, focal: float, centre: tuple[float, float]) -> Floats32:

@@ -8,7 +8,7 @@ import numpy as np
 
 from cow_service.perception.base import Embedded, Prompt, Segment
 from cow_service.records import BBox, Point
-from cow_service.vision.masks import bbox_of, iou
+from cow_service.vision.masks import bbox_of, iou, mask_iou
 from cow_service.vision.types import Floats32, Mask
 
 AGREE = 0.8  # IoU from which two masks are one
@@ -49,7 +49,7 @@ def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
         if segment is None:
             outlines.append(None)
             continue
-        agrees = any(_overlap(segment.mask, other.mask) >= AGREE for other in next(again))
+        agrees = any(mask_iou(segment.mask, other.mask) >= AGREE for other in next(again))
         outline = Outline(segment.share(*size), segment.score, agrees)
         outlines.append(outline if outline.mask.any() and iou(outline.bbox, box) >= FILLS else None)
     return outlines
@@ -66,12 +66,12 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
     agreed = [
         each
         for each, found in zip(possible, again, strict=True)
-        if (best := _first(found)) is not None and _overlap(each.mask, best.mask) >= AGREE
+        if (best := _first(found)) is not None and mask_iou(each.mask, best.mask) >= AGREE
     ]
     agreed.sort(key=lambda each: -each.score)
     chosen: list[Segment] = []
     for each in agreed:
-        if all(_overlap(each.mask, other.mask) < AGREE for other in chosen):
+        if all(mask_iou(each.mask, other.mask) < AGREE for other in chosen):
             chosen.append(each)
     close = [each for each in chosen if each.score >= chosen[0].score - RIVAL]
     outlines = [Outline(each.share(*image.size), each.score, True) for each in close]
@@ -84,10 +84,6 @@ def _first(candidates: Sequence[Segment]) -> Segment | None:
         if each.score >= LEAST_SCORE and 0 < each.mask.mean() <= MOST_SHARE:
             return each
     return None
-
-
-def _overlap(a: Mask, b: Mask) -> float:
-    return float(np.count_nonzero(a & b) / max(1, np.count_nonzero(a | b)))
 
 
 def _inmost(mask: Mask, size: tuple[int, int]) -> Point:

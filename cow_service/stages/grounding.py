@@ -15,12 +15,13 @@ from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObj
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
-from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object
+from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object, mask_iou
 from cow_service.vision.segmentation import mask_from_bbox
 from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
+SAME_MASK = 0.5  # IoU from which two outlines are of one thing
 WHITE = 128  # grey level from which a pixel of a mask is the object's
 MAX_SHARE = 0.95  # of the image that a box or a mask covers: more is no object
 
@@ -266,8 +267,10 @@ def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> Grounding
 
     def outlined(thing: LocatedObject) -> LocatedObject:
         outline = outlines.get(thing.bbox) if thing.mask is None else None
-        if thing.mask is not None or is_same_object(thing.bbox, reading.bbox):
+        if thing.mask is not None:
             return thing
+        if outline is not None and mask_iou(outline.mask, own.mask) > SAME_MASK:  # the mover, under another name
+            return thing.model_copy(update={"bbox": own.bbox})
         if outline is None or not outline.is_sure:
             doubted.append(thing.object)
             return thing.model_copy(update={"is_doubtful": True})

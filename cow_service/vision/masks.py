@@ -72,6 +72,11 @@ def iou(a: BBox, b: BBox) -> float:
     return width * height / both
 
 
+def mask_iou(a: Mask, b: Mask) -> float:
+    """Intersection over union of two masks [h, w]; 0 of two that are empty."""
+    return float(np.count_nonzero(a & b) / max(1, np.count_nonzero(a | b)))
+
+
 def is_same_object(a: BBox, b: BBox) -> bool:
     """Whether two boxes are of one object."""
     return iou(a, b) >= SAME_OBJECT_IOU

@@ -30,7 +30,7 @@ from cow_service.readers.embedded.outlines import (
 )
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, LocatedObject
-from cow_service.vision.masks import is_same_object
+from cow_service.vision.masks import is_same_object, mask_iou
 from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Mask
@@ -351,7 +351,7 @@ def with_found(scene: Scene, found: Sequence[SeenThing]) -> Scene:
     """The scene with what models found by its nouns; one thing under two of them is one thing."""
     things: list[tuple[Mask, frozenset[str]]] = []
     for seen in found:
-        twin = next((at for at, (mask, _) in enumerate(things) if _overlap(mask, seen.mask) > SAME), None)
+        twin = next((at for at, (mask, _) in enumerate(things) if mask_iou(mask, seen.mask) > SAME), None)
         if twin is None:
             things.append((seen.mask, frozenset((seen.noun,))))
         else:
@@ -359,17 +359,13 @@ def with_found(scene: Scene, found: Sequence[SeenThing]) -> Scene:
     return scene.with_found(things)
 
 
-def _overlap(a: Mask, b: Mask) -> float:
-    return float(np.count_nonzero(a & b) / max(1, np.count_nonzero(a | b)))
-
-
 def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tuple[list[str], frozenset[BBox]]:
     """A warning for each thing whose noun is not known, or whose outline is not that of the noun; and the boxes of
     those that look like something else, of which nothing is sure."""
     warnings, doubtful = list[str](), set[BBox]()
     for phrase, bbox in found:
-        region = next((each for each in scene.regions if is_same_object(each.bbox, bbox)), None)
-        if region is None or phrase.inside_box:
+        region = scene.region_of(bbox)
+        if region is None or phrase.inside_box or phrase.noun in region.called:
             continue
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
         # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.

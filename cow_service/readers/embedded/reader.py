@@ -235,7 +235,8 @@ def _bbox_of(
     regions: Sequence[Region], phrase: ObjectPhrase, mover: BBox, others: Sequence[ObjectPhrase]
 ) -> BBox | None:
     """The box of the one region, besides the mover, that fits a phrase; what several fit stays unnamed."""
-    beside = [region for region in regions if not is_same_object(region.bbox, mover)]
+    # What models outlined is a thing of its own, also where its box is nearly that of the mover before it.
+    beside = [each for each in regions if each.bbox != mover and (each.called or not is_same_object(each.bbox, mover))]
     region = matching.match_one(beside, phrase, others)
     return None if region is None else region.bbox
 
