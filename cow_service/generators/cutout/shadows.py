@@ -164,6 +164,7 @@ class UnshadedScene:
 
     image: Image  # [h, w, 3]
     noisy: dict[int, Mask]  # by `Path.body`: where a body with a contact shadow has left too little to divide
+    unmeasured: frozenset[int]  # by `Path.body`: what stands and moves, with a shadow, if any, that is still there
     shadows: tuple[MovingShadow, ...]
 
 
@@ -178,6 +179,7 @@ def take_shadows(
     """The scene [h, w, 3] without the shadows of the bodies that move, and these shadows."""
     objects = np.logical_or.reduce([body.mask for body in (*moving, *still)])
     floor, shadows, noisy = eroded(~objects, 2 * RIM + 1), list[MovingShadow](), dict[int, Mask]()
+    unmeasured: set[int] = set()
     for body in moving:
         index, points = body.path.body, np.array(body.path.points)
         if np.abs(points - points[0]).max() <= 1 and np.ptp(body.path.scale) <= 0.01:  # it stays where it is
@@ -195,13 +197,14 @@ def take_shadows(
         beside = eroded(masks[0], 2 * RIM + 1) if masks else floor
         shade = None if body.airborne else contact_shade(image, body.mask, bbox_of(body.mask), beside)
         if shade is None:
+            unmeasured |= set() if body.airborne else {index}
             continue
         if ground is None:
             shadows.append(partial(_attached_shadow, shade, body.path, factor * body.start, factor))
         else:
             shadows.append(partial(_contact_shadow, ground, body.path, shade, body.support))
         image, noisy[index] = _without_shade(image, shade, masks[0] if masks else ~objects)
-    return UnshadedScene(image, noisy, tuple(shadows))
+    return UnshadedScene(image, noisy, frozenset(unmeasured), tuple(shadows))
 
 
 def _light_through(given: GeneratorInput, body: MovingBody, ground: Ground) -> Vector | None:
