@@ -74,12 +74,13 @@ class Composed:
     """Keeps what the compositor composes its frames of."""
 
     def __init__(self) -> None:
+        self.given: GeneratorInput
         self.last: Layers | None = None
         cutout.take_apart = self.take_apart
 
     def take_apart(self, given: GeneratorInput, progress: Callable[[float], None]) -> Layers:
         """As the compositor's own."""
-        self.last = take_apart(given, progress)
+        self.given, self.last = given, take_apart(given, progress)
         return self.last
 
 

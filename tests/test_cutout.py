@@ -159,7 +159,7 @@ def test_until_something_moves_the_frame_is_the_image() -> None:
 def test_edges_are_soft() -> None:
     frame = frame_of(shot(ball(floor(), CENTRE, RADIUS, RED), line(3, 0, -4)), 1).astype(int)
     row = frame[200, 110:130, 0] - frame[200, 110:130, 1]
-    assert ((row > 3) & (row < 0.9 * row.max())).sum() >= 2
+    assert ((row > 3) & (row < 0.9 * row.max())).sum() >= 1
 
 
 def test_a_varied_background_is_continued_not_smeared() -> None:
