@@ -463,7 +463,7 @@ def test_an_inpainter_paints_all_holes_in_one_call_in_the_shading_around_them() 
     for x, y, r in (first, second):
         assert hole[np.hypot(xs - x, ys - y) < r + 1].all()
     assert (background[~hole] == world.image[~hole]).all()
-    assert np.abs(background[hole].astype(int) - plain[hole]).mean() < 2
+    assert np.abs(background[hole].astype(int) - plain[hole]).mean() < 4  # of 12
     canceled = []
     frame = next(generator.render(filmed, [1], canceled.append))
     assert canceled[0] == canceled[1] == 0.0

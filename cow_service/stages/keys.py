@@ -64,7 +64,7 @@ def digest_of(value: BaseModel | Mapping[str, Any]) -> str:
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 12  # of stored results; raised where what a stage means or stores changes
+FORMAT = 13  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ FEATHER = 3  # px over which patches overlap
 BLEND = 2  # px inside a hole over which a fill that was made elsewhere comes in
 SEAM = 6  # px on either side of a hole's rim whose colours are compared
 SEAM_WIDTH = 31  # px along the rim: so many are averaged, or texture would count as an error of the fill
-SEAM_NOISE, SEAM_MOST = 1.0, 24.0  # grey levels of such a difference that are left alone, and the most corrected
+SEAM_NOISE, SEAM_MOST = 2.0, 24.0  # grey levels of such a difference that are left alone, and the most corrected
 
 
 def erase_drawing(image: Image, mask: Mask) -> Image:
