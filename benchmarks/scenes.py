@@ -74,12 +74,13 @@ class Composed:
     """Keeps what the compositor composes its frames of."""
 
     def __init__(self) -> None:
+        self.given: GeneratorInput
         self.last: Layers | None = None
         cutout.take_apart = self.take_apart
 
-    def take_apart(self, given: GeneratorInput) -> Layers:
+    def take_apart(self, given: GeneratorInput, progress: Callable[[float], None]) -> Layers:
         """As the compositor's own."""
-        self.last = take_apart(given)
+        self.given, self.last = given, take_apart(given, progress)
         return self.last
 
 
@@ -90,7 +91,7 @@ def residue(composed: Layers, folder: Path, mover: Mask, others: Mask) -> float 
     """
     if not (folder / "background.jpg").exists() or composed.background.shape[:2] != mover.shape:
         return None
-    truth, clean = (_pixels((folder / name).read_bytes()).astype(int) for name in ("background.jpg", "clean.jpg"))
+    truth, clean = (pixels_of((folder / name).read_bytes()).astype(int) for name in ("background.jpg", "clean.jpg"))
     shadow = np.asarray(np.abs(clean - truth).max(axis=2) > SHADED)
     ring = np.asarray(cv2.dilate(mover.astype(np.uint8), np.ones((2 * AWAY + 1, 2 * AWAY + 1), np.uint8)) > 0)
     there = (ring | shadow) & ~(others & ~mover)
@@ -117,8 +118,8 @@ def measure(service: Service, folder: Path, composed: Composed) -> Row:
 
 
 def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simulation, composed: Composed) -> Row:
-    pixels, clean = (_pixels((folder / name).read_bytes()) for name in ("image.jpg", "clean.jpg"))
-    frames = [_pixels(service.artifacts.read(frame.sha256)) for frame in simulation.frames]
+    pixels, clean = (pixels_of((folder / name).read_bytes()) for name in ("image.jpg", "clean.jpg"))
+    frames = [pixels_of(service.artifacts.read(frame.sha256)) for frame in simulation.frames]
     ids = cv2.imread(str(folder / "ids.png"), cv2.IMREAD_UNCHANGED)
     truth = np.asarray(ids == meta["id_of"][meta["object"]])
     layers = composed.last
@@ -154,7 +155,7 @@ def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simul
     )
 
 
-def _pixels(encoded: bytes) -> NDArray[np.uint8]:
+def pixels_of(encoded: bytes) -> NDArray[np.uint8]:
     """RGB [h, w, 3] of an encoded image."""
     pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
     if pixels is None:

@@ -12,7 +12,8 @@ from pydantic import BaseModel
 
 from cow_service.records import GeneratorInfo, Grounding, Motion, Trajectory
 
-if TYPE_CHECKING:  # it needs OpenCV, which a machine for video models may lack
+if TYPE_CHECKING:  # they need OpenCV, which a machine for video models may lack
+    from cow_service.perception.base import Inpainter
     from cow_service.vision.scene import Obstacle, Scene
 
 
@@ -30,6 +31,7 @@ class GeneratorInput:
     before: GeneratorInput | None = None
     """Where things were put elsewhere: the same from the scene as the image shows it, from which they can be cut. Its
     trajectory has one frame more, the first, in which they are still there."""
+    inpainter: Inpainter | None = None  # paints what moving objects hide; None leaves it to the generator
 
 
 class Limits(Protocol):

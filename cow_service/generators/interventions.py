@@ -5,6 +5,7 @@ What is taken away leaves its place with its shadow, and what it hid is complete
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -51,7 +52,8 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
     still = (*still_bodies(leaving, moving, size, ground), StillBody(0, seen, extent, whole))
     eye = 0.0 if ground is None else ground.camera.height
     unshaded = take_shadows(leaving, clean, moving, still, ground, size[0] / scene.width)
-    erased = without_bodies(unshaded, moving, still, eye, resized_mask(scene.cues, size))
+    fill = None if leaving.inpainter is None else partial(leaving.inpainter.fill, progress=lambda done: None)
+    erased = without_bodies(unshaded, moving, still, eye, resized_mask(scene.cues, size), fill)
     changed = _with_changes(scene, erased)
     gone = np.logical_or.reduce([as_it_is.obstacles[index - 1].mask.full() for index in removed])
     behind = {

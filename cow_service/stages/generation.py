@@ -148,11 +148,14 @@ def _inputs(
     """What the generator is given and, where something is changed first, what it is given for the scene as it is."""
     scene = run.scene_of(grounding, motion.cue)
     obstacles, taken = obstacles_of(scene, grounding)
-    options, seed = run.generator_options, run.request.clip_seed
+    options, seed, inpainter = run.generator_options, run.request.clip_seed, run.backends.perception.inpainter
     if trajectory.factual is None:
-        return GeneratorInput(scene, grounding, motion, trajectory, obstacles, seed, options), None
+        given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, seed, options, inpainter=inpainter)
+        return given, None
     everything = (*obstacles, *taken)
-    as_it_is = GeneratorInput(scene, grounding, motion, trajectory.factual, everything, seed, options)
+    as_it_is = GeneratorInput(
+        scene, grounding, motion, trajectory.factual, everything, seed, options, inpainter=inpainter
+    )
     removed = range(len(obstacles) + 1, len(everything) + 1)
     given = without_removed(as_it_is, removed, trajectory) if taken else replace(as_it_is, trajectory=trajectory)
     return with_put(given, trajectory.factual), as_it_is

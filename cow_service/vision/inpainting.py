@@ -18,6 +18,7 @@ RIM, RIM_LEAST = 0.04, 3.0  # of the hole's size, px: next to it the fill fades 
 BESIDE, BESIDE_LEAST = 0.15, 6.0  # of the hole's size, px: so far around it shading is taken from
 MOST_SAMPLES = 1500  # pixels of a ring
 SHADOW_STEP = 14.0  # grey levels
+SHADOW_REACH = 0.15  # of the hole's size: so far around it its shadow is looked for
 LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level says more
 FADE = 0.14  # of the hole's size: how far out its shadow is taken away
 FADE_MOST = 0.011  # of the image's longer side: and no further
@@ -26,6 +27,10 @@ COARSE_SIDE = 96  # px: the crop is searched at this size
 TILE = 9  # px at the coarse size: what one patch fills
 CONTEXT = 5  # px around a tile that must fit
 FEATHER = 3  # px over which patches overlap
+BLEND = 2  # px inside a hole over which a fill that was made elsewhere comes in
+SEAM = 6  # px on either side of a hole's rim whose colours are compared
+SEAM_WIDTH = 31  # px along the rim: so many are averaged, or texture would count as an error of the fill
+SEAM_NOISE, SEAM_MOST = 2.0, 24.0  # grey levels of such a difference that are left alone, and the most corrected
 
 
 def erase_drawing(image: Image, mask: Mask) -> Image:
@@ -77,6 +82,52 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     return result
 
 
+def blend_fill(image: Image, filled: Image, hole: Mask, avoid: Mask) -> Image:
+    """The image [H, W, 3] with its hole [H, W] from another image, in the shading of what lies around the hole.
+
+    Pixels of `avoid` (other objects) say nothing of the shading. Outside the hole nothing changes.
+    """
+    crop = window_of(hole, SEAM + 1)
+    if crop is None:
+        return image
+    inside, source = hole[crop], image[crop].astype(np.float32)
+    known = ~(inside | dilated(avoid[crop]))
+    new = filled[crop].astype(np.float32)
+    beyond, within = (
+        cv2.distanceTransform((~there).astype(np.uint8), cv2.DIST_L2, 5) for there in (inside, known)
+    )  # px from the hole, and from what is known around it
+    (around, most), (own, least) = (
+        (_mean_along(values, band), cv2.boxFilter(band.astype(np.float32), -1, (SEAM_WIDTH,) * 2, normalize=False))
+        for values, band in ((source, known & (beyond <= SEAM)), (new, inside & (within <= SEAM)))
+    )
+    seen = inside & (within <= SEAM) & (most > SEAM_WIDTH) & (least > SEAM_WIDTH)
+    if seen.any():
+        off = push_pull(np.asarray(around - own, np.float32), seen)
+        new += np.sign(off) * np.clip(np.abs(off) - SEAM_NOISE, 0, SEAM_MOST)
+    share = three_channels(np.asarray(np.clip(within / (BLEND + 1), 0, 1), np.float32))
+    result = image.copy()
+    mixed = cv2.convertScaleAbs(np.maximum(source + (new - source) * share, 0))
+    result[crop] = np.where(inside[..., None], mixed, image[crop])
+    return result
+
+
+def _mean_along(values: Floats32, band: Mask) -> Floats32:
+    """Per pixel, the mean colour [h, w, 3] of what lies next to it in a band [h, w]."""
+    weight = band.astype(np.float32)
+    total = cv2.boxFilter(values * weight[..., None], -1, (SEAM_WIDTH,) * 2, normalize=False)
+    count = cv2.boxFilter(weight, -1, (SEAM_WIDTH,) * 2, normalize=False)
+    return np.asarray(total / np.maximum(count, 1)[..., None], np.float32)
+
+
+def shadow_beside(image: Image, hole: Mask, avoid: Mask) -> Mask:
+    """What is much darker [H, W] than most right around a hole, and none of `avoid`: the shadow of what stood there."""
+    found = np.zeros_like(hole)
+    around = _surroundings(image, hole, avoid, round(SHADOW_REACH * float(np.sqrt(np.count_nonzero(hole)))) + 4)
+    if around is not None:
+        found[around.crop] = around.shadow
+    return found
+
+
 @dataclass(frozen=True)
 class _Surroundings:
     """What lies around a hole, in a crop of the image."""
@@ -106,7 +157,7 @@ def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> 
     away = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
     rim = max(RIM_LEAST, RIM * float(np.sqrt(np.count_nonzero(inside))))
     # What is much darker than most at the hole's rim is the object's own shadow, no shading to draw in.
-    width = 2 * max(3, int(0.15 * np.sqrt(np.count_nonzero(inside)))) + 1
+    width = 2 * max(3, int(SHADOW_REACH * np.sqrt(np.count_nonzero(inside)))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
     shadow = (cv2.dilate(inside.astype(np.uint8), kernel) > 0) & known
     if shadow.any():

@@ -18,7 +18,7 @@ from cow_service.vision.masks import eroded, hull, resized_mask, turning, window
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
-EDGE_SIGMA = 0.8  # px: Gaussian that softens the sprite's edge
+EDGE_SIGMA = 0.5  # px: Gaussian that softens the sprite's edge; moving it blurs it further
 MARGIN = 4  # px around the mask that the soft edge takes
 SHADING_SIGMA = 0.1  # of a ball's width: coarser than this is its shading, finer is what is printed on it
 PRINTED = 14.0  # grey levels, 80th percentile: from so much fine detail on, a ball is seen to turn

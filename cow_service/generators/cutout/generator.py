@@ -44,7 +44,7 @@ class CutoutGenerator:
     ) -> Iterator[Image]:
         """The frames of these indices, RGB [h, w, 3]; only the windows of what moves are composed."""
         source, earlier = (given, 0) if given.before is None else (given.before, 1)
-        layers = take_apart(source)
+        layers = take_apart(source, lambda done: progress(0.0))
         for done, index in enumerate(indices):
             progress(done / len(indices))
             yield compose(layers, index + earlier)

@@ -1,7 +1,8 @@
 """Takes a scene apart: the background without what moves and its shadows, sprites, and what stands still."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import cv2
@@ -12,7 +13,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, Sprite, StillBody, moving_bodies, still_bodies
 from cow_service.generators.cutout.shadows import MovingShadow, UnshadedScene, take_shadows
 from cow_service.media.images import fit_within
-from cow_service.vision.inpainting import fill_hole
+from cow_service.vision.inpainting import blend_fill, fill_hole, shadow_beside
 from cow_service.vision.masks import CroppedMask, hull, iou, resized_mask, window_of
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.types import Image, Mask
@@ -76,8 +77,8 @@ class Layers:
     factor: float  # clip px per image px
 
 
-def take_apart(given: GeneratorInput) -> Layers:
-    """All that the frames are composed of."""
+def take_apart(given: GeneratorInput, progress: Callable[[float], None] = lambda done: None) -> Layers:
+    """All that the frames are composed of. `progress` hears how far an inpainter is, and may raise `Canceled`."""
     scene = given.scene
     clean = cast(CutoutOptions, given.options).clean_cues  # the generator's own `options_model`
     image = fit_within(scene.clean if clean else scene.image, MAX_SIDE)
@@ -90,9 +91,10 @@ def take_apart(given: GeneratorInput) -> Layers:
     if scene.side_view is None:
         unshaded = take_shadows(given, image, moving, still, ground, factor)
         cues = resized_mask(scene.cues, size) if clean else None
-        background = without_bodies(unshaded, moving, still, eye, cues)
+        fill = None if given.inpainter is None else partial(given.inpainter.fill, progress=progress)
+        background = without_bodies(unshaded, moving, still, eye, cues, fill)
     else:  # a drawing has no shadows, and what is behind its things is known
-        unshaded, background = UnshadedScene(image, {}, ()), image.copy()
+        unshaded, background = UnshadedScene(image, {}, frozenset(), ()), image.copy()
         holes = np.logical_or.reduce([_dilated(body.mask, DRAWN_RIM) for body in moving])
         holes &= ~np.logical_or.reduce([np.zeros_like(holes), *(body.mask for body in still)])
         background[holes] = fit_within(scene.side_view.empty, MAX_SIDE)[holes]
@@ -113,18 +115,21 @@ def take_apart(given: GeneratorInput) -> Layers:
 
 
 def without_bodies(
-    unshaded: UnshadedScene, moving: Sequence[MovingBody], still: Sequence[StillBody], eye: float, cues: Mask | None
+    unshaded: UnshadedScene,
+    moving: Sequence[MovingBody],
+    still: Sequence[StillBody],
+    eye: float,
+    cues: Mask | None,
+    fill: Callable[[Image, Mask], Image] | None = None,
 ) -> Image:
-    """A scene without shadows [h, w, 3], with the bodies that move taken out of it, too."""
+    """A scene without shadows [h, w, 3], with the bodies that move taken out of it, too.
+
+    `fill` paints all that they hid in one call; without it each hole is closed from what lies around it.
+    """
     image = unshaded.image
+    gone, stays = np.zeros(image.shape[:2], bool), np.zeros(image.shape[:2], bool)
     for body in moving:
-        noisy = unshaded.noisy.get(body.path.body)
-        growth = max(2, round(HOLE_GROWTH * float(np.sqrt(np.count_nonzero(body.mask)))))
-        hole = _dilated(body.mask, 2 * (growth if noisy is None else growth + SHADED_RIM) + 1)
-        if noisy is not None:
-            hole |= noisy
-        if cues is not None:  # where a cue next to the body was inpainted, the body's colour has spread
-            hole |= cues & _dilated(hole, 2 * growth + 1, 3)
+        hole = _hole_of(body, unshaded, cues)
         window = window_of(hole, 2)
         if window is None:
             continue
@@ -139,6 +144,11 @@ def without_bodies(
             if other.index == body.support:  # its top around the foot was in the shadow
                 solid &= ~other.mask
         rest = hole & ~solid
+        if fill is not None:
+            if body.path.body in unshaded.unmeasured:
+                rest |= shadow_beside(image, rest, objects)
+            gone, stays = gone | rest, stays | objects
+            continue
         for other in moving:
             objects |= other.mask & ~body.mask if other is not body else False
         for other in behind:
@@ -148,7 +158,21 @@ def without_bodies(
                 rest &= ~part
                 objects |= part
         image = fill_hole(image, rest, objects)
+    if fill is not None and gone.any():
+        image = blend_fill(image, fill(image, gone), gone, stays & ~gone)
     return image
+
+
+def _hole_of(body: MovingBody, unshaded: UnshadedScene, cues: Mask | None) -> Mask:
+    """What a body leaves behind [h, w]: its mask, its rim, and what was too dark beside it."""
+    noisy = unshaded.noisy.get(body.path.body)
+    growth = max(2, round(HOLE_GROWTH * float(np.sqrt(np.count_nonzero(body.mask)))))
+    hole = _dilated(body.mask, 2 * (growth if noisy is None else growth + SHADED_RIM) + 1)
+    if noisy is not None:
+        hole |= noisy
+    if cues is not None:  # where a cue next to the body was inpainted, the body's colour has spread
+        hole |= cues & _dilated(hole, 2 * growth + 1, 3)
+    return hole
 
 
 def _dilated(mask: Mask, width: int, iterations: int = 1) -> Mask:

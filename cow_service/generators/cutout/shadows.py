@@ -27,6 +27,7 @@ EXTENT = 2.5  # radii around the foot, within which a sphere's shade is drawn
 CELLS = 40  # along the longer side: such a shade is smooth, and computed at so few cells
 NO_SHADE = 0.01  # share of light
 DEEP = 0.55  # share of light: with more taken away, noise is all that dividing brings back
+PAINTED = 0.15  # share of light: where an inpainter paints the hole, it does better than dividing from here on
 LEAST_SPREAD, TEXTURE = 0.02, 2.5  # of the lightness, deviations of the texture: so far a lit floor's colours spread
 RIM = 2  # px around an object, where its colours mix with those of the floor
 STRETCH = 1.25  # of a sphere's radius: how far its shadow reaches from its middle
@@ -164,6 +165,7 @@ class UnshadedScene:
 
     image: Image  # [h, w, 3]
     noisy: dict[int, Mask]  # by `Path.body`: where a body with a contact shadow has left too little to divide
+    unmeasured: frozenset[int]  # by `Path.body`: what stands and moves, with a shadow, if any, that is still there
     shadows: tuple[MovingShadow, ...]
 
 
@@ -178,6 +180,7 @@ def take_shadows(
     """The scene [h, w, 3] without the shadows of the bodies that move, and these shadows."""
     objects = np.logical_or.reduce([body.mask for body in (*moving, *still)])
     floor, shadows, noisy = eroded(~objects, 2 * RIM + 1), list[MovingShadow](), dict[int, Mask]()
+    unmeasured: set[int] = set()
     for body in moving:
         index, points = body.path.body, np.array(body.path.points)
         if np.abs(points - points[0]).max() <= 1 and np.ptp(body.path.scale) <= 0.01:  # it stays where it is
@@ -195,13 +198,15 @@ def take_shadows(
         beside = eroded(masks[0], 2 * RIM + 1) if masks else floor
         shade = None if body.airborne else contact_shade(image, body.mask, bbox_of(body.mask), beside)
         if shade is None:
+            unmeasured |= set() if body.airborne else {index}
             continue
         if ground is None:
             shadows.append(partial(_attached_shadow, shade, body.path, factor * body.start, factor))
         else:
             shadows.append(partial(_contact_shadow, ground, body.path, shade, body.support))
-        image, noisy[index] = _without_shade(image, shade, masks[0] if masks else ~objects)
-    return UnshadedScene(image, noisy, tuple(shadows))
+        deep = DEEP if given.inpainter is None else PAINTED
+        image, noisy[index] = _without_shade(image, shade, masks[0] if masks else ~objects, deep)
+    return UnshadedScene(image, noisy, frozenset(unmeasured), tuple(shadows))
 
 
 def _light_through(given: GeneratorInput, body: MovingBody, ground: Ground) -> Vector | None:
@@ -234,8 +239,8 @@ def _shade_in_light(image: Image, body: MovingBody, ground: Ground, light: Vecto
     return cast_shade(image, seed, (float(x0), float(y0), float(x1), float(y1)), floor)
 
 
-def _without_shade(image: Image, shade: Shade, where: Mask) -> tuple[Image, Mask]:
-    """The image [h, w, 3] with a shade taken out of it in a mask, and a mask of where that leaves nothing but noise."""
+def _without_shade(image: Image, shade: Shade, where: Mask, most: float = DEEP) -> tuple[Image, Mask]:
+    """The image [h, w, 3] with a shade taken out of it in a mask, and a mask of where it took more than `most`."""
     deep = np.zeros_like(where)
     window = clipped(*shade.corners(), (image.shape[1], image.shape[0]))
     if window is None:
@@ -248,5 +253,5 @@ def _without_shade(image: Image, shade: Shade, where: Mask) -> tuple[Image, Mask
     bounded = np.clip(lit, (1 - spread) * floor, (1 + spread) * floor)
     shaded = np.clip(cv2.dilate(strongest(dark), np.ones((5, 5), np.uint8)) / LEAST_SHADE, 0, 1)[..., None]
     result[window] = np.clip(shaded * bounded + (1 - shaded) * lit + 0.5, 0, 255).astype(np.uint8)
-    deep[window] = dark @ np.full(3, 1 / 3, np.float32) > DEEP
+    deep[window] = dark @ np.full(3, 1 / 3, np.float32) > most
     return result, deep
