@@ -22,7 +22,7 @@ from cow_service.perception.base import Perception
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
 from cow_service.readers.chat import ChatReader
-from cow_service.records import Answer, Artifact, BackendInfo, Look, Models, Simulation
+from cow_service.records import Answer, Artifact, BackendInfo, BackendKind, Look, Models, Simulation
 from cow_service.registry import Registry
 from cow_service.requests import (
     AnswerRequest,
@@ -236,10 +236,7 @@ class Service:
         return Models(
             readers=tuple(self._describe("reader", name) for name in self.readers.names()),
             generators=tuple(self._describe("generator", name) for name in self.generators.names()),
-            perception=tuple(
-                self._describe(kind, name).model_copy(update={"kind": kind})
-                for kind, name in self.perception.installed()
-            ),
+            perception=tuple(self._describe(kind, name) for kind, name in self.perception.installed()),
             mllms=tuple(name for name, manifest in load_manifests().items() if manifest.role == "mllm"),
         )
 
@@ -296,17 +293,19 @@ class Service:
                 raise errors.InvalidRequest(detail, errors=(errors.FieldError(f"/{role}", detail),))
         return reader, generator
 
-    def _describe(self, role: str, name: str) -> BackendInfo:
+    def _describe(self, kind: BackendKind, name: str) -> BackendInfo:
         manifest = find_manifest(name)
         roles = {"reader": self.settings.reader, "generator": self.settings.generator, **self.perception.names}
-        default = name == roles.get(role)
+        default = name == roles.get(kind)
         if manifest is None:
-            return BackendInfo(name=name, default=default, ready=None, summary="Registered by another package.")
+            summary = "Registered by another package."
+            return BackendInfo(name=name, kind=kind, default=default, ready=None, summary=summary)
         modules = manifest.missing_modules()
         unset = tuple(name for name in manifest.settings if not self.settings.has(name))
         here = ready(manifest, self.settings.weights_dir, without=self.settings.own_parts(name))
         return BackendInfo(
             name=name,
+            kind=kind,
             default=default,
             ready=here and not modules and not unset,
             needs=manifest.modules,

@@ -27,7 +27,7 @@ from cow_service.jobs.readiness import Readiness
 from cow_service.observability import tracing
 from cow_service.observability.metrics import Metrics
 from cow_service.records import Problem
-from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.requests import AnswerRequest, LookRequest, SimulateRequest
 from cow_service.settings import Settings
 
 SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
@@ -144,7 +144,7 @@ def contract(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
-        for model in (Problem, SimulateRequest, AnswerRequest):
+        for model in (Problem, SimulateRequest, AnswerRequest, LookRequest):
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(schema.pop("$defs", {}))
             schemas[model.__name__] = schema

@@ -159,10 +159,9 @@ def print_models(models: records.Models, *, as_json: bool) -> None:
         print(models.model_dump_json(indent=2))
         return
     table = Table("role", "name", "ready", "what it is", box=None, pad_edge=False)
-    for role, backends in (("reader", models.readers), ("generator", models.generators)):
-        for backend in backends:
-            name = backend.name + (" (default)" if backend.default else "")
-            table.add_row(role, name, _readiness(backend), backend.summary)
+    for backend in (*models.readers, *models.generators, *models.perception):
+        name = backend.name + (" (default)" if backend.default else "")
+        table.add_row(backend.kind, name, _readiness(backend), backend.summary)
     console = Console()
     console.print(table)
     console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)

@@ -30,8 +30,8 @@ GROUPS: dict[PerceptionKind, str] = {
 }
 SETS: dict[str, tuple[str, ...]] = {  # by the value of COW_PERCEPTION; all of them under permissive licences
     "none": (),
-    "cpu": ("sam2-tiny", "grounding-dino-tiny", "moge-2-small", "lama"),
-    "gpu": ("sam2-large", "grounding-dino-base", "moge-2-large", "lama"),
+    "cpu": ("sam2-tiny", "grounding-dino-tiny", "moge-2-small"),
+    "gpu": ("sam2-large", "grounding-dino-base", "moge-2-large"),
 }
 MOST_EMBEDDINGS = 8  # images whose embedding is kept: some 16 MB each of a large model
 ImageKey = tuple[str | None, str]

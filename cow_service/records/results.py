@@ -256,11 +256,14 @@ def _text(record: Record) -> str:
     return record.model_dump_json(indent=2) + "\n"
 
 
+BackendKind = Literal["reader", "generator", "segmenter", "detector", "depth", "inpainter"]
+
+
 class BackendInfo(Record):
-    """A reader or generator: what it is, what it needs, whether it is ready."""
+    """A reader, a generator or a model that sees: what it is, what it needs, whether it is ready."""
 
     name: str
-    kind: Literal["reader", "generator", "segmenter", "detector", "depth", "inpainter"] | None = None
+    kind: BackendKind
     default: bool = Field(description="Used where a request names none; of models that see: used by the server.")
     ready: bool | None = Field(description="Null where nothing is known of it before it is used.")
     needs: tuple[str, ...] = Field(default=(), description="Python modules that it uses.")
