@@ -43,18 +43,6 @@ BASE_SWIN = {"embed_dim": 128, "depths": [2, 2, 18, 2], "num_heads": [4, 8, 16, 
 DINOV2_SMALL = {"hidden_size": 384, "num_attention_heads": 6, "image_size": 518, "patch_size": 14}
 
 
-class Tokens:
-    """Two tokens for each word: the real vocabulary comes with the weights."""
-
-    cls_token_id, sep_token_id = 101, 102
-
-    def convert_tokens_to_ids(self, _: str) -> int:
-        return 1012
-
-    def __call__(self, text: str, **_: Any) -> dict[str, list[int]]:
-        return {"input_ids": [2000] * (2 * len(text.split()))}
-
-
 def sam(hiera: dict[str, Any]) -> torch.nn.Module:
     backbone = Sam2HieraDetConfig(**hiera)
     channels = list(backbone.embed_dim_per_stage or ())[::-1]

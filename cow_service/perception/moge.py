@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -207,7 +208,7 @@ class Moge(nn.Module):
         self.neck = ConvStack(**neck)
         self.points_head, self.mask_head = ConvStack(**points_head), ConvStack(**mask_head)
         dims: Sequence[int] = scale_head["dims"]
-        layers = [each for pair in zip(dims, dims[1:], strict=False) for each in (nn.Linear(*pair), nn.ReLU())]
+        layers = [each for pair in pairwise(dims) for each in (nn.Linear(*pair), nn.ReLU())]
         self.scale_head = nn.Sequential(*layers[:-1])
         self.tokens = int(num_tokens_range[1])
 

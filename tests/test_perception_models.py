@@ -1,0 +1,390 @@
+"""The models that see, at toy size: real classes and files, random weights, pulled from a hub and loaded by factory."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import transformers
+from hub import Blob, Hub, running
+from safetensors.torch import load_file, save_file
+from transformers import BertConfig, BertTokenizer, Dinov2Config, Sam2HieraDetConfig, Sam2VisionConfig, SwinConfig
+
+from cow_service.errors import PerceptionUnavailable, WeightsUnavailable
+from cow_service.perception import depth, dino, moge, sam
+from cow_service.perception.base import Prompt
+from cow_service.perception.loading import LoadedModel
+from cow_service.settings import Settings
+from cow_service.vision.types import Image
+from cow_service.weights.manifests import find_manifest
+from cow_service.weights.repositories import download, resolve
+
+WIDTH, HEIGHT = 120, 80
+SIDE = 128  # px: what the toy segmenter sees
+WORDS = ("blue", "mug", "ball", "yellow", "table", "red", "a")
+FACTORIES: dict[str, Callable[[Settings], Any]] = {
+    "sam2-tiny": sam.create_sam2_tiny,
+    "grounding-dino-tiny": dino.create_dino_tiny,
+    "depth-anything-indoor": depth.create_depth_anything_indoor,
+    "moge-2-small": depth.create_moge_2_small,
+}
+
+
+def save_lively(network: Any, folder: Path) -> None:
+    """With larger weights than those of transformers, which would make nearly the same of everything."""
+    for weight in network.parameters():
+        if weight.ndim > 1:
+            weight.data *= 8
+    network.save_pretrained(folder)
+
+
+def make_sam(folder: Path) -> None:
+    """As it is published: a model for videos, of which the part for images is used."""
+    hiera = Sam2HieraDetConfig(
+        hidden_size=8, image_size=[SIDE, SIDE], embed_dim_per_stage=[8, 16, 32, 64], blocks_per_stage=[1, 1, 2, 1],
+        num_attention_heads_per_stage=[1, 1, 2, 2], window_size_per_stage=[4, 4, 4, 4], global_attention_blocks=[3],
+    )  # fmt: skip
+    vision = Sam2VisionConfig(
+        backbone_config=hiera, backbone_channel_list=[64, 32, 16, 8], fpn_hidden_size=32,
+        backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]],
+    )  # fmt: skip
+    config = transformers.Sam2VideoConfig(
+        vision_config=vision,
+        prompt_encoder_config={"hidden_size": 32, "image_size": SIDE},
+        mask_decoder_config={"hidden_size": 32, "mlp_dim": 32, "num_attention_heads": 2, "iou_head_hidden_dim": 16},
+        memory_attention_hidden_size=32, memory_attention_num_layers=1, memory_encoder_hidden_size=32,
+        memory_attention_feed_forward_hidden_size=32, mask_downsampler_embed_dim=32, memory_fuser_embed_dim=32,
+        memory_fuser_intermediate_dim=32, memory_fuser_num_layers=1, image_size=SIDE,
+    )  # fmt: skip
+    save_lively(transformers.Sam2VideoModel(config), folder)
+
+
+def make_dino(folder: Path) -> None:
+    swin = SwinConfig(
+        embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 2, 2], window_size=4, out_indices=[2, 3, 4], image_size=64
+    )
+    text = BertConfig(
+        vocab_size=1100, hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16
+    )  # fmt: skip
+    config = transformers.GroundingDinoConfig(
+        backbone_config=swin, text_config=text, d_model=32, num_queries=20, encoder_layers=1, decoder_layers=2,
+        encoder_attention_heads=2, decoder_attention_heads=2, encoder_ffn_dim=32, decoder_ffn_dim=32, max_text_len=8,
+    )  # fmt: skip
+    save_lively(transformers.GroundingDinoForObjectDetection(config), folder)
+    # The ids of these four are fixed in the model's code.
+    fixed = {0: "[PAD]", 100: "[UNK]", 101: "[CLS]", 102: "[SEP]", 103: "[MASK]", 1012: ".", 1029: "?"}
+    words = dict(enumerate(WORDS, start=1040))
+    vocabulary = [(fixed | words).get(i, f"[unused{i}]") for i in range(1100)]
+    (folder / "vocab.txt").write_text("\n".join(vocabulary))
+    BertTokenizer(vocab={word: i for i, word in enumerate(vocabulary)}).save_pretrained(folder)
+
+
+def make_depth_anything(folder: Path) -> None:
+    backbone = Dinov2Config(
+        hidden_size=32, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
+        out_indices=[1, 2, 3, 4], reshape_hidden_states=False,
+    )  # fmt: skip
+    config = transformers.DepthAnythingConfig(
+        backbone_config=backbone, neck_hidden_sizes=[8, 8, 8, 8], reassemble_hidden_size=32, fusion_hidden_size=8,
+        head_hidden_size=8, depth_estimation_type="metric", max_depth=20,
+    )  # fmt: skip
+    save_lively(transformers.DepthAnythingForDepthEstimation(config), folder)
+
+
+def make_moge(folder: Path) -> None:
+    widths = [16, 8, 8]
+    stack = {"dim_in": widths, "dim_res_blocks": widths, "resamplers": ["conv_transpose", "bilinear"]}
+    stack |= {"num_res_blocks": [0, 1, 0], "res_block_in_norm": "none", "res_block_hidden_norm": "none"}
+    config = {
+        "encoder": {"backbone": "toy", "intermediate_layers": [0, 1], "dim_out": 16},
+        "neck": stack | {"dim_in": [18, 2, 2], "dim_out": None},
+        "points_head": stack | {"dim_out": [None, None, 3]}, "mask_head": stack | {"dim_out": [None, None, 1]},
+        "normal_head": stack | {"dim_out": [None, None, 3]}, "scale_head": {"dims": [32, 16, 1]},
+        "remap_output": "exp", "num_tokens_range": [12, 54],
+    }  # fmt: skip
+    weights = dict(moge.Moge(**config).state_dict())
+    weights |= {"normal_head.x": torch.zeros(1), "encoder.image_mean": torch.zeros(1, 3, 1, 1)}
+    weights["mask_head.output_blocks.2.bias"] += 5  # it sees a surface everywhere
+    torch.save({"model_config": config, "model": weights}, folder / "model.pt")
+
+
+MAKERS = dict(zip(FACTORIES, (make_sam, make_dino, make_depth_anything, make_moge), strict=True))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _toy_sizes() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(moge.BACKBONES, "toy", (32, 2, 2))
+        patch.setattr(dino, "SHORT_SIDE", 64)
+        patch.delenv("HF_TOKEN", raising=False)
+        yield
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder into which the toys were pulled by the sources of the real manifests."""
+    data = tmp_path_factory.mktemp("home")
+    torch.manual_seed(0)
+    with running() as hub:
+        for name, make in MAKERS.items():
+            folder = tmp_path_factory.mktemp(name)
+            make(folder)
+            pull(hub, name, {path.name: Blob(path.read_bytes()) for path in folder.iterdir()}, data)
+    return data
+
+
+def pull(hub: Hub, name: str, files: dict[str, Blob], data: Path, **changed: Any) -> None:
+    manifest = find_manifest(name)
+    assert manifest is not None
+    source = manifest.sources["weights"].model_copy(update=changed)
+    hub.commit(source.repository, files)
+    weights = Settings(data_dir=data).weights_dir
+    download([resolve(source, weights, endpoint=hub.address)], weights, endpoint=hub.address)
+
+
+@pytest.fixture(scope="module")
+def toys(home: Path) -> dict[str, Any]:
+    return {name: create(Settings(data_dir=home, device="cpu")) for name, create in FACTORIES.items()}
+
+
+def own(home: Path, name: str, tmp_path: Path) -> Path:
+    """A copy of a model's files that may be changed."""
+    manifest = find_manifest(name)
+    assert manifest is not None
+    pulled = Settings(data_dir=home).weights_dir / str(manifest.weights).replace("/", "--")
+    return shutil.copytree(pulled, tmp_path / "own")
+
+
+def picture(seed: int = 0) -> Image:
+    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+
+
+def listen(network: torch.nn.Module) -> list[dict[str, Any]]:
+    """The arguments by name of each call from here on."""
+    heard: list[dict[str, Any]] = []
+    network.register_forward_pre_hook(lambda _, args, named: heard.append(named | {"args": args}), with_kwargs=True)
+    return heard
+
+
+# --- loading ---
+
+
+@pytest.mark.parametrize("name", FACTORIES)
+class TestLoading:
+    def test_the_fingerprint_changes_with_the_weights(
+        self, name: str, home: Path, toys: dict[str, Any], tmp_path: Path
+    ) -> None:
+        other = Settings(data_dir=home, device="cpu", checkpoints={name: own(home, name, tmp_path)})
+        assert name in toys[name].fingerprint
+        assert FACTORIES[name](other).fingerprint != toys[name].fingerprint
+
+    @pytest.mark.parametrize(("fault", "says"), [("missing", "lack"), ("unknown", "beyond its model, zzz.weight")])
+    def test_keys_that_do_not_fit_are_refused(
+        self, name: str, fault: str, says: str, home: Path, tmp_path: Path
+    ) -> None:
+        folder = own(home, name, tmp_path)
+        file = folder / ("model.pt" if name.startswith("moge") else "model.safetensors")
+        pickled = torch.load(file, weights_only=True) if file.suffix == ".pt" else None
+        weights = load_file(file) if pickled is None else pickled["model"]
+        gone = next(key for key in sorted(weights) if "proj" in key and not key.startswith("memory"))
+        if fault == "missing":
+            del weights[gone]
+            says = ".".join(gone.split(".")[-3:])  # transformers has other names for some than published files
+        else:
+            weights["zzz.weight"] = torch.zeros(1)
+        if pickled is None:
+            save_file(weights, file, {"format": "pt"})
+        else:
+            torch.save(pickled, file)
+        with pytest.raises(PerceptionUnavailable, match="The weights of") as refused:
+            FACTORIES[name](Settings(data_dir=home, device="cpu", checkpoints={name: folder}))
+        assert says in refused.value.detail
+        assert str(tmp_path) not in refused.value.detail
+
+    def test_missing_weights_are_refused_with_the_command_that_pulls_them(self, name: str, tmp_path: Path) -> None:
+        with pytest.raises(PerceptionUnavailable, match=f"Run `cow models pull {name}`"):
+            FACTORIES[name](Settings(data_dir=tmp_path, device="cpu"))
+
+    def test_out_of_memory_says_what_to_do(self, name: str, toys: dict[str, Any]) -> None:
+        toy = toys[name]
+
+        def fail(*_: Any) -> None:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+
+        hook = next(toy._model.network.children()).register_forward_pre_hook(fail)
+        call = {"sam2-tiny": lambda: toy.segment(toy.embed(picture()), [Prompt(point=(1, 1))])}.get(
+            name, (lambda: toy.detect(picture(), ["ball"])) if "dino" in name else lambda: toy.estimate(picture(), None)
+        )
+        try:
+            with pytest.raises(PerceptionUnavailable, match=f"'{name}' ran out of memory on cpu. Set COW_PERCEPTION"):
+                call()
+        finally:
+            hook.remove()
+        call()
+
+
+def test_a_pickle_is_pulled_only_where_the_manifest_says_so_and_runs_no_code(home: Path, tmp_path: Path) -> None:
+    with running() as hub, pytest.raises(WeightsUnavailable, match="only pickled files"):
+        pull(hub, "moge-2-small", {"model.pt": Blob(b"x")}, tmp_path / "data", pickled=False)
+
+    class Trap:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (tmp_path / "sprung").touch, ()
+
+    folder = own(home, "moge-2-small", tmp_path)
+    torch.save({"model_config": Trap(), "model": {}}, folder / "model.pt")
+    with pytest.raises(PerceptionUnavailable, match="'moge-2-small' cannot be loaded: UnpicklingError"):
+        depth.create_moge_2_small(Settings(data_dir=home, device="cpu", checkpoints={"moge-2-small": folder}))
+    assert not (tmp_path / "sprung").exists()
+
+
+# --- segmenter ---
+
+PROMPTS = (
+    Prompt(point=(30.0, 60.0)), Prompt(bbox=(10.0, 20.0, 60.0, 70.0)), Prompt(point=(90.5, 20.0)),
+    Prompt(bbox=(0.0, 0.0, 120.0, 80.0)),
+)  # fmt: skip
+
+
+def test_prompts_reach_the_segmenter_at_their_places(toys: dict[str, Any]) -> None:
+    toy = toys["sam2-tiny"]
+    heard = listen(toy._model.network.prompt_encoder.shared_embedding)
+    toy.segment(toy.embed(picture()), PROMPTS)
+    points, boxes = (call["args"][0][0, :, :-1].numpy() / SIDE * (WIDTH, HEIGHT) for call in heard[:2])  # the last pads
+    np.testing.assert_allclose(points[:, 0], [(30, 60), (90.5, 20)], atol=1e-4)
+    np.testing.assert_allclose(boxes.reshape(2, 4), [(10, 20, 60, 70), (0, 0, 120, 80)], atol=1e-4)
+
+
+def test_one_embedding_serves_many_prompts_as_if_each_were_alone(
+    toys: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    toy = toys["sam2-tiny"]
+    encoded = listen(toy._model.network.vision_encoder)
+    embedding = toy.embed(picture())
+    together = toy.segment(embedding, PROMPTS)
+    monkeypatch.setattr(sam, "MOST_TOGETHER", 1)
+    assert [len(each) for each in together] == [3, 1, 3, 1]
+    for candidates, (alone,) in zip(together, (toy.segment(embedding, [each]) for each in PROMPTS), strict=True):
+        assert [each.score for each in candidates] == sorted((each.score for each in candidates), reverse=True)
+        for one, other in zip(candidates, alone, strict=True):
+            assert (one.logits.shape, one.logits.dtype) == ((SIDE // 4, SIDE // 4), np.float32)
+            assert 0 <= one.score <= 1
+            np.testing.assert_allclose(one.logits, other.logits, atol=1e-5)
+    assert len(encoded) == 1
+    assert np.abs(together[0][0].logits - together[2][0].logits).max() > 0.1, "another point, another mask"
+    ((other, *_),) = toy.segment(toy.embed(picture(1)), PROMPTS[:1])
+    assert np.abs(together[0][0].logits - other.logits).max() > 0.1, "another image, another mask"
+
+
+def test_a_box_is_what_transformers_makes_of_one(toys: dict[str, Any]) -> None:
+    toy = toys["sam2-tiny"]
+    embedding = toy.embed(picture())
+    box = torch.tensor([[[10 / WIDTH, 20 / HEIGHT, 60 / WIDTH, 70 / HEIGHT]]]) * SIDE - 0.5
+    with torch.inference_mode():
+        found = toy._model.network(image_embeddings=embedding.maps, input_boxes=box, multimask_output=False)
+    np.testing.assert_allclose(toy.segment(embedding, PROMPTS[1:2])[0][0].logits, found.pred_masks[0, 0, 0], atol=1e-4)
+
+
+# --- detector ---
+
+
+def crafted(toy: dino.DinoDetector, queries: list[tuple[list[float], list[float]]]) -> dino.DinoDetector:
+    """The same with a network that finds, for each query, a box (middle, size) and chances of the text's tokens."""
+    chances = torch.zeros(len(queries), 8)
+    for row, (_, values) in zip(chances, queries, strict=True):
+        row[1 : 1 + len(values)] = torch.tensor(values)  # after the first token, which begins the text
+    output = SimpleNamespace(
+        logits=torch.logit(chances, eps=1e-6)[None], pred_boxes=torch.tensor([box for box, _ in queries])[None]
+    )
+
+    def network(**_: Any) -> Any:
+        return output
+
+    network.config = toy._model.network.config
+    model = LoadedModel(toy._model.manifest, Path(), network, torch.device("cpu"), "crafted")
+    return dino.DinoDetector(model, toy._tokenizer)
+
+
+def test_boxes_come_back_in_pixels_with_the_phrase_that_fits_best(toys: dict[str, Any]) -> None:
+    detector = crafted(toys["grounding-dino-tiny"], [
+        ([0.5, 0.5, 0.5, 0.25], [0.1, 0.6, 0.0, 0.55]),  # tokens: blue mug . mug
+        ([0.5, 0.5, 0.5, 0.26], [0.1, 0.5, 0.0, 0.5]),  # the same thing once more
+        ([0.1, 0.9, 0.4, 0.4], [0.7, 0.8, 0.0, 0.6]),  # beyond the image
+        ([0.5, 0.1, 0.1, 0.1], [0.29, 0.28, 0.0, 0.28]),
+    ])  # fmt: skip
+    blue, mug = detector.detect(picture(), ["Blue mug", "mug"])
+    assert (blue.phrase, mug.phrase) == ("Blue mug", "mug")
+    assert blue.bbox == pytest.approx((0, 56, 36, 80), abs=1e-4)
+    assert mug.bbox == pytest.approx((30, 30, 90, 50), abs=1e-4)
+    assert (blue.score, mug.score) == (pytest.approx(0.8), pytest.approx(0.55))
+
+
+def test_many_phrases_are_sought_in_groups_that_fit_the_models_text(toys: dict[str, Any]) -> None:
+    toy = toys["grounding-dino-tiny"]
+    heard = listen(toy._model.network)
+    phrases = ["blue mug", "a ball", "table", "red table", ".", "table"]
+    found = toy.detect(picture(), phrases)
+    text = toy._tokenizer(["blue mug. a ball.", "table. red table."])["input_ids"]
+    assert [call["input_ids"][0].tolist() for call in heard] == text
+    assert heard[0]["pixel_values"].shape == (1, 3, 64, 96)
+    one_by_one = [each for group in (phrases[:2], phrases[2:]) for each in toy.detect(picture(), group)]
+    assert found, "random weights find something, too"
+    assert sorted(found, key=repr) == sorted(one_by_one, key=repr)
+    assert all(0 <= each.bbox[0] < each.bbox[2] <= WIDTH and each.bbox[3] <= HEIGHT for each in found)
+
+
+# --- depth ---
+
+
+def test_depth_anything_keeps_the_shape_of_the_image(home: Path, toys: dict[str, Any], tmp_path: Path) -> None:
+    heard = listen(toys["depth-anything-indoor"]._model.network)
+    reading = toys["depth-anything-indoor"].estimate(picture(), 100.0)
+    assert heard[0]["args"][0].shape == (1, 3, 56, 84)
+    assert (reading.depth.shape, reading.scale, reading.focal) == ((56, 84), 1.0, None)
+    assert 0 < reading.depth.min() < reading.depth.max() < 20
+    folder = own(home, "depth-anything-indoor", tmp_path)
+    config = json.loads((folder / "config.json").read_text()) | {"depth_estimation_type": "relative"}
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(PerceptionUnavailable, match="not one of the metric models"):
+        FACTORIES["depth-anything-indoor"](Settings(device="cpu", checkpoints={"depth-anything-indoor": folder}))
+
+
+def test_moge_reads_an_image_of_any_shape(toys: dict[str, Any]) -> None:
+    wide, tall = (toys["moge-2-small"].estimate(each, None) for each in (picture(), picture().swapaxes(0, 1)))
+    assert (wide.depth.shape, tall.depth.shape) == ((24, 36), (36, 24))
+    assert np.isfinite(wide.depth).all()
+    assert wide.depth.min() > 0
+
+
+@pytest.mark.parametrize("exif", [None, 150.0])
+@pytest.mark.parametrize(("width", "height", "focal"), [(120, 80, 150.0), (600, 900, 500.0), (400, 100, 900.0)])
+def test_moge_recovers_focal_length_and_metres(
+    width: int, height: int, focal: float, exif: float | None, toys: dict[str, Any]
+) -> None:
+    """A slanted wall and a box before it, as the network gives it: another unit, and shifted along z; sky on top."""
+    v, u = np.mgrid[: height // 4, : width // 4] * 4.0 + 2
+    z = 4 + u / width
+    z[height // 8 :, width // 16 : width // 8] = 2.0
+    points = np.stack([(u - width / 2) * z / focal, (v - height / 2) * z / focal, z - 0.7], axis=-1) / 2.5
+    points += np.random.default_rng(0).normal(0, 0.002, points.shape)
+    sure = np.where(v < height / 8, 0.1, 0.9)
+
+    class Crafted:
+        grid = staticmethod(lambda _: (2, 2))
+
+        def __call__(self, *_: Any) -> Any:
+            return [torch.tensor(each) for each in (points, sure, 2.5)]
+
+    model = LoadedModel(toys["moge-2-small"]._model.manifest, Path(), Crafted(), torch.device("cpu"), "crafted")
+    known = None if exif is None else focal
+    reading = depth.MogeEstimator(model).estimate(np.zeros((height, width, 3), np.uint8), known)
+    assert reading.focal == pytest.approx(focal, rel=0.01)
+    assert (np.isnan(reading.depth) == (sure < 0.5)).all()
+    assert np.nanmax(np.abs(reading.depth / z - 1)) < 0.02
