@@ -2,26 +2,22 @@
 
     python benchmarks/perception.py [NAME...]
 
-Each runs in a process of its own, on one image of 1024x1024 px. The first call of everything is not counted. Writes
-`benchmarks/results/perception.json`.
+Each runs in a process of its own, on one image of 1024x1024 px; first calls are not counted. Writes results/perception.json.
 """
 
-from __future__ import annotations
-
 import json
-import platform
 import resource
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import transformers
-from transformers import BertConfig, Dinov2Config, Sam2HieraDetConfig, Sam2VisionConfig, SwinConfig
+import transformers as tf
 
 from cow_service.perception.base import Prompt
 from cow_service.perception.depth import DepthAnythingEstimator, MogeEstimator
@@ -29,65 +25,54 @@ from cow_service.perception.dino import DinoDetector
 from cow_service.perception.loading import LoadedModel
 from cow_service.perception.moge import Moge
 from cow_service.perception.sam import SamSegmenter
-from cow_service.weights.manifests import find_manifest
+from cow_service.weights.manifests import load_manifests
 
-RESULTS = Path(__file__).parent / "results" / "perception.json"
 SIDE = 1024  # px
-PHRASES = ["yellow ball", "blue mug", "table", "glass bottle", "red block"]
+PHRASES = ["yellow ball", "blue mug", "wooden table", "glass bottle", "red block"]
+METRIC = tf.DepthAnythingConfig(depth_estimation_type="metric", max_depth=20)
+# Words are unknown here, one token each: the real vocabulary comes with the weights.
+VOCABULARY = {"[PAD]": 0, "[UNK]": 100, "[CLS]": 101, "[SEP]": 102, "[MASK]": 103, ".": 1012}
 LARGE_HIERA = {
     "hidden_size": 144, "num_attention_heads": 2, "embed_dim_per_stage": [144, 288, 576, 1152],
     "num_attention_heads_per_stage": [2, 4, 8, 16], "blocks_per_stage": [2, 6, 36, 4],
     "global_attention_blocks": [23, 33, 43], "window_size_per_stage": [8, 4, 16, 8],
 }  # fmt: skip
-BASE_SWIN = {"embed_dim": 128, "depths": [2, 2, 18, 2], "num_heads": [4, 8, 16, 32], "window_size": 12}
-DINOV2_SMALL = {"hidden_size": 384, "num_attention_heads": 6, "image_size": 518, "patch_size": 14}
+BASE_SWIN = {
+    "embed_dim": 128, "depths": [2, 2, 18, 2], "num_heads": [4, 8, 16, 32], "window_size": 12, "out_indices": [2, 3, 4],
+}  # fmt: skip
 
 
-def sam(hiera: dict[str, Any]) -> torch.nn.Module:
-    backbone = Sam2HieraDetConfig(**hiera)
+def sam(**hiera: Any) -> torch.nn.Module:
+    backbone = tf.Sam2HieraDetConfig(**hiera)
     channels = list(backbone.embed_dim_per_stage or ())[::-1]
-    vision = Sam2VisionConfig(backbone_config=backbone, backbone_channel_list=channels)
-    return transformers.Sam2Model(transformers.Sam2Config(vision_config=vision))
+    vision = tf.Sam2VisionConfig(backbone_config=backbone, backbone_channel_list=channels)
+    return tf.Sam2Model(tf.Sam2Config(vision_config=vision))
 
 
-def dino(swin: dict[str, Any]) -> torch.nn.Module:
-    backbone = SwinConfig(out_indices=[2, 3, 4], **swin)
-    config = transformers.GroundingDinoConfig(backbone_config=backbone, text_config=BertConfig())
-    return transformers.GroundingDinoForObjectDetection(config)
+def dino(**swin: Any) -> torch.nn.Module:
+    backbone = tf.SwinConfig(**swin) if swin else None  # by default Swin-T
+    return tf.GroundingDinoForObjectDetection(tf.GroundingDinoConfig(backbone_config=backbone))
 
 
 def moge(backbone: str, width: int, layers: list[int]) -> torch.nn.Module:
     """The layout that is published for ViT-L; that of ViT-S stands in its checkpoint and is taken to be the same."""
-    widths = [width, 256, 128, 64, 32]
-    stack = {
-        "dim_in": widths, "dim_res_blocks": widths, "num_res_blocks": [0, 1, 1, 1, 0], "res_block_in_norm": "none",
-        "res_block_hidden_norm": "none", "resamplers": ["conv_transpose"] * 3 + ["bilinear"],
-    }  # fmt: skip
-    return Moge(
-        {"backbone": backbone, "intermediate_layers": layers, "dim_out": width},
-        stack | {"dim_in": [width + 2, 2, 2, 2, 2], "num_res_blocks": [0, 2, 2, 2, 0], "dim_out": None},
-        stack | {"dim_out": [None] * 4 + [3]},
-        stack | {"dim_out": [None] * 4 + [1]},
-        {"dims": [width, width, width, 1]},
-        "exp",
-        (1200, 3600),
-    )
-
-
-def depth_anything() -> torch.nn.Module:
-    backbone = Dinov2Config(out_indices=[3, 6, 9, 12], reshape_hidden_states=False, **DINOV2_SMALL)
-    config = transformers.DepthAnythingConfig(backbone_config=backbone, depth_estimation_type="metric", max_depth=20)
-    return transformers.DepthAnythingForDepthEstimation(config)
+    widths, resamplers = [width, 256, 128, 64, 32], ["conv_transpose"] * 3 + ["bilinear"]
+    stack = {"dim_in": widths, "dim_res_blocks": widths, "num_res_blocks": [0, 1, 1, 1, 0], "resamplers": resamplers}
+    stack |= {"res_block_in_norm": "none", "res_block_hidden_norm": "none"}
+    encoder = {"backbone": backbone, "intermediate_layers": layers, "dim_out": width}
+    neck = stack | {"dim_in": [width + 2, 2, 2, 2, 2], "num_res_blocks": [0, 2, 2, 2, 0], "dim_out": None}
+    points, mask = (stack | {"dim_out": [None] * 4 + [channels]} for channels in (3, 1))
+    return Moge(encoder, neck, points, mask, {"dims": [width, width, width, 1]}, "exp", (1200, 3600))
 
 
 NETWORKS: dict[str, Callable[[], torch.nn.Module]] = {
-    "sam2-tiny": lambda: sam({}),
-    "sam2-large": lambda: sam(LARGE_HIERA),
-    "grounding-dino-tiny": lambda: dino({}),
-    "grounding-dino-base": lambda: dino(BASE_SWIN),
+    "sam2-tiny": sam,
+    "sam2-large": lambda: sam(**LARGE_HIERA),
+    "grounding-dino-tiny": dino,
+    "grounding-dino-base": lambda: dino(**BASE_SWIN),
     "moge-2-small": lambda: moge("dinov2_vits14", 384, [2, 5, 8, 11]),
     "moge-2-large": lambda: moge("dinov2_vitl14", 1024, [5, 11, 17, 23]),
-    "depth-anything-indoor": depth_anything,
+    "depth-anything-indoor": lambda: tf.DepthAnythingForDepthEstimation(METRIC),
 }
 
 
@@ -102,7 +87,8 @@ def calls(model: LoadedModel, image: np.ndarray) -> Iterator[tuple[str, Callable
         boxes = [Prompt(bbox=(40.0 * i, 50.0, 40.0 * i + 200, 300.0)) for i in range(16)]
         yield "16 prompts", lambda: segmenter.segment(known, boxes)
     elif name.startswith("grounding"):
-        yield "5 phrases", lambda: DinoDetector(model, Tokens()).detect(image, PHRASES)
+        detector = DinoDetector(model, tf.BertTokenizer(vocab=VOCABULARY))
+        yield "5 phrases", lambda: detector.detect(image, PHRASES)
     else:
         kind = MogeEstimator if name.startswith("moge") else DepthAnythingEstimator
         yield "depth", lambda: kind(model).estimate(image, None)
@@ -110,10 +96,8 @@ def calls(model: LoadedModel, image: np.ndarray) -> Iterator[tuple[str, Callable
 
 def measure(name: str) -> dict[str, Any]:
     torch.manual_seed(0)
-    manifest = find_manifest(name)
-    assert manifest is not None
     network = NETWORKS[name]().eval().requires_grad_(False)
-    model = LoadedModel(manifest, Path(), network, torch.device("cpu"), name)
+    model = LoadedModel(load_manifests()[name], Path(), network, torch.device("cpu"), name)
     image = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
     times: dict[str, dict[str, float]] = {}
     for what, call in calls(model, image):
@@ -122,25 +106,23 @@ def measure(name: str) -> dict[str, Any]:
         call()
         times[what] = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
     parameters = sum(each.numel() for each in network.parameters())
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {"name": name, "parameters": parameters, "peak_bytes": peak, "times": times}
 
 
 def main() -> None:
-    if sys.argv[1:2] == ["--one"]:
-        print(json.dumps(measure(sys.argv[2])))
-        return
     rows: list[dict[str, Any]] = []
     print("| model | parameters | peak memory | wall time (CPU time) |\n|---|---|---|---|")
     for name in sys.argv[1:] or NETWORKS:
-        run = subprocess.run([sys.executable, __file__, "--one", name], stdout=subprocess.PIPE, check=True)
-        row = json.loads(run.stdout.splitlines()[-1])
-        rows.append(row)
-        times = ", ".join(f"{what} {t['wall_s']:.2f} s ({t['cpu_s']:.2f})" for what, t in row["times"].items())
-        peak = f"{row['peak_bytes'] / 1e9:.1f} GB"
-        print(f"| `{name}` | {row['parameters'] / 1e6:.1f} M | {peak} | {times} |", flush=True)
-    machine = {"torch": torch.__version__, "threads": torch.get_num_threads(), "machine": platform.machine()}
-    RESULTS.write_text(json.dumps({"image": SIDE, "weights": "random", **machine, "models": rows}, indent=1) + "\n")
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            rows.append(row := pool.submit(measure, name).result())
+        times = ", ".join(f"{what} {t['wall_s']:.1f} s ({t['cpu_s']:.1f})" for what, t in row["times"].items())
+        print(
+            f"| `{name}` | {row['parameters'] / 1e6:.1f} M | {row['peak_bytes'] / 1e9:.1f} GB | {times} |", flush=True
+        )
+    facts = {"image": SIDE, "weights": "random", "torch": torch.__version__, "threads": torch.get_num_threads()}
+    results = Path(__file__).parent / "results" / "perception.json"
+    results.write_text(json.dumps(facts | {"models": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

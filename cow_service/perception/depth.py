@@ -18,7 +18,10 @@ from cow_service.vision.types import Image
 
 
 class MogeEstimator:
-    """A `DepthEstimator`: depth in metres, nan where the model sees no surface, such as in the sky."""
+    """A `DepthEstimator`: depth in metres, nan where the model sees no surface, such as in the sky.
+
+    Of the manifest it takes `tokens`, the patches that an image is cut into: more show finer things and take longer.
+    """
 
     def __init__(self, model: LoadedModel) -> None:
         self._model = model
@@ -29,7 +32,7 @@ class MogeEstimator:
         height, width = image.shape[:2]
         aspect, diagonal = width / height, math.hypot(width, height)
         with self._model.computing() as network:
-            columns, rows = network.grid(aspect)
+            columns, rows = network.grid(int(self._model.manifest.defaults["tokens"]), aspect)
             found = network(self._model.pixels(image, (PATCH * columns, PATCH * rows)), aspect)
             points, sure, scale = (each.cpu().numpy().astype(np.float64) for each in found)
         known = (sure > 0.5) & np.isfinite(points).all(axis=2)

@@ -210,11 +210,12 @@ class Moge(nn.Module):
         dims: Sequence[int] = scale_head["dims"]
         layers = [each for pair in pairwise(dims) for each in (nn.Linear(*pair), nn.ReLU())]
         self.scale_head = nn.Sequential(*layers[:-1])
-        self.tokens = int(num_tokens_range[1])
+        self.fewest, self.most = num_tokens_range  # patches of an image in training
 
-    def grid(self, aspect: float) -> tuple[int, int]:
-        """Columns and rows of patches for an image of an aspect ratio (width / height)."""
-        return max(1, round(math.sqrt(self.tokens * aspect))), max(1, round(math.sqrt(self.tokens / aspect)))
+    def grid(self, tokens: int, aspect: float) -> tuple[int, int]:
+        """Columns and rows of about so many patches, of an image of an aspect ratio (width / height)."""
+        tokens = min(max(tokens, self.fewest), self.most)
+        return max(1, round(math.sqrt(tokens * aspect))), max(1, round(math.sqrt(tokens / aspect)))
 
     def forward(self, pixels: Tensor, aspect: float) -> tuple[Tensor, Tensor, Tensor]:
         """Points [h, w, 3] up to a shift along z, how sure they are [h, w] (0..1), and metres per unit.
