@@ -2,17 +2,17 @@
 
     python benchmarks/perception.py [NAME...]
 
-Each runs in a process of its own, on one image of 1024x1024 px; first calls are not counted. Writes results/perception.json.
+Each runs in a process of its own, on an image of 1024x1024 px; first calls are not counted. Writes a JSON file.
 """
 
 import json
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from cow_service.perception.moge import Moge
 from cow_service.perception.sam import SamSegmenter
 from cow_service.weights.manifests import load_manifests
 
+RESULTS = Path(__file__).parent / "results" / "perception.json"
 SIDE = 1024  # px
 PHRASES = ["yellow ball", "blue mug", "wooden table", "glass bottle", "red block"]
 METRIC = tf.DepthAnythingConfig(depth_estimation_type="metric", max_depth=20)
@@ -37,9 +38,8 @@ LARGE_HIERA = {
     "num_attention_heads_per_stage": [2, 4, 8, 16], "blocks_per_stage": [2, 6, 36, 4],
     "global_attention_blocks": [23, 33, 43], "window_size_per_stage": [8, 4, 16, 8],
 }  # fmt: skip
-BASE_SWIN = {
-    "embed_dim": 128, "depths": [2, 2, 18, 2], "num_heads": [4, 8, 16, 32], "window_size": 12, "out_indices": [2, 3, 4],
-}  # fmt: skip
+STAGES: Any = {"out_indices": [2, 3, 4]}
+BASE_SWIN = {"embed_dim": 128, "depths": [2, 2, 18, 2], "num_heads": [4, 8, 16, 32], "window_size": 12}
 
 
 def sam(**hiera: Any) -> torch.nn.Module:
@@ -50,7 +50,7 @@ def sam(**hiera: Any) -> torch.nn.Module:
 
 
 def dino(**swin: Any) -> torch.nn.Module:
-    backbone = tf.SwinConfig(**swin) if swin else None  # by default Swin-T
+    backbone = tf.SwinConfig(**STAGES, **swin) if swin else None  # by default Swin-T
     return tf.GroundingDinoForObjectDetection(tf.GroundingDinoConfig(backbone_config=backbone))
 
 
@@ -77,21 +77,19 @@ NETWORKS: dict[str, Callable[[], torch.nn.Module]] = {
 
 
 def calls(model: LoadedModel, image: np.ndarray) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """What is timed of a model."""
     name = model.manifest.name
     if name.startswith("sam2"):
         segmenter = SamSegmenter(model)
         yield "embed", lambda: segmenter.embed(image)
         known = segmenter.embed(image)
         yield "1 prompt", lambda: segmenter.segment(known, [Prompt(point=(300.0, 400.0))])
-        boxes = [Prompt(bbox=(40.0 * i, 50.0, 40.0 * i + 200, 300.0)) for i in range(16)]
-        yield "16 prompts", lambda: segmenter.segment(known, boxes)
+        yield "16 prompts", lambda: segmenter.segment(known, [Prompt(bbox=(40.0, 50.0, 240.0, 300.0))] * 16)
     elif name.startswith("grounding"):
         detector = DinoDetector(model, tf.BertTokenizer(vocab=VOCABULARY))
         yield "5 phrases", lambda: detector.detect(image, PHRASES)
     else:
-        kind = MogeEstimator if name.startswith("moge") else DepthAnythingEstimator
-        yield "depth", lambda: kind(model).estimate(image, None)
+        estimator = (MogeEstimator if name.startswith("moge") else DepthAnythingEstimator)(model)
+        yield "depth", lambda: estimator.estimate(image, None)
 
 
 def measure(name: str) -> dict[str, Any]:
@@ -105,9 +103,8 @@ def measure(name: str) -> dict[str, Any]:
         wall, cpu = time.perf_counter(), time.process_time()
         call()
         times[what] = {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
-    parameters = sum(each.numel() for each in network.parameters())
-    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"name": name, "parameters": parameters, "peak_bytes": peak, "times": times}
+    size, peak = sum(each.numel() for each in network.parameters()), 1024 * getrusage(RUSAGE_SELF).ru_maxrss
+    return {"name": name, "parameters": size, "peak_bytes": peak, "times": times}
 
 
 def main() -> None:
@@ -117,12 +114,9 @@ def main() -> None:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             rows.append(row := pool.submit(measure, name).result())
         times = ", ".join(f"{what} {t['wall_s']:.1f} s ({t['cpu_s']:.1f})" for what, t in row["times"].items())
-        print(
-            f"| `{name}` | {row['parameters'] / 1e6:.1f} M | {row['peak_bytes'] / 1e9:.1f} GB | {times} |", flush=True
-        )
+        print(f"| `{name}` | {row['parameters'] / 1e6:.1f} M | {row['peak_bytes'] / 1e9:.1f} GB | {times} |")
     facts = {"image": SIDE, "weights": "random", "torch": torch.__version__, "threads": torch.get_num_threads()}
-    results = Path(__file__).parent / "results" / "perception.json"
-    results.write_text(json.dumps(facts | {"models": rows}, indent=1) + "\n")
+    RESULTS.write_text(json.dumps(facts | {"models": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

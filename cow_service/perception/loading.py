@@ -37,9 +37,12 @@ class LoadedModel:
     _lock: Lock = field(default_factory=Lock)
 
     @contextmanager
-    def computing(self) -> Generator[Any]:
-        """The network, without gradients. Raises `PerceptionUnavailable` for whatever it raises."""
-        is_half = self.half is not None and self.device.type == "cuda"
+    def computing(self, *, is_precise: bool = False) -> Generator[Any]:
+        """The network, without gradients; in float32 where it is to be precise.
+
+        Raises `PerceptionUnavailable` for whatever it raises.
+        """
+        is_half = self.half is not None and self.device.type == "cuda" and not is_precise
         with (
             self._lock,
             translated(self.manifest.name, "cannot compute", self.device),

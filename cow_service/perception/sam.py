@@ -41,7 +41,7 @@ class SamSegmenter:
         with self._model.computing() as network:
             # A square whatever the shape of the image, as the model was trained.
             maps = network.get_image_embeddings(self._model.pixels(image, (self._side, self._side)))
-        return SamEmbedding(maps, (image.shape[1], image.shape[0]))
+        return SamEmbedding([each.float() for each in maps], (image.shape[1], image.shape[0]))
 
     def segment(self, embedding: SamEmbedding, prompts: Sequence[Prompt]) -> tuple[tuple[Segment, ...], ...]:
         """Candidates of each prompt, best first. A box counts more than a point. Raises `PerceptionUnavailable`."""
@@ -61,15 +61,15 @@ class SamSegmenter:
         """For places [P, 2 * len(labels)], px of the image."""
         # The model takes indices of pixels and adds half of one itself.
         points = places.reshape(1, len(places), -1, 2) * self._side / np.array(embedding.size, np.float32) - 0.5
-        with self._model.computing() as network:
+        with self._model.computing(is_precise=True) as network:  # half precision would move points by pixels
             output = network(
                 image_embeddings=embedding.maps,
                 input_points=torch.tensor(points, device=self._model.device),
                 input_labels=torch.tensor(labels, device=self._model.device).expand(1, len(places), -1),
                 multimask_output=labels == ON_IT,
             )
-            logits = output.pred_masks[0].float().cpu().numpy()  # [P, candidates, h, w]
-            scores = output.iou_scores[0].float().clamp(0, 1).cpu().numpy()  # [P, candidates]
+            logits = output.pred_masks[0].cpu().numpy()  # [P, candidates, h, w]
+            scores = output.iou_scores[0].clamp(0, 1).cpu().numpy()  # [P, candidates]
         return [
             tuple(Segment(logits[i, j], float(scores[i, j])) for j in np.argsort(-scores[i], kind="stable"))
             for i in range(len(places))
