@@ -147,8 +147,9 @@ class Perception:
     def _chosen(self, wanted: str) -> dict[PerceptionKind, str]:
         chosen: dict[PerceptionKind, str] = {}
         for name in SETS.get(wanted, tuple(each.strip() for each in wanted.split(","))):
-            kinds = (kind for kind, registry in self._registries.items() if name in registry.names())
-            kind: PerceptionKind | None = next(kinds, None)
+            kind: PerceptionKind | None = next(
+                (k for k, each in self._registries.items() if name in each.names()), None
+            )
             if kind is None or kind in chosen:
                 known = ", ".join((*SETS, *(name for _, name in self.installed())))
                 fault = "is no such model" if kind is None else f"is a second {kind} beside {chosen[kind]!r}"
