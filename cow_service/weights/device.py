@@ -1,5 +1,6 @@
 """Where weights run: the device that COW_DEVICE names, its CPU threads, and how PyTorch says that memory ran out."""
 
+import re
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from threading import Lock
@@ -57,3 +58,9 @@ def listed(names: Sequence[str], most: int = 8) -> str:
     """The first `most` names, and how many more there are; for error messages."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def reason_of(error: Exception) -> str:
+    """The kind and the first line of a foreign exception, without the folders that it names; for error messages."""
+    line = re.sub(r"(?<!\w)(/[\w.+-]+)+/?", "…", (str(error).splitlines() or [""])[0])[:300]
+    return f"{type(error).__name__}: {line}"

@@ -64,6 +64,10 @@ class Source(Record):
     repository: str = Field(pattern=r"^[\w.-]+/[\w.-]+$", description="owner/name")
     files: tuple[str, ...] = Field(min_length=1, description="Glob patterns of the files that are used.")
     licence: str
+    pickled: bool = Field(
+        default=False,
+        description="Whether they are pickles. So only where their reader lets them run no code.",
+    )
 
 
 class Manifest(Record):

@@ -351,7 +351,7 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
         patterns: list[str] = []
         for pattern in dict.fromkeys((*source.files, *others)):
             matching = {name for name in siblings if fnmatchcase(name, pattern)}
-            if found := {name for name in matching if not name.lower().endswith(PICKLED)}:
+            if found := {name for name in matching if source.pickled or not name.lower().endswith(PICKLED)}:
                 names |= found
                 patterns.append(pattern)
             elif pattern in source.files:

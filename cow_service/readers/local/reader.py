@@ -24,7 +24,7 @@ from cow_service.readers.mllm.client import MllmClient
 from cow_service.readers.mllm.models import ConfiguredModel, mllm_manifests, resolve_model
 from cow_service.readers.mllm.reader import MllmReader
 from cow_service.settings import Settings
-from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed
+from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed, reason_of
 from cow_service.weights.manifests import Manifest, load_families
 from cow_service.weights.repositories import verify, weights_identity
 
@@ -134,8 +134,7 @@ def _translated(name: str) -> Generator[None]:
             raise ReaderUnavailable(
                 f"'{name}' does not fit into memory. Set COW_MLLM to a smaller model, or COW_DEVICE to a larger device."
             ) from error
-        reason = re.sub(r"(?<!\w)(/[\w.+-]+)+/?", "…", (str(error).splitlines() or [""])[0])[:300]
         kind, remedy = CheckpointInvalid, ""
         if isinstance(error, ImportError):
             kind, remedy = ReaderUnavailable, " Install what it names."
-        raise kind(f"'{name}' cannot be loaded: {type(error).__name__}: {reason}{remedy}") from error
+        raise kind(f"'{name}' cannot be loaded: {reason_of(error)}{remedy}") from error
