@@ -42,8 +42,8 @@ class StandInSegmenter:
     def _segments(self, embedding: list[tuple[Mask, float]], prompt: Prompt) -> list[Segment]:
         found = embedding
         if prompt.point is not None:
-            x, y = prompt.point
-            found = [each for each in found if each[0][min(int(y), each[0].shape[0] - 1), min(int(x), each[0].shape[1] - 1)]]
+            x, y = (int(value) for value in prompt.point)
+            found = [each for each in found if each[0][y : y + 1, x : x + 1].any()]
         elif prompt.bbox is not None:
             box = prompt.bbox
             found = sorted(found, key=lambda each: -iou(bbox_of(each[0]), box))[:1]

@@ -8,7 +8,10 @@ import { lightOf } from "./pixels.js";
 import { callJson, pause, postJson } from "./server.js";
 import { get, set } from "./store.js";
 
-const PAUSE = 0.05; // s between two looks: moving over a bare floor must not keep the server busy
+const PAUSE = 0.1; // s between two looks: moving over a bare floor must not keep the server busy
+
+const ARTICLES = ["the", "a", "an"];
+const MOST_WORDS = 4; // of a name in a question
 
 /** Whether the server has a model of a kind. Where a look at this picture failed, boxes are drawn as without one. */
 export const canSee = ({ models, blind }, kind = "segmenter") =>
@@ -115,11 +118,25 @@ export function takeAsMover(thing) {
   const { bbox, mask = null, name = null } = thing;
   const { corrections, result, named, question } = get();
   const simulation = result?.simulation ?? null;
-  const known = named.get(question.trim())?.find((each) => isSameBox(each.bbox, bbox));
-  const object = name ?? known?.name ?? corrections.grounding?.object ?? simulation?.grounding.object;
+  const known = named.get(question.trim()) ?? [];
+  const object = name ?? known.find((each) => isSameBox(each.bbox, bbox))?.name ?? corrections.grounding?.object ?? simulation?.grounding.object;
   const fresh = { ...corrections, grounding: object ? { object } : {} }; // another thing may have another shape
   set({ taken: thing });
-  correct(moverWith(simulation, fresh, { bbox, mask }));
+  // Where the mover is given no reader looks for what the question asks about: what was found of it is given, too.
+  const own = corrections.objects.filter((each) => !known.some((other) => other.name === each.object));
+  const others = known.filter((each) => each.name !== object && !isSameBox(each.bbox, bbox) && isOnly(each, known));
+  const objects = [...own, ...others.map((each) => ({ object: each.name, bbox: each.bbox, mask: each.mask, role: "target" }))];
+  correct({ objects, ...moverWith(simulation, fresh, { bbox, mask }) });
+}
+
+const isOnly = ({ name }, things) => things.filter((each) => each.name === name).length === 1;
+
+/** A noun with what stands before it in the question: "blue cube". The server takes things for the same by that. */
+function inWords(noun, question) {
+  const words = question.toLowerCase().split(/[^\p{L}\p{N}'-]+/u);
+  const end = words.indexOf(noun.split(" ").at(-1));
+  const start = words.slice(0, Math.max(0, end)).findLastIndex((word) => ARTICLES.includes(word)) + 1;
+  return start > 0 && end - start < MOST_WORDS ? words.slice(start, end + 1).join(" ") : noun;
 }
 
 /** Looks for what a question names, once for each question. */
@@ -127,5 +144,6 @@ export async function lookFor(question) {
   if (get().named.has(question)) return;
   set({ named: new Map(get().named).set(question, []) });
   const things = await thingsOf({ question });
-  if (things) set({ named: new Map(get().named).set(question, things) });
+  const inFull = things?.map((each) => (isOnly(each, things) ? { ...each, name: inWords(each.name, question) } : each));
+  if (inFull) set({ named: new Map(get().named).set(question, inFull) });
 }
