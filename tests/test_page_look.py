@@ -22,20 +22,32 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield one
 
 
+def body_of(request: Request) -> dict[str, Any]:
+    """The body of a request as JSON; empty for a form."""
+    body = request.post_data if "json" in request.headers.get("content-type", "") else None
+    return json.loads(body) if body else {}
+
+
 class Seen:
     """A page with a picture, and what it asks the server for."""
 
     def __init__(self, address: str, windows: Windows, width: int = WIDE, **options: Any) -> None:
         self.page = windows.open(address, width, **options)
         self.requests: list[tuple[str, dict[str, Any]]] = []
+        self.in_flight, self.most_in_flight = 0, 0  # looks at points
         self.page.on("request", self._note)
+        self.page.on("requestfinished", self._note_end)
         drop(self.page, picture(3))
         expect(self.page.locator(".scene rect.body")).to_have_count(2)
 
     def _note(self, request: Request) -> None:
-        body = request.post_data if "json" in request.headers.get("content-type", "") else None
         if request.method == "POST":
-            self.requests.append((request.url.rsplit("/", 1)[1], json.loads(body) if body else {}))
+            self.requests.append((request.url.rsplit("/", 1)[1], body_of(request)))
+            self.in_flight += "point" in body_of(request)
+            self.most_in_flight = max(self.most_in_flight, self.in_flight)
+
+    def _note_end(self, request: Request) -> None:
+        self.in_flight -= "point" in body_of(request)
 
     def asked(self, path: str, field: str) -> list[Any]:
         """What the requests to a path had in a field."""
@@ -61,19 +73,22 @@ def seen(served: Served, windows: Windows) -> Seen:
 
 
 def test_the_pointer_lights_what_is_under_it(seen: Seen) -> None:
-    lit = seen.page.locator("image.lit")
+    lit, looks = seen.page.locator("image.lit"), lambda: len(seen.asked("look", "point"))
     for step in range(12):
         seen.page.mouse.move(*seen.at((BALL[0] - 6 + step, BALL[1])))
     expect(lit).to_have_count(1)
-    count = len(seen.asked("look", "point"))
-    assert count <= 2  # all further points lie in the mask that is lit
+    ball = lit.get_attribute("href") or ""
+    assert (count := looks()) <= 2  # all further points lie in the mask that is lit
     seen.page.mouse.move(*seen.at((BALL[0], BALL[1] + 5)))
     seen.page.mouse.move(*seen.at(CUBE))
-    seen.page.wait_for_timeout(400)
-    assert len(seen.asked("look", "point")) == count + 1
-    seen.page.mouse.move(*seen.at(BARE))
+    expect(lit).not_to_have_attribute("href", ball)
+    assert looks() == count + 1
+    for step in range(40):  # on the bare floor nothing is lit, so all points are new
+        seen.page.mouse.move(*seen.at((BARE[0] + step, BARE[1])))
     expect(lit).to_have_count(0)
     expect(seen.page.get_by_text("No clear outline here: draw a box.")).to_be_visible()
+    assert looks() < count + 30
+    assert seen.most_in_flight == 1
 
 
 def test_a_click_takes_it_and_another_one_what_is_within(seen: Seen) -> None:

@@ -95,7 +95,7 @@ export function light(thing) {
 
 let clicked = { url: null, point: [0, 0], things: [], place: 0 }; // the last click that found something
 
-/** The thing at a point, null where there is none; at the same point again, within `reach` px, the next one of those within each other. */
+/** The thing at a point, null where there is none, undefined where another picture is shown by now; at the same point again, within `reach` px, the next one of those within each other. */
 export async function thingAt(point, reach) {
   const { url } = get().picture;
   const isSame = clicked.url === url && Math.hypot(point[0] - clicked.point[0], point[1] - clicked.point[1]) <= reach;
@@ -105,6 +105,7 @@ export async function thingAt(point, reach) {
     wanted = null;
     await looking;
     const things = isLit(point) ? get().lit.things.filter((thing) => thing.light.covers(point)) : await thingsOf({ point });
+    if (get().picture?.url !== url) return undefined;
     if (things?.length) clicked = { url, point, things, place: 0 };
     else clicked.url = null;
   }

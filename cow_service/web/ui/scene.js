@@ -123,6 +123,7 @@ export function Scene({ state }) {
       const [x, y] = pressed.current;
       if (!isSeeing || Math.hypot(event.clientX - x, event.clientY - y) > CLICK) return;
       const thing = await thingAt(pointIn(event.currentTarget, event), CLICK * unit);
+      if (thing === undefined) return;
       if (thing) take(thing);
       const stays = thing ? tool === "mover" && get().lit?.others : tool !== "select";
       set({ tool: stays ? tool : thing ? "select" : "mover" });
