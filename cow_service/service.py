@@ -3,6 +3,7 @@
 import hashlib
 import re
 import uuid
+from collections import OrderedDict
 from collections.abc import Iterable
 from functools import partial
 from importlib.metadata import entry_points
@@ -18,7 +19,7 @@ from cow_service.media.artifacts import ArtifactStore, DiskArtifacts, RetryPolic
 from cow_service.media.images import check, decode, decode_data_url
 from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
-from cow_service.perception.base import Perception
+from cow_service.perception.base import MOST_EMBEDDINGS, ImageKey, Perception
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
 from cow_service.readers.chat import ChatReader
@@ -66,6 +67,7 @@ class Service:
         self._image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)
         self.perception = Perception(settings)
+        self._looked: OrderedDict[ImageKey, bytes] = OrderedDict()  # images as sent: a detector needs their pixels
         self.readers: Registry[Reader] = Registry("cow_service.readers", errors.ReaderUnavailable, settings)
         self._generator_limits = {point.name: point for point in entry_points(group="cow_service.generator_limits")}
         self.generators: Registry[Generator] = Registry("cow_service.generators", errors.GeneratorUnavailable, settings)
@@ -217,19 +219,28 @@ class Service:
         `owner` looked at before. Raises `PerceptionUnavailable`, `InvalidRequest`, `ArtifactNotFound` for an image that
         is not in memory any more, and the errors of `fetch` and `images.decode`.
         """
-        known = request.image if isinstance(request.image, ImageArtifact) and image is None else None
+        if isinstance(request.image, ImageArtifact) and image is None:
+            key = owner, request.image.artifact
+        else:
+            data = image or self.fetch(request.image)
+            key = owner, hashlib.sha256(data).hexdigest()
+            with self._guard:
+                self._looked[key] = data
+                self._looked.move_to_end(key)
+                while len(self._looked) > MOST_EMBEDDINGS:
+                    self._looked.popitem(last=False)
 
         def pixels() -> Image:
-            if known is not None:
+            with self._guard:
+                kept = self._looked.get(key)
+            if kept is None:
                 raise errors.ArtifactNotFound("The image is not in memory any more: send it again.")
-            return decode(data, max_megapixels=self.settings.max_image_megapixels).pixels
+            return decode(kept, max_megapixels=self.settings.max_image_megapixels).pixels
 
-        data = b"" if known is not None else image or self.fetch(request.image)
-        sha256 = hashlib.sha256(data).hexdigest() if known is None else known.artifact
         words = cast(WordReader, self.readers.get(WORD_READER))
         nouns = words.read_question(request.question).nouns if request.question is not None else ()
         with self.cpu.held(runs.priority_of(0, runs.now()), lambda: None):
-            return look(self.perception, (owner, sha256), pixels, request, nouns)
+            return look(self.perception, key, pixels, request, nouns)
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""

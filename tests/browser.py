@@ -110,13 +110,18 @@ def stage(page: Page, name: str) -> str:
     return page.locator(f"[data-stage={name}]").get_attribute("data-state") or ""
 
 
-def drag_in_picture(page: Page, start: Point, end: Point) -> None:
-    """Drags by the mouse between two points of the picture, px of the picture."""
+def in_window(page: Page, *points: Point) -> list[Point]:
+    """Where points of the picture, px of it, are in the window, once it is scrolled to."""
     svg = page.locator(".scene svg")
     svg.scroll_into_view_if_needed()
     to_window = """(svg, points) => points
         .map(([x, y]) => new DOMPoint(x, y).matrixTransform(svg.getScreenCTM())).map(({ x, y }) => [x, y])"""
-    from_window, to = svg.evaluate(to_window, [start, end])
+    return svg.evaluate(to_window, points)
+
+
+def drag_in_picture(page: Page, start: Point, end: Point) -> None:
+    """Drags by the mouse between two points of the picture, px of the picture."""
+    from_window, to = in_window(page, start, end)
     page.mouse.move(*from_window)
     page.mouse.down()
     page.mouse.move(*to, steps=4)

@@ -21,6 +21,10 @@ from conftest import SLOWNESS
 from drawn import ball, block, floor, png_bytes
 
 SLOW_GENERATOR = Path(__file__).resolve().parents[1] / "benchmarks" / "slow_generator"
+SEEING = {  # settings of a server that sees plain scenes
+    "PYTHONPATH": f"{Path(__file__).parent / 'stand_in_models'}:{SLOW_GENERATOR}",
+    "COW_PERCEPTION": "stand-in-segmenter,stand-in-detector",
+}
 TIME_LIMIT = 60.0 * SLOWNESS  # seconds for anything that must come about
 TERMINAL = ("succeeded", "failed", "canceled")
 ASYNC = {"Prefer": "respond-async"}

@@ -11,7 +11,8 @@ import { NOTHING_CORRECTED, get, set } from "./store.js";
 const MOST_UNDONE = 50;
 const LINE_SECONDS = 2; // between two looks at the place in the queue
 const JOB_ID = /^[A-Za-z0-9-]{1,64}$/;
-const NOTHING_ASKED = Object.freeze({ run: null, result: null, problem: null, compared: [], past: [], future: [], tool: "select" });
+const NOTHING_SEEN = { blind: false, lit: null, named: new Map(), taken: null };
+const NOTHING_ASKED = Object.freeze({ run: null, result: null, problem: null, compared: [], past: [], future: [], tool: "select", ...NOTHING_SEEN });
 
 let running = new AbortController(); // of what the page waits for
 

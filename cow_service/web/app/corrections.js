@@ -85,7 +85,7 @@ export function knownBeside(simulation, corrections) {
   };
 }
 
-/** Corrections with the mover elsewhere ({bbox} or {point}), or by another name ({object}). */
+/** Corrections with the mover elsewhere ({bbox}, also with its {mask}, or {point}), or by another name ({object}). */
 export function moverWith(simulation, corrections, change) {
   const { bbox, point, mask, ...rest } = corrections.grounding ?? (simulation ? groundingOf(simulation.grounding) : {});
   const place = change.bbox || change.point ? {} : present({ bbox, point, mask });

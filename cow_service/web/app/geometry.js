@@ -101,6 +101,39 @@ export function bandOf({ band, visible }, size) {
   return text;
 }
 
+const SQUARE = 0.25; // side of a square of the floor's grid, over the camera's height
+const NEAREST = 0.05; // depth of what is drawn, over the camera's height
+const LEAST_GAP = 2.5; // CSS px between two lines: farther away they would run together
+
+const radians = (degrees) => (degrees * Math.PI) / 180;
+
+/** Where the horizon crosses the middle of the picture, px down. */
+export const horizonOf = ({ focal, pitch }, { height }) => height / 2 - focal * Math.tan(radians(pitch));
+
+/** The floor that a camera {focal, pitch, roll} sees as a grid, and its horizon: SVG paths. The camera's height drops out of both. */
+export function floorGrid(camera, size, unit) {
+  const { focal } = camera;
+  const [sine, cosine] = [Math.sin(radians(camera.pitch)), Math.cos(radians(camera.pitch))];
+  const [s, c] = [Math.sin(radians(camera.roll)), Math.cos(radians(camera.roll))];
+  const reach = Math.hypot(size.width, size.height) / 2;
+  // From the middle of the picture, before the camera rolls.
+  const line = (x0, y0, x1, y1) => [[x0, y0], [x1, y1]].map(([x, y]) => pair([size.width / 2 + c * x + s * y, size.height / 2 - s * x + c * y])).join("L");
+  const horizon = horizonOf(camera, size) - size.height / 2;
+  const farthest = Math.sqrt((focal * SQUARE) / (LEAST_GAP * unit)); // depth; between lines there, dy = focal * SQUARE / depth^2
+  const down = (ahead) => (focal * (cosine - ahead * sine)) / (ahead * cosine + sine);
+  const [first, last] = [NEAREST, farthest].map((depth) => Math.floor((depth - sine) / cosine / SQUARE));
+  const lines = [];
+  for (let row = first + 1; row <= last; row += 1) lines.push(line(-reach, down(row * SQUARE), reach, down(row * SQUARE)));
+  const far = last * SQUARE * cosine + sine; // depth of the last row
+  const columns = Math.ceil((reach * far) / focal / SQUARE);
+  const near = down((NEAREST - sine) / cosine);
+  for (let column = -columns; column <= columns; column += 1) {
+    const x = column * SQUARE * focal;
+    lines.push(line(x / NEAREST, near, x / far, down(last * SQUARE)));
+  }
+  return { grid: lines.map((each) => `M${each}`).join(""), horizon: `M${line(-2 * reach, horizon, 2 * reach, horizon)}` };
+}
+
 const cornersOf = ([x0, y0, x1, y1]) => [[x0, y0], [x1, y0], [x1, y1], [x0, y1]];
 
 /** The convex hull of some points (Andrew's monotone chain), all in the same turn. */

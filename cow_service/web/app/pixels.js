@@ -5,6 +5,7 @@ import { artifactBlob } from "./artifacts.js";
 
 const THRESHOLD = 128; // of a mask's grey levels
 const OUTLINE = [255, 196, 0]; // RGB, as in the server's overlay
+const FILL = 90; // of 255: how opaque a lit thing is
 const MOST_SIDE = 1024; // px: outlines of larger pictures are made at this size
 
 function drawn(image, width, height) {
@@ -17,7 +18,8 @@ function drawn(image, width, height) {
 
 const urlOf = (canvas) => new Promise((resolve) => canvas.toBlob((blob) => resolve(URL.createObjectURL(blob))));
 
-function outlineIn(context, width, height, thickness) {
+/** Draws the outline of a mask instead of it; `fill` is how opaque what lies inside is, 0 to 255. */
+function outlineIn(context, width, height, thickness, fill = 0) {
   const data = context.getImageData(0, 0, width, height);
   const inside = new Uint8Array(width * height);
   for (let i = 0; i < inside.length; i += 1) inside[i] = data.data[4 * i] >= THRESHOLD ? 1 : 0;
@@ -28,10 +30,24 @@ function outlineIn(context, width, height, thickness) {
       if (!inside[i]) continue;
       const edge = x < thickness || y < thickness || x >= width - thickness || y >= height - thickness
         || !inside[i - thickness] || !inside[i + thickness] || !inside[i - thickness * width] || !inside[i + thickness * width];
-      if (edge) out.data.set([...OUTLINE, 255], 4 * i);
+      if (edge || fill) out.data.set([...OUTLINE, edge ? 255 : fill], 4 * i);
     }
   }
   context.putImageData(out, 0, 0);
+}
+
+/** A mask, as a data URL, to lay over the image: its picture, and whether it covers a point of the image. */
+export async function lightOf(mask) {
+  const image = new Image();
+  image.src = mask;
+  await image.decode();
+  const scale = Math.min(1, MOST_SIDE / Math.max(image.width, image.height));
+  const [width, height] = [Math.round(image.width * scale), Math.round(image.height * scale)];
+  const context = drawn(image, width, height);
+  const { data } = context.getImageData(0, 0, width, height);
+  outlineIn(context, width, height, Math.max(1, Math.round(width / 640)), FILL);
+  const covers = ([x, y]) => data[4 * (Math.floor(y * scale) * width + Math.floor(x * scale))] >= THRESHOLD;
+  return { href: context.canvas.toDataURL(), covers };
 }
 
 /** A picture of the outline of a mask, and the masked part of the image alone. */

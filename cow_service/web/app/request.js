@@ -12,6 +12,9 @@ const LISTS = ["objects", "interventions"];
 const OF_CLIP = ["num_frames", "fps", "ensemble", "generator_options"];
 const SETTINGS = ["reader", "generator", "imagine", "votes", "seed", "frames", "video", ...OF_CLIP];
 
+/** A thing by its mask alone, where it has one: a request takes no box beside it, which the page shows. */
+const placed = ({ mask, bbox, ...rest }) => ({ ...rest, ...(mask ? { mask } : bbox ? { bbox } : {}) });
+
 /** The request without its image. Fields that have the server's default are left out. */
 export function requestOf({ question, settings, corrections }) {
   const answering = settings.kind === "answer";
@@ -20,6 +23,8 @@ export function requestOf({ question, settings, corrections }) {
   if (choices.length && !request.options) request.options = choices;
   for (const name of CORRECTED) if (corrections[name]) request[name] = corrections[name];
   for (const name of LISTS) if (corrections[name].length) request[name] = corrections[name];
+  if (request.grounding) request.grounding = placed(request.grounding);
+  if (request.objects) request.objects = request.objects.map(placed);
   for (const name of ["reader", "generator"]) if (settings[name]) request[name] = settings[name];
   for (const name of OF_CLIP) if (!same(settings[name], DEFAULT_SETTINGS[name])) request[name] = settings[name];
   if (settings.seed !== null) request.seed = settings.seed;

@@ -40,6 +40,10 @@ let state = {
   past: [],
   future: [],
   tool: "select", // or "mover", "object", "direction"
+  blind: false, // a look at the picture failed: boxes are drawn
+  lit: null, // {things, others} under the pointer, the first of which is lit: [{bbox, mask, score, name, light}]
+  named: new Map(), // a question: the things that it names
+  taken: null, // the thing that was chosen last as what moves
   run: null, // {job, done: [stages], settings} while a job is in the making
   result: null, // {jobId, kind, answer, simulation, settings, asked} of the last job that succeeded
   compared: [], // the same question by other readers and generators

@@ -27,6 +27,12 @@ export function Rect({ box, kind }) {
   return html`<rect class=${kind} x=${box[0]} y=${box[1]} width=${Math.max(0, box[2] - box[0])} height=${Math.max(0, box[3] - box[1])} />`;
 }
 
+/** A thing that the server sees: its outline, or a dashed box where that is not certain. */
+export function Lit({ thing, size }) {
+  if (!thing.light) return html`<${Rect} box=${thing.bbox} kind="lit unsure" />`;
+  return html`<image class="lit" href=${thing.light.href} x="0" y="0" width=${size.width} height=${size.height} />`;
+}
+
 /** An arrow with a head. */
 export function Arrow({ from, direction, size, unit }) {
   const tip = tipOf(from, direction, size);

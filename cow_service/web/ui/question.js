@@ -3,10 +3,13 @@
 import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
 import { ask, cancel, changeSettings, correct } from "../app/asking.js";
 import { correctedWords } from "../app/corrections.js";
+import { isSameBox } from "../app/geometry.js";
+import { canSee, light, lookFor, takeAsMover } from "../app/seeing.js";
 import { NOTHING_CORRECTED, set } from "../app/store.js";
 import { CHANGES, OUTCOMES, sentenceOf, suggestionsOf, waysOf } from "../app/suggestions.js";
 
 const MOST_CHARACTERS = 4000;
+const TYPING_ENDS = 600; // ms without a key
 // Where a question was not understood, others are shown that would be.
 const NOT_UNDERSTOOD = ["cannot-ground", "object-not-found", "cannot-read-direction"];
 
@@ -34,6 +37,7 @@ export function Question({ state }) {
     <textarea id="question" ref=${field} dir="auto" rows="2" maxlength=${MOST_CHARACTERS} value=${question} placeholder="If the toy car moves forward, will it hit the vase?"
       onInput=${(event) => set({ question: event.target.value })}
       onKeyDown=${(event) => event.key === "Enter" && !event.shiftKey && !event.isComposing && send(event)}></textarea>
+    <${Chips} state=${state} />
     ${suggestions.length > 0 && html`<ul class="suggestions" aria-label=${stuck ? "Questions that would be understood" : "Suggestions"}>
       ${suggestions.map((text) => html`<li key=${text}><button type="button" dir="auto" onClick=${() => {
         set({ question: text });
@@ -48,6 +52,25 @@ export function Question({ state }) {
     </div>
     <${Settings} settings=${settings} models=${models} />
   </form>`;
+}
+
+/** What the server's detector finds of what the question names. */
+function Chips({ state }) {
+  const { question, picture, named, corrections } = state;
+  const asked = question.trim();
+  const canFind = canSee(state) && canSee(state, "detector") && picture.blob !== null; // of an opened job all is known
+  useEffect(() => {
+    if (!canFind || !asked) return undefined;
+    const timer = setTimeout(() => void lookFor(asked), TYPING_ENDS);
+    return () => clearTimeout(timer);
+  }, [asked, picture.url, canFind]);
+  const things = (canFind && named.get(asked)) || [];
+  return things.length > 0 && html`<ul class="chips" aria-label="What was found, to take as what moves">
+    <li class="hint">What moves?</li>
+    ${things.map((thing, place) => html`<li key=${place}><button type="button" dir="auto" aria-pressed=${isSameBox(corrections.grounding?.bbox, thing.bbox)}
+      title=${thing.light ? "Take it as what moves" : "Take its box as what moves: its outline is not certain"} onClick=${() => takeAsMover(thing)}
+      onFocus=${() => light(thing)} onBlur=${() => light(null)} onPointerEnter=${() => light(thing)} onPointerLeave=${() => light(null)}>${thing.name}</button></li>`)}
+  </ul>`;
 }
 
 function Choice({ label, value, options, onChange }) {

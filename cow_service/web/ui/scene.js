@@ -5,14 +5,17 @@ import { correct } from "../app/asking.js";
 import { boxBetween, directionBetween, isBox, lineOf, middleOf, movedBox, pulledPath, rounded, tipOf, waypointFrames } from "../app/geometry.js";
 import { useCutout } from "../app/pixels.js";
 import { freeName, groundingOf, isDirected, knownBeside, motionTowards, moverWith, roleOf } from "../app/corrections.js";
-import { set } from "../app/store.js";
+import { canSee, light, pointAt, prepare, takeAsMover, thingAt } from "../app/seeing.js";
+import { get, set } from "../app/store.js";
 import { BoxHandles, Handle, pointIn } from "./handles.js";
-import { Arrow, Labels, Moment, Rect, World, labelsOf } from "./marks.js";
+import { Arrow, Labels, Lit, Moment, Rect, World, labelsOf } from "./marks.js";
 import { Transport, usePlayer } from "./player.js";
+import { Floor, FloorLine } from "./floor.js";
 import { Filmstrip } from "./filmstrip.js";
 import { Tools } from "./tools.js";
 
-const LAYERS = { names: true, path: true, band: true, futures: true };
+const CLICK = 8; // CSS px: a pointer that moved less has clicked
+const LAYERS = { names: true, path: true, band: true, futures: true, floor: false };
 
 /** The size of a CSS pixel in pixels of the image, as an element is shown now. */
 function useUnit(element, width) {
@@ -31,15 +34,16 @@ function useUnit(element, width) {
 }
 
 export function Scene({ state }) {
-  const { picture, result, corrections, tool, found, question } = state;
+  const { picture, result, corrections, tool, found, question, lit, taken } = state;
   const simulation = result?.simulation ?? null;
   const size = { width: picture.width, height: picture.height };
   const frame = useRef(null);
   const unit = useUnit(frame, picture.width);
   const [layers, setLayers] = useState(LAYERS);
   const [draft, setDraft] = useState(null);
-  const [pending, setPending] = useState(null); // the box of an object that has no name yet
+  const [pending, setPending] = useState(null); // {bbox, mask} of an object that has no name yet
   const busy = useRef(false); // somebody drags
+  const pressed = useRef([0, 0]); // where the pointer went down, CSS px of the window
   busy.current = draft !== null;
   const player = usePlayer(simulation, () => busy.current || frame.current.querySelector("svg").contains(document.activeElement));
   const cutout = useCutout(picture, simulation?.grounding.mask ?? null, simulation?.grounding.bbox ?? null);
@@ -48,7 +52,15 @@ export function Scene({ state }) {
     setDraft(null);
     setPending(null);
   }, [picture.url]);
+  const hasSight = canSee(state);
+  const isSeeing = hasSight && (tool === "mover" || tool === "object" || (tool === "select" && !simulation));
+  useEffect(() => {
+    if (hasSight && picture.blob) void prepare(picture); // that of an opened job is sent once it is needed
+  }, [picture.url, hasSight]);
+  useEffect(() => light(null), [isSeeing]);
 
+  const camera = simulation?.trajectory.camera ? { ...simulation.trajectory.camera, ...corrections.camera } : null;
+  const isTakenShown = taken?.light && taken.mask === corrections.grounding?.mask && !draft?.mover && (!simulation || state.run);
   const moverBox = draft?.mover ?? corrections.grounding?.bbox ?? simulation?.grounding.bbox ?? null;
   const moverName = corrections.grounding?.object ?? simulation?.grounding.object ?? "what moves";
   const origin = corrections.grounding?.point ?? (draft?.mover || corrections.grounding?.bbox ? middleOf(moverBox) : simulation?.grounding.point ?? null);
@@ -72,14 +84,7 @@ export function Scene({ state }) {
     ...world.filter((label) => label.kind !== "body" || !ownNames.has(label.text)),
   ];
 
-  const endOfBox = (box) => {
-    if (!isBox(box)) return;
-    if (tool === "mover") {
-      const name = corrections.grounding?.object ?? simulation?.grounding.object;
-      const fresh = { ...corrections, grounding: name ? { object: name } : {} }; // another thing may have another shape
-      correct(moverWith(simulation, fresh, { bbox: box }));
-    } else setPending(box);
-  };
+  const take = (thing) => (tool === "object" ? setPending(thing) : takeAsMover(thing));
 
   const drawing = {
     onPointerDown(event) {
@@ -90,7 +95,10 @@ export function Scene({ state }) {
       setDraft({ tool, from: at, to: at });
     },
     onPointerMove(event) {
-      if (!draft?.from) return;
+      if (!draft?.from) {
+        if (isSeeing && !event.buttons && event.pointerType !== "touch") pointAt(pointIn(event.currentTarget, event));
+        return;
+      }
       const to = pointIn(event.currentTarget, event);
       const aim = draft.tool === "direction" ? { direction: directionBetween(origin ?? draft.from, to) } : { box: boxBetween(draft.from, to, size) };
       setDraft({ ...draft, to, ...aim });
@@ -100,14 +108,26 @@ export function Scene({ state }) {
       const { box, direction: aimed, from } = draft;
       setDraft(null);
       if (draft.tool !== "direction") {
-        if (box) endOfBox(box);
-        set({ tool: "select" });
+        const isDrawn = box && isBox(box);
+        if (isDrawn) take({ bbox: box });
+        if (isDrawn || !isSeeing) set({ tool: "select" }); // else it was a click
       } else if (aimed) {
         const place = origin ? {} : moverWith(simulation, corrections, { point: from });
         correct({ ...place, motion: motionTowards(simulation, corrections, aimed), trajectory: null });
       }
     },
     onPointerCancel: () => setDraft(null),
+    onPointerDownCapture: (event) => (pressed.current = [event.clientX, event.clientY]),
+    onPointerLeave: () => isSeeing && light(null),
+    async onClick(event) {
+      const [x, y] = pressed.current;
+      if (!isSeeing || Math.hypot(event.clientX - x, event.clientY - y) > CLICK) return;
+      const thing = await thingAt(pointIn(event.currentTarget, event), CLICK * unit);
+      if (thing === undefined) return;
+      if (thing) take(thing);
+      const stays = thing ? tool === "mover" && get().lit?.others : tool !== "select";
+      set({ tool: stays ? tool : thing ? "select" : "mover" });
+    },
   };
 
   const moverMoves = {
@@ -131,13 +151,13 @@ export function Scene({ state }) {
     onEnd: (handle, dx, dy) => {
       setDraft(null);
       if (Math.hypot(dx, dy) < 2 * unit) return;
-      const moved = { ...corrections.objects[place], bbox: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) };
+      const moved = { ...corrections.objects[place], mask: null, bbox: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) };
       correct({ objects: corrections.objects.map((object, index) => (index === place ? moved : object)) });
     },
   });
 
   return html`<section class="scene" aria-label="Picture">
-    <${Tools} state=${state} layers=${layers} setLayers=${setLayers} hasFutures=${(path?.futures ?? []).length > 0} />
+    <${Tools} state=${state} layers=${layers} setLayers=${setLayers} hasFloor=${camera !== null} hasFutures=${(path?.futures ?? []).length > 0} isSeeing=${isSeeing} />
     <div class=${`frame tool-${tool}`} ref=${frame} style=${{ aspectRatio: `${size.width} / ${size.height}`, "--ratio": size.width / size.height }}>
       <img src=${picture.url} alt=${`The picture: ${picture.name}`} draggable=${false} />
       ${player.url && html`<video key=${player.url} ref=${player.element} src=${player.url} muted playsinline preload="auto" tabindex="-1" aria-label="The imagined clip"
@@ -146,6 +166,9 @@ export function Scene({ state }) {
         ${!simulation && found.map((body, place) => html`<${Rect} key=${place} box=${body.bbox} kind="body" />`)}
         ${simulation && html`<${World} simulation=${simulation} unit=${unit} size=${size} layers=${layers} line=${points !== path.points ? lineOf({ points, visible: path.visible }) : null} />`}
         ${cutout && !draft?.mover && !player.playing && html`<image class="outline" href=${cutout.outline} x="0" y="0" width=${size.width} height=${size.height} />`}
+        ${layers.floor && camera && html`<${Floor} camera=${camera} corrections=${corrections} size=${size} unit=${unit} isEditable=${editing} />`}
+        ${isTakenShown && html`<${Lit} thing=${taken} size=${size} />`}
+        ${lit?.things[0] && !draft && html`<${Lit} thing=${lit.things[0]} size=${size} />`}
         ${moverBox && html`<${Rect} box=${moverBox} kind=${cutout && !draft?.mover ? "mover thin" : "mover"} />`}
         ${corrections.objects.map((object, place) => {
           const box = draft?.object === place ? draft.box : object.bbox;
@@ -157,7 +180,7 @@ export function Scene({ state }) {
         ${origin && !player.playing && html`<circle class="point" cx=${origin[0]} cy=${origin[1]} r=${3.5 * unit} />`}
         ${draft?.from && draft.tool === "direction" && draft.direction && !origin && html`<${Arrow} from=${draft.from} direction=${draft.direction} size=${size} unit=${unit} />`}
         ${draft?.from && draft.box && html`<${Rect} box=${draft.box} kind=${draft.tool === "mover" ? "mover" : "own"} />`}
-        ${pending && html`<${Rect} box=${pending} kind="own" />`}
+        ${pending && html`<${Rect} box=${pending.bbox} kind="own" />`}
         ${editing && moverBox && (simulation || corrections.grounding?.bbox) && html`<${BoxHandles} box=${moverBox} unit=${unit} name=${moverName} kind="of-mover" ...${moverMoves} />`}
         ${editing && corrections.objects.map((object, place) => object.bbox && html`<${BoxHandles} key=${`handles ${place}`} box=${draft?.object === place ? draft.box : object.bbox}
           unit=${unit} name=${object.object} kind="of-own" ...${ownObject(place)} />`)}
@@ -181,9 +204,10 @@ export function Scene({ state }) {
           }} />`}
       </svg>
     </div>
+    ${layers.floor && camera && html`<${FloorLine} camera=${camera} corrections=${corrections} />`}
     ${pending && html`<${NameForm} onName=${(name) => {
       setPending(null);
-      const object = { object: freeName(name, corrections.objects), bbox: pending, role: roleOf(name, question) };
+      const object = { object: freeName(name, corrections.objects), bbox: pending.bbox, mask: pending.mask ?? null, role: roleOf(name, question) };
       correct({ objects: [...corrections.objects, object] });
     }} onCancel=${() => setPending(null)} />`}
     ${simulation && html`<${Transport} player=${player} trajectory=${simulation.trajectory} />`}

@@ -10,17 +10,31 @@ const TOOLS = [
   ["object", "Another object", "Draw a box around another object, then name it."],
   ["direction", "Direction", "Drag from the object to where it goes."],
 ];
-const LAYER_NAMES = { names: "Names", path: "Path", band: "Band", futures: "Futures" };
+const CLICKS = {
+  select: "Click what moves, or draw it: choose “What moves”.",
+  mover: "Click what moves, or draw a box around it.",
+  object: "Click another object, or draw a box around it; then name it.",
+};
+const LAYER_NAMES = { names: "Names", path: "Path", band: "Band", futures: "Futures", floor: "Floor" };
 const LAYER_HINTS = {
   names: "Names of what was found",
   path: "The path of what moves",
   band: "Where most of the computed worlds have it",
   futures: "Where it is in some other worlds",
+  floor: "The floor as a grid, to correct how far down the camera looks",
 };
 
-export function Tools({ state, layers, setLayers, hasFutures }) {
+/** What to do now. `isSeeing`: what is clicked is outlined by the server. */
+function hintOf({ tool, lit }, isSeeing) {
+  if (!isSeeing) return tool === "select" ? null : TOOLS.find(([name]) => name === tool)[2];
+  if (lit?.others) return `Click again for another of the ${lit.others + 1} things that lie here within each other.`;
+  return lit && !lit.things.length ? "No clear outline here: draw a box." : CLICKS[tool];
+}
+
+export function Tools({ state, layers, setLayers, hasFutures, hasFloor, isSeeing }) {
   const { tool, past, future, result } = state;
-  const shown = Object.keys(LAYER_NAMES).filter((name) => name !== "futures" || hasFutures);
+  const told = hintOf(state, isSeeing);
+  const shown = Object.keys(LAYER_NAMES).filter((name) => ({ futures: hasFutures, floor: hasFloor })[name] ?? true);
   return html`<div class="tools">
     <div class="segments" role="group" aria-label="What dragging does">
       ${TOOLS.map(([name, label, hint]) => html`<button key=${name} aria-pressed=${tool === name} title=${hint} onClick=${() => set({ tool: name })}>${label}</button>`)}
@@ -33,6 +47,6 @@ export function Tools({ state, layers, setLayers, hasFutures }) {
       ${shown.map((name) => html`<label key=${name} title=${LAYER_HINTS[name]}><input type="checkbox" checked=${layers[name]}
         onChange=${(event) => setLayers({ ...layers, [name]: event.target.checked })} />${LAYER_NAMES[name]}</label>`)}
     </div>`}
-    ${tool !== "select" && html`<p class="hint" role="status">${TOOLS.find(([name]) => name === tool)[2]}</p>`}
+    ${told && html`<p class="hint" role="status">${told}</p>`}
   </div>`;
 }
