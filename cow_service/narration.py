@@ -206,7 +206,9 @@ def _of_depth(request: SimulateRequest, grounding: Grounding, trajectory: Trajec
             why = "was given for a drawing that is seen from the side"
         else:
             why = "shows no floor that things could stand on"
-        return [f"The depth map {why}: nothing is answered from it. Leave `depth` out, or give another map."]
+        given = depth.source == "request"
+        remedy = "Leave `depth` out, or give another map" if given else "Give a map as `depth`, or another picture"
+        return [f"The depth map {why}: nothing is answered from it. {remedy}."]
     told = [
         f"The depth map does not show '{body.object}' where the image does, as something that rises above the floor."
         for body in trajectory.bodies

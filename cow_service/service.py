@@ -3,7 +3,6 @@
 import hashlib
 import re
 import uuid
-from collections import OrderedDict
 from collections.abc import Iterable
 from functools import partial
 from importlib.metadata import entry_points
@@ -19,7 +18,7 @@ from cow_service.media.artifacts import ArtifactStore, DiskArtifacts, RetryPolic
 from cow_service.media.images import check, decode, decode_data_url
 from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
-from cow_service.perception.base import MOST_EMBEDDINGS, ImageKey, Perception
+from cow_service.perception.base import Perception
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
 from cow_service.readers.chat import ChatReader
@@ -38,8 +37,7 @@ from cow_service.settings import Settings, SettingsError
 from cow_service.stages import run as runs
 from cow_service.stages.looking import look
 from cow_service.vision.scene import SeenImages
-from cow_service.vision.types import Image
-from cow_service.weights.manifests import find_manifest, load_manifests
+from cow_service.weights.manifests import check_modules, find_manifest, load_manifests
 from cow_service.weights.repositories import ready
 
 OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
@@ -67,7 +65,6 @@ class Service:
         self._image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)
         self.perception = Perception(settings)
-        self._looked: OrderedDict[ImageKey, bytes] = OrderedDict()  # images as sent: a detector needs their pixels
         self.readers: Registry[Reader] = Registry("cow_service.readers", errors.ReaderUnavailable, settings)
         self._generator_limits = {point.name: point for point in entry_points(group="cow_service.generator_limits")}
         self.generators: Registry[Generator] = Registry("cow_service.generators", errors.GeneratorUnavailable, settings)
@@ -201,8 +198,10 @@ class Service:
         """
         reader, name = self._names_of(request)
         if self.settings.role != "api":  # else workers have what it lacks
-            _check_modules(reader, errors.ReaderUnavailable)
-            _check_modules(name, errors.GeneratorUnavailable)
+            check_modules(reader, errors.ReaderUnavailable)
+            check_modules(name, errors.GeneratorUnavailable)
+            for model in self.perception.names.values():
+                check_modules(model, errors.PerceptionUnavailable)
         limits: Limits | None = None  # where only the generator itself knows them, and it is not loaded
         if name in self._generator_limits:
             limits = self._generator_limits[name].load()()
@@ -219,28 +218,18 @@ class Service:
         `owner` looked at before. Raises `PerceptionUnavailable`, `InvalidRequest`, `ArtifactNotFound` for an image that
         is not in memory any more, and the errors of `fetch` and `images.decode`.
         """
-        if isinstance(request.image, ImageArtifact) and image is None:
-            key = owner, request.image.artifact
-        else:
-            data = image or self.fetch(request.image)
-            key = owner, hashlib.sha256(data).hexdigest()
-            with self._guard:
-                self._looked[key] = data
-                self._looked.move_to_end(key)
-                while len(self._looked) > MOST_EMBEDDINGS:
-                    self._looked.popitem(last=False)
+        if self.settings.role == "api":
+            raise errors.PerceptionUnavailable("This server computes nothing (COW_ROLE=api): give a box instead.")
+        known = request.image.artifact if isinstance(request.image, ImageArtifact) and image is None else None
+        if known is None and image is None:
+            image = self.fetch(request.image)
 
-        def pixels() -> Image:
-            with self._guard:
-                kept = self._looked.get(key)
-            if kept is None:
-                raise errors.ArtifactNotFound("The image is not in memory any more: send it again.")
-            return decode(kept, max_megapixels=self.settings.max_image_megapixels).pixels
-
+        key = owner, known or hashlib.sha256(image or b"").hexdigest()
         words = cast(WordReader, self.readers.get(WORD_READER))
         nouns = words.read_question(request.question).nouns if request.question is not None else ()
+        most = self.settings.max_image_megapixels
         with self.cpu.held(runs.priority_of(0, runs.now()), lambda: None):
-            return look(self.perception, key, pixels, request, nouns)
+            return look(self.perception, key, image, request, nouns, most)
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""
@@ -288,11 +277,11 @@ class Service:
             return self._devices.setdefault(name, PrioritySemaphore(permits))
 
     def _reader(self, name: str) -> Reader:
-        _check_modules(name, errors.ReaderUnavailable)
+        check_modules(name, errors.ReaderUnavailable)
         return self.readers.get(name)
 
     def _generator(self, name: str) -> Generator:
-        _check_modules(name, errors.GeneratorUnavailable)
+        check_modules(name, errors.GeneratorUnavailable)
         return self.generators.get(name)
 
     def _names_of(self, request: SimulateRequest) -> tuple[str, str]:
@@ -347,12 +336,3 @@ def open_artifact_store(settings: Settings) -> ArtifactStore:
 def is_url(ref: ImageRef) -> bool:
     """Whether an image must be fetched: it is given by a URL that holds no data."""
     return isinstance(ref, ImageUrl) or (isinstance(ref, str) and _OTHER_URL.match(ref[:256]) is not None)
-
-
-def _check_modules(name: str, unavailable: type[errors.CowError]) -> None:
-    """Raises `unavailable`, with the command that helps, where a backend's modules are not installed."""
-    manifest = find_manifest(name)
-    if manifest is not None and (missing := manifest.missing_modules()):
-        raise unavailable(
-            f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
-        )

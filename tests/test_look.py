@@ -70,7 +70,7 @@ def test_an_image_is_named_by_its_digest_until_the_server_forgets_it(served: Ser
     served.start()
     for place in ({"point": [60, 80]}, {"question": QUESTION}):
         told = problem(look(served, image, **place), 404, "artifact-not-found")
-        assert "send it again" in told["detail"]
+        assert "send the image again" in told["detail"]
     problem(look(served, {"artifact": "0" * 64}), 404, "artifact-not-found")
 
 

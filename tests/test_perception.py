@@ -6,6 +6,7 @@ import base64
 import json
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 from stand_ins import TrueModels, TrueScene, read_truth
 
 from cow_service.errors import CannotGround, PerceptionUnavailable
-from cow_service.media.images import decode_own
+from cow_service.media.images import decode_own, encode_png
 from cow_service.perception.base import Embedded, Perception, Prompt, Segment
 from cow_service.perception.outlines import outlines_at, outlines_in
 from cow_service.records import Answer
@@ -105,7 +106,7 @@ def rectangle(x0: int, y0: int, x1: int, y1: int) -> Mask:
 
 
 def seen(*shapes: tuple[Mask, float], scrap: bool = False) -> Embedded:
-    return Embedded(Drawn(shapes, scrap), None, (80, 60))
+    return Embedded(Drawn(shapes, scrap), None, (80, 60), None)
 
 
 @settings(deadline=None, max_examples=40)
@@ -149,11 +150,10 @@ def test_what_does_not_fill_its_box_is_not_taken_and_what_one_prompt_alone_gives
 def test_edges_of_a_small_mask_are_smooth_at_the_size_of_the_image() -> None:
     y, x = np.mgrid[:64, :64]
     logits = (20 - np.hypot(x - 31.5, y - 31.5)).astype(np.float32)
-    share = Segment(logits, 0.9).share(256, 256)
+    mask = Segment(logits, 0.9).enlarged(256, 256).full()
     yy, xx = np.mgrid[:256, :256]
     truth = np.hypot(xx - 127.5, yy - 127.5) < 80
-    assert mask_iou(share > 0.5, truth) > 0.99
-    assert ((share > 0.1) & (share < 0.9)).any()
+    assert mask_iou(mask, truth) > 0.99
 
 
 # --- stage 1
@@ -261,7 +261,7 @@ def test_a_depth_model_stands_in_for_the_depth_of_a_request_and_no_more(service:
     truth = read_truth(CANDLE)
     service.perception = TrueModels(truth, depth_level=0.03)
     found = simulate(service, CANDLE)
-    assert found.trajectory.depth.deviation == pytest.approx(0.03)
+    assert (found.trajectory.depth.source, found.trajectory.depth.deviation) == ("model", pytest.approx(0.03))
     assert found.trajectory.depth.focal == pytest.approx(truth.camera.focal)
     assert "depth" in found.timings
     service.perception = TrueModels(truth)
@@ -269,7 +269,13 @@ def test_a_depth_model_stands_in_for_the_depth_of_a_request_and_no_more(service:
 
 
 @pytest.mark.parametrize(
-    ("depth", "scale"), [(np.full((40, 60), np.nan), 1.0), (np.linspace(1e-6, 1, 2400).reshape(40, 60), None)]
+    ("depth", "scale"),
+    [
+        (np.full((40, 60), np.nan), 1.0),  # nothing is seen
+        (np.full((40, 60), np.nan), None),
+        (np.linspace(1e-6, 1, 2400).reshape(40, 60), None),  # with an offset
+        (np.full((40, 60), 2.0), 1e12),  # no picture is of such a size
+    ],
 )
 def test_depth_that_cannot_be_used_is_not(service: Service, depth: Any, scale: float | None) -> None:
     class Blind(TrueModels):
@@ -283,6 +289,34 @@ def test_depth_that_cannot_be_used_is_not(service: Service, depth: Any, scale: f
 
 
 # --- the server's choice
+
+
+def test_a_mover_by_its_mask_and_again_by_its_box_is_one_thing(service: Service) -> None:
+    truth = read_truth(CANDLE)
+    candle = truth.thing("blue candle")
+    mask = f"data:image/png;base64,{base64.b64encode(encode_png(candle.mask)).decode()}"
+    service.perception = TrueModels(truth)
+    given = {
+        "grounding": {"object": "candle", "mask": mask},
+        "objects": [{"object": "it", "bbox": bbox_of(candle.mask)}],
+    }
+    found = simulate(service, CANDLE, **given)
+    assert found.grounding.others == ()
+    assert any("lies where the mover is" in warning for warning in found.warnings)
+
+
+def test_looks_of_several_threads_at_one_image_are_one(service: Service) -> None:
+    drawn = Drawn([(rectangle(10, 10, 40, 40), 0.9)])
+
+    class Models(TrueModels):
+        def load(self, kind: Any) -> Any:
+            return drawn
+
+    models = Models(read_truth(CANDLE))
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: models.embed((None, "x"), lambda: np.zeros((60, 80, 3), np.uint8)), range(8)))
+    assert drawn.embedded == 1
+    assert all(each is found[0] for each in found)
 
 
 def test_one_look_at_an_image_serves_every_click(service: Service) -> None:
@@ -307,7 +341,8 @@ def test_models_are_chosen_by_name_one_of_each_kind() -> None:
     assert Perception(Settings()).names == {}
     chosen = Perception(Settings(perception="sam2-tiny, moge-2-small")).names
     assert chosen == {"segmenter": "sam2-tiny", "depth": "moge-2-small"}
-    for wrong in ("sam2-tiny,sam2-large", "sam3", ""):
+    assert "inpainter" in Perception(Settings(perception="cpu,lama")).names
+    for wrong in ("sam2-tiny,sam2-large", "cpu,sam2-large", "sam3", ""):
         with pytest.raises((SettingsError, ValueError), match=r"COW_PERCEPTION|perception"):
             Perception(Settings(perception=wrong))
 

@@ -19,7 +19,15 @@ from starlette.datastructures import Headers
 from cow_service.api.body import parse, receive
 from cow_service.api.middleware.access import charge
 from cow_service.api.middleware.body_limit import release_body
-from cow_service.errors import Canceled, CowError, FieldError, InvalidRequest, JobNotFound, StorageUnavailable
+from cow_service.errors import (
+    ArtifactNotFound,
+    Canceled,
+    CowError,
+    FieldError,
+    InvalidRequest,
+    JobNotFound,
+    StorageUnavailable,
+)
 from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobSpec, JobState
@@ -31,6 +39,7 @@ from cow_service.stages.run import now
 
 POLL_SECONDS = 3.0  # another process may have run the job
 MAX_CONCURRENT_BODIES = 4  # read at the same time
+MAX_CONCURRENT_LOOKS = 2  # they wait for the CPU with everything else
 MAX_CONCURRENT_FETCHES = 64  # of images given by URL
 RETRY_AFTER = {"Retry-After": "1"}
 REPLAYED = "Idempotent-Replayed"  # as Stripe names it
@@ -164,6 +173,7 @@ class Submitter:
         self.engine = engine
         self._bodies = FairThreads(MAX_CONCURRENT_BODIES)
         self._fetches = FairThreads(MAX_CONCURRENT_FETCHES)
+        self._looks = FairThreads(MAX_CONCURRENT_LOOKS)
 
     async def run(self, request: Request, kind: JobKind, model: type[SimulateRequest]) -> Response:
         """The job's result, or the job itself where the caller does not want to wait so long.
@@ -191,12 +201,23 @@ class Submitter:
 
     async def look(self, request: Request) -> Look:
         """What the models of this process see. Raises as `Service.look`."""
-        owner, raw = owner_of(request), await receive(request)
+        service, owner, raw = self.engine.service, owner_of(request), await receive(request)
+        asked = await self.in_thread(owner, partial(parse, raw, LookRequest))
+        image = raw.image
+        if is_url(asked.image):
+            image = await self._fetches.run(owner, partial(service.fetch, asked.image))
+            charge.get()("MB of bodies", len(image) / 1e6)
 
         def see() -> Look:
-            return self.engine.service.look(parse(raw, LookRequest), owner, raw.image)
+            try:
+                return service.look(asked, owner, image)
+            except ArtifactNotFound:
+                if not isinstance(asked.image, ImageArtifact):
+                    raise
+                self.engine.may_read(asked.image.artifact, owner)  # of a job, perhaps
+                return service.look(asked, owner, service.fetch(asked.image))
 
-        return await self.in_thread(owner, see)
+        return await unless_disconnected(request, self._looks.run(owner, see))
 
     def submission(self, request: Request, kind: JobKind) -> Submission:
         """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from cow_service.weights.repositories import Download
 
 
-app = typer.Typer(rich_markup_mode=None, help="List readers and generators; pull and check weights.")
+app = typer.Typer(rich_markup_mode=None, help="List readers, generators and models that see; pull and check weights.")
 
 Name = Annotated[str, argument("As `cow models` lists it.", "NAME")]
 
@@ -48,7 +48,14 @@ def pull(
         ),
     ] = None,
 ) -> None:
-    """Download a model's weights and check every file; files that are here already stay."""
+    """Download a model's weights, or those of COW_PERCEPTION=NAME, and check every file; what is here stays."""
+    from cow_service.perception.base import SETS  # noqa: PLC0415
+
+    for each in SETS.get(name, (name,)):
+        _pull(each, revision)
+
+
+def _pull(name: str, revision: list[str] | None) -> None:
     manifest = _manifest(name)
     revisions = _revisions(manifest, revision or [])
     if not manifest.sources:

@@ -7,19 +7,20 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from threading import Lock
+from dataclasses import dataclass, replace
+from threading import RLock
 from typing import Any, Literal, Protocol, cast
 
 import cv2
-import numpy as np
 
 from cow_service.errors import PerceptionUnavailable
 from cow_service.records import BBox, Point
 from cow_service.registry import Registry
 from cow_service.settings import Settings, SettingsError
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.scene import ImageKey
 from cow_service.vision.types import Floats, Floats32, Image, Mask
-from cow_service.weights.manifests import find_manifest
+from cow_service.weights.manifests import check_modules
 
 PerceptionKind = Literal["segmenter", "detector", "depth", "inpainter"]
 GROUPS: dict[PerceptionKind, str] = {
@@ -34,8 +35,6 @@ SETS: dict[str, tuple[str, ...]] = {  # by the value of COW_PERCEPTION; all of t
     "gpu": ("sam2-large", "grounding-dino-base", "moge-2-large"),
 }
 MOST_EMBEDDINGS = 8  # images whose embedding is kept: some 16 MB each of a large model
-ImageKey = tuple[str | None, str]
-"""Whose image it is, and its SHA-256: nobody learns by the time it takes what others look at."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +57,9 @@ class Segment:
         """[h, w] at the model's own size."""
         return self.logits > 0
 
-    def share(self, width: int, height: int) -> Floats32:
-        """[height, width]: how much of each pixel of the image is the thing's, 0..1."""
-        # Logits, not shares, are enlarged: those of a clear edge would give stairs.
-        large = cv2.resize(self.logits, (width, height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(1 / (1 + np.exp(-np.clip(large, -30, 30))), np.float32)
+    def enlarged(self, width: int, height: int) -> CroppedMask:
+        """The mask of the image. Logits are enlarged, not the mask: its edges would be stairs."""
+        return CroppedMask.of(cv2.resize(self.logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0)
 
 
 class Segmenter(Protocol):
@@ -139,6 +136,7 @@ class Embedded:
     segmenter: Segmenter
     embedding: Any
     size: tuple[int, int]  # width and height, px
+    source: bytes | None  # the image as it was sent, where a look may need its pixels again
 
     def segment(self, prompts: Sequence[Prompt]) -> tuple[tuple[Segment, ...], ...]:
         """Candidates for each prompt."""
@@ -155,17 +153,18 @@ class Perception:
         }
         self.names: dict[PerceptionKind, str] = self._chosen(settings.perception)
         self._embeddings: OrderedDict[ImageKey, Embedded] = OrderedDict()
-        self._lock = Lock()
+        self._lock = RLock()  # `embed` asks for an image with it held, which may be one that is kept here
 
     def _chosen(self, wanted: str) -> dict[PerceptionKind, str]:
         chosen: dict[PerceptionKind, str] = {}
         kinds: dict[str, PerceptionKind] = {name: kind for kind, name in self.installed()}
-        for name in SETS.get(wanted, tuple(each.strip() for each in wanted.split(","))):
+        said = [each.strip().lower() for each in wanted.split(",") if each.strip()]
+        for name in (name for each in said for name in SETS.get(each, (each,))):
             kind = kinds.get(name)
             if kind is None or kind in chosen:
                 known = ", ".join((*SETS, *kinds))
                 fault = "is no such model" if kind is None else f"is a second {kind} beside {chosen[kind]!r}"
-                raise SettingsError(f"Bad settings: COW_PERCEPTION: {name!r} {fault}: there are {known}.")
+                raise SettingsError(f"Bad settings: COW_PERCEPTION: {name!r} {fault}. It takes: {known}.")
             chosen[kind] = name
         return chosen
 
@@ -177,13 +176,8 @@ class Perception:
         """The model of a kind, None where the server has none. Raises `PerceptionUnavailable`."""
         if kind not in self.names:
             return None
-        name = self.names[kind]
-        manifest = find_manifest(name)
-        if manifest is not None and (missing := manifest.missing_modules()):
-            raise PerceptionUnavailable(
-                f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
-            )
-        return self._registries[kind].get(name)
+        check_modules(self.names[kind], PerceptionUnavailable)
+        return self._registries[kind].get(self.names[kind])
 
     @property
     def segmenter(self) -> Segmenter | None:
@@ -209,17 +203,24 @@ class Perception:
         """What decides the work of the models of some kinds, as far as the server has them."""
         return {kind: model.fingerprint for kind in kinds if (model := self.load(kind)) is not None}
 
-    def embed(self, key: ImageKey, image: Callable[[], Image]) -> Embedded:
+    def source_of(self, key: ImageKey) -> bytes | None:
+        """The bytes of an image that was looked at, as long as they are kept."""
+        with self._lock:
+            found = self._embeddings.get(key)
+            return None if found is None else found.source
+
+    def embed(self, key: ImageKey, image: Callable[[], Image], source: bytes | None = None) -> Embedded:
         """What the segmenter knows of an image, which is asked for only where it is new. There must be a segmenter."""
         segmenter = self.segmenter
         assert segmenter is not None, "asked for only where there is a segmenter"
-        with self._lock:
+        with self._lock:  # also while it looks: who asks for the same image waits, and the model takes one at a time
             found = self._embeddings.get(key)
-        if found is None:
-            pixels = image()
-            found = Embedded(segmenter, segmenter.embed(pixels), (pixels.shape[1], pixels.shape[0]))
-        with self._lock:
-            self._embeddings[key] = found
+            if found is None:
+                pixels = image()
+                found = Embedded(segmenter, segmenter.embed(pixels), (pixels.shape[1], pixels.shape[0]), source)
+                self._embeddings[key] = found
+            elif found.source is None and source is not None:
+                self._embeddings[key] = found = replace(found, source=source)
             self._embeddings.move_to_end(key)
             while len(self._embeddings) > MOST_EMBEDDINGS:
                 self._embeddings.popitem(last=False)

@@ -7,24 +7,20 @@ opened here; the manifest names a copy of its generator as safetensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from cow_service import __version__
-from cow_service.errors import PerceptionUnavailable, WeightsUnavailable
+from cow_service.perception.loading import LoadedModel, check_keys, load
 from cow_service.settings import Settings
 from cow_service.vision.masks import scaled_size, window_of
 from cow_service.vision.types import Image, Mask
-from cow_service.weights.device import choose_device, is_out_of_memory, listed
 from cow_service.weights.manifests import load_manifests
-from cow_service.weights.repositories import verify, weights_identity
 
 CONTEXT, LEAST_CONTEXT = 1.0, 96  # of the hole's longer side, and px: so far around it the network sees
 MOST_SIDE = 1024  # px: larger crops are painted smaller; what is painted at more gets blotchy
@@ -165,9 +161,8 @@ class Lama(nn.Module):
 class LamaInpainter:
     """See `Inpainter`."""
 
-    def __init__(self, name: str, model: Lama, device: torch.device, fingerprint: str) -> None:
-        self.fingerprint = fingerprint
-        self._name, self._model, self._device = name, model, device
+    def __init__(self, model: LoadedModel) -> None:
+        self._model, self.fingerprint = model, model.fingerprint
 
     def fill(self, image: Image, hole: Mask, progress: Callable[[float], None]) -> Image:
         """See `Inpainter`. Raises `PerceptionUnavailable` where memory runs out."""
@@ -187,9 +182,9 @@ class LamaInpainter:
         more = [(0, max(LEAST_SIDE, -(-length // MULTIPLE) * MULTIPLE) - length) for length in (rows, columns)]
         colours = torch.from_numpy(np.pad(seen, [*more, (0, 0)], mode="symmetric")).permute(2, 0, 1)
         gone = torch.from_numpy(np.pad(inside, more, mode="symmetric"))[None]
-        with _memory(self._name), torch.inference_mode():
-            given = torch.cat((colours / 255 * ~gone, gone)).to(self._device, torch.float32)
-            found = self._model(given[None], progress)[0, :, :rows, :columns]
+        with self._model.computing(is_precise=True) as network:
+            given = torch.cat((colours / 255 * ~gone, gone)).to(self._model.device, torch.float32)
+            found = network(given[None], progress)[0, :, :rows, :columns]
             painted = (found * 255).round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).cpu().numpy()
         if scale < 1:
             painted = cv2.resize(painted, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -200,44 +195,16 @@ class LamaInpainter:
 
 def create_lama(settings: Settings) -> LamaInpainter:
     """Factory for the registry. Raises `PerceptionUnavailable`."""
+    return LamaInpainter(load("lama", settings, _build))
+
+
+def _build(folder: Path) -> Lama:
     manifest = load_manifests()["lama"]
-    device, source = choose_device(settings.device, PerceptionUnavailable), manifest.sources["weights"]
-    sizes = manifest.architecture
+    sizes, file = manifest.architecture, manifest.sources["weights"].files[0]
     with torch.device("meta"):  # weights take their places below
         model = Lama(int(sizes["ngf"]), int(sizes["n_blocks"]), float(sizes["ratio_gin"]))
-    try:
-        folder = verify(source, settings.weights_dir, manifest.name)
-        weights = load_file(folder / source.files[0])
-    except WeightsUnavailable as error:
-        raise PerceptionUnavailable(error.detail) from error
-    except SafetensorError as error:
-        raise PerceptionUnavailable(f"'{manifest.name}' cannot be loaded: {error}") from error
-    weights = {name.removeprefix(PREFIX): tensor for name, tensor in weights.items()}
-    wanted = {name: tensor.shape for name, tensor in model.state_dict().items()}
-    wrong = {
-        "the file lacks": [name for name in wanted if name not in weights],
-        "the file has, beyond its model,": [name for name in weights if name not in wanted],
-        "the file has in another shape": [
-            name for name in wanted if name in weights and weights[name].shape != wanted[name]
-        ],
-    }
-    for what, names in wrong.items():
-        if names:
-            raise PerceptionUnavailable(f"The weights of '{manifest.name}' do not fit: {what} {listed(names)}.")
-    with _memory(manifest.name):
-        model.load_state_dict(weights, assign=True)
-        model.eval().requires_grad_(False).to(device)
-    identity = f"{manifest.name} {__version__} {weights_identity(manifest, settings)}"
-    return LamaInpainter(manifest.name, model, device, identity)
-
-
-@contextmanager
-def _memory(name: str) -> Generator[None]:
-    try:
-        yield
-    except RuntimeError as error:
-        if not is_out_of_memory(error):
-            raise
-        raise PerceptionUnavailable(
-            f"'{name}' does not fit into memory. Set COW_DEVICE to a larger device, or leave it out of COW_PERCEPTION."
-        ) from error
+    weights = {name.removeprefix(PREFIX): tensor for name, tensor in load_file(folder / file).items()}
+    wanted = model.state_dict()
+    check_keys("lama", [name for name in wanted if name not in weights], [n for n in weights if n not in wanted])
+    model.load_state_dict(weights, assign=True)
+    return model

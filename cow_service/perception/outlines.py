@@ -8,12 +8,12 @@ import numpy as np
 
 from cow_service.perception.base import Embedded, Prompt, Segment
 from cow_service.records import BBox, Point
-from cow_service.vision.masks import bbox_of, iou, mask_iou
-from cow_service.vision.types import Floats32, Mask
+from cow_service.vision.masks import CroppedMask, bbox_of, iou, mask_iou
+from cow_service.vision.types import Mask
 
 AGREE = 0.8  # IoU from which two masks are one
 LEAST_SCORE = 0.5  # of a candidate
-FILLS = 0.5  # IoU of the box that was given and that of its mask: less is a part of it, or something else
+FILLS, IS_WHOLE = 0.5, 0.75  # IoU of a box that was given and that of its mask: less is something else, or a part
 RIVAL = 0.05  # of the score: a candidate that is so close to the best is meant as well
 MOST_SHARE = 0.95  # of the image: more is no thing
 
@@ -22,25 +22,25 @@ MOST_SHARE = 0.95  # of the image: more is no thing
 class Outline:
     """What a segmenter takes for a thing."""
 
-    share: Floats32  # [H, W]: how much of each pixel is the thing's, 0..1
+    cropped: CroppedMask
     score: float
     is_sure: bool  # two prompts agree on it
 
     @property
     def mask(self) -> Mask:
         """[H, W]."""
-        return self.share > 0.5
+        return self.cropped.full()
 
     @property
     def bbox(self) -> BBox:
         """Tight, px."""
-        return bbox_of(self.mask)
+        return self.cropped.bbox
 
 
 def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
     """What is in each box; None where nothing fills it.
 
-    It is sure where the point deepest inside of its mask gives the same mask again.
+    It is sure where it fills the box well, and the point deepest inside of its mask gives the same mask again.
     """
     size, best = image.size, [_first(found) for found in image.segment([Prompt(bbox=box) for box in boxes])]
     again = iter(image.segment([Prompt(point=_inmost(each.mask, size)) for each in best if each is not None]))
@@ -50,8 +50,9 @@ def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
             outlines.append(None)
             continue
         agrees = any(mask_iou(segment.mask, other.mask) >= AGREE for other in next(again))
-        outline = Outline(segment.share(*size), segment.score, agrees)
-        outlines.append(outline if outline.mask.any() and iou(outline.bbox, box) >= FILLS else None)
+        mask = segment.enlarged(*size)
+        fills = iou(mask.bbox, box) if mask.area else 0.0
+        outlines.append(Outline(mask, segment.score, agrees and fills >= IS_WHOLE) if fills >= FILLS else None)
     return outlines
 
 
@@ -74,16 +75,14 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
         if all(mask_iou(each.mask, other.mask) < AGREE for other in chosen):
             chosen.append(each)
     close = [each for each in chosen if each.score >= chosen[0].score - RIVAL]
-    outlines = [Outline(each.share(*image.size), each.score, True) for each in close]
-    return [each for each in outlines if each.mask.any()]
+    outlines = [Outline(each.enlarged(*image.size), each.score, True) for each in close]
+    return [each for each in outlines if each.cropped.area]
 
 
 def _first(candidates: Sequence[Segment]) -> Segment | None:
     """The best of some candidates that is good enough to be a thing."""
-    for each in sorted(candidates, key=lambda each: -each.score):
-        if each.score >= LEAST_SCORE and 0 < each.mask.mean() <= MOST_SHARE:
-            return each
-    return None
+    good = (each for each in candidates if each.score >= LEAST_SCORE and 0 < each.mask.mean() <= MOST_SHARE)
+    return next(good, None)
 
 
 def _inmost(mask: Mask, size: tuple[int, int]) -> Point:

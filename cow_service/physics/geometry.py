@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -59,6 +60,7 @@ class DepthMap:
     scale: float | None  # metres per unit; None: relative depth
     deviation: float  # relative, one standard deviation
     focal: float | None  # px; None: it is not known
+    source: Literal["request", "model"] = "request"
 
     def metres_per_pixel(self, bbox: BBox, focal: float) -> float | None:
         """At what is in the middle of a box (px), for a focal length (px); None where nobody knows it."""
@@ -73,6 +75,7 @@ class DepthMap:
         """The record of it, with what was measured in it, if anything was."""
         mover = None if measured is None else measured.footprints[0]
         return DepthEstimate(
+            source=self.source,
             scale=self.scale,
             focal=math.exp(fit.mean[1]) * self.depth.shape[1],
             valid=float(np.isfinite(self.depth).mean()),

@@ -300,6 +300,7 @@ class Surface(Record):
 class DepthEstimate(Record):
     """The depth map that a world was measured in."""
 
+    source: Literal["request", "model"] = Field(description="Who gave it: the request, or a model of the server.")
     scale: float | None = Field(description="Metres per unit; null: relative depth.")
     focal: float = Field(gt=0, description="px.")
     valid: float = Field(ge=0, le=1, description="Share of the pixels whose depth is known.")

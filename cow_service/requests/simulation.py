@@ -30,12 +30,19 @@ MAX_OBJECTS = 64
 ObjectWords = Annotated[Words, Field(min_length=1, max_length=200)]
 
 
+def _with_area(bbox: records.BBox) -> records.BBox:
+    if bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2:
+        raise ValueError(f"[x0, y0, x1, y1] must have x1 and y1 at least 2 px beyond x0 and y0, got {list(bbox)}")
+    return bbox
+
+
+Box = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_with_area)]
+
+
 class PlaceRequest(Record):
     """An object's place in the image, and what the caller knows of it beside. What is left out is read or assumed."""
 
-    bbox: tuple[Finite, Finite, Finite, Finite] | None = Field(
-        default=None, description="[x0, y0, x1, y1], px of the upright image, x right, y down."
-    )
+    bbox: Box | None = Field(default=None, description="[x0, y0, x1, y1], px of the upright image, x right, y down.")
     point: tuple[Finite, Finite] | None = Field(
         default=None, description="[x, y], px, on the object: its outline is cut from the image around it."
     )
@@ -60,13 +67,6 @@ class PlaceRequest(Record):
             raise ValueError("give either `bbox` or `point`, or instead of both a `mask`")
         return self
 
-    @field_validator("bbox")
-    @classmethod
-    def _has_area(cls, bbox: records.BBox | None) -> records.BBox | None:
-        if bbox is not None and (bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2):
-            raise ValueError(f"[x0, y0, x1, y1] must have x1 and y1 at least 2 px beyond x0 and y0, got {list(bbox)}")
-        return bbox
-
 
 class GroundingRequest(PlaceRequest):
     """Skips stage 1: the object that moves, by its box, its mask, or a point on it."""
@@ -82,7 +82,7 @@ class LookRequest(Record):
 
     image: ImageRef
     point: tuple[Finite, Finite] | None = Field(default=None, description="[x, y], px of the upright image.")
-    bbox: tuple[Finite, Finite, Finite, Finite] | None = Field(default=None, description="[x0, y0, x1, y1], px.")
+    bbox: Box | None = Field(default=None, description="[x0, y0, x1, y1], px.")
     question: Words | None = Field(default=None, min_length=1, max_length=4000)
 
     @model_validator(mode="after")

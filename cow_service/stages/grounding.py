@@ -7,7 +7,7 @@ from functools import partial
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
 from cow_service.narration import OF_ITSELF, OF_TARGET, same_name
-from cow_service.perception.outlines import Outline, outlines_at, outlines_in
+from cow_service.perception.outlines import outlines_at, outlines_in
 from cow_service.readers.base import GroundingReading, NamedChange, SeenThing, WordReader
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
@@ -22,6 +22,7 @@ from cow_service.vision.types import Mask
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 SAME_MASK = 0.5  # IoU from which two outlines are of one thing
+MOST_FOUND = 24  # detections that are outlined, best first
 WHITE = 128  # grey level from which a pixel of a mask is the object's
 MAX_SHARE = 0.95  # of the image that a box or a mask covers: more is no object
 
@@ -36,7 +37,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     request, question = run.request, run.question
     # Where things are: as the request says; the reader is asked for the rest.
     with run.cpu():
-        given, reading, warnings = _read_places(run)
+        given, masks, reading, warnings = _read_places(run)
     source = "request" if reading is not None else run.reader.source
     if reading is None:
         empty, changed = run.reader_input("grounding"), request.changed_names
@@ -56,10 +57,15 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in question.drawings_named]
     # The others, and what is changed of all of them.
     mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
-    # Two masks are two things, however much their boxes overlap.
-    has_mask = request.grounding is not None and request.grounding.mask is not None
+    # Two masks tell whether two things are one, however much their boxes overlap.
     beside = [
-        each for each in given if (has_mask and each.mask is not None) or not is_same_object(each.bbox, mover.bbox)
+        each
+        for each, other in zip(given, masks, strict=True)
+        if (
+            not is_same_object(each.bbox, mover.bbox)
+            if other is None or reading.mask is None
+            else mask_iou(other, reading.mask) <= SAME_MASK
+        )
     ]
     boxes = [each.bbox for each in beside]
     seen = (each for each in reading.others if not is_among(each.bbox, boxes))
@@ -122,21 +128,24 @@ class Place:
     is_doubtful: bool = False  # no two looks at it agree on its outline
 
 
-def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], GroundingReading | None, list[str]]:
-    """The objects of a request, what it says of the mover and asks in words, and warnings.
+def _read_places(
+    run: Run[SimulateRequest],
+) -> tuple[tuple[LocatedObject, ...], list[Mask | None], GroundingReading | None, list[str]]:
+    """The objects of a request with their masks, what it says of the mover and asks in words, and warnings.
 
-    The second is None where the mover is left to the reader. Raises as `_locate` does, and for an object that is given
+    The third is None where the mover is left to the reader. Raises as `_locate` does, and for an object that is given
     twice.
     """
     request = run.request
     given = [(f"/objects/{index}", each) for index, each in enumerate(request.objects)]
     mover = [] if request.place is None else [("/grounding", request.place)]
     places = [_locate(run, each, pointer) for pointer, each in (*given, *mover)]
+    masks = [place.mask for place in places[: len(given)]]
     objects, warnings = list[LocatedObject](), list[str]()
     for (pointer, each), place in zip(given, places, strict=False):
         twin = next((at for at, other in enumerate(objects) if iou(place.bbox, other.bbox) >= SAME_BOX_IOU), None)
         if twin is not None:
-            detail = f"has the same box as `objects.{twin}`"
+            detail = f"lies in the same box as `objects.{twin}`"
             message = f"`{field_of(pointer)}` {detail}: give each object once."
             raise InvalidRequest(message, errors=(FieldError(pointer, detail),))
         mask = None if place.mask is None else run.backends.artifacts.put(encode_png(place.mask), "image/png")
@@ -153,7 +162,7 @@ def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], 
         )
         warnings += place.warnings
     if request.place is None:
-        return tuple(objects), None, warnings
+        return tuple(objects), masks, None, warnings
     reading = GroundingReading(
         request.place.object or DEFAULT_NAME,
         places[-1].bbox,
@@ -164,7 +173,7 @@ def _read_places(run: Run[SimulateRequest]) -> tuple[tuple[LocatedObject, ...], 
         asked=run.question.asked,
         is_doubtful=places[-1].is_doubtful,
     )
-    return tuple(objects), reading, warnings
+    return tuple(objects), masks, reading, warnings
 
 
 def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Place:
@@ -236,15 +245,12 @@ def _find(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, .
     """What the detector finds for some nouns, outlined as well as can be. To be called with `cpu` held."""
     detector, scene = run.backends.perception.detector, run.scene
     assert detector is not None, "asked for only where there is a detector"
-    found = detector.detect(run.image.pixels, nouns) if nouns else ()
-    outlines: list[Outline | None] = [None] * len(found)
-    if run.can_segment:
-        outlines = outlines_in(run.embedded(), [each.bbox for each in found])
-    masks = (
-        mask_from_bbox(scene.clean, each.bbox) if outline is None else outline.mask
-        for each, outline in zip(found, outlines, strict=True)
-    )
-    return tuple(SeenThing(each.phrase, mask, each.score) for each, mask in zip(found, masks, strict=True))
+    found = detector.detect(scene.undrawn, nouns)[:MOST_FOUND] if nouns else ()
+    if not run.can_segment:
+        masks = [(each, mask_from_bbox(scene.clean, each.bbox)) for each in found]
+        return tuple(SeenThing(each.phrase, mask, each.score) for each, mask in masks if mask.any())
+    outlines = zip(found, outlines_in(run.embedded(), [each.bbox for each in found]), strict=True)
+    return tuple(SeenThing(each.phrase, one.mask, each.score) for each, one in outlines if one and one.is_sure)
 
 
 def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> GroundingReading:

@@ -1,10 +1,10 @@
 """A look at an image with the server's models, apart from any job: for callers who choose a thing by hand."""
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from cow_service.errors import FieldError, InvalidRequest, PerceptionUnavailable
-from cow_service.media.images import encode_png
+from cow_service.errors import ArtifactNotFound, FieldError, InvalidRequest, PerceptionUnavailable
+from cow_service.media.images import decode, encode_png
 from cow_service.perception.base import ImageKey, Perception
 from cow_service.perception.outlines import Outline, outlines_at, outlines_in
 from cow_service.records import BBox, Look, SeenObject
@@ -13,20 +13,29 @@ from cow_service.vision.types import Image
 
 
 def look(
-    perception: Perception, key: ImageKey, image: Callable[[], Image], request: LookRequest, nouns: Sequence[str]
+    perception: Perception, key: ImageKey, data: bytes | None, request: LookRequest, nouns: Sequence[str], most: float
 ) -> Look:
     """What is at the point or in the box of a request, or is called by one of the nouns of its question.
 
-    `image` is asked for where the segmenter does not know it yet, and where nouns are looked for.
-    Raises `PerceptionUnavailable`, `InvalidRequest` for a place outside the image, and what `image` raises.
+    `data` is the image as it was sent, of `most` megapixels at the most; None: it is one that was looked at before.
+    Raises `PerceptionUnavailable`, `InvalidRequest` for a place outside the image, `ArtifactNotFound`, and what
+    `images.decode` raises.
     """
+
+    def image() -> Image:
+        kept = perception.source_of(key) if data is None else data
+        if kept is None:
+            raise ArtifactNotFound("The image is not in memory any more: send it again.")
+        return decode(kept, max_megapixels=most).pixels
+
     needed = ("segmenter",) if request.question is None else ("segmenter", "detector")
     lacking = [kind for kind in needed if kind not in perception.names]
     if lacking:
         raise PerceptionUnavailable(
-            f"This server has no {' and no '.join(lacking)}: it is started with COW_PERCEPTION=none or without one."
+            f"This server has no {' and no '.join(lacking)}: give a box instead, or start it with COW_PERCEPTION=cpu, "
+            "gpu, or names of models."
         )
-    embedded = perception.embed(key, image)
+    embedded = perception.embed(key, image, data)
     width, height = embedded.size
     things: list[SeenObject] = []
     if request.point is not None:
@@ -36,12 +45,15 @@ def look(
         _check_inside(request.bbox, embedded.size, "bbox")
         things = [_seen(each.bbox, each) for each in outlines_in(embedded, [request.bbox]) if each is not None]
     elif nouns and (detector := perception.detector) is not None:
-        found = detector.detect(image(), nouns)
+        found = detector.detect(image(), nouns)[:MOST_FOUND]
         outlines = outlines_in(embedded, [each.bbox for each in found])
         for each, outline in zip(found, outlines, strict=True):
             box = each.bbox if outline is None else outline.bbox
             things.append(_seen(box, outline).model_copy(update={"name": each.phrase, "score": each.score}))
     return Look(image=key[1], width=width, height=height, things=tuple(things))
+
+
+MOST_FOUND = 24  # things that are outlined, best first
 
 
 def _seen(bbox: BBox, outline: Outline | None) -> SeenObject:
@@ -53,7 +65,7 @@ def _seen(bbox: BBox, outline: Outline | None) -> SeenObject:
 
 def _check_inside(bbox: BBox, size: tuple[int, int], field: str) -> None:
     x0, y0, x1, y1 = bbox
-    if not (0 <= x0 <= x1 <= size[0] and 0 <= y0 <= y1 <= size[1]):
+    if not (0 <= x0 < size[0] and 0 <= y0 < size[1] and x0 <= x1 <= size[0] and y0 <= y1 <= size[1]):
         detail = f"lies outside the upright image of {size[0]} x {size[1]} px"
         raise InvalidRequest(
             f"`{field}` {detail}: give pixels of it, x right and y down.", errors=(FieldError(f"/{field}", detail),)

@@ -135,6 +135,7 @@ class Run(Generic[Request_co]):
     turn: int = 0  # of the job, among those of all callers: the lower comes first
     seen: SeenImages | None = None  # images that other runs have measured; None: everything is measured anew
     _image_key: ImageKey = (None, "")
+    _is_estimated: bool = False  # the depth map, by a model
     results: dict[Stage, StageResult[Any]] = field(default_factory=dict[Stage, StageResult[Any]])
     timings: dict[str, float] = field(default_factory=dict[str, float])  # seconds per stage
     reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
@@ -180,8 +181,9 @@ class Run(Generic[Request_co]):
     def embedded(self) -> Embedded:
         """The image as the segmenter sees it; the server must have one. To be called with `cpu` held."""
         self.check_canceled()
-        key = self._image_key[0], self.image.info.sha256
-        return self.backends.perception.embed(key, lambda: self.image.pixels)
+        clean = " clean" if self.scene.cues.any() else ""  # what is drawn over things is none of them
+        key = self._image_key[0], self.image.info.sha256 + clean
+        return self.backends.perception.embed(key, lambda: self.scene.undrawn)
 
     @property
     def wants_depth(self) -> bool:
@@ -191,8 +193,8 @@ class Run(Generic[Request_co]):
         return is_free and "depth" in self.backends.perception.names
 
     def take_depth(self, depth: DepthRequest | None) -> None:
-        """Goes on as if the request had given that depth map."""
-        self.request = self.request.model_copy(update={"depth": depth})
+        """Goes on as if the request had given that depth map, but says whose it is."""
+        self.request, self._is_estimated = self.request.model_copy(update={"depth": depth}), depth is not None
         self.__dict__.pop("depth", None)
 
     @cached_property
@@ -218,7 +220,8 @@ class Run(Generic[Request_co]):
         if given.scale is None and nearest < LEAST_NEAREST * usual:
             raise _no_depth("begins at the camera itself: depths must be proportional to distances, without an offset")
         depth = np.where(values > 0, values.astype(np.float64), np.nan)
-        return DepthMap(depth, given.scale, given.deviation, given.focal)
+        source = "model" if self._is_estimated else "request"
+        return DepthMap(depth, given.scale, given.deviation, given.focal, source)
 
     @property
     def focal(self) -> Estimate | None:

@@ -68,7 +68,7 @@ Measured = dict[str, Any]
 """Cached properties of a `Scene` by their names."""
 PART_OF = 0.5  # of its area: what lies in a thing that was outlined is no thing of its own
 # Neither mover nor words decide them.
-OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "_undrawn", "side_view", "_all_trails", "segments")
+OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "undrawn", "side_view", "_all_trails", "segments")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,23 +124,23 @@ class Scene:
         return mask
 
     @cached_property
-    def _undrawn(self) -> Image:
+    def undrawn(self) -> Image:
         """The image [H, W, 3] without arrows and boxes."""
         return erase_drawing(self.image, self.cues)
 
     @cached_property
     def side_view(self) -> SideView | None:
         """The drawing seen from the side that the image is; None for a picture that has depth."""
-        return find_side_view(self._undrawn)
+        return find_side_view(self.undrawn)
 
     @cached_property
     def segments(self) -> Floats:
         """Ends [N, 4] (x, y, x, y; px) of straight edges, longest first; none for a drawing without depth."""
-        return np.zeros((0, 4)) if self.side_view else find_segments(self._undrawn, self.cues)
+        return np.zeros((0, 4)) if self.side_view else find_segments(self.undrawn, self.cues)
 
     @cached_property
     def _all_trails(self) -> tuple[Trail, ...]:
-        return () if self.side_view else find_trails(self._undrawn)
+        return () if self.side_view else find_trails(self.undrawn)
 
     @cached_property
     def trails(self) -> tuple[Trail, ...]:
@@ -154,7 +154,7 @@ class Scene:
     @cached_property
     def clean(self) -> Image:
         """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail and their shadows."""
-        image = self._undrawn
+        image = self.undrawn
         for trail in self.trails:
             image = without_earlier_positions(image, trail)
             objects = np.zeros((self.height, self.width), bool)

@@ -61,6 +61,6 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """The kind and the first line of a foreign exception, without the folders that it names; for error messages."""
-    line = re.sub(r"(?<!\w)(/[\w.+-]+)+/?", "…", (str(error).splitlines() or [""])[0])[:300]
+    """The kind of a foreign exception and how its text begins, without the folders that it names; for messages."""
+    line = re.sub(r"(?<!\w)(/[\w.+-]+)+/?", "…", " ".join(str(error).split()))[:300]
     return f"{type(error).__name__}: {line}"

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, JsonValue
 
+from cow_service.errors import CowError
 from cow_service.records import Record
 
 
@@ -113,6 +114,15 @@ class Manifest(Record):
     def install_line(self) -> str:
         """The command that installs what this backend needs."""
         return f'pip install "cow-service[{self.extra}]"' if self.extra else "pip install --force-reinstall cow-service"
+
+
+def check_modules(name: str, unavailable: type[CowError]) -> None:
+    """Raises `unavailable`, with the command that helps, where the modules of a backend are not installed."""
+    manifest = find_manifest(name)
+    if manifest is not None and (missing := manifest.missing_modules()):
+        raise unavailable(
+            f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
+        )
 
 
 class Coordinates(Record):

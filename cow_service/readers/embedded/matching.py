@@ -177,8 +177,10 @@ def _row(regions: Sequence[Region], phrase: ObjectPhrase) -> Row:
             colour = EXACT
         else:
             colour = NEAR if phrase.colour in region.colours else IMPOSSIBLE
-        said = (CALLED if phrase.noun in region.called else NOT_CALLED) if is_found else 0.0
-        row.append(_shape_ratio(region, phrase) + colour + said)
+        shape, is_called = _shape_ratio(region, phrase), phrase.noun in region.called
+        if is_called:  # outlines of real things are of many forms
+            shape = max(shape, LEAST)
+        row.append(shape + colour + (CALLED if is_called else NOT_CALLED if is_found else 0.0))
     return row
 
 
@@ -235,7 +237,9 @@ def _foremost(
     # Where no colour says for certain that one is meant, and the outlines speak against it, none is; nor is what is
     # clearly another kind of thing, such as a candle where a cone of its colour was not seen.
     is_sure = any(
-        _shape_ratio(each, phrase) >= POOR or (each.colour == phrase.colour and not is_other_kind(each, phrase.head))
+        phrase.noun in each.called
+        or _shape_ratio(each, phrase) >= POOR
+        or (each.colour == phrase.colour and not is_other_kind(each, phrase.head))
         for each in fitting
     )
     return fitting if is_sure else []
@@ -367,6 +371,7 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         region = scene.region_of(bbox)
         if region is None or phrase.inside_box or phrase.noun in region.called:
             continue
+        elsewhere = any(phrase.noun in each.called for each in scene.regions)
         place = f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})"
         # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
         head, looks, own = phrase.head or "", looks_like(region), form_of(phrase.head)
@@ -376,6 +381,9 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         colour = None if phrase.colour else like_a_colour(phrase.text)
         if colour is not None:
             warnings.append(f"'{phrase.text}' was taken for what is {place}: '{colour}' is no colour that is known.")
+            doubtful.add(bbox)
+        elif elsewhere:
+            warnings.append(f"'{phrase.text}' was taken for what is {place}: the detector calls another thing so.")
             doubtful.add(bbox)
         elif looks is not None and is_other and phrase.noun is not None and head not in _ANYTHING:
             warnings.append(f"'{phrase.text}' was taken for what is {place}, which looks like a {looks}, not '{head}'.")

@@ -46,7 +46,8 @@ export async function lightOf(mask) {
   const context = drawn(image, width, height);
   const { data } = context.getImageData(0, 0, width, height);
   outlineIn(context, width, height, Math.max(1, Math.round(width / 640)), FILL);
-  const covers = ([x, y]) => data[4 * (Math.floor(y * scale) * width + Math.floor(x * scale))] >= THRESHOLD;
+  const at = (value, length) => Math.min(length - 1, Math.max(0, Math.floor(value * scale)));
+  const covers = ([x, y]) => data[4 * (at(y, height) * width + at(x, width))] >= THRESHOLD;
   return { href: context.canvas.toDataURL(), covers };
 }
 

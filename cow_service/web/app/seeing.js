@@ -26,7 +26,11 @@ async function send(picture) {
 }
 
 function digestOf(picture) {
-  if (sent.url !== picture.url) sent = { url: picture.url, sha256: send(picture) };
+  if (sent.url !== picture.url) {
+    const mine = { url: picture.url, sha256: send(picture) };
+    mine.sha256.catch(() => { if (sent === mine) sent = { url: null, sha256: null }; }); // tried again where it is opened again
+    sent = mine;
+  }
   return sent.sha256;
 }
 
@@ -124,8 +128,9 @@ export function takeAsMover(thing) {
   const fresh = { ...corrections, grounding: object ? { object } : {} }; // another thing may have another shape
   set({ taken: thing });
   // Where the mover is given no reader looks for what the question asks about: what was found of it is given, too.
-  const own = corrections.objects.filter((each) => !known.some((other) => other.name === each.object));
-  const others = known.filter((each) => each.name !== object && !isSameBox(each.bbox, bbox) && isOnly(each, known));
+  const own = corrections.objects;
+  const others = known.filter((each) => each.name !== object && !isSameBox(each.bbox, bbox) && isOnly(each, known)
+    && !own.some((other) => other.object === each.name));
   const objects = [...own, ...others.map((each) => ({ object: each.name, bbox: each.bbox, mask: each.mask, role: "target" }))];
   correct({ objects, ...moverWith(simulation, fresh, { bbox, mask }) });
 }
