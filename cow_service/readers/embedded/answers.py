@@ -187,7 +187,7 @@ NOT_TOLD = "Not sure, because nothing in the image tells what was asked: its obj
 NO_OPTION = "The world's answer is '{said}', but not exactly one of the options says so."
 NOT_AMONG = "Not sure, because what is met first, '{said}', is not one of what the question asks about."
 NOT_IDENTIFIED = (
-    "Not sure, because something that the question names may be another thing or a part; the warnings say which."
+    "Not sure, because something that the question names may be another thing, or a part; see the warnings."
 )
 NOT_CLEAR = "Not sure, because a thing that matters was not seen clearly; the warnings say which."
 TOO_FAINT = "Not sure, because something may stand in the way that is too faint to tell; the warnings say where."

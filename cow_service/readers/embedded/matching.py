@@ -382,7 +382,7 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         if colour is not None:
             warnings.append(f"'{phrase.text}' was taken for what is {place}: '{colour}' is no colour that is known.")
             doubtful.add(bbox)
-        elif elsewhere:
+        elif elsewhere and _shape_ratio(region, phrase) <= CLEAR:  # a detector misses some
             warnings.append(f"'{phrase.text}' was taken for what is {place}: the detector calls another thing so.")
             doubtful.add(bbox)
         elif looks is not None and is_other and phrase.noun is not None and head not in _ANYTHING:
