@@ -1,14 +1,6 @@
 """The pipeline: what happens to a request, stage by stage. The only file that names the stages in order."""
 
-from cow_service.errors import (
-    Canceled,
-    CowError,
-    DeviceFailed,
-    InvalidRequest,
-    MllmUnavailable,
-    PerceptionUnavailable,
-    ReaderUnavailable,
-)
+from cow_service import errors
 from cow_service.readers.options import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
@@ -93,11 +85,18 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     )
 
 
-def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, CowError | None]:
+def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, errors.CowError | None]:
     """The simulation, or the error for which there is none. Raises what leaves no answer either."""
     try:
         return simulate(run), None
-    except (InvalidRequest, Canceled, MllmUnavailable, ReaderUnavailable, PerceptionUnavailable, DeviceFailed):
+    except (
+        errors.InvalidRequest,
+        errors.Canceled,
+        errors.MllmUnavailable,
+        errors.ReaderUnavailable,
+        errors.PerceptionUnavailable,
+        errors.DeviceFailed,
+    ):
         raise  # the last: another process may be able to imagine
-    except CowError as error:
+    except errors.CowError as error:
         return None, error

@@ -57,16 +57,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in question.drawings_named]
     # The others, and what is changed of all of them.
     mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
-    # Two masks tell whether two things are one, however much their boxes overlap.
-    beside = [
-        each
-        for each, other in zip(given, masks, strict=True)
-        if (
-            not is_same_object(each.bbox, mover.bbox)
-            if other is None or reading.mask is None
-            else mask_iou(other, reading.mask) <= SAME_MASK
-        )
-    ]
+    beside = [each for each, mask in zip(given, masks, strict=True) if not _is_mover(each, mask, reading)]
     boxes = [each.bbox for each in beside]
     seen = (each for each in reading.others if not is_among(each.bbox, boxes))
     others = (*beside, *(each.model_copy(update={"source": each.source or source}) for each in seen))
@@ -113,6 +104,13 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     things = (*others_of(grounding), *removed_of(grounding))
     artifacts = (mask.sha256, *(each.mask.sha256 for each in things if each.mask is not None))
     return StageResult(value=grounding, warnings=tuple(warnings), artifacts=artifacts, hints=reading.hints)
+
+
+def _is_mover(thing: LocatedObject, mask: Mask | None, mover: GroundingReading) -> bool:
+    """Whether a thing is what moves. Two masks [H, W] tell, however much their boxes overlap."""
+    if mask is None or mover.mask is None:
+        return is_same_object(thing.bbox, mover.bbox)
+    return mask_iou(mask, mover.mask) > SAME_MASK
 
 
 # --- places that the request gives
