@@ -144,7 +144,7 @@ def test_other_objects_a_law_and_no_ensemble(tmp_path: Path, picture: Path) -> N
     assert simulation.motion.law == "ballistic"
     assert [(one.object, one.bbox) for one in simulation.grounding.others] == [("blue cube", (430, 160, 510, 250))]
     twice = cow(tmp_path, "simulate", str(picture), QUESTION, *other)
-    assert "`objects.1` has the same box as `objects.0`" in twice.stderr
+    assert "`objects.1` lies in the same box as `objects.0`" in twice.stderr
     wrong = cow(tmp_path, "simulate", str(picture), QUESTION, "--other", "430,160")
     assert "--other takes NAME=X0,Y0,X1,Y1" in wrong.stderr
 

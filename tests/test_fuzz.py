@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import schemathesis
-from conftest import ROOT, SCALE, Server
+from conftest import ROOT, SCALE
 from engines import app_for
 from fuzz_hooks import POSTED, doable
 from hypothesis import HealthCheck, given, settings
@@ -20,6 +20,7 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
+from servers import SEEING, Served
 
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -41,6 +42,7 @@ def contract(tmp_path_factory: pytest.TempPathFactory):
         ("POST", "/simulate", GenerationMode.NEGATIVE),
         ("POST", "/answer", GenerationMode.POSITIVE),
         ("POST", "/answer", GenerationMode.NEGATIVE),
+        ("POST", "/look", GenerationMode.NEGATIVE),
         ("POST", "/v1/chat/completions", GenerationMode.POSITIVE),
         ("POST", "/v1/chat/completions", GenerationMode.NEGATIVE),
         ("POST", "/v1/responses", GenerationMode.POSITIVE),
@@ -81,15 +83,20 @@ def test_every_answer_is_in_the_contract(contract, method: str, path: str, mode:
 
 
 @pytest.mark.timeout(400 * SCALE)
-def test_a_real_server_keeps_the_contract(server: Server) -> None:
+def test_a_real_server_keeps_the_contract(tmp_path: Path) -> None:
     """Examples, coverage of every constraint, fuzzing, and chains of calls along the links of `openapi.yaml`."""
+    with Served(tmp_path, **SEEING, COW_MAX_BODY_MB="3") as server:
+        fuzz(str(server.http.base_url), tmp_path)
+
+
+def fuzz(address: str, folder: Path) -> None:
     command = [
-        str(Path(sys.executable).with_name("schemathesis")), "run", str(ROOT / "openapi.yaml"), "--url", server.address,
+        str(Path(sys.executable).with_name("schemathesis")), "run", str(ROOT / "openapi.yaml"), "--url", address,
         "--phases", "examples,coverage,fuzzing,stateful", "--max-examples", str(SCALE), "--seed", "1",
         "--suppress-health-check", "all", "--max-time", str(10 * SCALE),
         "--checks", ",".join(check.__name__ for check in CHECKS), "--request-timeout", "60",
         "--no-color", "--no-shrink",
-        "--generation-database", "none", "--continue-on-failure", "--report-dir", str(server.data / "fuzz"),
+        "--generation-database", "none", "--continue-on-failure", "--report-dir", str(folder / "fuzz"),
     ]  # fmt: skip
     hooks = os.environ | {"SCHEMATHESIS_HOOKS": "fuzz_hooks", "PYTHONPATH": str(Path(__file__).parent)}
     limit = 380 * SCALE
@@ -102,4 +109,4 @@ def test_the_contract_has_no_other_operations(contract) -> None:
     jobs = {"/jobs", "/jobs/{id}", *(f"/jobs/{{id}}/{part}" for part in ("request", "download", "events", "cancel"))}
     others = {"/artifacts/{sha256}", "/models", "/workers", "/livez", "/readyz", "/metrics"}
     chat = {"/v1/chat/completions", "/v1/responses", "/v1/models", "/v1/models/{model}"}
-    assert set(contract) == {"/simulate", "/answer"} | chat | jobs | others
+    assert set(contract) == {"/simulate", "/answer", "/look"} | chat | jobs | others

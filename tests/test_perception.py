@@ -7,16 +7,18 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import mllm_server as say
 import numpy as np
 import pytest
 from conftest import ROOT
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from runs import run_of
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
@@ -26,10 +28,12 @@ from cow_service.errors import CannotGround, PerceptionUnavailable
 from cow_service.media.images import decode_own, encode_png
 from cow_service.perception.base import Embedded, Perception, Prompt, Segment
 from cow_service.perception.outlines import outlines_at, outlines_in
+from cow_service.readers.mllm.reader import create
 from cow_service.records import Answer
 from cow_service.requests import AnswerRequest, LookRequest, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
+from cow_service.stages.grounding import ground
 from cow_service.vision.masks import bbox_of, mask_iou
 from cow_service.vision.types import Mask
 
@@ -252,6 +256,45 @@ def test_nouns_that_rules_do_not_know_are_known_by_the_detector(service: Service
     (gnome,) = simulate(service, CANDLE, **asked).grounding.others
     assert (gnome.object, gnome.is_doubtful) == ("gnome", False)
     assert gnome.bbox == bbox_of(truth.thing("cyan cone").mask)
+
+
+def test_boxes_of_a_multimodal_llm_are_outlined(service: Service) -> None:
+    """They lie some pixels off, and the outline is that of the thing."""
+    truth = read_truth(CANDLE)
+    candle, cone = (bbox_of(truth.thing(name).mask) for name in ("blue candle", "cyan cone"))
+    height, width = truth.image.shape[:2]
+
+    def place(name: str, box: tuple[float, float, float, float]) -> dict[str, Any]:
+        loose = [box[0] - 3, box[1] - 4, box[2] + 3, box[3] + 2]
+        scale = (1000 / width, 1000 / height) * 2
+        return {"label": name, "bbox_2d": [round(value * each) for value, each in zip(loose, scale, strict=True)]}
+
+    what = {"object": "blue candle", "others": ["cyan cone"], "kind": "linear", "sentence": "The candle slides."}
+    where = place("blue candle", candle) | {"others": [place("cyan cone", cone)]}
+    where |= {"cue": "text", "direction": [200, 500, 700, 500]}
+    with say.mllm_server() as mllm:
+        mllm.say(json.dumps(what), json.dumps(where))
+        reader = create(Settings(data_dir=service.settings.data_dir, mllm="qwen3-vl-8b", mllm_base_url=mllm.address))
+        run = run_of(truth.image, reader=lambda: reader, question="If the candle slides right, will it hit the cone?")
+        run.backends = replace(run.backends, perception=TrueModels(truth))
+        found = ground(run).value
+        reader.close()
+    assert found.bbox == candle
+    (other,) = found.others
+    assert (other.object, other.bbox, other.is_doubtful) == ("cyan cone", cone, False)
+    assert other.mask is not None
+
+
+def test_a_picture_of_nothing_gives_no_answer(service: Service) -> None:
+    truth = read_truth(CANDLE)
+    _, png = cv2.imencode(".png", np.full((*truth.image.shape[:2], 3), 128, np.uint8))
+    empty = type(truth)("nothing", truth.image, (), truth.depth, truth.camera)
+    service.perception = TrueModels(empty, false=1.0)
+    body = body_of(CANDLE, image=f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}")
+    answer = service.answer(AnswerRequest.model_validate(body))
+    assert answer.not_sure
+    assert answer.simulation_problem is not None
+    assert answer.simulation_problem.code == "cannot-ground"
 
 
 # --- depth

@@ -161,7 +161,7 @@ def print_models(models: records.Models, *, as_json: bool) -> None:
     table = Table("role", "name", "ready", "what it is", box=None, pad_edge=False)
     for backend in (*models.readers, *models.generators, *models.perception):
         name = backend.name + (" (default)" if backend.default else "")
-        table.add_row(backend.kind, name, _readiness(backend), backend.summary)
+        table.add_row(backend.kind or "", name, _readiness(backend), backend.summary)
     console = Console()
     console.print(table)
     console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)
@@ -253,7 +253,7 @@ def examine(service: Service) -> Report:
         data_folder=str(service.settings.data_dir),
         free_disk_gb=round(shutil.disk_usage(folder).free / 1e9, 1),
         problem=problem,
-        backends=[*models.readers, *models.generators],
+        backends=[*models.readers, *models.generators, *models.perception],
         unserved=list(unserved),
         jobs_problem=jobs_problem,
     )

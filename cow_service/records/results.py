@@ -263,7 +263,7 @@ class BackendInfo(Record):
     """A reader, a generator or a model that sees: what it is, what it needs, whether it is ready."""
 
     name: str
-    kind: BackendKind
+    kind: BackendKind | None = Field(default=None, description="Null only from servers that do not tell it yet.")
     default: bool = Field(description="Used where a request names none; of models that see: used by the server.")
     ready: bool | None = Field(description="Null where nothing is known of it before it is used.")
     needs: tuple[str, ...] = Field(default=(), description="Python modules that it uses.")
