@@ -20,6 +20,7 @@ from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.vision.circles import Edges
+from cow_service.vision.regions import measure
 from cow_service.vision.scene import Scene
 from cow_service.vision.trail_removal import without_earlier_shadows
 from cow_service.vision.trails import Position, Trail, find_trails, trail_of
@@ -36,12 +37,16 @@ def scene_with(opacities: list[float], places: list[tuple[float, float]] = PLACE
     return jpeg(trail(image, places, [26.0] * len(places), ORANGE, opacities), 95)
 
 
+def trails_of(image: np.ndarray) -> tuple[Trail, ...]:
+    return find_trails(image, measure(image))
+
+
 OPAQUE, FADED = scene_with([1.0] * 4), scene_with([0.3, 0.5, 0.7, 1.0])
 
 
 @pytest.mark.parametrize("image", [OPAQUE, FADED], ids=["opaque", "faded"])
 def test_every_position_of_a_drawn_trail_is_found(image: np.ndarray) -> None:
-    (found,) = find_trails(image)
+    (found,) = trails_of(image)
     seen = sorted(position.centre for position in found.positions)
     assert found.evident
     assert np.abs(np.array(seen) - np.array(sorted(PLACES))).max() < 1.5
@@ -49,14 +54,14 @@ def test_every_position_of_a_drawn_trail_is_found(image: np.ndarray) -> None:
 
 
 def test_the_opaque_end_of_a_faded_trail_is_the_present_position() -> None:
-    (found,) = find_trails(FADED)
+    (found,) = trails_of(FADED)
     assert found.end_known
     assert math.dist(found.present.centre, PLACES[-1]) < 1.5
     assert [round(position.opacity, 1) for position in found.positions] == pytest.approx([0.3, 0.5, 0.7, 1.0], abs=0.11)
 
 
 def test_a_multiple_exposure_leaves_the_end_to_the_words() -> None:
-    (found,) = find_trails(OPAQUE)
+    (found,) = trails_of(OPAQUE)
     assert not found.end_known
     for ended in (found.ending(near=(460, 230, 530, 300)), found.ending(side=(1.0, 0.0))):
         assert math.dist(ended.present.centre, PLACES[-1]) < 1.5
@@ -66,11 +71,11 @@ def test_a_multiple_exposure_leaves_the_end_to_the_words() -> None:
 def test_what_is_no_trail() -> None:
     capsule = floor()
     cv2.line(capsule, (120, 300), (200, 120), GREEN, 44, cv2.LINE_AA)
-    assert find_trails(capsule) == ()
+    assert trails_of(capsule) == ()
     three = floor()
     for x, rgb in ((150, ORANGE), (210, GREEN), (270, PURPLE)):
         three = ball(three, (x, 200), 24, rgb)
-    assert find_trails(three) == ()
+    assert trails_of(three) == ()
 
 
 def test_three_balls_that_stand_apart_are_a_trail_only_where_the_question_says_so() -> None:
@@ -85,7 +90,7 @@ def test_three_balls_that_stand_apart_are_a_trail_only_where_the_question_says_s
 
 @pytest.mark.parametrize("image", sorted(EXAMPLES.glob("*/image.jpg")), ids=lambda path: path.parent.name)
 def test_the_examples_show_no_trail(image: Path) -> None:
-    assert find_trails(np.ascontiguousarray(cv2.imread(str(image))[..., ::-1])) == ()
+    assert trails_of(np.ascontiguousarray(cv2.imread(str(image))[..., ::-1])) == ()
 
 
 @pytest.mark.parametrize(("image", "present"), [(FADED, 3), (OPAQUE, 3), (OPAQUE, 0)], ids=["faded", "last", "first"])

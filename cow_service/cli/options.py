@@ -162,7 +162,7 @@ def request_body(
             metavar="NAME=X0,Y0,X1,Y1",
         ),
     ] = None,
-    ensemble: Annotated[int, option("How many worlds the probabilities are counted in; 0: none.")] = 50,
+    ensemble: Annotated[int, option("How many worlds the probabilities are counted in, at most; 0: none.")] = 50,
     depth: Annotated[Path | None, option("Depth map of the image: a grey PNG with 16 bits.", **EXISTING)] = None,
     depth_scale: Annotated[float | None, option("Metres per unit of the depth map.", shown="not known")] = None,
     trajectory: Annotated[Path | None, option("JSON with the `trajectory` of a request.", **EXISTING)] = None,

@@ -44,13 +44,12 @@ class YuvFrames:
         height, width = rgb.shape[:2]
         rows, columns = slice(0, height), slice(0, width)
         if not self._is_first:  # the window, of even sides, in which it differs from the frame before
-            differs = rgb.reshape(height, -1) != self._rgb.reshape(height, -1)
-            found = np.nonzero(differs.any(axis=1))[0]
-            if not len(found):
+            differs = np.asarray(cv2.absdiff(rgb, self._rgb)).reshape(height, 3 * width)
+            left, top, across, down = cv2.boundingRect(differs)
+            if not across:
                 return self._planes
-            rows = slice(int(found[0]) // 2 * 2, int(found[-1]) // 2 * 2 + 2)
-            found = np.nonzero(differs[rows].any(axis=0))[0] // 3
-            columns = slice(int(found[0]) // 2 * 2, int(found[-1]) // 2 * 2 + 2)
+            rows = slice(top // 2 * 2, (top + down + 1) // 2 * 2)
+            columns = slice(left // 3 // 2 * 2, ((left + across - 1) // 3 + 2) // 2 * 2)
         part = rgb[rows, columns]
         self._planes[rows, columns] = cv2.transform(part, _TO_LUMA).reshape(part.shape[:2])
         halved = cv2.resize(part, (part.shape[1] // 2, part.shape[0] // 2), interpolation=cv2.INTER_AREA)
@@ -121,9 +120,11 @@ def _encode(frames: Iterable[Pixels], path: Path, rate: Fraction, width: int, he
             if pixels.shape != (height, width, 3) or pixels.dtype != np.uint8:
                 shape = f"{pixels.shape} of {pixels.dtype}"
                 raise ValueError(f"Frame {count} is {shape}: it must be {(height, width, 3)} of uint8.")
-            pixels = np.ascontiguousarray(pixels)  # noqa: PLW2901
-            even = cv2.copyMakeBorder(pixels, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-            frame = av.VideoFrame.from_ndarray(planes.converted(np.asarray(even, np.uint8)), format="yuv420p")
+            even = np.ascontiguousarray(pixels)
+            if height % 2 or width % 2:
+                border = cv2.copyMakeBorder(even, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+                even = np.asarray(border, np.uint8)
+            frame = av.VideoFrame.from_ndarray(planes.converted(even), format="yuv420p")
             frame.colorspace, frame.color_range = Colorspace.ITU709, ColorRange.MPEG
             frame.pts, frame.time_base = count, context.time_base
             container.mux(stream.encode(frame))

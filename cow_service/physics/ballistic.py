@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -86,14 +87,19 @@ class Course:
     legs: tuple[Leg, ...]
     halts: bool = False  # it is stopped where it first meets a body
 
+    @cached_property
+    def ends(self) -> tuple[float, ...]:
+        """When each leg ends, s."""
+        return tuple(itertools.accumulate(leg.duration for leg in self.legs))
+
     @property
     def end(self) -> float:
         """When the last leg ends, s."""
-        return sum(leg.duration for leg in self.legs)
+        return self.ends[-1]
 
     def changes(self, start: float, end: float) -> bool:
         """Whether a leg ends between two times (s)."""
-        return any(start < at < end for at in itertools.accumulate(leg.duration for leg in self.legs))
+        return any(start < at < end for at in self.ends)
 
     def mean_velocity(self, start: float, end: float) -> Floats:
         """[3] m/s, between two times (s): with it, steps of any length lead to the same places."""

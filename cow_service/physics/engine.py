@@ -1,8 +1,9 @@
 """Runs worlds of rigid bodies on a floor with Rapier: bounces, pushes, rolling, tipping, coming to rest.
 
 Many worlds run in one engine, side by side on one floor and apart, because a step of the engine costs less than
-reading its results. Coordinates are metres right, above the floor and ahead. Inside the engine lengths are scaled so
-that bodies have the size for which its tolerances are made; gravity is scaled alike, so that times stay seconds.
+reading its results: those are kept as they come, and made arrays of every few frames. Coordinates are metres right,
+above the floor and ahead. Inside the engine lengths are scaled so that bodies have the size for which its tolerances
+are made; gravity is scaled alike, so that times stay seconds.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import rapier3d as rapier
+from numpy.typing import NDArray
 
+from cow_service.concurrency import on_one_core
 from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.records import Shape
 from cow_service.vision.types import Floats, Mask
@@ -87,7 +90,8 @@ class RigidShape:
 ENGINE_SIZE = 0.15  # m inside the engine: half the width of the first body of the first world
 SPACING = 24.0  # m inside the engine, between worlds
 COLOURS = 5  # worlds so many places apart, along and across, share a collision group
-REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what gets further away is taken out
+REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what would get further away is taken out
+CHECKED = 4  # recorded frames after which it is asked what is far away, finished, or at rest
 LEAST_STEPS, LEAST_STEPS_OF_MANY = 60.0, 30.0  # steps per second, at least, of a world alone and of many
 FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.5
 MOST_GRAVITY = 500.0  # m/s^2 inside the engine: what is smaller than 3 mm would sink into the floor between two steps
@@ -148,7 +152,8 @@ def run_worlds(
 
     The same input gives the same output, bit by bit.
     """
-    return _Engine(worlds, num_frames, fps, every, finished, turns_wanted, path_fps or fps).run(until_rest)
+    with on_one_core():  # steps run in a thread of the engine: to wake it on another core takes longer than a step
+        return _Engine(worlds, num_frames, fps, every, finished, turns_wanted, path_fps or fps).run(until_rest)
 
 
 class _Engine:
@@ -189,9 +194,16 @@ class _Engine:
         cells = [k % side % COLOURS * COLOURS + k // side % COLOURS for k in range(len(worlds))]
         self.groups = [rapier.Group(1 << cell) for cell in cells]
         everything = [((k, i), body) for k, bodies in enumerate(worlds) for i, body in enumerate(bodies)]
-        self.followers = {which: body.follows for which, body in everything if body.follows is not None}
+        steps = (np.arange((num_frames - 1) * self.substeps) + 1) / (fps * self.substeps)  # s, at their ends
+        self.followers = {
+            (k, i): _along(body.follows, steps * path_fps) * self.scale + self.origin[k]
+            for (k, i), body in everything
+            if body.follows is not None
+        }
         self.courses = {which: body.course for which, body in everything if body.course is not None}
+        self.turns_of_courses = sorted({time for course in self.courses.values() for time in course.ends})
         self.handles = [[self.add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
+        self.bodies = [[self.world.rigid_bodies[handle] for handle in row] for row in self.handles]
         shape = len(worlds), len(worlds[0]), len(self.frames)
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
         self.meetings: list[list[Meeting]] = [[] for _ in worlds]
@@ -200,21 +212,24 @@ class _Engine:
         self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
         self.touching: list[dict[int, set[int]]] = [{} for _ in worlds]
         self.joined: dict[frozenset[tuple[int, int]], int] = {}  # pairs of colliders that touch, per pair of bodies
+        self.recorded: _Recorded | None = None  # None: another body moves since the last frame
+        self.kept: list[_Frame] = []  # what was recorded since the last check
 
     def run(self, until_rest: bool) -> list[WorldRun]:
-        self.record([(k, i) for k, bodies in enumerate(self.worlds) for i in range(len(bodies))], 0)
-        row = 0
-        for row in range(1, len(self.frames)):
-            self.advance(self.frames[row - 1])
-            for moving in (self.positions, self.velocities, self.turns):
-                moving[:, :, row] = moving[:, :, row - 1]
-            self.positions[:, :, row] += self.drift[..., None] * self.velocities[:, :, row] * (self.every / self.fps)
-            self.record([(k, i) for k, awake in enumerate(self.awake) for i in awake if not self.drift[k, i]], row)
-            if self.finished is not None:
-                for k in np.nonzero(self.finished(self.positions[:, 0, row], self.velocities[:, 0, row]))[0].tolist():
-                    self.take_out(k, 0, row)
-            if until_rest and self.is_at_rest(row):
-                break
+        self.record(_Recorded.of(self.bodies, [set(range(len(bodies))) for bodies in self.worlds], self.drift))
+        self.check(0)
+        row, last, checked = 0, len(self.frames) - 1, 0
+        while row < last:
+            self.advance(self.frames[row])
+            row += 1
+            if self.recorded is None:
+                self.recorded = _Recorded.of(self.bodies, self.awake, self.drift)
+            self.record(self.recorded)
+            if row - checked == CHECKED or row == last:
+                self.check(row)
+                checked = row
+                if until_rest and self.is_at_rest(row):
+                    break
         positions, velocities, turns = (v[:, :, : row + 1] for v in (self.positions, self.velocities, self.turns))
         return [
             WorldRun(positions[k], velocities[k], turns[k], self.meetings[k], set(self.awake[k]))
@@ -265,23 +280,20 @@ class _Engine:
         if body.middle is not None and body.hollow is None:
             builder = builder.additional_mass_properties(_mass_properties(body, self.scale))
         handle = self.world.add_body(builder, colliders=colliders)
-        for collider in self.body_of(handle).colliders:
+        for collider in self.world.rigid_bodies[handle].colliders:
             self.owner[collider.index] = k, i
         return handle
 
-    def body_of(self, handle: rapier.RigidBodyHandle) -> rapier.RigidBody:
-        return self.world.rigid_bodies[handle]
-
     def advance(self, frame: int) -> None:
         """From one recorded frame to the next."""
-        for step in range(self.every * self.substeps):
-            time = frame / self.fps + step / (self.fps * self.substeps)
-            self.steer(time, 1 / (self.fps * self.substeps))
-            before: dict[tuple[int, int], Floats] = {}  # velocities
-            if self.is_alone:
-                before = {(0, i): np.array(self.body_of(self.handles[0][i]).linvel.to_tuple()) for i in self.awake[0]}
-            self.world.step()
-            for event in self.collector.drain_collision_events():
+        world, drain, step = self.world, self.collector.drain_collision_events, 1 / (self.fps * self.substeps)
+        for number in range(frame * self.substeps, (frame + self.every) * self.substeps):
+            time = number * step
+            self.steer(number, step)
+            # Velocities before the step, of which meetings tell the change.
+            before = {(0, i): self.bodies[0][i].linvel for i in self.awake[0]} if self.is_alone else {}
+            world.step()
+            for event in drain():
                 first, second = event.collider1.index, event.collider2.index
                 # Containers have many colliders: bodies begin to touch with the first pair of them.
                 pair = frozenset((self.owner.get(first, FLOOR), self.owner.get(second, FLOOR)))
@@ -290,16 +302,18 @@ class _Engine:
                 if event.started and touching == 0:
                     self.meet(time, first, second, before)
 
-    def steer(self, time: float, step: float) -> None:
-        """Has bodies follow their paths and courses from a time on for one step (s)."""
+    def steer(self, number: int, step: float) -> None:
+        """Has bodies follow their paths and courses for one step (s) by its number."""
         for (k, i), path in self.followers.items():
-            at = min((time + step) * self.path_fps, len(path) - 1.0)
-            low = min(int(at), len(path) - 2)
-            there = (path[low] + (at - low) * (path[low + 1] - path[low])) * self.scale + self.origin[k]
-            self.body_of(self.handles[k][i]).set_next_kinematic_translation(tuple(there.tolist()))
+            self.bodies[k][i].set_next_kinematic_translation(tuple(path[number].tolist()))
+        time = number * step
+        while self.turns_of_courses and self.turns_of_courses[0] <= time - 1.5 * step:
+            del self.turns_of_courses[0]
+        if not self.turns_of_courses or self.turns_of_courses[0] >= time + step:
+            return
         for (k, i), course in list(self.courses.items()):
             if course.changes(time - 1.5 * step, time + step):
-                body, shape = self.body_of(self.handles[k][i]), self.worlds[k][i]
+                body, shape = self.bodies[k][i], self.worlds[k][i]
                 x, y, z = (course.mean_velocity(time, time + step) * self.scale).tolist()
                 body.linvel = rapier.Vec3(x, body.linvel.y if shape.falls else y, z)
                 if shape.shape == "sphere" and shape.falls:  # on the floor it rolls
@@ -311,10 +325,10 @@ class _Engine:
     def release(self, k: int, i: int) -> None:
         """A body glides no more: from now on it is subject to friction."""
         self.courses.pop((k, i), None)
-        for collider in self.body_of(self.handles[k][i]).colliders:
+        for collider in self.bodies[k][i].colliders:
             self.world.colliders[collider].friction = self.worlds[k][i].friction
 
-    def meet(self, time: float, first: int, second: int, before: dict[tuple[int, int], Floats]) -> None:
+    def meet(self, time: float, first: int, second: int, before: dict[tuple[int, int], rapier.Vec3]) -> None:
         """Notes that two colliders begin to touch. The lower body comes first, the floor last."""
         met = sorted(self.owner[index] for index in (first, second) if index in self.owner)
         if not met:
@@ -322,8 +336,7 @@ class _Engine:
         (k, a), b = met[0], met[1][1] if len(met) > 1 else None
         impulse = 0.0
         if (k, a) in before:
-            after = np.array(self.body_of(self.handles[k][a]).linvel.to_tuple())
-            impulse = float(np.linalg.norm(after - before[k, a])) / self.scale
+            impulse = math.dist(self.bodies[k][a].linvel.to_tuple(), before[k, a].to_tuple()) / self.scale
         self.meetings[k].append(Meeting(time, a, b, impulse))
         if b is None or self.worlds[k][a].is_ghostly or self.worlds[k][b].is_ghostly:
             return
@@ -340,7 +353,7 @@ class _Engine:
                 course = self.courses.get((k, i))
                 self.release(k, i)
                 if course is not None and course.halts:
-                    for stopped in (self.body_of(self.handles[k][each]) for each in (a, b)):
+                    for stopped in (self.bodies[k][each] for each in (a, b)):
                         stopped.linvel = stopped.angvel = rapier.Vec3(0.0, 0.0, 0.0)
 
     def wake(self, k: int, bodies: set[int]) -> None:
@@ -349,29 +362,72 @@ class _Engine:
         while waiting:
             i = waiting.pop()
             self.awake[k].add(i)
+            self.recorded = None
             waiting += self.touching[k].get(i, set()) - self.awake[k]
 
-    def record(self, which: Sequence[tuple[int, int]], row: int) -> None:
-        """Writes down where some bodies of worlds are."""
-        if not which:
-            return
-        bodies = [self.body_of(self.handles[k][i]) for k, i in which]
-        k, i = (np.array(column) for column in zip(*which, strict=True))
-        positions = np.array([body.translation.to_tuple() for body in bodies]) - self.origin[k]
-        self.positions[k, i, row] = positions / self.scale
-        self.velocities[k, i, row] = np.array([body.linvel.to_tuple() for body in bodies]) / self.scale
-        if self.records_turns:
-            turns = [body.rotation for body in bodies]
-            self.turns[k, i, row] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
-        for far in np.nonzero(np.abs((positions - self.middle[k])[:, [0, 2]]).max(axis=1) > REACH)[0].tolist():
-            self.take_out(*which[far], row)
+    def record(self, which: _Recorded) -> None:
+        """Keeps where some bodies are."""
+        bodies = which.bodies
+        turns = [body.rotation for body in bodies] if self.records_turns else []
+        self.kept.append((which, [body.translation for body in bodies], [body.linvel for body in bodies], turns))
+
+    def check(self, row: int) -> None:
+        """Writes down what was recorded up to a row, and takes out what is far away or finished."""
+        for at, (which, *moving_points, turns) in enumerate(self.kept, row + 1 - len(self.kept)):
+            for moving in (self.positions, self.velocities, self.turns):
+                moving[:, :, at] = moving[:, :, max(0, at - 1)]
+            self.positions[:, :, at] += self.drift[..., None] * self.velocities[:, :, at] * (self.every / self.fps)
+            if not which.bodies:
+                continue
+            k, i = which.places
+            positions, velocities = (np.array([value.to_tuple() for value in values]) for values in moving_points)
+            self.positions[k, i, at] = (positions - self.origin[k]) / self.scale
+            self.velocities[k, i, at] = velocities / self.scale
+            if self.records_turns:
+                self.turns[k, i, at] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
+        self.kept.clear()
+        ahead = self.velocities[:, :, row] * (CHECKED * self.every / self.fps)  # until the next check
+        away = (self.positions[:, :, row] + ahead) * self.scale - self.middle[:, None]
+        far = (np.abs(away[..., [0, 2]]).max(axis=2) > REACH) & ~self.drift
+        for k, i in np.argwhere(far).tolist():
+            if i in self.awake[k]:
+                self.take_out(k, i, row)
+        if self.finished is not None and row:
+            for k in np.nonzero(self.finished(self.positions[:, 0, row], self.velocities[:, 0, row]))[0].tolist():
+                self.take_out(k, 0, row)
 
     def take_out(self, k: int, i: int, row: int) -> None:
         """Leaves a body out of what is computed from now on: it keeps its last velocity over the floor."""
         if not self.drift[k, i]:
-            self.body_of(self.handles[k][i]).is_enabled = False
-            self.drift[k, i] = True
+            self.bodies[k][i].is_enabled = False
+            self.drift[k, i], self.recorded = True, None
             self.velocities[k, i, row, 1] = 0.0
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """The bodies that are recorded as long as no other begins to move and none is taken out."""
+
+    bodies: list[rapier.RigidBody]
+    places: tuple[NDArray[np.int64], NDArray[np.int64]]  # [N] each: their worlds, and their places in these
+
+    @staticmethod
+    def of(bodies: Sequence[Sequence[rapier.RigidBody]], awake: Sequence[set[int]], drift: Mask) -> _Recorded:
+        """Those that are awake and not taken out."""
+        which = [(k, i) for k, moving in enumerate(awake) for i in sorted(moving) if not drift[k, i]]
+        k, i = np.array(which, np.int64).reshape(-1, 2).T
+        return _Recorded([bodies[k][i] for k, i in which], (k, i))
+
+
+_Frame = tuple[_Recorded, list[rapier.Vec3], list[rapier.Vec3], list[rapier.Rotation3]]
+"""Positions, velocities and rotations of bodies."""
+
+
+def _along(path: Floats, at: Floats) -> Floats:
+    """Positions [N, 3] along a path [F, 3], at frames of it [N] that need not be whole; at rest after its end."""
+    at = np.minimum(at, len(path) - 1.0)
+    low = np.minimum(at.astype(np.int64), len(path) - 2)
+    return path[low] + (at - low)[:, None] * (path[low + 1] - path[low])
 
 
 def _combined(collider: rapier.ColliderBuilder) -> rapier.ColliderBuilder:

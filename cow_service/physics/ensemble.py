@@ -2,21 +2,25 @@
 
 The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, or
 `SURE_OF_MISS` where a throw meets nothing, and robust where it has at least `ROBUST` of them.
+
+Worlds are run in batches, until those that are left are not likely to change that (a sequential test): what all of the
+first batch agree on is settled.
 """
 
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from math import ceil, comb, floor
 
 import numpy as np
 
 from cow_service.physics.draws import NAMES, PARAMETERS, ensemble, likeliest
 from cow_service.physics.events import NEVER, WorldEvents, find_world_events
-from cow_service.physics.world import WorldInput, Worlds, run_world
+from cow_service.physics.world import DrawnWorlds, WorldInput, Worlds, run_world
 from cow_service.records import Asked, AskedForm, AskedRelation, Doubt, EncounterKind
 from cow_service.vision.types import Floats, Mask
 
+BATCHES = (15, 30)  # worlds after which it is asked whether all that are wanted have to be run
 EVERY = 2  # frames of its clock between those that are recorded of the ensemble
 TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
 SURE = 0.7  # share of the worlds from which an answer is given
@@ -24,6 +28,8 @@ SURE = 0.7  # share of the worlds from which an answer is given
 # the heading makes worlds miss, and hardly ever hit.
 SURE_OF_MISS = 0.85
 ROBUST = 0.9
+# The chance, at most, that those which are left would change whether the answer is sure, and whether it is robust.
+MAY_CHANGE, MAY_CHANGE_ROBUST = 0.01, 0.12
 MATTERS = 0.2  # correlation with the outcome from which a parameter is named
 MOST_NAMED = 3
 
@@ -48,7 +54,7 @@ class Query:
 class Decided:
     """What the worlds say to a question."""
 
-    probability: float | None
+    probability: float
     sure: bool
     robust: bool
     depends_on: tuple[Doubt, ...]
@@ -95,27 +101,72 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
         pairs = zip(given, queries, strict=True)
         return tuple(EnsembleResult(each, _run(each, likeliest()), None, asked, None) for each, asked in pairs)
     rows = ensemble(size)
-    # Side by side: the engine's steps, half of the time, are not held up by the interpreter's lock.
-    with ThreadPoolExecutor(1) as beside:
-        likely = beside.submit(lambda: [_run(each, likeliest()) for each in given])
-        worlds = [_run(each, rows, EVERY) for each in given]
-        shown = likely.result()
-    decided: list[Decided | None] = []
-    for asked, each in zip(queries, worlds, strict=True):
-        if asked is None or not asked.is_decidable or (asked.asked.form == "changes" and len(worlds) == 1):
-            decided.append(None)
-        elif asked.asked.form == "changes":
-            decided.append(decide_change(asked, each.events, worlds[1].events, rows))
-        else:
-            decided.append(decide(asked, each.events, rows))
+    drawn = [DrawnWorlds.of(each, rows, EVERY) for each in given]
+    worlds, decided = list[ObservedWorlds](), list[Decided | None]()
+    count = 0
+    for most in (*(batch for batch in BATCHES if batch < size), size):
+        run = [each.run(slice(count, most)) for each in drawn]
+        if count:
+            layouts = [each.layout.of(slice(0, most)) for each in drawn]
+            run = [each.worlds.joined(*more) for each, more in zip(worlds, zip(run, layouts, strict=True), strict=True)]
+        count = most
+        worlds = [_observed(*each, rows[:count]) for each in zip(given, run, strict=True)]
+        decided = _decide(queries, worlds, rows[:count])
+        verdicts = [each for each in decided if each is not None]
+        if len(verdicts) == len(decided) and all(_is_settled(each, query, count, size) for each in verdicts):
+            break
+    rows, shown = rows[:count], [_run(each, likeliest()) for each in given]
     if query is not None and any(each is not None and each.sure for each in decided):
         shown = _agreeing(given, query, decided, rows, worlds, shown)
     return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
 
 
-def _run(world: WorldInput, draws: Floats, every: int = 1) -> ObservedWorlds:
-    worlds = run_world(world, draws, every)
+def _run(world: WorldInput, draws: Floats) -> ObservedWorlds:
+    return _observed(world, run_world(world, draws), draws)
+
+
+def _observed(world: WorldInput, worlds: Worlds, draws: Floats) -> ObservedWorlds:
     return ObservedWorlds(worlds, find_world_events(worlds.within_horizon, world.bodies, draws, world.size))
+
+
+def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], draws: Floats) -> list[Decided | None]:
+    """What is decided of each world; None where worlds decide nothing."""
+    decided: list[Decided | None] = []
+    for asked, each in zip(queries, worlds, strict=True):
+        if asked is None or not asked.is_decidable or (asked.asked.form == "changes" and len(worlds) == 1):
+            decided.append(None)
+        elif asked.asked.form == "changes":
+            decided.append(decide_change(asked, each.events, worlds[1].events, draws))
+        else:
+            decided.append(decide(asked, each.events, draws))
+    return decided
+
+
+def _is_settled(decided: Decided, query: Query | None, count: int, size: int) -> bool:
+    """Whether so many worlds, drawn from `size`, are not likely to say otherwise than all of them would.
+
+    The worlds that agree are hypergeometrically distributed; what all of them would say differs where they cross a
+    share, and is likeliest to do so just beyond it.
+    """
+    share = decided.probability
+    if query is not None and query.asked.form in ("whether", "when", "changes"):
+        share = max(share, 1 - share)
+    sure = {SURE, SURE if query is None else query.sure_of_miss}
+    return all(
+        _chance_beyond(share * count, count, size, least) < may_change
+        for least, may_change in (*((each, MAY_CHANGE) for each in sure), (ROBUST, MAY_CHANGE_ROBUST))
+    )
+
+
+def _chance_beyond(agreeing: float, count: int, size: int, share: float) -> float:
+    """The chance of so many agreeing ones, or of more extreme numbers, among `count` drawn from `size` worlds of which
+    the agreeing share lies just beyond a share, on the other side than theirs."""
+    least = ceil(share * size)  # of all, to reach it
+    if agreeing >= share * count:
+        total, seen = least - 1, range(floor(agreeing), count + 1)
+    else:
+        total, seen = least, range(ceil(agreeing) + 1)
+    return sum(comb(total, each) * comb(size - total, count - each) for each in seen) / comb(size, count)
 
 
 def _agreeing(

@@ -61,6 +61,18 @@ class Layout:
     unsupported: frozenset[int] = frozenset()  # bodies whose support was taken away, or put elsewhere
     put: frozenset[int] = frozenset()  # bodies that were put where they are
 
+    def of(self, draws: slice) -> Layout:
+        """That of some draws."""
+        return replace(
+            self,
+            cameras=self.cameras.of(draws),
+            bodies=tuple(body.of(draws) for body in self.bodies),
+            velocity=self.velocity[draws],
+            further=tuple(leg[draws] for leg in self.further),
+            others={body: velocity[draws] for body, velocity in self.others.items()},
+            light=self.light[draws],
+        )
+
     def first(self, count: int) -> Layout:
         """Without the bodies behind the first ones, which are taken away: what stood on them has no support."""
         loose: set[int] = set()

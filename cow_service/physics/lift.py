@@ -66,6 +66,10 @@ class Cameras:
         focal, axes, height = (np.repeat(values[one], count, axis=0) for values in (self.focal, self.axes, self.height))
         return replace(self, focal=focal, axes=axes, height=height)
 
+    def of(self, draws: slice) -> Cameras:
+        """Those of some draws."""
+        return replace(self, focal=self.focal[draws], axes=self.axes[draws], height=self.height[draws])
+
     def rays(self, point: tuple[float, float] | Floats) -> Floats:
         """Rays [K, 3] through an image point (px), or through one each [K, 2]: right, up and ahead, of depth 1."""
         across = (np.asarray(point, np.float64) - np.array([self.width / 2, self.height_px / 2])) / self.focal[:, None]
@@ -106,6 +110,12 @@ class LiftedBody:
         """As the first draw has it, so many times."""
         centre, *halves = (np.repeat(v[:1], count, axis=0) for v in (self.centre, self.half_width, self.half_height))
         return replace(self, centre=centre, half_width=halves[0], half_height=halves[1])
+
+    def of(self, draws: slice) -> LiftedBody:
+        """As some draws have it."""
+        share = self.depth_share[draws] if isinstance(self.depth_share, np.ndarray) else self.depth_share
+        centre, half, tall = self.centre[draws], self.half_width[draws], self.half_height[draws]
+        return replace(self, centre=centre, half_width=half, half_height=tall, depth_share=share)
 
     @property
     def top(self) -> Floats:

@@ -6,6 +6,8 @@ a tenth of the container's depth below the rim, is `on-the-rim`: it is held up t
 in the worlds in which it ends as it was meant to: inside; on top; or, beside others, without overlapping them.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -70,6 +72,13 @@ class Placements:
     clearance: Floats  # [K]: width of the opening or gap less that of the body, as a share of it; nan without one
     above_rim: Floats  # [K]: share of the body's height above the rim; nan but for `into` a container
     released: float  # s
+
+    def joined(self, other: Placements) -> Placements:
+        """With those of more draws."""
+        clearance, above = (
+            np.concatenate(both) for both in ((self.clearance, other.clearance), (self.above_rim, other.above_rim))
+        )
+        return replace(self, results=(*self.results, *other.results), clearance=clearance, above_rim=above)
 
     @property
     def fits(self) -> Mask:

@@ -114,6 +114,22 @@ class Worlds:
     before: tuple[Placements, ...] = ()  # of what is put somewhere before anything moves
     seen: tuple[tuple[RigidShape, ...], ...] | None = None  # per draw, then: bodies as the image shows them
 
+    def joined(self, other: Worlds, layout: Layout) -> Worlds:
+        """With those of more draws, and the layout of all of them; where the others' rest begins later, until then."""
+        frames = max(each.runs[0].positions.shape[1] for each in (self, other))
+        placements = None
+        if self.placements is not None and other.placements is not None:
+            placements = self.placements.joined(other.placements)
+        return replace(
+            self,
+            layout=layout,
+            shapes=(*self.shapes, *other.shapes),
+            runs=(*self.cut(frames).runs, *other.cut(frames).runs),
+            placements=placements,
+            before=tuple(one.joined(more) for one, more in zip(self.before, other.before, strict=True)),
+            seen=None if self.seen is None or other.seen is None else (*self.seen, *other.seen),
+        )
+
     def cut(self, frames: int, until: float = math.inf) -> Worlds:
         """With so many recorded frames, the last one repeated as needed, and the meetings up to a time (s)."""
         return replace(self, runs=tuple(run.cut(frames, until) for run in self.runs))
@@ -130,36 +146,57 @@ def run_world(given: WorldInput, draws: Floats, every: int = 1) -> Worlds:
 
     One world alone runs at the clip's frame rate and covers the clip; many run at a rate of their own.
     """
-    fps, frames = CLOCK, math.ceil(given.horizon * CLOCK) + 1
-    if len(draws) == 1:
-        fps, frames = given.fps, given.frames
-    bodies, goals = (*given.bodies, *given.removed), given.placed_before
-    layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.others, given.level, given.measured)
-    layout = layout.first(len(given.bodies))
-    if goals:
-        layout = layout.rearranged(new_supports(goals, layout.supports))
-    seen = tuple(_Draw(given, layout, draws, k).shapes() for k in range(len(draws)))
-    settled = Settled(seen, ())
-    if goals:
-        flying = [i for i, body in enumerate(layout.bodies) if not body.stands]
-        settled = settle(goals, seen, draws, fps, flying)
-    shapes, placements = settled.shapes, None
-    if given.placement is not None:
-        carried = min(CARRIED, MOST_CARRIED * (given.num_frames - 1) / given.fps)
-        shapes, runs, placements = carry(given.placement, shapes, draws, carried, frames, fps, every)
-    else:
+    return DrawnWorlds.of(given, draws, every).run(slice(0, len(draws)))
 
-        def has_left(positions: Floats, velocities: Floats) -> Mask:
-            """Which movers [K] have left the image sideways and go on that way, or lie behind the camera."""
-            (points, depth), width = layout.cameras.project(positions), given.size[0]
-            x = points[:, 0]
-            step = layout.cameras.project(positions + velocities * LOOK_AHEAD)[0][:, 0] - x
-            return ((x < -LEFT_BY * width) & (step < 0)) | ((x > (1 + LEFT_BY) * width) & (step > 0)) | (depth < 0)
 
-        finished = None if len(draws) == 1 or given.motion.steps or given.others else has_left
-        runs = run_worlds(shapes, frames, fps, every, finished, given.turns_wanted, True, given.fps)
-    before, shown = settled.placements, seen if goals else None
-    return Worlds(layout, shapes, tuple(runs), every, fps, given.horizon, placements, before, shown)
+@dataclass(frozen=True)
+class DrawnWorlds:
+    """The worlds of draws [K, P], placed as the image shows them and not yet run."""
+
+    given: WorldInput
+    layout: Layout
+    draws: Floats
+    every: int
+
+    @staticmethod
+    def of(given: WorldInput, draws: Floats, every: int) -> DrawnWorlds:
+        """Places all bodies, what is taken away included."""
+        bodies, goals = (*given.bodies, *given.removed), given.placed_before
+        layout = lay_out(bodies, given.motion, given.fit, given.size, draws, given.others, given.level, given.measured)
+        layout = layout.first(len(given.bodies))
+        return DrawnWorlds(
+            given, layout.rearranged(new_supports(goals, layout.supports)) if goals else layout, draws, every
+        )
+
+    def run(self, part: slice) -> Worlds:
+        """Runs those of some draws."""
+        given, every, goals = self.given, self.every, self.given.placed_before
+        layout, draws = self.layout.of(part), self.draws[part]
+        fps, frames = CLOCK, math.ceil(given.horizon * CLOCK) + 1
+        if len(self.draws) == 1:
+            fps, frames = given.fps, given.frames
+        seen = tuple(_Draw(given, layout, draws, k).shapes() for k in range(len(draws)))
+        settled = Settled(seen, ())
+        if goals:
+            flying = [i for i, body in enumerate(layout.bodies) if not body.stands]
+            settled = settle(goals, seen, draws, fps, flying)
+        shapes, placements = settled.shapes, None
+        if given.placement is not None:
+            carried = min(CARRIED, MOST_CARRIED * (given.num_frames - 1) / given.fps)
+            shapes, runs, placements = carry(given.placement, shapes, draws, carried, frames, fps, every)
+        else:
+
+            def has_left(positions: Floats, velocities: Floats) -> Mask:
+                """Which movers [K] have left the image sideways and go on that way, or lie behind the camera."""
+                (points, depth), width = layout.cameras.project(positions), given.size[0]
+                x = points[:, 0]
+                step = layout.cameras.project(positions + velocities * LOOK_AHEAD)[0][:, 0] - x
+                return ((x < -LEFT_BY * width) & (step < 0)) | ((x > (1 + LEFT_BY) * width) & (step > 0)) | (depth < 0)
+
+            finished = None if len(self.draws) == 1 or given.motion.steps or given.others else has_left
+            runs = run_worlds(shapes, frames, fps, every, finished, given.turns_wanted, True, given.fps)
+        before, shown = settled.placements, seen if goals else None
+        return Worlds(layout, shapes, tuple(runs), every, fps, given.horizon, placements, before, shown)
 
 
 @dataclass(frozen=True)

@@ -430,7 +430,8 @@ class SimulateRequest(Record):
         default=50,
         ge=0,
         le=500,
-        description="How many worlds the probabilities are counted in; 0: none, and no probabilities.",
+        description="How many worlds the probabilities are counted in, at most: no more are run as soon as the others "
+        "are not likely to change what is answered. 0: none, and no probabilities.",
     )
     reader: Name | None = Field(default=None, description="Who looks at the image; by default the server's.")
     generator: Name | None = Field(default=None, description="Who makes the frames; by default the server's.")

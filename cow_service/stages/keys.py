@@ -65,14 +65,13 @@ RESULT_TYPES: dict[Stage, type[StageResult[Any]]] = {
 }
 
 
-def digest_of(value: BaseModel | Mapping[str, Any]) -> str:
-    """SHA-256 of a record, or of JSON values, the same in every process."""
-    plain = value.model_dump(mode="json") if isinstance(value, BaseModel) else value
-    return hashlib.sha256(json.dumps(plain, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+def digest_of(values: Mapping[str, Any]) -> str:
+    """SHA-256 of JSON values, the same in every process."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 13  # of stored results; raised where what a stage means or stores changes
+FORMAT = 14  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -176,9 +175,10 @@ def key_of(
 
 
 def _digest(value: Record | None) -> str | None:
-    if isinstance(value, Simulation):
-        return digest_of(value.model_dump(mode="json", include=_SIMULATION_FIELDS))
-    return None if value is None else digest_of(value)
+    if value is None:
+        return None
+    included = _SIMULATION_FIELDS if isinstance(value, Simulation) else None
+    return hashlib.sha256(value.model_dump_json(include=included).encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:

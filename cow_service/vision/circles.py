@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 
 from cow_service.records import BBox, Point
-from cow_service.vision.contrast import lab_gradients
+from cow_service.vision.contrast import WORKING_SIDE, lab_gradients
 from cow_service.vision.masks import lab_of, scaled
-from cow_service.vision.types import Floats, Image, Mask
+from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-WORKING_SIDE = 512  # px: images are searched at this size
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts
 MAX_EDGES = 12_000  # edge pixels: an image with more is too cluttered to be searched
 LEAST_RADIUS, MOST_RADIUS = 5.0, 80.0  # px at the working size
@@ -76,7 +75,12 @@ class Edges:
     def of(image: Image) -> Edges | None:
         """The edges of an RGB image [H, W, 3]; None where it is too cluttered, or plain."""
         small = scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2])))
-        dx, dy, total = lab_gradients(lab_of(small))
+        return Edges.at(lab_gradients(lab_of(small)), (image.shape[1], image.shape[0]))
+
+    @staticmethod
+    def at(gradients: tuple[Floats32, Floats32, Floats32], size: tuple[int, int]) -> Edges | None:
+        """The edges of an image of a size (width, height) by its `lab_gradients` at the working size, else as `of`."""
+        dx, dy, total = gradients
         strong = total > max(EDGE[0], EDGE[1] * float(np.median(total[::2, ::2])))
         strong[:2] = strong[-2:] = False
         strong[:, :2] = strong[:, -2:] = False
@@ -100,8 +104,8 @@ class Edges:
         here, ahead, behind, points, normals = (values[peak] for values in (here, ahead, behind, points, normals))
         bend = np.maximum(2 * here - ahead - behind, 1e-6)
         points += np.clip(0.5 * (ahead - behind) / bend, -0.5, 0.5)[:, None] * normals
-        down, (height, width) = np.argsort(points[:, 1], kind="stable"), small.shape[:2]
-        stretch = image.shape[1] / width, image.shape[0] / height
+        down, (height, width) = np.argsort(points[:, 1], kind="stable"), total.shape
+        stretch = size[0] / width, size[1] / height
         return Edges(points[down], normals[down], (height, width), stretch)
 
     def circles(self) -> tuple[Circle, ...]:

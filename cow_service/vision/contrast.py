@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 from cow_service.vision.masks import dilated, lab_of, scaled
 from cow_service.vision.types import Floats32, Image
 
+WORKING_SIDE = 512  # px: images are measured and searched at this size
 CHROMA_STEP = 9.0  # Lab units from the surroundings: an object
 BRIGHT_STEP = 5.0  # Lab lightness above the surroundings: an object
 STRONG_CHROMA_STEP = 18.0  # Lab units from the surroundings: no wall or floor
@@ -32,18 +34,20 @@ class View:
     bright: Floats32  # lightness above the surroundings
     around: Floats32  # lightness of the surroundings
     spread: Floats32  # how far the lightness of the surroundings varies: the texture of a floor is no thing
-    edges: Floats32  # Lab gradient per px
+    across: Floats32  # [h, w, 3] Lab gradients per px to the right
+    down: Floats32  # [h, w, 3] and down
+    edges: Floats32  # length of all of them
     median_edge: float  # of the whole image
     edge_threshold: float  # gradient from which the outline of an object may lie on it
 
-    @property
+    @cached_property
     def light(self) -> Floats32:
         """Share (0..1 and more) of the surroundings' light that a pixel gets if it is of the same matter, cube root."""
         return np.asarray((self.lab[..., 0] + LIGHT_OFFSET) / (self.around + LIGHT_OFFSET), np.float32)
 
     def crop(self, window: tuple[slice, slice]) -> View:
         """The same measurements for a part of the image."""
-        names = ("lab", "chroma", "chroma_gap", "bright", "around", "spread", "edges")
+        names = ("lab", "chroma", "chroma_gap", "bright", "around", "spread", "across", "down", "edges")
         return replace(self, **{name: getattr(self, name)[window] for name in names})
 
 
@@ -78,7 +82,7 @@ def view_of(small: Image) -> View:
     deviation = scaled(np.asarray(off_light * (255 / SPREAD_LIMIT), np.uint8), 0.25)
     typical = np.maximum(_median(deviation, WIDE, WIDE), _median(deviation, *STRIP)).astype(np.float32)
     spread = cv2.resize(typical * np.float32(1.48 * SPREAD_LIMIT / 255), small.shape[1::-1])
-    edges = lab_gradients(lab)[2]
+    across, down, edges = lab_gradients(lab)
     median_edge = float(np.median(edges))
     return View(
         lab=lab,
@@ -87,6 +91,8 @@ def view_of(small: Image) -> View:
         bright=bright,
         around=np.asarray(around, np.float32),
         spread=np.asarray(spread, np.float32),
+        across=across,
+        down=down,
         edges=edges,
         median_edge=median_edge,
         edge_threshold=max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge),

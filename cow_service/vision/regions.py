@@ -28,6 +28,7 @@ from cow_service.vision.contrast import (
     BRIGHT_STEP,
     CHROMA_STEP,
     STRONG_CHROMA_STEP,
+    WORKING_SIDE,
     View,
     colour_name,
     colour_names,
@@ -36,7 +37,6 @@ from cow_service.vision.contrast import (
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats32, Image, Mask
 
-WORKING_SIDE = 512  # px: images are searched at this size
 SHARP_SHARE = 0.65  # of an outline that must lie on edges
 OUT_OF_TEXTURE = 1.7  # of the surroundings' spread in lightness: the least step in an outline, per px
 SPREADS, BRIGHT_SPREADS = 3.0, 3.7  # of that spread: what is so much darker, or brighter, is no texture

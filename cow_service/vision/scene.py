@@ -140,7 +140,7 @@ class Scene:
 
     @cached_property
     def _all_trails(self) -> tuple[Trail, ...]:
-        return () if self.side_view else find_trails(self.undrawn)
+        return () if self.side_view else find_trails(self.undrawn, self._undrawn_view)
 
     @cached_property
     def trails(self) -> tuple[Trail, ...]:
@@ -164,7 +164,15 @@ class Scene:
         return image
 
     @cached_property
+    def _undrawn_view(self) -> View:
+        return measure(self.undrawn)
+
+    @property
     def _view(self) -> View:
+        return self._undrawn_view if self.clean is self.undrawn else self._clean_view
+
+    @cached_property
+    def _clean_view(self) -> View:
         return measure(self.clean)
 
     @cached_property

@@ -41,7 +41,7 @@ class SideView:
 def find_side_view(image: Image) -> SideView | None:
     """The side view that an RGB image [H, W, 3] is; None for a picture that has depth, or no level ground."""
     height = image.shape[0]
-    if _flat_colours(image[::4, ::4]) is None:  # most pictures end here
+    if _flat_colours(np.ascontiguousarray(image[::4, ::4])) is None:  # most pictures end here
         return None
     colours = _flat_colours(image)
     if colours is None:
@@ -68,18 +68,20 @@ def find_side_view(image: Image) -> SideView | None:
 
 def _flat_colours(image: Image) -> list[NDArray[np.int16]] | None:
     """The few colours [3] of a drawing; None for a photograph."""
-    counts = np.bincount(((image >> 2).astype(np.int64) @ np.array([4096, 64, 1])).ravel(), minlength=1 << 18)
-    order = np.argsort(-counts)[:256]
-    pixels = image.astype(np.int16)
-    found, has_one = list[NDArray[np.int16]](), np.zeros(image.shape[:2], bool)
-    for at in order.tolist():
+    red, green, blue = np.moveaxis((image >> 2).astype(np.int32), 2, 0)
+    counts = np.bincount((red << 12 | green << 6 | blue).ravel(), minlength=1 << 18)
+    size = image.shape[0] * image.shape[1]
+    common = np.nonzero(counts >= LEAST_COLOUR * size)[0]
+    found, has_one = list[NDArray[np.int16]](), np.zeros(image.shape[:2], np.uint8)
+    for at in common[np.argsort(-counts[common], kind="stable")].tolist():
         colour = np.array([at >> 12, at >> 6 & 63, at & 63], np.int16) * 4 + 2
-        if counts[at] < LEAST_COLOUR * has_one.size or len(found) == MOST_COLOURS:
+        if len(found) == MOST_COLOURS:
             break
         if all(np.abs(colour - other).max() >= APART for other in found):
             found.append(colour)
-            has_one |= np.abs(pixels - colour).max(axis=2) <= SAME
-    return found if len(found) > 1 and has_one.mean() > FLAT else None
+            low, high = (tuple(np.clip(colour + step, 0, 255).tolist()) for step in (-SAME, SAME))
+            has_one |= np.asarray(cv2.inRange(image, low, high), np.uint8)
+    return found if len(found) > 1 and np.count_nonzero(has_one) > FLAT * size else None
 
 
 def _ground(labels: NDArray[np.int64], background: int) -> tuple[Mask | None, int]:

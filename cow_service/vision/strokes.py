@@ -84,8 +84,10 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
     """Candidates in an RGB image [h, w, 3] of working size. A drawing can be found twice, with slight differences."""
     # Where something narrow stands out from what is around it, and a little beyond.
     half = scaled(image, 0.5)
-    around = cv2.medianBlur(half, THIN // 2 | 1)
-    narrow = (cv2.absdiff(half, around).max(axis=2) > STANDS_OUT).astype(np.uint8) * 255
+    # A median over so wide a window is as good of every second pixel, and takes a fifth of the time.
+    around = cv2.resize(cv2.medianBlur(scaled(half, 0.5), THIN // 4 | 1), half.shape[1::-1])
+    red, green, blue = cv2.split(cv2.absdiff(half, around))
+    _, narrow = cv2.threshold(cv2.max(cv2.max(red, green), blue), STANDS_OUT, 255, cv2.THRESH_BINARY)
     narrow = cv2.resize(cv2.dilate(narrow, _SQUARE), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     for (bx, by, bw, bh), _, _, thin in _patches(np.asarray(narrow, np.uint8), most=1.0):
         window = image[by : by + bh, bx : bx + bw]

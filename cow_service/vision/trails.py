@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,12 +17,14 @@ import numpy as np
 
 from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
+from cow_service.vision.contrast import View
 from cow_service.vision.masks import iou
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08
 MOST_UNREST = 12.0  # grey levels of a background's variation that are allowed for
+SCREENED_SUPPORT = 0.45, 0.2  # of the circumference of one at an end and of a third, on edges of a smoothed image
 END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
 PALE_SUPPORT, PREDICTED = 0.4, 0.2  # the same of one that a trail's path leads to, and how near to it, in radii
 SURE_SUPPORT = 0.3  # of the circumference: with more, no better circle is sought nearby
@@ -136,8 +138,12 @@ def trail_ending_at(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
     return None
 
 
-def find_trails(image: Image) -> tuple[Trail, ...]:
-    """Trails of balls in an RGB image [H, W, 3] without drawings on it, the longest first."""
+def find_trails(image: Image, view: View) -> tuple[Trail, ...]:
+    """Trails of balls in an RGB image [H, W, 3] without drawings on it, the longest first. `view` is that of it."""
+    # Most pictures end here: the view's edges are those of a smoothed image, which show circles, if not notches.
+    smooth = Edges.at((view.across, view.down, view.edges), (image.shape[1], image.shape[0]))
+    if smooth is None or not _Search(smooth, image).may_find(smooth.circles()):
+        return ()
     edges = Edges.of(image)
     if edges is None:
         return ()
@@ -145,14 +151,10 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     ends = [c for c in edges.circles() if c.support >= END_SUPPORT and search.contrast(c) >= LEAST_CONTRAST]
     trails: list[Trail] = []
     tried = 0
-    for a, b in itertools.combinations(ends, 2):
+    for a, b in _pairs(ends):
         found = [position for trail in trails for position in trail.positions]
         known = any(math.dist(c.centre, p.centre) < 0.6 * p.radius for c in (a, b) for p in found)
-        # Whether they may be positions of one ball with others between or beyond them.
-        apart, mean = math.dist(a.centre, b.centre), (a.radius + b.radius) / 2
-        small, large = sorted((a.radius, b.radius))
-        may_be_one = 0.25 * mean < apart < MOST_GAP * 3 * mean and large < SIZES**3 * small
-        if tried < MAX_PAIRS and not known and may_be_one and search.are_alike((a, b)):
+        if tried < MAX_PAIRS and not known and search.are_alike((a, b)):
             tried += 1
             trail = search.trail_through(a, b)
             trails += [] if trail is None else [trail]
@@ -170,6 +172,19 @@ class _Search:
 
     edges: Edges
     image: Image
+
+    def may_find(self, circles: Sequence[Circle]) -> bool:
+        """Whether three of some circles may be positions of one ball, two of them such as `trail_through` starts from.
+
+        Of a position that others cover in part, enough is seen to be among the circles that stand out.
+        """
+        seen = [c for c in circles if c.support >= SCREENED_SUPPORT[1]]
+        ends = [c for c in seen if c.support >= SCREENED_SUPPORT[0] and self.contrast(c) >= 0.8 * LEAST_CONTRAST]
+        for pair in _pairs(ends):
+            chains = [chain for each in seen if (chain := _joined(each, *pair)) is not None]
+            if chains and self.are_alike(pair) and any(self.are_alike(chain) for chain in chains):
+                return True
+        return False
 
     def trail_through(self, a: Circle, b: Circle) -> Trail | None:
         """The trail through two positions; None where fewer than three lie along a path.
@@ -297,6 +312,8 @@ class _Search:
             both = free[i] & free[model]
             if np.count_nonzero(both) < 6:
                 both = free[i] | free[model]
+            if not both.any():  # each lies behind the others
+                return None
             seen, wanted = inner[i][both], inner[model][both]
             share = _opacity(seen - about[i], wanted - about[model], seen - wanted, unrest[i] if compared else math.inf)
             if share is None:
@@ -357,6 +374,30 @@ def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
             if found.support > SURE_SUPPORT:
                 break
     return max(near, key=lambda circle: circle.support, default=None)
+
+
+def _pairs(ends: Sequence[Circle]) -> Iterator[tuple[Circle, Circle]]:
+    """Those that may be positions of one ball, with others between or beyond them."""
+    for a, b in itertools.combinations(ends, 2):
+        apart, mean = math.dist(a.centre, b.centre), (a.radius + b.radius) / 2
+        small, large = sorted((a.radius, b.radius))
+        if 0.25 * mean < apart < MOST_GAP * 3 * mean and large < SIZES**3 * small:
+            yield a, b
+
+
+def _joined(circle: Circle, a: Circle, b: Circle) -> Chain | None:
+    """Two positions and a circle that may be a third, in order: it is about as large, and between or beyond them."""
+    small, large = sorted((a.radius, b.radius))
+    x, y = b.x - a.x, b.y - a.y
+    along, aside = (
+        ((circle.x - a.x) * right + (circle.y - a.y) * down) / (x * x + y * y) for right, down in ((x, y), (y, -x))
+    )
+    if not small / SIZES**2 < circle.radius < large * SIZES**2 or not -SPACING[1] < along < 1 + SPACING[1]:
+        return None
+    near = any(math.dist(circle.centre, each.centre) < LEAST_GAP * small for each in (a, b))
+    if near or abs(aside) > MOST_SAG + max(0.0, -along, along - 1):
+        return None
+    return (circle, a, b) if along < 0 else (a, b, circle) if along > 1 else (a, circle, b)
 
 
 def _is_path(chain: Chain) -> bool:

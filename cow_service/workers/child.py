@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 
+import cv2
 import psutil
 
 from cow_service.concurrency import leave_decisions_to_the_parent
@@ -147,6 +148,7 @@ class WorkerProcess:
 def main(descriptor: int) -> None:
     """Works on the pipe of a file descriptor until it ends."""
     leave_decisions_to_the_parent()
+    cv2.setNumThreads(1)  # a process for each core: threads of their own would take a quarter more time, all together
     pipe = Connection(descriptor)
     try:
         first = messages.receive_by_worker(pipe)
