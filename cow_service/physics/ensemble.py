@@ -9,6 +9,7 @@ first batch agree on is settled.
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import ceil, comb, floor
 
@@ -101,10 +102,23 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
         pairs = zip(given, queries, strict=True)
         return tuple(EnsembleResult(each, _run(each, likeliest()), None, asked, None) for each, asked in pairs)
     rows = ensemble(size)
+    with ThreadPoolExecutor(1) as beside:  # half of the time is the engine's, which does not hold the interpreter up
+        likely = beside.submit(lambda: [_run(each, likeliest()) for each in given])
+        worlds, decided = _run_until_settled(given, queries, rows)
+        shown = likely.result()
+    rows = rows[: len(worlds[0].worlds.runs)]
+    if query is not None and any(each is not None and each.sure for each in decided):
+        shown = _agreeing(given, query, decided, rows, worlds, shown)
+    return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
+
+
+def _run_until_settled(
+    given: Sequence[WorldInput], queries: Sequence[Query | None], rows: Floats
+) -> tuple[list[ObservedWorlds], list[Decided | None]]:
+    """The first of some draws [K, P] in each world, as many as it takes, and what they say."""
     drawn = [DrawnWorlds.of(each, rows, EVERY) for each in given]
-    worlds, decided = list[ObservedWorlds](), list[Decided | None]()
-    count = 0
-    for most in (*(batch for batch in BATCHES if batch < size), size):
+    worlds, decided, count = list[ObservedWorlds](), list[Decided | None](), 0
+    for most in (*(batch for batch in BATCHES if batch < len(rows)), len(rows)):
         run = [each.run(slice(count, most)) for each in drawn]
         if count:
             layouts = [each.layout.of(slice(0, most)) for each in drawn]
@@ -113,12 +127,9 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
         worlds = [_observed(*each, rows[:count]) for each in zip(given, run, strict=True)]
         decided = _decide(queries, worlds, rows[:count])
         verdicts = [each for each in decided if each is not None]
-        if len(verdicts) == len(decided) and all(_is_settled(each, query, count, size) for each in verdicts):
+        if len(verdicts) == len(decided) and all(_is_settled(each, queries[0], count, len(rows)) for each in verdicts):
             break
-    rows, shown = rows[:count], [_run(each, likeliest()) for each in given]
-    if query is not None and any(each is not None and each.sure for each in decided):
-        shown = _agreeing(given, query, decided, rows, worlds, shown)
-    return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
+    return worlds, decided
 
 
 def _run(world: WorldInput, draws: Floats) -> ObservedWorlds:

@@ -125,9 +125,9 @@ def generate(
                     EncodedFrame.of(_marked(pixels, made_by), index, trajectory.fps, wanted.max_side, encoder)
                     for index, pixels in zip(indices, pictures, strict=True)
                 ]
-        kept, kept_factual = stored(frames, put), stored(factual, put)
-        with run.cpu():
+        with run.cpu():  # while the last frames are encoded
             overlay = put(_draw_overlay(run.image.pixels, given, as_it_is or given), "image/jpeg")
+        kept, kept_factual = stored(frames, put), stored(factual, put)
     clip = Clip(frames=kept, factual_frames=kept_factual, video=video, overlay=overlay, generator=made_by)
     named = (*clip.frames, *clip.factual_frames, *([] if video is None else [video]), clip.overlay)
     warnings = (TOY.format(name=made_by.name),) if made_by.is_toy else ()

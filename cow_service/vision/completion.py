@@ -262,6 +262,8 @@ def white_sides(view: View, core: Mask) -> Mask:
     neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
     white = core & (view.bright > BRIGHT_STEP) & neutral
     _, labels, tops, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
+    if not (tops[1:, 4] >= LEAST_TOP).any():
+        return np.zeros(white.shape, bool)
     near_edges = dilated(view.edges > view.edge_threshold, 5)
     lit_too = ((cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) & (view.chroma < 2 * CHROMA_STEP)) | white
     sides, surely_white = np.zeros(white.shape, bool), set[int]()
@@ -304,6 +306,8 @@ def white_sides(view: View, core: Mask) -> Mask:
 def black_faces(view: View, black: Mask) -> Mask:
     """Black patches with the lit faces beside them: dark patches between strong edges."""
     faces = black.copy()
+    if not black.any():
+        return faces
     for near, patch, _ in enclosed(view, STRONG_EDGE, 0.0):
         touched = np.count_nonzero(dilated(patch, times=4) & black[near])
         if (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -71,13 +72,14 @@ def view_of(small: Image) -> View:
         coarse = np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8)
         wide = _median(coarse, WIDE, WIDE)
     strip = _median(coarse, *STRIP)
-    distance, gap, around = _against(lab, wide)
+    planes = cv2.split(lab)
+    distance, gap, around = _against(planes, wide)
     # The line is known to a pixel of the strip.
     for shifted in (np.concatenate([strip[1:], strip[-1:]]), np.concatenate([strip[:1], strip[:-1]])):
-        other = _against(lab, shifted)
+        other = _against(planes, shifted)
         nearer = other[0] < distance
         distance, gap, around = (np.where(nearer, *pair) for pair in zip(other, (distance, gap, around), strict=True))
-    bright = np.asarray(lab[..., 0] - around, np.float32)
+    bright = np.asarray(planes[0] - around, np.float32)
     off_light = np.where(gap < CHROMA_STEP, np.minimum(np.abs(bright), SPREAD_LIMIT), 0)
     deviation = scaled(np.asarray(off_light * (255 / SPREAD_LIMIT), np.uint8), 0.25)
     typical = np.maximum(_median(deviation, WIDE, WIDE), _median(deviation, *STRIP)).astype(np.float32)
@@ -86,7 +88,7 @@ def view_of(small: Image) -> View:
     median_edge = float(np.median(edges))
     return View(
         lab=lab,
-        chroma=np.asarray(cv2.magnitude(lab[..., 1], lab[..., 2]), np.float32),
+        chroma=np.asarray(cv2.magnitude(*planes[1:]), np.float32),
         chroma_gap=np.asarray(gap, np.float32),
         bright=bright,
         around=np.asarray(around, np.float32),
@@ -99,13 +101,17 @@ def view_of(small: Image) -> View:
     )
 
 
-def _against(lab: Floats32, surface: Image) -> tuple[Floats32, Floats32, Floats32]:
-    """How far pixels [h, w] are from a surface's colours [h', w', 3], in the a*b* plane alone, and its lightness."""
-    enlarged = cv2.resize(surface, lab.shape[1::-1], interpolation=cv2.INTER_LINEAR).astype(np.float32)
-    lightness, a, b = enlarged[..., 0] / np.float32(2.55), enlarged[..., 1] - 128, enlarged[..., 2] - 128
-    light = (lab[..., 0] + LIGHT_OFFSET) / (lightness + LIGHT_OFFSET)
-    gap = np.asarray(cv2.magnitude(lab[..., 1] - light * a, lab[..., 2] - light * b), np.float32)
-    return gap + np.float32(0.5) * np.abs(lab[..., 0] - lightness), gap, lightness
+def _against(planes: Sequence[Floats32], surface: Image) -> tuple[Floats32, Floats32, Floats32]:
+    """How far pixels, in three planes [h, w] of Lab, are from a surface's colours [h', w', 3], in the a*b* plane alone,
+    and its lightness."""
+    own, size = planes[0], planes[0].shape[1::-1]
+    lightness, a, b = (
+        cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR).astype(np.float32) for plane in cv2.split(surface)
+    )
+    lightness, a, b = lightness / np.float32(2.55), a - 128, b - 128
+    light = (own + LIGHT_OFFSET) / (lightness + LIGHT_OFFSET)
+    gap = np.asarray(cv2.magnitude(planes[1] - light * a, planes[2] - light * b), np.float32)
+    return gap + np.float32(0.5) * np.abs(own - lightness), gap, lightness
 
 
 def lab_gradients(lab: Floats32) -> tuple[Floats32, Floats32, Floats32]:
