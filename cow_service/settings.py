@@ -1,8 +1,11 @@
 """Settings of the service, from the environment: each `COW_` plus the field's name in capitals."""
 
 import base64
+import os
 import re
+import sys
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,6 +22,24 @@ MAX_SECRETS = 2  # that sign at the same time, while one takes over from the oth
 # Without a name or a password before the bucket: they would be kept in the job database.
 OBJECT_STORE = re.compile(r"(s3|gs|az)://[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._-]+)*/?")
 ORIGIN = r"^(\*|[a-z][a-z0-9+.-]*://[^/\s?#@A-Z]+)$"  # as browsers write it: lower case, no path
+
+
+MAX_WORKERS = 256
+WORKER_BYTES = 400e6  # of memory for each process that computes
+
+
+def usable_cores() -> int:
+    """How many processes may compute at the same time: one per core that this one may use, as far as memory allows."""
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    if sys.platform == "win32":
+        return cores
+    memory = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    with suppress(OSError, ValueError):  # of a container, where there is one: "max" is none
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        cores = min(cores, max(1, round(float(quota) / float(period))))
+    with suppress(OSError, ValueError):
+        memory = min(memory, float(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return max(1, min(cores, int(memory / 2 / WORKER_BYTES), MAX_WORKERS))
 
 
 class SettingsError(Exception):
@@ -92,8 +113,8 @@ class Settings(BaseSettings):
     """How video models run: a profile of their manifest."""
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
     """Where models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU."""
-    concurrency: int = Field(default=2, ge=1, le=256)
-    """Requests computed at the same time; others wait."""
+    concurrency: int = Field(default_factory=usable_cores, ge=1, le=MAX_WORKERS)
+    """Requests computed at the same time; others wait. By default one per CPU core, as memory allows."""
     workers: bool = True
     """Compute in processes of their own, one per request at a time; 0: in that of the server, where a crash ends every
     job and Python computes one at a time."""

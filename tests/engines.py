@@ -1,8 +1,9 @@
-"""One running engine for all tests of this process: DBOS is one per process, and starting it for each test is slow."""
+"""One running engine for all tests of this process: DBOS, which keeps calls of webhooks, is one per process."""
 
 from __future__ import annotations
 
 import atexit
+import base64
 import tempfile
 import time
 from functools import cache
@@ -13,12 +14,14 @@ from fastapi import FastAPI
 from job_rows import open_jobs
 
 from cow_service.api.app import create_app
+from cow_service.jobs.calls import Calls
 from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.webhooks import Webhooks
 from cow_service.observability.metrics import Metrics
 from cow_service.service import Service
 from cow_service.settings import Settings
 
+SECRET = f"whsec_{base64.b64encode(bytes(32)).decode()}"
 FRESH = {"Cache-Control": "no-cache"}  # for requests that must not find what another test came to
 
 
@@ -26,7 +29,7 @@ FRESH = {"Cache-Control": "no-cache"}  # for requests that must not find what an
 def running_engine() -> JobEngine:
     """The engine, with a database of its own."""
     folder = tempfile.TemporaryDirectory(prefix="cow-tests-")
-    engine = JobEngine(Service(Settings(data_dir=Path(folder.name), shutdown_grace=0)))
+    engine = JobEngine(Service(Settings(data_dir=Path(folder.name), shutdown_grace=0, webhook_secret=SECRET)))
     engine.start()
 
     def end() -> None:
@@ -44,13 +47,25 @@ def app_for(service: Service) -> FastAPI:
     if engine.service is not service:
         engine.service.close()  # its connections to an MLLM
     engine._parts.service = service
-    use_webhooks(engine.webhooks, service.settings, service.metrics)
+    use_webhooks(service.settings, service.metrics)
     return create_app(engine, closing=False)
 
 
-def use_webhooks(webhooks: Webhooks, settings: Settings, metrics: Metrics) -> None:
-    """Signs with the secret of other settings, and counts elsewhere."""
-    webhooks._secret, webhooks._metrics = settings.webhook_secret, metrics
+@cache
+def webhooks() -> Webhooks:
+    """Those that the engine was started with."""
+    calls = running_engine().calls
+    assert isinstance(calls, Webhooks)
+    return calls
+
+
+def use_webhooks(settings: Settings, metrics: Metrics) -> None:
+    """Signs with the secret of other settings, and counts elsewhere; or makes no calls where they have none."""
+    hooks, engine = webhooks(), running_engine()
+    engine.calls = Calls()
+    if settings.webhook_secret is not None:
+        hooks._secret, hooks._metrics, engine.calls = settings.webhook_secret, metrics, hooks
+    engine.jobs._on_end = engine.calls.enqueue
 
 
 def end_jobs(engine: JobEngine, seconds: float = 30.0 * SLOWNESS) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import engines
 import pytest
 import sqlalchemy as sa
 from dbos import DBOS
@@ -19,11 +20,12 @@ from pydantic import SecretStr
 from servers import eventually
 
 from cow_service.errors import InternalError, InvalidRequest
-from cow_service.jobs import webhooks, workflows
+from cow_service.jobs import webhooks
+from cow_service.jobs.active import ActiveJobs
+from cow_service.jobs.attempts import Dispatcher
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import MAX_STARTS, JobFilters, JobTable
 from cow_service.jobs.schema import JOBS
-from cow_service.jobs.workflows import Dispatcher
 from cow_service.settings import Settings
 
 
@@ -176,7 +178,8 @@ def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
 
     jobs = SimpleNamespace(waiting_queues=lambda: ["light"], take=take)
     settings = SimpleNamespace(running_limit_per_key=None)
-    parts: Any = SimpleNamespace(executor="me", jobs=jobs, service=SimpleNamespace(settings=settings))
+    service, database = SimpleNamespace(settings=settings), SimpleNamespace(file=None)
+    parts: Any = SimpleNamespace(executor="me", jobs=jobs, service=service, database=database, active=ActiveJobs())
     dispatcher = Dispatcher(parts, lambda queue: capacity, started.append)
     dispatcher.start()
     eventually(lambda: len(started) == capacity)
@@ -192,10 +195,8 @@ def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
 def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
     """By the public interface of DBOS: what was left pending goes back to its queue, and nothing else is touched."""
     engine = running_engine()
-    client, table = (
-        engine.webhooks.client,
-        sa.Table("workflow_status", sa.MetaData(), autoload_with=engine.database.engine),
-    )
+    hooks = engines.webhooks()
+    table = sa.Table("workflow_status", sa.MetaData(), autoload_with=engine.database.engine)
     left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, "job")}
     with engine.database.transaction() as connection:
         for name, workflow in left.items():
@@ -204,10 +205,10 @@ def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
                     workflow_uuid=workflow, status="PENDING", name=name, executor_id="ended", application_version="none"
                 )
             )
-    assert "ended" in workflows.busy_executors(client)
-    workflows.recover(client, engine.jobs, ["ended"])
+    assert "ended" in hooks.busy_executors()
+    hooks.recover(["ended"])
     webhook = DBOS.get_workflow_status(left[webhooks.WORKFLOW])
     assert webhook is not None
     assert (webhook.status, webhook.queue_name) == ("ENQUEUED", webhooks.QUEUE)
     assert DBOS.get_workflow_status(left["job"]) is None
-    client.delete_workflows([left[webhooks.WORKFLOW]])
+    hooks.client.delete_workflows([left[webhooks.WORKFLOW]])

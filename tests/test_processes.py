@@ -203,7 +203,7 @@ def test_an_api_server_is_ready_with_a_worker(postgres: str, tmp_path: Path) -> 
         told = problem(api.http.get("/readyz"), 503, "not-ready")
         assert "`cow worker --queues light`" in told["detail"]
         port = str(free_port())
-        with Worker(tmp_path, log="worker", COW_METRICS_PORT=port, **own) as worker:
+        with Worker(tmp_path, log="worker", COW_METRICS_PORT=port, COW_CONCURRENCY="1", **own) as worker:
             eventually(lambda: api.http.get("/readyz").status_code == 200)
             assert [one["role"] for one in workers_of(api)["processes"]] == ["api", "worker"]
             job = api.submit(slow(2))["id"]

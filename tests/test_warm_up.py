@@ -1,4 +1,4 @@
-"""A server is warm before it says that it is ready, and nothing of the warm-up stays."""
+"""A server warms up behind its start, and nothing of the warm-up stays."""
 
 from __future__ import annotations
 
@@ -43,22 +43,22 @@ def test_a_failure_is_told_and_ends_nothing(
     assert "the warm-up failed" in caplog.text
 
 
-def test_it_is_ready_once_it_is_warm(service: Service) -> None:
-    warm, begun = threading.Event(), []
+def test_it_is_ready_before_it_is_warm_and_warms_up_once(service: Service) -> None:
+    warm, begun = threading.Event(), threading.Semaphore(0)
 
     def warm_up() -> None:
-        begun.append(1)
+        begun.release()
         warm.wait(10)
 
     readiness = Readiness(service, lambda: None, warm_up)
     readiness.start()
-    readiness.wait(0.05)
-    assert not readiness._done.is_set()
-    warm.set()
     readiness.wait(10)
     readiness.check()
+    assert begun.acquire(timeout=10)
     readiness.check()
-    assert begun == [1], "once, and not whenever readiness is asked for"
+    warm.set()
+    readiness.end()
+    assert not begun.acquire(blocking=False), "once, and not whenever readiness is asked for"
 
 
 def test_a_process_does_not_end_in_the_middle_of_it(service: Service) -> None:

@@ -16,10 +16,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import engines
 import httpx
 import pytest
 from dbos import DBOS
-from engines import app_for, running_engine, use_webhooks
+from engines import app_for
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from servers import ASYNC, BODY, SLOW_GENERATOR, TIME_LIMIT, events_of, eventually, problem, slow
@@ -103,10 +104,11 @@ def app(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FastAPI]:
     secret = " ".join(f"whsec_{base64.b64encode(each).decode()}" for each in (b"n" * 32, SECRET))
     service = Service(Settings(data_dir=tmp_path / "data", webhook_secret=secret))
     app = app_for(service)
-    hooks = running_engine().webhooks
-    monkeypatch.setitem(vars(hooks), "_egress", Egress(None, permitted=lambda address: address == "127.0.0.1"))
+    monkeypatch.setitem(
+        vars(engines.webhooks()), "_egress", Egress(None, permitted=lambda address: address == "127.0.0.1")
+    )
     yield app
-    use_webhooks(hooks, Settings(data_dir=tmp_path / "data"), service.metrics)
+    engines.use_webhooks(Settings(data_dir=tmp_path / "data"), service.metrics)
 
 
 @pytest.fixture
@@ -314,7 +316,7 @@ def test_a_receiver_that_is_gone_is_left_alone(http: TestClient, receiver: Recei
 def test_addresses_that_are_never_called(
     app: FastAPI, http: TestClient, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    monkeypatch.setitem(vars(running_engine().webhooks), "_egress", Egress(None))
+    monkeypatch.setitem(vars(engines.webhooks()), "_egress", Egress(None))
     before = len(http.get("/jobs", params={"limit": 500}).json()["jobs"])
     for headers in (ASYNC, {}):
         response = http.post("/simulate", json={**BODY, "webhook": url}, headers=headers)
@@ -326,7 +328,7 @@ def test_addresses_that_are_never_called(
 def test_a_name_that_leads_inside_is_not_called(
     http: TestClient, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(vars(running_engine().webhooks), "_egress", Egress(None))
+    monkeypatch.setitem(vars(engines.webhooks()), "_egress", Egress(None))
     job = submitted(http, {**BODY, "webhook": receiver.url.replace("127.0.0.1", "localhost")})
     eventually(lambda: attempts(job))
     all_done(job)

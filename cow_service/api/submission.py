@@ -320,7 +320,7 @@ class Submitter:
                 self.engine.may_read(picture.artifact, submission.owner)
         backends = self.engine.service.precheck(body)
         if body.webhook is not None:
-            self.engine.webhooks.check(body.webhook)
+            self.engine.calls.check(body.webhook)
         return backends
 
     def _submit(self, submission: Submission, body: SimulateRequest) -> str | None:

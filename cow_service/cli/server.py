@@ -78,7 +78,7 @@ def migrate() -> None:
 
     Servers and workers do so themselves when they start, unless COW_MIGRATE is false.
     """
-    from cow_service.jobs.workflows import migrate as run  # noqa: PLC0415
+    from cow_service.jobs.webhooks import migrate as run  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
     run(load_settings())

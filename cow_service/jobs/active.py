@@ -7,11 +7,13 @@ from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, CowError
 from cow_service.records import JobKind, WorkerJob
 from cow_service.requests import Stage
 
 STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
+QUIET_SECONDS = 30.0  # without a job that anybody runs or waits for, after which a process looks for some more rarely
 STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation the last is left out
 
 
@@ -63,11 +65,35 @@ class ActiveJobs:
         self._running: dict[str, ActiveJob] = {}
         self._elsewhere: dict[str, At] = {}  # how far jobs are that other processes run
         self._waiters: dict[str, list[Waiter]] = {}
+        self._stirred = threading.Condition()
+        self._busy_at = time.monotonic()  # when there was last a sign of a job
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether there was no sign of a job for a while."""
+        return not (self._running or self._waiters) and time.monotonic() - self._busy_at > QUIET_SECONDS
+
+    def stir(self) -> None:
+        """There is a sign of a job, or a thread that rests is to end."""
+        was_quiet, self._busy_at = self.is_quiet, time.monotonic()
+        if was_quiet:
+            with self._stirred:
+                self._stirred.notify_all()
+
+    def rest(self, stop: threading.Event, seconds: float, quiet_seconds: float) -> None:
+        """Waits so long, or for the other time as long as it is quiet. `stop`, with `stir`, ends it."""
+        if not self.is_quiet:
+            stop.wait(seconds)
+            return
+        with self._stirred:
+            if not stop.is_set():
+                self._stirred.wait(quiet_seconds)
 
     @contextmanager
     def running(self, job: str, kind: JobKind, run: str = "") -> Generator[ActiveJob]:
         """Around an attempt to compute a job."""
         active = ActiveJob(kind, run)
+        self.stir()
         with self._lock:
             self._running[job] = active
         try:
@@ -76,6 +102,7 @@ class ActiveJobs:
             with self._lock:
                 if self._running.get(job) is active:  # else another job of the same id runs by now
                     del self._running[job]
+            self._busy_at = time.monotonic()
 
     def progress(self, job: str, active: ActiveJob, stage: Stage | None, done: float) -> None:
         """Records how far the work on a job is, and wakes its waiters. Raises `Canceled` on request."""
@@ -118,6 +145,7 @@ class ActiveJobs:
 
     def set_progress_elsewhere(self, job: str, stage: Stage | None, done: float) -> None:
         """Notes how far a job is that another process computes, and wakes its waiters."""
+        self.stir()
         if self.get(job) is None:
             self._elsewhere[job] = stage, done
             self._wake(job)
@@ -141,6 +169,7 @@ class ActiveJobs:
     def waiting(self, job: str) -> Generator[Waiter]:
         """Around a wait for a job, on the running event loop."""
         waiter = Waiter(asyncio.get_running_loop())
+        self.stir()
         with self._lock:
             self._waiters.setdefault(job, []).append(waiter)
         try:
@@ -169,6 +198,25 @@ class ActiveJobs:
     def _waiters_of(self, job: str) -> list[Waiter]:
         with self._lock:
             return [waiter for waiter in self._waiters.get(job, []) if not waiter.loop.is_closed()]
+
+
+class RestingThread(BackgroundThread):
+    """A thread that looks for work of its own accord, more rarely while there are no jobs."""
+
+    def __init__(self, name: str, active: ActiveJobs, join_seconds: float | None = None) -> None:
+        super().__init__(name, join_seconds)
+        self._active = active
+
+    def rest(self, seconds: float, quiet_seconds: float) -> bool:
+        """Waits so long, or for the other time as long as it is quiet; returns whether to go on."""
+        self._active.rest(self._stop, seconds, quiet_seconds)
+        return not self._stop.is_set()
+
+    def stop(self) -> None:
+        """Ends the thread."""
+        self._stop.set()
+        self._active.stir()
+        super().stop()
 
 
 def share_done(kind: str, stage: str | None, done: float) -> float:

@@ -25,7 +25,7 @@ from sqlalchemy.exc import DisconnectionError, OperationalError, SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
-from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, STAGES, STORES, schema_of, update_tables
+from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES, schema_of, update_tables
 from cow_service.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
@@ -80,6 +80,13 @@ class Database:
         self.now: sa.ColumnElement[float] = (sa.func.julianday("now") - 2440587.5) * 86400.0
         if self.file is None:
             self.now = sa.cast(sa.extract("epoch", sa.func.clock_timestamp()), sa.Float)
+
+    def prepare(self, *, migrate: bool) -> None:
+        """Makes our tables, or looks whether they are there. Raises `StorageUnavailable`."""
+        if migrate:
+            self.create_tables()
+        elif self.schema() < SCHEMA:
+            raise StorageUnavailable("The job database lacks tables of this version of COW: run `cow migrate` first.")
 
     def create_tables(self) -> None:
         """Makes our tables, or adds what those of an earlier version lack, and makes the folder of a file.
@@ -330,6 +337,7 @@ class StalledConnections(BackgroundThread):
         self._driver_error = psycopg.Error
         self._guard = threading.Lock()
         self._in_use: dict[psycopg.Connection[Any], float] = {}
+        self._is_used = threading.Event()
         event.listen(engine, "checkout", self._take)
         event.listen(engine, "checkin", self._give_back)
         event.listen(engine, "invalidate", self._give_back)
@@ -346,6 +354,7 @@ class StalledConnections(BackgroundThread):
     def _begin(self, connection: psycopg.Connection[Any]) -> None:
         with self._guard:
             self._in_use[connection] = time.monotonic()
+        self._is_used.set()
 
     def _end(self, connection: psycopg.Connection[Any] | None) -> None:
         with self._guard:
@@ -366,9 +375,19 @@ class StalledConnections(BackgroundThread):
         entry.info["idle_since"] = time.monotonic()
         self._end(connection)
 
+    def stop(self) -> None:
+        """Ends the thread."""
+        self._stop.set()
+        self._is_used.set()
+        super().stop()
+
     def run(self) -> None:
         """Looks at what is in use."""
         while not self._stop.wait(STALLED_SECONDS / 10):
+            if not self._in_use:
+                self._is_used.clear()
+                if not self._in_use:
+                    self._is_used.wait()
             late = time.monotonic() - STALLED_SECONDS
             with self._guard:  # its socket is not closed meanwhile, nor the number of that given to another one
                 for connection in [one for one, since in self._in_use.items() if since < late]:

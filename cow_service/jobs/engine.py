@@ -1,8 +1,8 @@
 """The job engine: accepts jobs, has them computed durably, and reports their state.
 
 A job is a row of the job database, in the database before its submission is acknowledged. It waits in the queue of its
-generator, from which any process on the same database may take it. DBOS keeps the calls of webhooks. A process has one
-engine, as DBOS is one per process.
+generator, from which any process on the same database may take it. Where webhooks are called, DBOS keeps the calls, and
+a process has one engine, as DBOS is one per process.
 """
 
 import logging
@@ -10,8 +10,6 @@ import threading
 import uuid
 from collections.abc import Callable, Iterable
 from http import HTTPStatus
-
-from dbos import DBOS
 
 from cow_service.errors import (
     ArtifactNotFound,
@@ -22,16 +20,16 @@ from cow_service.errors import (
     ShuttingDown,
 )
 from cow_service.jobs.active import ActiveJobs
+from cow_service.jobs.attempts import Dispatcher, Runner
+from cow_service.jobs.calls import Calls
 from cow_service.jobs.computing import Computer, EngineParts, InProcess
-from cow_service.jobs.database import Database, database_errors
+from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobFilters, JobSpec, JobState, JobTable, TakenJob
-from cow_service.jobs.maintenance import FolderLease, Maintenance, SessionLease
-from cow_service.jobs.notifications import Notification, PolledNotifications, PostgresNotifications
+from cow_service.jobs.maintenance import FolderLease, Lease, Maintenance
+from cow_service.jobs.notifications import Notification, Notifications, PolledNotifications
 from cow_service.jobs.processes import Processes
 from cow_service.jobs.queues import queue_of, step_of
 from cow_service.jobs.readiness import StorageCheck
-from cow_service.jobs.webhooks import Webhooks, attempt_ids
-from cow_service.jobs.workflows import Dispatcher, Runner, launch, set_runner
 from cow_service.records import TERMINAL, AcceptedRequest, JobPage, ProcessRole
 from cow_service.service import Service
 
@@ -51,19 +49,25 @@ class JobEngine:
     def __init__(self, service: Service, computer: Computer | None = None, role: ProcessRole | None = None) -> None:
         """`computer`: who computes the jobs; by default this process. `role`: by default that of the settings."""
         self.database, self.active = Database(service.settings), ActiveJobs()
-        self.webhooks = Webhooks(service.settings, service.metrics, self.database)
-        self.jobs = JobTable(self.database, self.webhooks.enqueue)
+        self.calls = Calls()
+        if service.settings.webhook_secret is not None:
+            from cow_service.jobs.webhooks import Webhooks  # noqa: PLC0415 # DBOS takes long to import
+
+            self.calls = Webhooks(service.settings, service.metrics, self.database)
+        self.jobs = JobTable(self.database, self.calls.enqueue)
         self._parts = EngineParts(service, self.database, self.jobs, self.active)
         self._computer = computer or InProcess(self._parts)
         if self.database.file is None:
-            self._lease = SessionLease(self.database)
-            self._notifications = PostgresNotifications(self._parts, self._receive)
+            from cow_service.jobs import postgres  # noqa: PLC0415 # its driver takes long to import
+
+            self._lease: Lease = postgres.SessionLease(self.database)
+            self._notifications: Notifications = postgres.PostgresNotifications(self._parts, self._receive)
         else:
             self._lease = FolderLease(service.settings.data_dir / "executors")
             self._notifications = PolledNotifications(self._parts, self._receive)
-        self._runner = Runner(self._parts, self._computer, self.webhooks, self._notifications, self._attempt_ended)
+        self._runner = Runner(self._parts, self._computer, self._notifications, self._attempt_ended)
         self._dispatcher = Dispatcher(self._parts, self._computer.capacity, self._runner.start)
-        self._maintenance = Maintenance(self._parts, self.webhooks, self._lease, self.remove)
+        self._maintenance = Maintenance(self._parts, self.calls, self._lease, self.remove)
         self.processes = Processes(self._parts, self._computer, role)
         self.storage = StorageCheck(lambda: self.service.artifacts)
         self.is_running = False
@@ -89,15 +93,14 @@ class JobEngine:
         """Opens the database and recovers the jobs that were interrupted. Raises `StorageUnavailable`."""
         settings = self.service.settings
         self.service.artifacts.check()
-        set_runner(self._runner)
         try:
             self._parts.executor = self._lease.acquire()
-            launch(self.database, self._parts.executor, migrate=settings.migrate)
+            self.database.prepare(migrate=settings.migrate)
+            self.calls.start(self.jobs, self._parts.executor, migrate=settings.migrate)
             self.database.claim(self.service.artifacts.address)
-            self.webhooks.register_queue()
             self.database.watch()
         except BaseException:
-            DBOS.destroy()
+            self.calls.stop()
             self._lease.release()
             raise
         self._stopping, self.is_running = False, True
@@ -125,13 +128,12 @@ class JobEngine:
         self._dispatcher.stop()
         self._notifications.stop()
         self._runner.wait(self.service.settings.shutdown_grace + HANDOVER_SECONDS)
-        DBOS.destroy()
+        self.calls.stop()
         if self._grace is not None:
             self._grace.cancel()
         self._interrupt()
         self.processes.stop()
         self._computer.close()
-        set_runner(None)
         self._lease.release()  # before the database's: a session that has no answer is ended by what that stops
         self.database.close()
         self.is_running = False
@@ -242,8 +244,7 @@ class JobEngine:
 
     def remove(self, jobs: list[str], untouched_since: float) -> None:
         """Removes jobs that have ended, and those of their artifacts that were not used since (Unix time, s)."""
-        with database_errors():
-            self.webhooks.client.delete_workflows([attempt for job_id in jobs for attempt in attempt_ids(job_id)])
+        self.calls.forget(jobs)
         for sha256 in self.jobs.delete(jobs):
             self.service.artifacts.delete(sha256, untouched_since + 1)
 

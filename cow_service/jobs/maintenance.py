@@ -1,33 +1,27 @@
 """Background work of a job engine: recovers jobs, notices cancellations, and cleans up what nobody needs any more."""
 
-import hashlib
 import logging
 import math
-import threading
 import time
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
-from functools import partial
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Any, LiteralString
+from typing import Protocol
 from uuid import uuid4
 
-import psycopg
-from dbos import error as dbos_error
 from filelock import FileLock, Timeout
 from sqlalchemy.exc import SQLAlchemyError
 
-from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, StorageUnavailable
-from cow_service.jobs import workflows
+from cow_service.jobs.active import RestingThread
+from cow_service.jobs.calls import Calls
 from cow_service.jobs.computing import EngineParts
-from cow_service.jobs.database import Database, database_errors
-from cow_service.jobs.webhooks import Webhooks
+from cow_service.jobs.database import Database
 from cow_service.media.artifacts import ListedArtifact
 from cow_service.service import Service
 
-POLL_SECONDS = 1.0  # for processes that ended, and for jobs that run here and were canceled by another process
+# For processes that ended, and for jobs that run here and were canceled by another process; the same without any job.
+POLL_SECONDS, QUIET_POLL_SECONDS = 1.0, 20.0
 STALLED_SECONDS = 10.0  # between checks for stalled jobs
 CLEAN_UP_SECONDS = 600.0  # between two rounds
 TURN_SECONDS = 0.9 * CLEAN_UP_SECONDS  # since the last one of any process, which may have begun late
@@ -40,11 +34,24 @@ JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down do
 UNREFERENCED_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
 BUDGET_GRACE_SECONDS = 900.0  # that it is kept after its last use, whatever the budget: a stage may be about to refer
 LEFTOVER_SECONDS = 24 * 3600.0  # that a temporary file is kept after it was last written to
-BEAT_SECONDS = 1.5  # between two signs of life
-SILENCE_SECONDS = 8.0  # after which PostgreSQL ends the session of a lease
-CONFIRM_SECONDS = 2.5  # that a lease must be free: after a restart of the server everybody's is for a moment
 
 log = logging.getLogger("cow_service")
+
+
+class Lease(Protocol):
+    """What shows that a process has not ended."""
+
+    def acquire(self) -> str:
+        """Takes a lease on a new executor id, and returns the id. Raises `StorageUnavailable`."""
+        ...
+
+    def ended(self, executors: Iterable[str]) -> AbstractContextManager[list[str]]:
+        """Those of some executors whose processes have ended. Nobody else finds them inside the block."""
+        ...
+
+    def release(self) -> None:
+        """Gives the lease back."""
+        ...
 
 
 class FolderLease:
@@ -56,7 +63,7 @@ class FolderLease:
         self._executor = ""
 
     def acquire(self) -> str:
-        """Takes a lease on a new executor id, and returns the id. Raises `StorageUnavailable`."""
+        """As `Lease` says."""
         self._executor = uuid4().hex
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -68,7 +75,7 @@ class FolderLease:
 
     @contextmanager
     def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
-        """Those of some executors whose processes have ended. Nobody else finds them inside the block."""
+        """As `Lease` says."""
         locks: dict[str, FileLock] = {}
         try:
             for executor in set(executors) - {self._executor}:
@@ -83,110 +90,25 @@ class FolderLease:
                 Path(lock.lock_file).unlink(missing_ok=True)
 
     def release(self) -> None:
-        """Gives the lease back."""
+        """As `Lease` says."""
         if self._lock is not None:
             self._lock.release()
             Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock = None
 
 
-class SessionLease(BackgroundThread):
-    """The lease of a process on PostgreSQL: an advisory lock of a session, which ends after a silence.
-
-    So also a process that is frozen, or whose machine is gone, loses it.
-    """
-
-    def __init__(self, database: Database) -> None:
-        super().__init__("cow-lease")
-        self._database = database
-        self._executor = ""
-        self._session: psycopg.Connection[Any] | None = None
-        self._guard = threading.Lock()
-        self._free_since: dict[str, float] = {}
-
-    def acquire(self) -> str:
-        """As that of a folder."""
-        self._executor = uuid4().hex
-        with database_errors():
-            self._open()
-        self.start()
-        return self._executor
-
-    @contextmanager
-    def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
-        """As that of a folder. One counts as ended when its lease was free before, too."""
-        with self._guard:
-            session = self._session
-            if session is None:  # an outage: nobody can be told from those that have ended
-                yield []
-                return
-            free = set[str]()
-            try:
-                with database_errors():
-                    for one in set(executors) - {self._executor}:
-                        free |= {one} if self._ask(session, "SELECT pg_try_advisory_lock(%s)", _key(one)) else set()
-                now = time.monotonic()
-                self._free_since = {one: self._free_since.get(one, now) for one in free}
-                yield [one for one, since in self._free_since.items() if now - since >= CONFIRM_SECONDS]
-            finally:
-                with suppress(psycopg.Error):  # with the session its locks end, too
-                    for one in free:
-                        self._ask(session, "SELECT pg_advisory_unlock(%s)", _key(one))
-
-    def release(self) -> None:
-        """As that of a folder."""
-        self.stop()
-        self._close()
-
-    def run(self) -> None:
-        """Keeps the session alive, and takes the lease again after an outage."""
-        while not self._stop.wait(BEAT_SECONDS):
-            with self._guard:
-                try:
-                    if self._session is None:
-                        self._open()
-                    else:
-                        self._ask(self._session, "SELECT 1")
-                except psycopg.Error:
-                    log.warning("the lease of this process was lost: it is taken again when the database is back")
-                    self._close()
-                    self._free_since = {}
-
-    def _open(self) -> None:
-        session = self._database.session()
-        self._ask(session, "SELECT set_config('idle_session_timeout', %s, false)", f"{SILENCE_SECONDS:g}s")
-        self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held by who looks at it, for a moment
-        self._session = session
-
-    def _close(self) -> None:
-        session, self._session = self._session, None
-        with suppress(psycopg.Error):
-            if session is not None:
-                session.close()
-
-    def _ask(self, session: psycopg.Connection[Any], statement: LiteralString, *values: object) -> object:
-        """The value that a statement returns. Raises `psycopg.Error`, also where no answer comes."""
-        with self._database.limited(session):
-            row = session.execute(statement, values).fetchone()
-        return None if row is None else row[0]
-
-
-def _key(executor: str) -> int:
-    return int.from_bytes(hashlib.sha256(executor.encode()).digest()[:8], signed=True)
-
-
-class Maintenance(BackgroundThread):
+class Maintenance(RestingThread):
     """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time."""
 
     def __init__(
         self,
         parts: EngineParts,
-        hooks: Webhooks,
-        lease: FolderLease | SessionLease,
+        calls: Calls,
+        lease: Lease,
         remove: Callable[[list[str], float], None],
     ) -> None:
-        super().__init__("cow-maintenance", JOIN_TIMEOUT_SECONDS)
-        self._parts, self._hooks, self._lease, self._remove = parts, hooks, lease, remove
+        super().__init__("cow-maintenance", parts.active, JOIN_TIMEOUT_SECONDS)
+        self._parts, self._calls, self._lease, self._remove = parts, calls, lease, remove
         self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
 
     def run(self) -> None:
@@ -206,20 +128,22 @@ class Maintenance(BackgroundThread):
                 begun[work] = now
                 try:
                     work()
-                except (CowError, dbos_error.DBOSException, SQLAlchemyError) as error:
+                except (CowError, SQLAlchemyError) as error:
                     log.warning("maintenance: %s", getattr(error, "detail", type(error).__name__))
                 except Exception:
                     log.exception("maintenance failed")
-            self._stop.wait(POLL_SECONDS)
+            self.rest(POLL_SECONDS, QUIET_POLL_SECONDS)
 
     def _recover(self) -> None:
         """Has the jobs of processes that have ended done by others."""
-        executors = self._parts.jobs.executors() | workflows.busy_executors(self._hooks.client)
+        executors = self._parts.jobs.executors() | self._calls.busy_executors()
         if not (others := executors - {self._parts.executor}):
             return
         with self._lease.ended(others) as ended:
-            for job_id in workflows.recover(self._hooks.client, self._parts.jobs, ended) if ended else ():
-                log.info("recovering %s", job_id)
+            if ended:
+                for job_id in self._parts.jobs.recover(ended):
+                    log.info("recovering %s", job_id)
+                self._calls.recover(ended)
 
     def _notice_cancellations(self) -> None:
         """Another process may have canceled or deleted a job that runs here, or taken it while this one was frozen."""
@@ -254,15 +178,11 @@ class Maintenance(BackgroundThread):
             raise
 
     def clean_up_jobs(self) -> None:
-        """Removes jobs past their retention, and what DBOS keeps from before that."""
+        """Removes jobs past their retention, and what is kept of calls from before that."""
         before = time.time() - 3600.0 * self._parts.service.settings.job_retention_hours
         while not self._stop.is_set() and (jobs := self._parts.jobs.ended_before(before, MAX_REMOVED_JOBS)):
             self._remove(jobs, before)
-        # The records that DBOS keeps of calls of webhooks.
-        moment, client = datetime.fromtimestamp(before, UTC).isoformat(), self._hooks.client
-        ended = partial(client.list_workflows, completed_before=moment, limit=MAX_REMOVED_JOBS)
-        while not self._stop.is_set() and (records := ended(load_input=False, load_output=False)):
-            client.delete_workflows([record.workflow_id for record in records])
+        self._calls.clean_up(before, self._stop.is_set)
         if not self._stop.is_set():
             self._parts.database.give_room_back(self._stop.is_set)
 

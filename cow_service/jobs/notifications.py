@@ -3,28 +3,21 @@
 All of it only makes things quick: what counts is in the database.
 """
 
-import json
 import time
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Literal
 
-import psycopg
-import sqlalchemy as sa
-
-from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError
+from cow_service.jobs.active import RestingThread
 from cow_service.jobs.computing import EngineParts
 from cow_service.requests import Stage
 
-CHANNEL = "cow_jobs"
-RECONNECT_SECONDS = 1.0  # after a session was lost
-LISTEN_SECONDS = 1.0  # of one wait, after which it is looked whether to stop
 POLL_SECONDS = 0.05  # between two looks at SQLite, where somebody waits
+QUIET_POLL_SECONDS = 20.0  # where nobody does: who begins to ends that
 POLL_SHARE = 20  # and so many times as long as one took
-PROGRESS_SECONDS = 0.2  # between two messages on the progress of a job
 
 
 @dataclass(frozen=True)
@@ -40,54 +33,17 @@ class Notification:
 Receive = Callable[[Notification], None]
 
 
-class Notifications(BackgroundThread):
+class Notifications(RestingThread):
     """Sends to the other processes, and receives from them in a thread of its own."""
 
     def __init__(self, parts: EngineParts, receive: Receive) -> None:
         """`receive` is called with what other processes send."""
-        super().__init__("cow-notifications")
+        super().__init__("cow-notifications", parts.active)
         self._parts, self._receive = parts, receive
 
     @abstractmethod
     def send(self, notification: Notification) -> None:
         """Tells all processes. What cannot be told is found in the database later."""
-
-
-class PostgresNotifications(Notifications):
-    """By LISTEN and NOTIFY."""
-
-    def __init__(self, parts: EngineParts, receive: Receive) -> None:
-        super().__init__(parts, receive)
-        self._sent: dict[str, float] = {}  # when the progress of a job was last sent
-
-    def send(self, notification: Notification) -> None:
-        """As the base class says."""
-        now = time.monotonic()
-        if notification.what != "progress":
-            self._sent.pop(notification.job_id, None)
-        elif now - self._sent.get(notification.job_id, 0.0) < PROGRESS_SECONDS:
-            return
-        else:
-            self._sent[notification.job_id] = now
-        with suppress(CowError):
-            payload = json.dumps([self._parts.executor, asdict(notification)])
-            self._parts.database.read(sa.select(sa.func.pg_notify(CHANNEL, payload)))
-
-    def run(self) -> None:
-        """Receives, and opens another session where one is lost."""
-        while not self._stop.is_set():
-            try:
-                with self._parts.database.session() as session:
-                    with self._parts.database.limited(session):
-                        session.execute(f"LISTEN {CHANNEL}")
-                    while not self._stop.is_set():
-                        for message in session.notifies(timeout=LISTEN_SECONDS):
-                            with suppress(ValueError, TypeError):  # of another version
-                                sender, values = json.loads(message.payload)
-                                if sender != self._parts.executor:
-                                    self._receive(Notification(**values))
-            except psycopg.Error:
-                self._stop.wait(RECONNECT_SECONDS)
 
 
 class PolledNotifications(Notifications):
@@ -99,7 +55,7 @@ class PolledNotifications(Notifications):
     def run(self) -> None:
         """Looks the more rarely, the longer a look takes."""
         took = 0.0
-        while not self._stop.wait(max(POLL_SECONDS, POLL_SHARE * took)):
+        while self.rest(max(POLL_SECONDS, POLL_SHARE * took), QUIET_POLL_SECONDS):
             began = time.monotonic()
             if awaited := self._parts.active.awaited_elsewhere():
                 with suppress(CowError):

@@ -14,8 +14,8 @@ from typing import Any, Literal, TypeVar
 import sqlalchemy as sa
 
 from cow_service import __version__
-from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError, NotReady
+from cow_service.jobs.active import RestingThread
 from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import RATE_SECONDS, VERSION, JobTable, OpenCount
@@ -25,7 +25,7 @@ from cow_service.observability.logging import rfc3339
 from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, WorkerInfo, Workers
 from cow_service.settings import Settings
 
-TELL_SECONDS = 2.0  # between two rows
+TELL_SECONDS, QUIET_TELL_SECONDS = 2.0, 5.0  # between two rows, and while there are no jobs
 FORGOTTEN_SECONDS = 3600.0  # after which a row is deleted
 JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 MAX_AGE_SECONDS = 1.0  # of an overview that is given out again
@@ -74,12 +74,12 @@ class ProcessTable:
         return tuple(sorted(found, key=lambda one: (one.role, one.host or "", one.pid or 0)))
 
 
-class Processes(BackgroundThread):
+class Processes(RestingThread):
     """This process among those on the job database. A thread of its own: maintenance may take minutes."""
 
     def __init__(self, parts: EngineParts, computer: Computer, role: ProcessRole | None) -> None:
         """`role`: by default that of the settings."""
-        super().__init__("cow-processes", JOIN_TIMEOUT_SECONDS)
+        super().__init__("cow-processes", parts.active, JOIN_TIMEOUT_SECONDS)
         self._parts, self._computer = parts, computer
         self._role: ProcessRole = role or parts.service.settings.role
         self._table = ProcessTable(parts.database)
@@ -135,7 +135,7 @@ class Processes(BackgroundThread):
                 workers=self.workers(),
             )
             self._try(partial(self._table.write, info))
-            self._stop.wait(TELL_SECONDS)
+            self.rest(TELL_SECONDS, QUIET_TELL_SECONDS)
 
     def _try(self, work: Callable[[], None]) -> None:
         """Does it, and goes on where it fails: what is told is for people, and no job depends on it."""

@@ -33,7 +33,7 @@ class Readiness:
         fault: Callable[[], str | None] = lambda: None,
     ) -> None:
         """`load` returns once they are loaded, and raises the `CowError` for which they cannot be. `warm_up` is called
-        once, then. `fault` says what holds up the jobs, and passes by itself."""
+        once, when all is ready. `fault` says what holds up the jobs, and passes by itself."""
         self._service = service
         self._load_backends, self._fault = load or service.check, fault
         self._warm_up = warm_up
@@ -74,13 +74,14 @@ class Readiness:
     def _load(self, failed: Callable[[], None]) -> None:
         try:
             self._load_backends()
-            with self._warming:
-                self._warm_up()
         except CowError as error:
             self.error = error
             failed()
+            return
         finally:
             self._done.set()
+        with self._warming:
+            self._warm_up()
 
 
 class StorageCheck:

@@ -72,7 +72,7 @@ def view_of(small: Image) -> View:
         coarse = np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8)
         wide = _median(coarse, WIDE, WIDE)
     strip = _median(coarse, *STRIP)
-    planes = cv2.split(lab)
+    planes = [np.asarray(plane, np.float32) for plane in cv2.split(lab)]
     distance, gap, around = _against(planes, wide)
     # The line is known to a pixel of the strip.
     for shifted in (np.concatenate([strip[1:], strip[-1:]]), np.concatenate([strip[:1], strip[:-1]])):

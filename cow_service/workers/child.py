@@ -34,7 +34,7 @@ from cow_service.settings import Settings
 from cow_service.workers import messages
 from cow_service.workers.messages import FromWorker
 
-HEARTBEAT_SECONDS = 1.0
+HEARTBEAT_SECONDS = 2.0
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for a key checks whether it was canceled
 MIN_PROGRESS = 0.005  # of a stage, between two messages
 
@@ -130,14 +130,14 @@ class WorkerProcess:
         failure = None
         try:
             self._service.check()
-            if self._service.settings.warmup:
-                warm_up(self._service.settings)
         except CowError as error:
             failure = error_as_json(error)
         except Exception:
             log.exception("the default backends could not be loaded")
             failure = error_as_json(unforeseen())
         self._send(messages.Loaded(failure))
+        if failure is None and self._service.settings.warmup:
+            warm_up(self._service.settings)
 
     def _work(self, job_id: str) -> None:
         end = self._jobs[job_id].compute(self._service, self._database)

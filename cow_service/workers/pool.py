@@ -28,7 +28,7 @@ from cow_service.workers.process import EndReason, Worker, WorkerGone
 
 MAX_CRASHES = 3  # of workers that had nothing but the job, or of their device
 HEARTBEAT_TIMEOUT_SECONDS = 15.0  # after which a worker that says nothing is ended
-WATCH_SECONDS = 0.5  # between two looks at each worker
+WATCH_SECONDS = 1.0  # between two looks at each worker
 FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS = 1.0, 60.0  # after a worker that could not start; doubled each time
 POLL_SECONDS = 0.1  # how often a job that waits for such a pause checks whether it was canceled
 SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
@@ -38,7 +38,7 @@ log = logging.getLogger("cow_service")
 
 
 class Group:
-    """The workers for one kind of jobs. They are started when they are first needed."""
+    """The workers for one kind of jobs: the first is started when it is needed, the others when that has loaded."""
 
     def __init__(self, name: str, settings: Settings, metrics: Metrics) -> None:
         """`settings` are those of the server, of which each worker has its share."""
@@ -70,6 +70,13 @@ class Group:
         """Starts the first worker."""
         with self._lock:
             self._start()
+
+    def fill(self) -> None:
+        """Starts the next worker of all that there may be, once those that were started have loaded."""
+        with self._lock:
+            is_loaded = all(worker.is_loaded and worker.is_alive for worker in self.workers)
+            if not self._closed and is_loaded and 0 < len(self.workers) < self.size:
+                self._start()
 
     def recover(self) -> None:
         """Starts a worker, after a pause, in the place of one that could not start."""
@@ -303,6 +310,7 @@ class WorkerPool(Computer):
                         worker.heard = looked
                     self._judge(worker, looked)
                 group.recover()
+                group.fill()
 
     def _judge(self, worker: Worker, now: float) -> None:
         if not worker.is_loaded and now - worker.started > self._settings.load_timeout:

@@ -1,7 +1,7 @@
-"""Attempts: to compute a job, each in a thread, and to call a webhook, each a workflow of DBOS.
+"""Attempts to compute a job, each in a thread, and who takes jobs from the queues.
 
 The table of jobs (`job_table.py`) says who computes which job: where its process ends, another process makes the next
-attempt. A call of a webhook is kept by DBOS alone, which delays it, and runs it again.
+attempt.
 """
 
 import logging
@@ -10,53 +10,40 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import replace
-from uuid import uuid4
-
-from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer
-from dbos import error as dbos_error
-from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, CowError, StorageUnavailable, unforeseen
-from cow_service.jobs import webhooks
 from cow_service.jobs.active import ActiveJob
 from cow_service.jobs.computing import Computer, EngineParts, Outages, Work
-from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import VERSION, JobTable, TakenJob
+from cow_service.jobs.job_table import TakenJob
 from cow_service.jobs.notifications import Notification, Notifications
-from cow_service.jobs.schema import SCHEMA
-from cow_service.jobs.webhooks import Webhooks
 from cow_service.observability import logging as context
 from cow_service.observability import tracing
 from cow_service.requests import Stage
-from cow_service.settings import Settings
 
-POLL_SECONDS = 0.25  # between two looks at the queues, besides whenever it is woken: other processes add jobs, too
+# Between two looks at the queues, besides whenever it is woken: other processes add jobs, too. While there are none,
+# those on PostgreSQL say so when there is one.
+POLL_SECONDS, QUIET_POLL_SECONDS, QUIET_POSTGRES_SECONDS = 0.25, 2.0, 20.0
 STOP_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 
 log = logging.getLogger("cow_service")
 
 
-class Interrupted(BaseException):
-    """The engine ends in the middle of a workflow. No `Exception`: DBOS must not record it as an outcome."""
-
-
 class Runner:
-    """Does the work of this process: its jobs, and its workflows. Safe to use from every thread."""
+    """Computes the jobs of this process. Safe to use from every thread."""
 
     def __init__(
         self,
         parts: EngineParts,
         computer: Computer,
-        hooks: Webhooks,
         notifications: Notifications,
         on_end: Callable[[TakenJob, bool], None],
     ) -> None:
         """`on_end` is called when an attempt is over, with whether the job has ended by it."""
         self._parts, self._jobs, self._active, self._computer = parts, parts.jobs, parts.active, computer
-        self._hooks, self._notifications, self._on_end = hooks, notifications, on_end
+        self._notifications, self._on_end = notifications, on_end
         self._threads: list[threading.Thread] = []
 
     def start(self, job: TakenJob) -> None:
@@ -90,26 +77,6 @@ class Runner:
             log.exception("the outcome of job %s could not be stored", job.id)
         finally:
             self._on_end(job, ended)
-
-    def call_webhook(self, job_id: str, url: str, attempt: int) -> None:
-        """Makes an attempt to call a webhook, and sees to another one where that failed."""
-
-        def check() -> None:
-            if _runner is not self:
-                raise Interrupted
-
-        def call() -> float | None:
-            found = patient.wait_through(lambda: self._jobs.find(job_id, None))
-            return None if found is None else self._hooks.send(found.job, url, attempt)
-
-        def enqueue() -> None:
-            with self._parts.database.transaction() as connection:
-                self._hooks.enqueue(connection, job_id, url, attempt + 1, wait)
-
-        patient = Outages(math.inf, check)
-        wait = DBOS.run_step({"name": "call"}, call)  # its outcome is kept: a crash after it does not repeat it
-        if wait is not None:
-            patient.wait_through(enqueue)
 
     def _compute(self, job: TakenJob, running: ActiveJob) -> bool:
         """Whether the result or the error of a job is stored; not where it was canceled."""
@@ -157,83 +124,6 @@ class Runner:
         return True
 
 
-_runner: Runner | None = None
-
-
-def set_runner(runner: Runner | None) -> None:
-    """Sets who does the work: DBOS calls functions, and one process has one engine."""
-    global _runner  # noqa: PLW0603
-    _runner = runner
-
-
-@DBOS.workflow(name=webhooks.WORKFLOW)
-def call_webhook(job_id: str, url: str, attempt: int) -> None:
-    """An attempt to notify a webhook that a job has ended."""
-    assert _runner is not None, "workflows run only while an engine does"
-    _runner.call_webhook(job_id, url, attempt)
-
-
-def launch(database: Database, executor: str, *, migrate: bool, queues: tuple[str, ...] = (webhooks.QUEUE,)) -> None:
-    """Makes the tables, or looks whether they are there, and has DBOS run on them. Raises `StorageUnavailable`.
-
-    `queues`: those of DBOS from which this process takes work.
-    """
-    if migrate:
-        database.create_tables()
-    elif database.schema() < SCHEMA:
-        raise StorageUnavailable("The job database lacks tables of this version of COW: run `cow migrate` first.")
-    config = DBOSConfig(
-        name=webhooks.APPLICATION,
-        system_database_url=database.url,
-        system_database_engine=database.engine,
-        application_version=VERSION,
-        executor_id=executor,
-        serializer=DBOSPortableJSONSerializer(),  # no pickles: reading the database runs no code
-        use_listen_notify=False,  # what processes tell each other is ours
-        run_migrations=migrate,
-        log_level="WARNING",
-    )
-    try:
-        DBOS(config=config)
-        DBOS.listen_queues(queues)
-        DBOS.launch()
-    except (SQLAlchemyError, dbos_error.DBOSException) as error:
-        DBOS.destroy()
-        remedy = "see COW_DATABASE_URL" if migrate else "run `cow migrate` first, and see COW_DATABASE_URL"
-        raise StorageUnavailable(f"The job database cannot be used ({type(error).__name__}): {remedy}.") from error
-
-
-def busy_executors(client: DBOSClient) -> set[str]:
-    """The processes that have workflows in hand."""
-    pending = client.list_workflows(status="PENDING", load_input=False, load_output=False)
-    return {workflow.executor_id for workflow in pending if workflow.executor_id is not None}
-
-
-def recover(client: DBOSClient, jobs: JobTable, ended: list[str]) -> list[str]:
-    """Has the work of processes that have ended done by others; returns the ids of their jobs.
-
-    Calls of webhooks go back to their queue. An earlier version kept records of attempts to compute a job, too: these
-    are over, and are deleted.
-    """
-    recovered = jobs.recover(ended)
-    pending = client.list_workflows(executor_id=ended, status="PENDING", load_input=False, load_output=False)
-    for workflow in pending:
-        if workflow.name == webhooks.WORKFLOW:
-            client.resume_workflow(workflow.workflow_id, queue_name=webhooks.QUEUE)
-    client.delete_workflows([workflow.workflow_id for workflow in pending if workflow.name != webhooks.WORKFLOW])
-    return recovered
-
-
-def migrate(settings: Settings) -> None:
-    """Creates the tables of the job database that are missing, and updates those of an older DBOS.
-
-    Raises `StorageUnavailable`.
-    """
-    with closing(Database(settings)) as database:
-        launch(database, f"migrate-{uuid4().hex}", migrate=True, queues=())
-        DBOS.destroy()
-
-
 class Dispatcher(BackgroundThread):
     """The places of this process, and the thread that fills them. Safe to use from every thread."""
 
@@ -241,6 +131,7 @@ class Dispatcher(BackgroundThread):
         """`capacity`: of a queue by its name; `start` begins the work on a job that was taken."""
         super().__init__("cow-dispatcher", STOP_SECONDS)
         self._parts, self._capacity, self._start = parts, capacity, start
+        self._quiet_seconds = QUIET_POSTGRES_SECONDS if parts.database.file is None else QUIET_POLL_SECONDS
         self._places = threading.Lock()
         self._held: Counter[str] = Counter()  # the places of each queue that are held; only the thread takes more
         self._woken = threading.Event()
@@ -283,7 +174,7 @@ class Dispatcher(BackgroundThread):
                 log.warning("no jobs are taken: %s", error.detail)
             except Exception:
                 log.exception("no jobs were taken")
-            if not self._woken.wait(POLL_SECONDS):
+            if not self._woken.wait(self._quiet_seconds if self._parts.active.is_quiet else POLL_SECONDS):
                 self._look = True
 
     def _fill(self, queue: str) -> None:
