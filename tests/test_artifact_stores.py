@@ -13,7 +13,7 @@ import pytest
 from job_rows import add_job
 
 from cow_service.errors import ArtifactNotFound, StorageUnavailable
-from cow_service.jobs.database import Database
+from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import JobTable
 from cow_service.jobs.maintenance import collect_artifacts
 from cow_service.media import object_artifacts
@@ -247,7 +247,8 @@ def test_the_file_of_the_database_gives_room_back(tmp_path: Path):
     for job in jobs:
         digits = noise.integers(0, 10**9, 60_000).tobytes().hex()  # what is stored deflated stays large
         add_job(database, job)
-        database.store_result(hashlib.sha256(job.encode()).hexdigest(), job, "motion", digits, [])
+        key = hashlib.sha256(job.encode()).hexdigest()
+        database.store_results(job, [StoredResult(key, "motion", digits, ())])
     database.give_room_back(lambda: False)
     file = tmp_path / "jobs.sqlite3"
     full = file.stat().st_size

@@ -23,7 +23,7 @@ from cow_service.errors import InternalError, InvalidRequest
 from cow_service.jobs import webhooks
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.attempts import Dispatcher
-from cow_service.jobs.database import Database
+from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import MAX_STARTS, JobFilters, JobTable
 from cow_service.jobs.schema import JOBS
 from cow_service.settings import Settings
@@ -117,10 +117,10 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
 def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_without_it(database: Database) -> None:
     table = JobTable(database)
     job = take_new_job(database, "job", "me")
-    database.store_result("key", "job", "grounding", "{}", ["a" * 64])
+    database.store_results("job", [StoredResult("key", "grounding", "{}", ("a" * 64,))])
     assert not table.succeed(job, "{}", None, ("grounding", "generation"))
     assert table.taken_by("me") == {"job": job.run}
-    database.store_result("another key", "job", "generation", "{}", ["b" * 64])
+    database.store_results("job", [StoredResult("another key", "generation", "{}", ("b" * 64,))])
     assert table.succeed(job, "{}", None, ("grounding", "generation"))
 
 

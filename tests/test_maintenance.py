@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from job_rows import add_job
 
-from cow_service.jobs.database import Database, packed, unpacked
+from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import JobTable
+from cow_service.jobs.packing import packed, unpacked
 from cow_service.settings import Settings
 
 
@@ -46,7 +47,8 @@ def test_what_belongs_to_a_job_is_deleted_with_it(tmp_path: Path) -> None:
     database.create_tables()
     for job, shared in (("one", "5" * 64), ("two", "5" * 64)):
         add_job(database, job)
-        database.store_result(job * 4, job, "trajectory", "{}", [job * 8, shared], '{"value":1}')
+        stored = StoredResult(job * 4, "trajectory", "{}", (job * 8, shared), '{"value":1}')
+        database.store_results(job, [stored])
     assert JobTable(database).delete(["one"]) == {"one" * 8}, "the other artifacts are needed by another job"
     assert database.find_result("one" * 4) is None
     assert database.find_result("two" * 4) == ("two", {"value": {"value": 1}})

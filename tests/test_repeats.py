@@ -135,9 +135,11 @@ def test_repeats_have_the_mean_and_the_variance_of_the_model(
     fourth = variance * (1 - 3 * variance)  # the fourth central moment of a draw of 0 or 1
     assert abs(statistics.mean(drawn) - rate) < 3 * (variance / REPEATS) ** 0.5
     assert abs(statistics.variance(drawn) - variance) < 3 * ((fourth - variance**2) / REPEATS) ** 0.5
-    # One request imagined, whoever was first; the others took that, and each drew its own answer all the same.
-    reused = SIMULATED if imagine == "always" else []
-    assert Counter(stage for each in found for stage in each["reused"]) == dict.fromkeys(reused, REPEATS - 1)
+    # One request imagined, whoever was first; the others took that, and each drew its own answer all the same. Of quick
+    # stages those that run at the same moment do not wait for each other.
+    reused = Counter(stage for each in found for stage in each["reused"])
+    assert reused.keys() == set(SIMULATED if imagine == "always" else [])
+    assert {reused[stage] for stage in ("grounding", "generation") if reused} <= {REPEATS - 1}
     costs = Counter((each["usage"]["calls"], each["usage_total"]["calls"]) for each in found)
     assert costs == ({(1, 3): REPEATS - 1, (3, 3): 1} if reused else {(1, 1): REPEATS})
     assert len(mllm.asked) == sum(each["usage"]["calls"] for each in found)

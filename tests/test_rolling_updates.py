@@ -26,8 +26,9 @@ from test_migration import cow
 
 from cow_service.errors import StorageUnavailable
 from cow_service.jobs import schema
-from cow_service.jobs.database import Database, packed
+from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobTable
+from cow_service.jobs.packing import packed
 from cow_service.jobs.schema import METADATA, PROCESSES, SCHEMAS
 from cow_service.media.artifacts import DiskArtifacts
 from cow_service.settings import Settings

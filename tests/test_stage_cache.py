@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,13 @@ def step(
     )
 
 
+def stored(store: StoredStep, key: StageKey, compute: Callable[[], StageResult[Any]]) -> tuple[StageResult[Any], bool]:
+    """What a job comes to that has this stage alone."""
+    found = store("motion", key, compute)
+    store.flush()
+    return found
+
+
 def result(speed: float) -> StageResult[Any]:
     scale = MetresPerPixel(value=0.01, source="default")
     motion = Motion(
@@ -65,7 +73,7 @@ def result(speed: float) -> StageResult[Any]:
 
 def test_nobody_finds_what_another_key_asked(database: Database, tmp_path: Path) -> None:
     def reused(job_id: str, owner: str | None) -> bool:
-        return step(database, tmp_path, job_id, owner=owner)("motion", StageKey("a" * 64), lambda: result(1))[1]
+        return stored(step(database, tmp_path, job_id, owner=owner), SHARED, lambda: result(1))[1]
 
     assert [reused(str(n), owner) for n, owner in enumerate(["alice", "bob", None, "alice", "bob", None])] == [
         False, False, False, True, True, True,
@@ -74,7 +82,7 @@ def test_nobody_finds_what_another_key_asked(database: Database, tmp_path: Path)
 
 def test_a_result_is_found_by_other_jobs_only_where_it_may_be(database: Database, tmp_path: Path) -> None:
     def speed_of(job_id: str, key: StageKey, computed: float, fresh: bool = False) -> tuple[float, bool]:
-        found, reused = step(database, tmp_path, job_id, fresh)("motion", key, lambda: result(computed))
+        found, reused = stored(step(database, tmp_path, job_id, fresh), key, lambda: result(computed))
         return found.value.speed, reused
 
     assert speed_of("one", SHARED, 1) == (1, False)
@@ -91,7 +99,7 @@ def test_a_result_that_says_more_is_taken_where_there_is_none_of_its_own(databas
     alone = StageKey("c" * 64, also=(SHARED.digest,))
 
     def speed_of(job_id: str, key: StageKey, computed: float, **how: Any) -> tuple[float, bool]:
-        found, reused = step(database, tmp_path, job_id, **how)("motion", key, lambda: result(computed))
+        found, reused = stored(step(database, tmp_path, job_id, **how), key, lambda: result(computed))
         return found.value.speed, reused
 
     assert speed_of("one", SHARED, 1) == (1, False)
@@ -109,7 +117,7 @@ def test_nothing_is_stored_for_a_job_that_was_canceled_meanwhile(database: Datab
         raise Canceled("The job was canceled.")
 
     with pytest.raises(Canceled):
-        step(database, tmp_path, "one", check=canceled)("motion", SHARED, lambda: result(1))
+        stored(step(database, tmp_path, "one", check=canceled), SHARED, lambda: result(1))
     assert database.find_result(SHARED.digest) is None
     assert database.finished_stages("one") == set()
 
@@ -118,7 +126,7 @@ def test_nothing_is_stored_for_a_job_that_was_deleted_meanwhile(database: Databa
     store = step(database, tmp_path, "one")
     JobTable(database).delete(["one"])
     with pytest.raises(Canceled, match="was deleted"):
-        store("motion", SHARED, lambda: result(1))
+        stored(store, SHARED, lambda: result(1))
     assert database.find_result(SHARED.digest) is None
     with pytest.raises(Canceled, match="was deleted"):
         database.reuse_result("one", "grounding", ["0" * 64])
@@ -137,7 +145,7 @@ def test_servers_of_one_database_have_one_place_for_artifacts(tmp_path: Path) ->
     databases[1].claim("folder-1")
 
 
-@pytest.mark.parametrize("away", ["find_result", "store_result", "compute"])
+@pytest.mark.parametrize("away", ["find_result", "store_results", "compute"])
 def test_an_outage_is_waited_for(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, away: str
 ) -> None:
@@ -158,10 +166,10 @@ def test_an_outage_is_waited_for(
 
     if works is not None:
         monkeypatch.setattr(database, away, fail)
-    found, reused = step(database, tmp_path, "one", budget=30)("motion", SHARED, compute)
+    found, reused = stored(step(database, tmp_path, "one", budget=30), SHARED, compute)
     assert (found.value.speed, reused, len(computed), left) == (7, False, 1, [0])
     monkeypatch.undo()
-    assert step(database, tmp_path, "two")("motion", SHARED, compute)[1]
+    assert stored(step(database, tmp_path, "two"), SHARED, compute)[1]
 
 
 def test_an_outage_without_end_fails_the_job_or_ends_with_it(
@@ -172,7 +180,7 @@ def test_an_outage_without_end_fails_the_job_or_ends_with_it(
 
     monkeypatch.setattr(database, "find_result", fail)
     with pytest.raises(StorageUnavailable):
-        step(database, tmp_path, "one", budget=0.3)("motion", SHARED, lambda: result(7))
+        stored(step(database, tmp_path, "one", budget=0.3), SHARED, lambda: result(7))
     asked = []
 
     def canceled() -> None:
@@ -181,4 +189,4 @@ def test_an_outage_without_end_fails_the_job_or_ends_with_it(
             raise Canceled("The job was canceled.")
 
     with pytest.raises(Canceled):
-        step(database, tmp_path, "one", budget=30, check=canceled)("motion", SHARED, lambda: result(7))
+        stored(step(database, tmp_path, "one", budget=30, check=canceled), SHARED, lambda: result(7))

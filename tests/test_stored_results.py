@@ -13,7 +13,8 @@ from fastapi.testclient import TestClient
 from job_rows import add_job
 from servers import data_url
 
-from cow_service.jobs.database import Database, unpacked
+from cow_service.jobs.database import Database, StoredResult
+from cow_service.jobs.packing import unpacked
 from cow_service.jobs.schema import JOBS, RESULTS, TRAJECTORIES
 from cow_service.records import Simulation
 from cow_service.service import Service
@@ -71,7 +72,7 @@ def test_each_stage_key_has_a_trajectory_of_its_own(tmp_path: Path) -> None:
     database.create_tables()
     add_job(database, "job")
     for key, text in ((KEY, '{"paths":[1]}'), (OTHER, '{"paths":[2]}')):
-        database.store_result(key, "job", "trajectory", "{}", [], text)
+        database.store_results("job", [StoredResult(key, "trajectory", "{}", (), text)])
     found = [database.find_result(key) for key in (KEY, OTHER)]
     assert found == [("job", {"value": {"paths": [1]}}), ("job", {"value": {"paths": [2]}})]
     database.close()

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
+import sqlalchemy as sa
+
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, CowError, StorageUnavailable, unforeseen
 from cow_service.jobs.active import ActiveJob
@@ -88,11 +90,16 @@ class Runner:
             if stage is None:
                 return
             if not begun:
+                told = Notification("progress", job.id, stage, done)
                 with suppress(StorageUnavailable):  # it is tried again
-                    begun = self._jobs.begin(job)
+                    begun = self._jobs.begin(job, lambda connection: self._notifications.send_within(connection, told))
                     if not begun:
                         raise Canceled("The job was canceled.")
+                return
             self._notifications.send(Notification("progress", job.id, stage, done))
+
+        def tell(connection: sa.Connection) -> None:
+            self._notifications.send_within(connection, Notification("ended", job.id))
 
         traced = replace(job, spec=job.spec.model_copy(update={"traceparent": context.traceparent()}))
         patient = Outages(math.inf, running.check)  # the work is done: its outcome is not given up
@@ -108,11 +115,11 @@ class Runner:
                 else:
                     log.exception("job %s failed", job.id)
                     failure = unforeseen()
-                status, stored = "failed", patient.wait_through(lambda: self._jobs.fail(job, failure))
+                status, stored = "failed", patient.wait_through(lambda: self._jobs.fail(job, failure, tell))
             else:
                 for stage, seconds in computed.timings.items():
                     metrics.stage_seconds.labels(stage).observe(seconds)
-                given = job, computed.result, computed.trajectory_key, computed.stages
+                given = job, computed.result, computed.trajectory_key, computed.stages, tell
                 status, stored = "succeeded", patient.wait_through(lambda: self._jobs.succeed(*given))
             if not stored:
                 raise Canceled("The job is another process's, or has lost a stage.")
@@ -135,7 +142,8 @@ class Dispatcher(BackgroundThread):
         self._places = threading.Lock()
         self._held: Counter[str] = Counter()  # the places of each queue that are held; only the thread takes more
         self._woken = threading.Event()
-        self._look = True  # at the queues: there may be jobs that wait
+        self._look = True  # at all queues: there may be jobs that wait
+        self._due = set[str]()  # queues with a new job
 
     def drain(self) -> None:
         """Takes no more jobs."""
@@ -147,9 +155,12 @@ class Dispatcher(BackgroundThread):
         self.drain()
         super().stop()
 
-    def wake(self) -> None:
-        """Has the queues looked at now: there is a new job, or a place."""
-        self._look = True
+    def wake(self, queue: str | None = None) -> None:
+        """Has a queue filled now, as there is a new job; or all of them looked at, as there may be, or is a place."""
+        if queue is None:
+            self._look = True
+        else:
+            self._due.add(queue)
         self._woken.set()
 
     def free_places(self, queue: str) -> int:
@@ -166,9 +177,9 @@ class Dispatcher(BackgroundThread):
         """Starts what waits in the queues."""
         while not self._stop.is_set():
             self._woken.clear()
-            look, self._look = self._look, False
+            (look, self._look), (due, self._due) = (self._look, False), (self._due, set())
             try:
-                for queue in self._parts.jobs.waiting_queues() if look else ():
+                for queue in self._parts.jobs.waiting_queues() if look else due:
                     self._fill(queue)
             except CowError as error:
                 log.warning("no jobs are taken: %s", error.detail)

@@ -8,7 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 from weakref import WeakValueDictionary
@@ -17,9 +17,9 @@ import psutil
 from pydantic import ValidationError
 from pydantic_core import to_json
 
-from cow_service.errors import ArtifactNotFound, StorageUnavailable
+from cow_service.errors import ArtifactNotFound, CowError, StorageUnavailable
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.database import Database
+from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import JobTable, TakenJob
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.observability.metrics import gpu_memory
@@ -32,6 +32,9 @@ from cow_service.stages.run import Progress, Run
 
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result checks whether it was canceled
 FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # seconds between two tries
+
+# Stages that take less than their transactions would: behind one that was computed they are not looked for, either.
+QUICK: tuple[Stage, ...] = ("grounding", "depth", "motion", "trajectory")
 
 Value = TypeVar("Value")
 HoldKey = Callable[[str, Callable[[], None]], AbstractContextManager[None]]
@@ -90,7 +93,12 @@ class KeyLocks:
 
 @dataclass
 class StoredStep:
-    """The `Step` of one job: a result is stored as soon as it is there, and not computed again."""
+    """The `Step` of one job: what is stored is not computed again.
+
+    Results of quick stages are stored together, before the next one that may take long, or by `flush`: a transaction
+    costs more than they do. One that waits for that is computed again by a job that wants the same at this moment. What
+    a multimodal LLM has said is stored at once: it would not say the same again.
+    """
 
     job_id: str
     owner: str | None  # whose results of other jobs may be taken: nobody learns what another key asked
@@ -101,7 +109,8 @@ class StoredStep:
     hold_key: HoldKey
     outages: Outages
     trajectory_key: str | None = None  # of this job's trajectory, where it computed one
-    stages: set[str] = field(default_factory=set[str])  # whose results are stored
+    stages: set[str] = field(default_factory=set[str])  # whose results are stored, or wait for that
+    waiting: list[StoredResult] = field(default_factory=list[StoredResult])  # to be stored
 
     def __call__(
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
@@ -117,24 +126,34 @@ class StoredStep:
             scope = {"owner": self.owner}
         digest, *also = (digest_of({**scope, "key": each}) if scope else each for each in (key.digest, *key.also))
         with self.hold_key(digest, self.outages.check_canceled):
-            found = self.outages.wait_through(
-                lambda: next((each for key in (digest, *also) if (each := self._find(stage, key)) is not None), None)
-            )
+            found = None
+            if stage not in QUICK or not self.waiting:
+                found = self.outages.wait_through(
+                    lambda: next((each for key in (digest, *also) if (each := self._find(stage, key))), None)
+                )
             self.looked_for(stage, found is not None and found[1])
             if found is None:
                 found = result, _ = self.outages.wait_through(compute), False
-                self.outages.check_canceled()  # the job may have been deleted: nothing may be stored for it
                 text, trajectory = result.model_dump_json(exclude={"value"} if stage == "trajectory" else None), None
                 if stage == "trajectory":
                     trajectory, self.trajectory_key = result.value.model_dump_json(), digest
-                stored = digest, self.job_id, stage, text, result.artifacts, trajectory
-                self.outages.wait_through(lambda: self.database.store_result(*stored))
+                self.waiting.append(StoredResult(digest, stage, text, result.artifacts, trajectory))
+                if result.usage.calls or stage not in QUICK:
+                    self.flush()
             self.stages.add(stage)
             return found
 
+    def flush(self) -> None:
+        """Stores what waits for it. Raises `Canceled` where the job was deleted or canceled."""
+        self.outages.check_canceled()  # nothing may be stored for a job that was deleted
+        if self.waiting:
+            self.outages.wait_through(lambda: self.database.store_results(self.job_id, self.waiting))
+            self.waiting = []
+
     def _find(self, stage: Stage, digest: str) -> tuple[StageResult[Any], bool] | None:
         """A stored result all of whose artifacts are there, and whether it is another job's."""
-        row = self.database.find_result(digest)
+        row = self.database.find_result(digest, self.job_id, self.waiting)
+        self.waiting = []
         if row is None:
             return None
         job_id, values = row
@@ -242,7 +261,13 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     given = work.progress, step, outages.wait_through, job.id, spec.created_at, spec.turn
     seen = None if spec.fresh else service.seen
     with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
-        result = answer(cast("Run[AnswerRequest]", run)) if isinstance(request, AnswerRequest) else simulate(run)
+        try:
+            result = answer(cast("Run[AnswerRequest]", run)) if isinstance(request, AnswerRequest) else simulate(run)
+        except CowError:  # the stages before the one that failed are found by the next try
+            with suppress(CowError):
+                step.flush()
+            raise
+        step.flush()
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
     simulation = result.simulation if isinstance(result, Answer) else result
     trajectory_key = None if simulation is None else step.trajectory_key

@@ -10,21 +10,21 @@ import sqlite3
 import sys
 import threading
 import time
-import zlib
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import sqlalchemy as sa
-from pydantic_core import from_json
 from sqlalchemy import event
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DisconnectionError, OperationalError, SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
+from cow_service.jobs.packing import packed, packed_paths, unpacked
 from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES, schema_of, update_tables
 from cow_service.settings import Settings, SettingsError
 
@@ -40,7 +40,6 @@ MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cu
 TABLES_LOCK = 0x434F5701  # of PostgreSQL, held while tables are created
 INCREMENTAL = 2  # SQLite's number of that mode
 VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
-DEFLATE_LEVEL = 3  # of zlib: higher ones take several times as long and save a twentieth
 OPEN = ("queued", "running")  # the statuses of jobs that have not ended
 
 # These run several times in every job: as plain text they take a fifth of the time that expressions do.
@@ -62,6 +61,17 @@ _DONE = "INSERT INTO cow_stages_of_jobs (job_id, stage) VALUES (?, ?) ON CONFLIC
 _ADD_REFERENCES = "INSERT INTO cow_references (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
 
 log = logging.getLogger("cow_service")
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """The result of a stage, to be stored."""
+
+    key: str
+    stage: str
+    result: str  # JSON
+    artifacts: tuple[str, ...]
+    trajectory: str | None = None  # JSON: its value, where that is stored apart from it
 
 
 class Database:
@@ -229,9 +239,13 @@ class Database:
         finally:
             os.close(descriptor)
 
-    def find_result(self, key: str) -> tuple[str, Any] | None:
-        """The job that computed a stage's result, and the result as JSON values."""
-        with self._cursor() as cursor:
+    def find_result(self, key: str, job: str = "", store: Sequence[StoredResult] = ()) -> tuple[str, Any] | None:
+        """The job that computed a stage's result, and the result as JSON values.
+
+        First it stores results of a job, in the same transaction. Raises as `store_results` does.
+        """
+        with self._cursor(writes=bool(store)) as cursor:
+            self._store(cursor, job, store)
             cursor.execute(self._plain(_FIND), (key,))
             row = cursor.fetchone()
         if row is None:
@@ -241,22 +255,24 @@ class Database:
             result["value"] = unpacked(trajectory)
         return job, result
 
-    def store_result(
-        self, key: str, job: str, stage: str, result: str, artifacts: Iterable[str], trajectory: str | None = None
-    ) -> None:
-        """Adds references to a stage's artifacts, and saves its result; its value apart from it as `trajectory`.
+    def store_results(self, job: str, results: Sequence[StoredResult]) -> None:
+        """Adds references to the artifacts of a job's stages, and saves their results together.
 
         Raises `Canceled` where the job was deleted.
         """
         with self._cursor(writes=True) as cursor:
-            self._add_references(cursor, job, artifacts)
-            if trajectory is not None:
-                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, key, packed(trajectory)))
-            cursor.execute(self._plain(_SAVE), (key, job, stage, packed(result), time.time()))
-            cursor.execute(self._plain(_DONE), (job, stage))
+            self._store(cursor, job, results)
+
+    def _store(self, cursor: Any, job: str, results: Sequence[StoredResult]) -> None:
+        self._add_references(cursor, job, [sha256 for each in results for sha256 in each.artifacts])
+        for each in results:
+            if each.trajectory is not None:
+                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, each.key, packed_paths(each.trajectory)))
+            cursor.execute(self._plain(_SAVE), (each.key, job, each.stage, packed(each.result), time.time()))
+            cursor.execute(self._plain(_DONE), (job, each.stage))
 
     def reuse_result(self, job: str, stage: str, artifacts: Iterable[str]) -> None:
-        """Adds references to the artifacts of a result that another job had computed. Raises as `store_result` does."""
+        """Adds references to the artifacts of a result that another job had computed. Raises as `store_results`."""
         with self._cursor(writes=True) as cursor:
             self._add_references(cursor, job, artifacts)
             cursor.execute(self._plain(_DONE), (job, stage))
@@ -398,16 +414,6 @@ class StalledConnections(BackgroundThread):
                         socket.socket(fileno=os.dup(connection.fileno())) as stalled,
                     ):
                         stalled.shutdown(socket.SHUT_RDWR)
-
-
-def packed(json: str) -> bytes:
-    """A JSON text as the database keeps it: a trajectory is tens of kilobytes of digits."""
-    return zlib.compress(json.encode(), DEFLATE_LEVEL)
-
-
-def unpacked(kept: bytes) -> Any:
-    """The values of a JSON text that was packed."""
-    return from_json(zlib.decompress(kept))
 
 
 @contextmanager

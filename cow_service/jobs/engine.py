@@ -9,6 +9,7 @@ import logging
 import threading
 import uuid
 from collections.abc import Callable, Iterable
+from functools import partial
 from http import HTTPStatus
 
 from cow_service.errors import (
@@ -150,10 +151,13 @@ class JobEngine:
 
     def check_capacity(self, owner: str | None) -> None:
         """Raises `QueueFull` where another job would be too many, `ShuttingDown` where none is accepted."""
-        limit, own_limit = self.service.settings.queue_limit, self.service.settings.own_queue_limit
         if self._stopping:
             raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
-        jobs, own = self.jobs.count_open(owner)
+        self._check_open(owner, *self.jobs.count_open(owner))
+
+    def _check_open(self, owner: str | None, jobs: int, own: int) -> None:
+        """Raises `QueueFull` where so many open jobs, and so many of the owner, leave no room for another one."""
+        limit, own_limit = self.service.settings.queue_limit, self.service.settings.own_queue_limit
         if jobs >= limit:
             raise QueueFull(f"{jobs} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later.")
         if owner is not None and own_limit < limit and own >= own_limit:
@@ -196,11 +200,12 @@ class JobEngine:
         settings = self.service.settings
         queue = queue_of(spec.reader, spec.generator, settings)
         step = step_of(settings.key_weights.get(owner or "", 1.0))
-        with self._submitting:  # the number of jobs must not change between the check and the insertion
+        if self._stopping:
             self.check_capacity(owner)
-            is_new = self.jobs.insert(job_id, spec, owner, queue, step)
+        with self._submitting:  # the number of jobs must not change between the check and the insertion
+            is_new = self.jobs.insert(job_id, spec, owner, queue, step, partial(self._check_open, owner))
         if is_new:
-            self._dispatcher.wake()
+            self._dispatcher.wake(queue)
             if self._dispatcher.free_places(queue) <= 0:
                 self._notifications.send(Notification("queued", job_id))
         return is_new
@@ -258,7 +263,6 @@ class JobEngine:
         self._dispatcher.give_place_back(job.queue)
         if has_ended:
             self.active.notify_ended(job.id)
-            self._notifications.send(Notification("ended", job.id))
 
     def _receive(self, notification: Notification) -> None:
         """What another process has told of a job."""

@@ -19,7 +19,8 @@ from pydantic_core import to_json
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds
 from cow_service.jobs.active import At, share_done
-from cow_service.jobs.database import OPEN, Database, packed, unpacked
+from cow_service.jobs.database import OPEN, Database
+from cow_service.jobs.packing import packed, unpacked
 from cow_service.jobs.queues import moves, next_turn
 from cow_service.jobs.schema import JOBS, REFERENCES, STAGES, TRAJECTORIES
 from cow_service.observability.logging import rfc3339
@@ -37,6 +38,12 @@ CLAIM_LOCK = 0x434F5702  # of PostgreSQL, held while jobs are taken that a limit
 
 OnEnd = Callable[[sa.Connection, str, str], None]
 """Called in the transaction that ends a job: with the job, and the webhook that it has."""
+Tell = Callable[[sa.Connection], None]
+"""Called in a transaction, to tell other processes of it when it is committed."""
+
+
+def _tell_nobody(connection: sa.Connection) -> None:
+    """Does nothing."""
 
 
 class JobSpec(Record):
@@ -155,13 +162,23 @@ class JobTable:
         ((jobs, own),) = self._database.read(_OPEN_JOBS, {"owner": owner})
         return jobs, own
 
-    def insert(self, job_id: str, spec: JobSpec, owner: str | None, queue: str, step: int) -> bool:
+    def insert(
+        self,
+        job_id: str,
+        spec: JobSpec,
+        owner: str | None,
+        queue: str,
+        step: int,
+        check: Callable[[int, int], None] = lambda jobs, own: None,
+    ) -> bool:
         """Adds a job and what it needs; False where there is one of that id.
 
-        Its turn comes `step` after that of its owner's last job.
+        Its turn comes `step` after that of its owner's last job. `check` is given how many jobs are open, all and those
+        of the owner; what it raises passes through, and nothing is added.
         """
         with self._database.transaction() as connection:
             given = {"owner": owner, "queue": queue}
+            check(*connection.execute(_OPEN_JOBS, {"owner": owner}).one())
             first: Sequence[Any] = connection.execute(_FIRST_TURN, given).all()
             jobs: Sequence[Any] = connection.execute(_TURNS_OF_OWNER, given).all()
             turn = next_turn([*first, *jobs], owner, spec.priority, step)
@@ -208,11 +225,14 @@ class JobTable:
             for row in sorted(rows, key=lambda row: (row.turn, row.created_at, row.id))
         ]
 
-    def begin(self, job: TakenJob) -> bool:
+    def begin(self, job: TakenJob, tell: Tell = _tell_nobody) -> bool:
         """Work on a job begins. False where it is no longer this process's: it was canceled, for example."""
         mine = JOBS.c.id == job.id, JOBS.c.run == job.run, JOBS.c.status.in_(OPEN)
         with self._database.transaction() as connection:
-            return connection.execute(sa.update(JOBS).where(*mine).values(status="running")).rowcount > 0
+            is_mine = connection.execute(sa.update(JOBS).where(*mine).values(status="running")).rowcount > 0
+            if is_mine:
+                tell(connection)
+        return is_mine
 
     def release(self, job_id: str, run: str) -> None:
         """Puts a job back into its queue, if it has not ended."""
@@ -220,17 +240,24 @@ class JobTable:
         with self._database.transaction() as connection:
             connection.execute(sa.update(JOBS).where(*mine).values(_RELEASED))
 
-    def succeed(self, job: TakenJob, result: str, trajectory_key: str | None, stages: Collection[str]) -> bool:
+    def succeed(
+        self,
+        job: TakenJob,
+        result: str,
+        trajectory_key: str | None,
+        stages: Collection[str],
+        tell: Tell = _tell_nobody,
+    ) -> bool:
         """Stores the result of a job. False where the job is no longer this process's, and where one of its stages is
         not stored: PostgreSQL loses the latest ones in a crash, with what refers to their artifacts.
         """
         values = {"result": packed(result), "format": FORMAT, "trajectory_key": trajectory_key}
         stored = sa.select(sa.func.count()).where(STAGES.c.job_id == job.id, STAGES.c.stage.in_(stages))
-        return self._end(job.id, "succeeded", job.run, stored.scalar_subquery() == len(stages), **values)
+        return self._end(job.id, "succeeded", job.run, stored.scalar_subquery() == len(stages), tell, **values)
 
-    def fail(self, job: TakenJob, error: CowError) -> bool:
+    def fail(self, job: TakenJob, error: CowError, tell: Tell = _tell_nobody) -> bool:
         """Stores what a job failed with. False where the job is no longer this process's."""
-        return self._end(job.id, "failed", job.run, error=json.dumps(error_as_json(error)))
+        return self._end(job.id, "failed", job.run, tell=tell, error=json.dumps(error_as_json(error)))
 
     def cancel(self, job_id: str) -> bool:
         """Ends a job; False where it had ended."""
@@ -363,6 +390,7 @@ class JobTable:
         status: JobStatus,
         run: str | None = None,
         condition: sa.ColumnElement[bool] | None = None,
+        tell: Tell = _tell_nobody,
         **values: Any,
     ) -> bool:
         """Ends an open job, and has its webhook called. Of an attempt: only if it is the latest."""
@@ -371,8 +399,10 @@ class JobTable:
         ended = sa.update(JOBS).where(*where).values(status=status, ended=time.time(), **values)
         with self._database.transaction(durable=True) as connection:
             row = connection.execute(ended.returning(JOBS.c.webhook)).one_or_none()
-            if row is not None and row.webhook is not None:
-                self._on_end(connection, job_id, row.webhook)
+            if row is not None:
+                tell(connection)
+                if row.webhook is not None:
+                    self._on_end(connection, job_id, row.webhook)
             if row is None and run is not None:  # an earlier try whose commit was not heard of may have done it
                 row = connection.execute(sa.select(JOBS.c.id).where(*this, JOBS.c.status == status)).one_or_none()
         return row is not None

@@ -3,17 +3,22 @@
 All of it only makes things quick: what counts is in the database.
 """
 
+from __future__ import annotations
+
 import time
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from cow_service.errors import CowError
 from cow_service.jobs.active import RestingThread
 from cow_service.jobs.computing import EngineParts
 from cow_service.requests import Stage
+
+if TYPE_CHECKING:
+    import sqlalchemy as sa
 
 POLL_SECONDS = 0.05  # between two looks at SQLite, where somebody waits
 QUIET_POLL_SECONDS = 20.0  # where nobody does: who begins to ends that
@@ -45,11 +50,18 @@ class Notifications(RestingThread):
     def send(self, notification: Notification) -> None:
         """Tells all processes. What cannot be told is found in the database later."""
 
+    @abstractmethod
+    def send_within(self, connection: sa.Connection, notification: Notification) -> None:
+        """The same once the transaction of a connection is committed."""
+
 
 class PolledNotifications(Notifications):
     """On SQLite, whose processes are on one machine: asks for the end of jobs that somebody waits for."""
 
     def send(self, notification: Notification) -> None:
+        """Does nothing."""
+
+    def send_within(self, connection: sa.Connection, notification: Notification) -> None:
         """Does nothing."""
 
     def run(self) -> None:

@@ -29,7 +29,7 @@ CONFIRM_SECONDS = 2.5  # that a lease must be free: after a restart of the serve
 CHANNEL = "cow_jobs"
 RECONNECT_SECONDS = 1.0  # after a session was lost
 LISTEN_SECONDS = 1.0  # of one wait, after which it is looked whether to stop
-PROGRESS_SECONDS = 0.2  # between two messages on the progress of a job
+PROGRESS_SECONDS = 0.5  # between two messages on the progress of a job
 
 
 log = logging.getLogger("cow_service")
@@ -129,16 +129,29 @@ class PostgresNotifications(Notifications):
 
     def send(self, notification: Notification) -> None:
         """As the base class says."""
+        if self._is_due(notification):
+            with suppress(CowError):
+                self._parts.database.read(self._statement(notification))
+
+    def send_within(self, connection: sa.Connection, notification: Notification) -> None:
+        """As the base class says."""
+        if self._is_due(notification):
+            connection.execute(self._statement(notification))
+
+    def _is_due(self, notification: Notification) -> bool:
+        """Whether it is time to tell of it: not of every step of progress."""
         now = time.monotonic()
         if notification.what != "progress":
             self._sent.pop(notification.job_id, None)
-        elif now - self._sent.get(notification.job_id, 0.0) < PROGRESS_SECONDS:
-            return
+        elif now - self._sent.get(notification.job_id, -PROGRESS_SECONDS) < PROGRESS_SECONDS:
+            return False
         else:
             self._sent[notification.job_id] = now
-        with suppress(CowError):
-            payload = json.dumps([self._parts.executor, asdict(notification)])
-            self._parts.database.read(sa.select(sa.func.pg_notify(CHANNEL, payload)))
+        return True
+
+    def _statement(self, notification: Notification) -> sa.Select[Any]:
+        payload = json.dumps([self._parts.executor, asdict(notification)])
+        return sa.select(sa.func.pg_notify(CHANNEL, payload))
 
     def run(self) -> None:
         """Receives, and opens another session where one is lost."""

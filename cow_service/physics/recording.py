@@ -262,10 +262,10 @@ class _Shown:
         if worlds.seen is not None:
             start, scale = points[0], scale / scale[0]
         band, futures = self._spread(index, points - path.points[0])
-        points, scale = np.round(points, POINT_DECIMALS), np.round(scale, SCALE_DECIMALS)
-        turned = np.round(rotation(worlds, index), ROTATION_DECIMALS)
+        points, scale = rounded(points, POINT_DECIMALS), rounded(scale, SCALE_DECIMALS)
+        turned = rounded(rotation(worlds, index), ROTATION_DECIMALS)
         visible = np.all((points >= 0) & (points < np.array(self.world.size)), axis=1) & ~path.passed[0]
-        moving = np.round(states(worlds, index), STATE_DECIMALS)
+        moving = rounded(states(worlds, index), STATE_DECIMALS)
         return Path(
             body=index,
             states=tuple(tuple(state) for state in moving.tolist()),
@@ -275,9 +275,7 @@ class _Shown:
             rotation=tuple(turned.tolist()) if np.abs(turned).max() > 0.05 else (),
             band=band,
             futures=futures,
-            tracks=tuple(
-                pairs(np.round(track, POINT_DECIMALS)) for track in tracks(body, start, points, scale, turned)
-            ),
+            tracks=tuple(pairs(rounded(track, POINT_DECIMALS)) for track in tracks(body, start, points, scale, turned)),
             **self._times(index),
         )
 
@@ -296,10 +294,10 @@ class _Shown:
             return np.stack([np.interp(frames, stamps, points[:, axis]) for axis in (0, 1)], axis=1) + shift
 
         low, high = np.percentile(worlds, BAND_PERCENTILES, axis=0)
-        edges = np.round(np.hstack([at_frames(low), at_frames(high)]), BAND_DECIMALS)
+        edges = rounded(np.hstack([at_frames(low), at_frames(high)]), BAND_DECIMALS)
         band = tuple((x0, y0, x1, y1) for x0, y0, x1, y1 in edges.tolist())
         chosen = np.linspace(0, len(worlds) - 1, min(MAX_FUTURES, len(worlds))).round().astype(int)
-        futures = (pairs(at_frames(worlds[world]).round(FUTURE_DECIMALS)) for world in chosen)
+        futures = (pairs(rounded(at_frames(worlds[world]), FUTURE_DECIMALS)) for world in chosen)
         return band, tuple(futures) if index == 0 else ()
 
     def record_free_path(self, path: FreePath, given: TrajectoryRequest | None) -> Path:
@@ -454,6 +452,11 @@ def moving_until(paths: Sequence[Path], fps: float) -> float:
         moving = np.nonzero((steps > SETTLED) | (np.abs(np.diff(np.array(path.scale))) > SETTLED / 100))[0]
         still = max(still, int(moving[-1]) + 1 if len(moving) else 0)
     return min(left, still) / fps
+
+
+def rounded(values: Floats, decimals: int) -> Floats:
+    """Values with so many decimals; none of them is a negative zero."""
+    return np.round(values, decimals) + 0.0
 
 
 def pairs(points: Floats) -> tuple[Point, ...]:
