@@ -263,7 +263,7 @@ class Database:
         found, all_of_them = set[str](), list(artifacts)
         for start in range(0, len(all_of_them), MAX_IDS):
             some = all_of_them[start : start + MAX_IDS]
-            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.sha256.in_(some)))
+            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.sha256.in_(some)).distinct())
         return found
 
     def referenced_by_open_jobs(self) -> set[str]:
