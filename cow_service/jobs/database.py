@@ -25,7 +25,7 @@ from sqlalchemy.exc import DisconnectionError, OperationalError, SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
-from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, STAGES, STORES, schema_of, update_tables
+from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, STAGES, STORES, add_indexes, schema_of, update_tables
 from cow_service.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
@@ -94,6 +94,8 @@ class Database:
             lock = f"SELECT pg_advisory_xact_lock({TABLES_LOCK})" if self.file is None else "BEGIN IMMEDIATE"
             connection.execute(sa.text(lock))
             update_tables(connection, self.now)
+        with database_errors(), self._reading.connect() as connection:
+            add_indexes(connection)
 
     def schema(self) -> int:
         """That of the tables; 0 where there are none. Raises `StorageUnavailable` where this version cannot use it."""
