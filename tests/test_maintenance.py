@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 import os
 import random
+import threading
+import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 import sqlalchemy as sa
 from hypothesis import given
 from hypothesis import strategies as st
 from job_rows import add_job
+from servers import eventually
 
 from cow_service.errors import ArtifactNotFound
+from cow_service.jobs import maintenance, workflows
 from cow_service.jobs.database import Database, packed, unpacked
 from cow_service.jobs.job_table import JobTable
 from cow_service.jobs.maintenance import BUDGET_GRACE_SECONDS, CHUNK, UNREFERENCED_GRACE_SECONDS, collect_artifacts
@@ -180,3 +184,42 @@ def test_an_artifact_of_many_jobs_is_one(database: Database) -> None:
     for job in ("one", "two"):
         refer(database, job, ["a" * 64])
     assert database.referenced(["a" * 64, "b" * 64]) == {"a" * 64}
+
+
+class EndlessListing(ManyArtifacts):
+    """A store of young artifacts without end."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, [])
+        self.is_listed = threading.Event()
+
+    def listed(self) -> Iterator[ListedArtifact]:
+        self.is_listed.set()
+        while True:
+            yield ListedArtifact("a" * 64, SIZE, time.time())
+
+
+def test_a_long_listing_holds_up_no_other_maintenance(
+    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(maintenance, "CLEAN_UP_SECONDS", 0.0)
+    monkeypatch.setattr(maintenance, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(workflows, "busy_executors", lambda _client: set[str]())
+    store, canceled = EndlessListing(tmp_path), list[str]()
+    service = SimpleNamespace(artifacts=store, settings=Settings())
+    # A job that another process has canceled, once the listing has begun.
+    active = SimpleNamespace(
+        runs=lambda: {"job": "1"} if store.is_listed.is_set() else {}, request_cancel=canceled.append
+    )
+    parts: Any = SimpleNamespace(
+        service=service, database=database, jobs=JobTable(database), active=active, executor="me"
+    )
+    hooks: Any = SimpleNamespace(client=SimpleNamespace(list_workflows=lambda **_: []))
+    thread = maintenance.Maintenance(parts, hooks, maintenance.FolderLease(tmp_path), lambda _jobs, _since: None)
+    thread.start()
+    try:
+        eventually(lambda: canceled)
+        assert not database.take_turn("artifacts", 600)
+    finally:
+        thread.stop()
+    assert database.take_turn("artifacts", 600), "it was stopped before it was done: another process may begin"
