@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import object_store
+import obstore
 import pytest
 from job_rows import add_job
 
@@ -111,15 +112,15 @@ def test_what_is_not_there_is_named(store):
         for name in (SHA256, "../" * 21 + "x", SHA256.upper()):
             with pytest.raises(ArtifactNotFound, match=r"send the image again|64 lower-case hex digits"):
                 call(name)
-    assert not store.delete(SHA256, time.time() + LONG)
+    assert store.delete([SHA256], time.time() + LONG) == set()
     with pytest.raises(ValueError, match="'image/gif' is not kept"):
         store.put(DATA, "image/gif")
 
 
 def test_it_is_deleted_unless_it_was_used(store):
     store.put(DATA, "image/png")
-    assert not store.delete(SHA256, time.time() - LONG)
-    assert store.delete(SHA256, time.time() + LONG)
+    assert store.delete([SHA256], time.time() - LONG) == set()
+    assert store.delete([SHA256], time.time() + LONG) == {SHA256}
     assert list(store.listed()) == []
 
 
@@ -169,6 +170,29 @@ def test_each_call_takes_one_request(objects, store_of_objects, monkeypatch):
     # What is used again after a while is sent again: the store has no other way to say so.
     monkeypatch.setattr(object_artifacts, "RENEWED_AFTER_SECONDS", -60.0)
     assert took(lambda: store.touch(SHA256)) == {"HEAD": 1, "GET": 1, "PUT": 1}
+
+
+def test_many_are_deleted_by_few_requests(objects, store_of_objects):
+    together = object_artifacts.DELETED_TOGETHER
+    names = [store_of_objects.put(b"%d" % number, "image/png").sha256 for number in range(2 * together + 1)]
+    objects.requests.clear()
+    assert store_of_objects.delete(names, time.time() + LONG) == set(names)
+    assert objects.requests == {"HEAD": len(names), "POST": 3}
+    assert objects.names() == set()
+
+
+def test_what_another_process_deletes_first_harms_no_others(objects, store_of_objects, monkeypatch):
+    """Google and Azure answer that it is not there, and delete no others of the same request."""
+    names, delete = [store_of_objects.put(data, "image/png").sha256 for data in (b"a", b"b")], obstore.delete
+
+    def fail(store, paths):
+        if not isinstance(paths, str) or paths == names[0]:
+            raise FileNotFoundError
+        delete(store, paths)
+
+    monkeypatch.setattr(obstore, "delete", fail)
+    store_of_objects.delete(names, time.time() + LONG)
+    assert objects.names() == {names[0]}
 
 
 def test_a_store_that_is_away_or_refuses_is_a_typed_error(objects, store_of_objects, tmp_path, monkeypatch):

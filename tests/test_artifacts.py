@@ -217,9 +217,9 @@ def test_what_nobody_needs_any_more_goes(store, folder):
     assert {(each.size, each.used_at) for each in listed.values()} == {(len(DATA), 1000), (len(b"other"), 1000)}
     store.touch(kept.sha256)
     assert [one.sha256 for one in store.listed() if one.used_at <= 1000] == [loose.sha256]
-    assert not store.delete(kept.sha256, untouched_since=1000)
-    assert store.delete(loose.sha256, untouched_since=1000)
-    assert not store.delete(loose.sha256, untouched_since=1000)
+    both = [kept.sha256, loose.sha256]
+    assert store.delete(both, untouched_since=1000) == {loose.sha256}
+    assert store.delete(both, untouched_since=1000) == set()
     assert store.read(kept.sha256) == DATA
     with pytest.raises(ArtifactNotFound):
         store.touch(loose.sha256)

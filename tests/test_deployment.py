@@ -98,6 +98,43 @@ def test_each_queue_is_scaled_by_its_own_jobs() -> None:
         assert trigger["metadata"]["targetQueryValue"] == given.get("COW_CONCURRENCY", "1")
 
 
+def of_kind(kind: str) -> list[dict[str, Any]]:
+    return [one for one in RESOURCES if one["kind"] == kind]
+
+
+def test_every_deployment_is_scaled_by_one_thing() -> None:
+    scaled = [one["spec"]["scaleTargetRef"]["name"] for one in [*SCALED, *of_kind("HorizontalPodAutoscaler")]]
+    assert sorted(scaled) == sorted(DEPLOYMENTS)
+    for name, workload in DEPLOYMENTS.items():
+        assert "replicas" not in workload["spec"], f"{name}: each update would set the number back"
+        assert container_of(workload)["resources"]["requests"]["cpu"], "a share of which the autoscaler looks at"
+    (servers,) = of_kind("HorizontalPodAutoscaler")
+    (budget,) = (one for one in of_kind("PodDisruptionBudget") if one["metadata"]["name"] == "cow-api")
+    assert budget["spec"]["minAvailable"] < servers["spec"]["minReplicas"], "else no node can be emptied"
+
+
+def selects(selector: dict[str, Any], labels: dict[str, str]) -> bool:
+    said = [labels.get(one["key"]) not in one["values"] for one in selector.get("matchExpressions", ())]
+    return selector["matchLabels"].items() <= labels.items() and all(said)
+
+
+@pytest.mark.parametrize("name", DEPLOYMENTS)
+def test_pods_are_reached_where_they_listen_and_reach_what_they_need(name: str) -> None:
+    template = DEPLOYMENTS[name]["spec"]["template"]
+    policies = [
+        one["spec"]
+        for one in of_kind("NetworkPolicy")
+        if selects(one["spec"]["podSelector"], template["metadata"]["labels"])
+    ]
+    (inward,) = (one for one in policies if one["policyTypes"] == ["Ingress"])
+    (outward,) = (one for one in policies if one["policyTypes"] == ["Egress"])
+    assert [port["port"] for rule in inward["ingress"] for port in rule["ports"]] == [
+        port["name"] for port in container_of(DEPLOYMENTS[name])["ports"]
+    ]
+    assert all(rule.get("from") for rule in inward["ingress"]) == (name != "cow-api"), "only servers ask for keys"
+    assert {port["port"] for rule in outward["egress"] for port in rule["ports"]} >= {53, 443, 5432}
+
+
 def test_every_alarm_is_in_the_runbook() -> None:
     assert {rule["alert"] for rule in RULES} == set(re.findall(r"^### (Cow\w+)$", RUNBOOK, re.MULTILINE))
     for rule in RULES:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -64,6 +66,88 @@ def test_jobs_are_taken_in_their_turns_and_once(database: Database) -> None:
     assert table.waiting_queues() == ["ati"]
     assert table.executors() == {"me", "other"}
     assert (table.count_open("alice"), table.count_open(None)) == ((7, 3), (7, 1))
+
+
+LISTS = [
+    {"kind": "answer"},
+    {"kind": "answer", "status": ["failed"]},
+    {"kind": "answer", "status": ["queued", "failed", "failed"]},
+    {"kind": "simulate", "status": ["running"]},
+    {"status": ["failed", "canceled"]},
+    {},
+]
+
+
+def fill(database: Database, count: int) -> None:
+    """Simulations that succeeded, by two keys; of a hundred jobs one is an answer that failed."""
+    add_job(database, "first", "alice")
+    columns = [column.name for column in JOBS.columns]
+    values = {
+        "id": "'job-' || n",
+        "owner": "CASE n % 2 WHEN 0 THEN 'alice' ELSE 'bob' END",
+        "kind": "CASE n % 100 WHEN 0 THEN 'answer' ELSE 'simulate' END",
+        "status": "CASE n % 100 WHEN 0 THEN 'failed' ELSE 'succeeded' END",
+        "created_at": "'2026-01-01T00:00:' || (10 + n % 50) || '.000Z'",  # many have equal times
+    }
+    query = (
+        f"WITH RECURSIVE numbers AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM numbers WHERE n < {count}) "
+        f"INSERT INTO cow_jobs ({', '.join(columns)}) "
+        f"SELECT {', '.join(values.get(name, name) for name in columns)} FROM "
+        "(SELECT * FROM cow_jobs WHERE id = 'first') f, numbers"
+    )
+    with database.transaction() as connection:
+        connection.execute(sa.text(query.replace(" id,", " f.id,")))
+
+
+@pytest.mark.parametrize("owner", [None, "alice"])
+@pytest.mark.parametrize("wanted", LISTS, ids=str)
+def test_lists_have_what_is_wanted_once(database: Database, owner: str | None, wanted: dict[str, Any]) -> None:
+    fill(database, 600)
+    rows = database.read(sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.kind, JOBS.c.status, JOBS.c.created_at))
+    expected = [
+        row.id
+        for row in sorted(rows, key=lambda row: (row.created_at, row.id), reverse=True)
+        if row.owner == (owner or row.owner)
+        and row.kind == wanted.get("kind", row.kind)
+        and row.status in wanted.get("status", [row.status])
+    ]
+    table, found, cursor = JobTable(database), [], None
+    while found == [] or cursor is not None:
+        page = table.page(owner, JobFilters(limit=100, cursor=cursor, **wanted), {})
+        found += ids([*page.jobs])
+        cursor = page.next
+        if not page.jobs:
+            break
+    assert found == expected
+
+
+@pytest.mark.parametrize("owner", [None, "alice"])
+@pytest.mark.parametrize("wanted", LISTS, ids=str)
+def test_no_list_looks_at_other_jobs(database: Database, owner: str | None, wanted: dict[str, Any]) -> None:
+    """Each is answered from ranges of an index that hold nothing else."""
+    fill(database, 20_000)
+    asked: list[tuple[str, Any]] = []
+
+    def note(_connection: Any, _cursor: Any, statement: str, values: Any, *_: Any) -> None:
+        asked.append((statement, values))
+
+    sa.event.listen(database.engine, "before_cursor_execute", note)
+    JobTable(database).page(owner, JobFilters(**wanted), {})
+    sa.event.remove(database.engine, "before_cursor_execute", note)
+    ((statement, values),) = asked
+    with database.engine.connect() as connection:
+        if database.file is None:
+            connection.exec_driver_sql("ANALYZE cow_jobs")
+            (plan,) = connection.exec_driver_sql(f"EXPLAIN (FORMAT JSON) {statement}", values).scalars()
+            used = re.findall(r'"(?:Index|Relation) Name": "(cow_jobs\w*)"', json.dumps(plan))
+            assert used.count("cow_jobs") * 2 == len(used), "a table is read without an index"
+        else:
+            steps = [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values)]
+            used = [name for step in steps for name in re.findall(r"cow_jobs\w*", step)]
+            assert not [step for step in steps if re.match(r"SCAN cow_jobs(?! USING)", step)]
+    of_kind = "cow_jobs_of_kind" if owner is None else "cow_jobs_of_owner_and_kind"
+    plain = "cow_jobs_of_time" if owner is None else "cow_jobs_of_owner"
+    assert {*used} - {"cow_jobs"} == {of_kind if wanted else plain}
 
 
 def test_no_owner_has_more_taken_jobs_than_they_may_have(database: Database) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import psycopg
 import pytest
 import sqlalchemy as sa
 from conftest import ROOT
@@ -151,6 +152,51 @@ def test_a_column_that_an_older_version_lacks_is_added(old: Database) -> None:
     assert old.read(sa.text("SELECT webhook FROM cow_jobs")) == [(None,)]
     assert old.schema() == schema.SCHEMA
     old.close()
+
+
+def indexes_of(database: Database) -> dict[str, bool]:
+    """Those of the table of jobs, and whether they are used."""
+    if database.file is not None:
+        return {str(one["name"]): True for one in sa.inspect(database.engine).get_indexes("cow_jobs")}
+    joined = "pg_index JOIN pg_class ON pg_class.oid = indexrelid"
+    query = f"SELECT relname, indisvalid FROM {joined} WHERE relname ~ '^cow_jobs_[^p]'"
+    return {row.relname: row.indisvalid for row in database.read(sa.text(query))}
+
+
+def test_indexes_that_an_older_version_lacks_are_added(old: Database) -> None:
+    wanted = {str(index.name): True for index in schema.JOBS.indexes}
+    assert indexes_of(old).items() < wanted.items()
+    old.create_tables()
+    assert indexes_of(old) == wanted
+    if old.file is None:  # the making of one was interrupted
+        with old.transaction() as connection:
+            broken = "UPDATE pg_index SET indisvalid = false WHERE indexrelid = 'cow_jobs_of_kind'::regclass"
+            connection.execute(sa.text(broken))
+        assert indexes_of(old) != wanted
+        old.create_tables()
+        assert indexes_of(old) == wanted
+    old.close()
+
+
+def hurry(connection: psycopg.Connection[Any], _: object) -> None:
+    connection.execute("SET lock_timeout = '100ms'")
+    connection.commit()
+
+
+@pytest.mark.slow
+def test_an_index_that_must_wait_for_too_long_keeps_no_server_from_starting(tmp_path: Path) -> None:
+    with postgres_server() as url, closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))) as old:
+        with_old_tables(old)
+        with old.engine.connect() as backup:
+            backup.execution_options(isolation_level="REPEATABLE READ").execute(sa.text("SELECT * FROM cow_jobs"))
+            other = Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))
+            sa.event.listen(other.engine, "connect", hurry)
+            other.create_tables()
+            other.close()
+            assert old.schema() == schema.SCHEMA
+            assert not all(indexes_of(old).values())
+        old.create_tables()
+        assert all(indexes_of(old).values())
 
 
 def test_a_change_that_others_do_not_bear_waits_for_their_end(old: Database, monkeypatch: pytest.MonkeyPatch) -> None:

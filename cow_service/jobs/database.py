@@ -25,7 +25,17 @@ from sqlalchemy.exc import DisconnectionError, OperationalError, SQLAlchemyError
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs.packing import packed, packed_paths, unpacked
-from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES, schema_of, update_tables
+from cow_service.jobs.schema import (
+    JOBS,
+    MAINTENANCE,
+    REFERENCES,
+    SCHEMA,
+    STAGES,
+    STORES,
+    add_indexes,
+    schema_of,
+    update_tables,
+)
 from cow_service.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
@@ -111,6 +121,8 @@ class Database:
             lock = f"SELECT pg_advisory_xact_lock({TABLES_LOCK})" if self.file is None else "BEGIN IMMEDIATE"
             connection.execute(sa.text(lock))
             update_tables(connection, self.now)
+        with database_errors(), self._reading.connect() as connection:
+            add_indexes(connection)
 
     def schema(self) -> int:
         """That of the tables; 0 where there are none. Raises `StorageUnavailable` where this version cannot use it."""
@@ -286,7 +298,7 @@ class Database:
         found, all_of_them = set[str](), list(artifacts)
         for start in range(0, len(all_of_them), MAX_IDS):
             some = all_of_them[start : start + MAX_IDS]
-            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.sha256.in_(some)))
+            found |= self._column(sa.select(REFERENCES.c.sha256).where(REFERENCES.c.sha256.in_(some)).distinct())
         return found
 
     def referenced_by_open_jobs(self) -> set[str]:

@@ -250,8 +250,7 @@ class JobEngine:
     def remove(self, jobs: list[str], untouched_since: float) -> None:
         """Removes jobs that have ended, and those of their artifacts that were not used since (Unix time, s)."""
         self.calls.forget(jobs)
-        for sha256 in self.jobs.delete(jobs):
-            self.service.artifacts.delete(sha256, untouched_since + 1)
+        self.service.artifacts.delete(self.jobs.delete(jobs), untouched_since + 1)
 
     def may_read(self, sha256: str, owner: str | None) -> None:
         """Raises `ArtifactNotFound` for an artifact that no job of the owner refers to."""

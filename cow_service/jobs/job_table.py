@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from typing import Any, cast
+from itertools import product
+from typing import Any, cast, get_args
 from uuid import uuid4
 
 import sqlalchemy as sa
@@ -319,10 +320,6 @@ class JobTable:
         query = sa.select(*_SHOWN).order_by(JOBS.c.created_at.desc(), JOBS.c.id.desc()).limit(filters.limit + 1)
         if owner is not None:
             query = query.where(JOBS.c.owner == owner)
-        if filters.status:
-            query = query.where(JOBS.c.status.in_(filters.status))
-        if filters.kind is not None:
-            query = query.where(JOBS.c.kind == filters.kind)
         if filters.created_after is not None:
             query = query.where(JOBS.c.created_at >= _text(filters.created_after, round_up=True))
         if filters.created_before is not None:
@@ -330,6 +327,14 @@ class JobTable:
         if filters.cursor is not None:
             last = sa.tuple_(*(sa.literal(part) for part in _read_cursor(filters.cursor)))
             query = query.where(sa.tuple_(JOBS.c.created_at, JOBS.c.id) < last)
+        if filters.kind is not None or filters.status:
+            # A range of an index for each kind and status, of which no more is read than a page has.
+            kinds = [filters.kind] if filters.kind else get_args(JobKind)
+            pairs = product(kinds, sorted({*(filters.status or get_args(JobStatus))}))
+            ranges = (query.where(JOBS.c.kind == kind, JOBS.c.status == status) for kind, status in pairs)
+            merged = sa.union_all(*(sa.select(one.subquery()) for one in ranges)).subquery()
+            newest = merged.c.created_at.desc(), merged.c.id.desc()
+            query = sa.select(merged).order_by(*newest).limit(filters.limit + 1)
         found = self._database.read(query)
         rows = found[: filters.limit]
         jobs: list[Job] = []

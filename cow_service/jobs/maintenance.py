@@ -2,9 +2,12 @@
 
 import logging
 import math
+import threading
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Iterable
 from contextlib import AbstractContextManager, contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 from uuid import uuid4
@@ -17,7 +20,7 @@ from cow_service.jobs.active import RestingThread
 from cow_service.jobs.calls import Calls
 from cow_service.jobs.computing import EngineParts
 from cow_service.jobs.database import Database
-from cow_service.media.artifacts import ListedArtifact
+from cow_service.media.artifacts import ArtifactStore, ListedArtifact
 from cow_service.service import Service
 
 # For processes that ended, and for jobs that run here and were canceled by another process; the same without any job.
@@ -28,7 +31,9 @@ TURN_SECONDS = 0.9 * CLEAN_UP_SECONDS  # since the last one of any process, whic
 # The same where artifacts are listed, which costs seconds for hundreds of thousands. It must be done sooner only where
 # they have a budget: without a reference they are kept for an hour anyway.
 LISTING_SECONDS = 0.9 * 3600.0
+RENEWAL_SECONDS = 60.0  # after which the turn of a listing that goes on is taken again: it may last longer than a turn
 MAX_REMOVED_JOBS = 200  # at a time
+CHUNK = 1000  # artifacts that are looked at together
 JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 # Both are longer than an object store's times of use may be wrong.
 UNREFERENCED_GRACE_SECONDS = 3600.0  # that an artifact is kept without a reference: a request may be about to name it
@@ -112,13 +117,17 @@ class Maintenance(RestingThread):
         self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
 
     def run(self) -> None:
+        """Does the work, that which may take minutes in a thread of its own: jobs are recovered meanwhile."""
+        cleaning = {self._clean_up_in_turn: CLEAN_UP_SECONDS}
+        cleaner = threading.Thread(target=self._repeat, args=(cleaning,), name="cow-clean-up", daemon=True)
+        cleaner.start()
+        self._repeat(
+            {self._recover: 0.0, self._notice_cancellations: 0.0, self._release_stalled: STALLED_SECONDS},
+        )
+        cleaner.join()
+
+    def _repeat(self, kinds: dict[Callable[[], None], float]) -> None:
         """Does each kind of work when it is due. Errors are logged only: maintenance continues whatever happens."""
-        kinds = {
-            self._recover: 0.0,
-            self._notice_cancellations: 0.0,
-            self._release_stalled: STALLED_SECONDS,
-            self._clean_up_in_turn: CLEAN_UP_SECONDS,
-        }
         begun = dict.fromkeys(kinds, time.monotonic())  # recovered jobs refer to their artifacts before any are removed
         while not self._stop.is_set():
             for work, seconds in kinds.items():
@@ -171,11 +180,18 @@ class Maintenance(RestingThread):
         seconds = LISTING_SECONDS if settings.artifacts_max_gb is None else TURN_SECONDS
         if self._stop.is_set() or not database.take_turn("artifacts", seconds):
             return
+
+        def stop() -> bool:  # between two chunks
+            database.take_turn("artifacts", RENEWAL_SECONDS)
+            return self._stop.is_set()
+
+        is_done = False
         try:
-            collect_artifacts(self._parts.service, database, self._stop.is_set)
-        except BaseException:
-            database.give_turn_back("artifacts")  # an hour is long
-            raise
+            collect_artifacts(self._parts.service, database, stop)
+            is_done = not self._stop.is_set()
+        finally:
+            if not is_done:
+                database.give_turn_back("artifacts")  # an hour is long
 
     def clean_up_jobs(self) -> None:
         """Removes jobs past their retention, and what is kept of calls from before that."""
@@ -188,32 +204,81 @@ class Maintenance(RestingThread):
 
 
 def collect_artifacts(service: Service, database: Database, stop: Callable[[], bool], now: float | None = None) -> None:
-    """Removes what is not needed any more, as of `now` (Unix time, s; by default the clock's), until `stop` says so."""
+    """Removes what is not needed any more, as of `now` (Unix time, s; by default the clock's), until `stop` says so.
+
+    The store is listed in chunks, of which one is in memory at a time; the longest unused go by a second listing.
+
+    What is used meanwhile stays, however long this takes: whoever refers to an artifact has used it within the grace
+    before that. One without a reference in the database, whose last use, looked up again right before it is deleted,
+    was before the grace of the start, has got none since.
+    """
     now = time.time() if now is None else now
     store, max_gb = service.artifacts, service.settings.artifacts_max_gb
     store.remove_leftovers(now - LEFTOVER_SECONDS)
-    listed, grace = list(store.listed()), now - UNREFERENCED_GRACE_SECONDS
-    needed = database.referenced(one.sha256 for one in listed if one.used_at <= grace)
-    left: list[ListedArtifact] = []
-    for one in listed:
-        kept = one.used_at > grace or one.sha256 in needed or stop()
-        if kept or not store.delete(one.sha256, grace):
-            left.append(one)
-    if removed := len(listed) - len(left):
+    max_bytes = math.inf if max_gb is None else max_gb * 1e9
+    # Those of jobs that become open later are protected by their last use. A queue's limit keeps these few.
+    in_use = set[str]() if max_gb is None else database.referenced_by_open_jobs()
+    grace, removed, total = now - UNREFERENCED_GRACE_SECONDS, 0, 0
+    removable: Counter[int] = Counter()  # bytes that the budget may remove, by the class of their age
+    for chunk in _chunks(store, stop):
+        old = {one.sha256 for one in chunk if one.used_at <= grace}
+        deleted = store.delete(old - database.referenced(old), grace)
+        removed += len(deleted)
+        for one in chunk:
+            if one.sha256 not in deleted:
+                total += one.size
+                if one.used_at <= now - BUDGET_GRACE_SECONDS and one.sha256 not in in_use:
+                    removable[_age_class(now - one.used_at)] += one.size
+    if removed:
         log.info("removed %d artifacts that no job refers to", removed)
+    if total > max_bytes and not stop():
+        total -= _remove_longest_unused(store, stop, now, in_use, removable, total - max_bytes)
+        if total > max_bytes:
+            shown = total / 1e9, max_gb
+            log.warning("artifacts have %.1f GB, more than COW_ARTIFACTS_MAX_GB=%g: what is left is in use", *shown)
 
-    # The longest unused go until all fit: none of an open job, and none that was used just now.
-    total, max_bytes = sum(one.size for one in left), math.inf if max_gb is None else max_gb * 1e9
-    if total <= max_bytes:
-        return
-    needed, grace, removed = database.referenced_by_open_jobs(), now - BUDGET_GRACE_SECONDS, 0
-    for one in sorted(left, key=lambda each: each.used_at):
-        if total <= max_bytes or one.used_at > grace or stop():
+
+def _remove_longest_unused(
+    store: ArtifactStore,
+    stop: Callable[[], bool],
+    now: float,
+    in_use: Collection[str],
+    removable: Counter[int],
+    excess: float,
+) -> int:
+    """Removes artifacts of the highest classes of ages, of the last class as many as it takes; returns their bytes."""
+    for last_class in sorted(removable, reverse=True):
+        if removable[last_class] >= excess:
             break
-        if one.sha256 not in needed and store.delete(one.sha256, grace):
-            total -= one.size
-            removed += 1
+        excess -= removable[last_class]
+    else:
+        last_class = -1  # not even all of them are enough
+    removed = removed_bytes = 0
+    for chunk in _chunks(store, stop) if removable else ():
+        sizes: dict[str, int] = {}
+        for one in chunk:
+            age_class = _age_class(now - one.used_at)
+            if age_class < last_class or one.used_at > now - BUDGET_GRACE_SECONDS or one.sha256 in in_use:
+                continue
+            if age_class == last_class:
+                if excess <= 0:
+                    continue
+                excess -= one.size
+            sizes[one.sha256] = one.size
+        deleted = store.delete(sizes, now - BUDGET_GRACE_SECONDS)
+        removed += len(deleted)
+        removed_bytes += sum(sizes[sha256] for sha256 in deleted)
     log.info("removed %d artifacts for COW_ARTIFACTS_MAX_GB", removed)
-    if total > max_bytes:
-        shown = total / 1e9, max_gb
-        log.warning("artifacts have %.1f GB, more than COW_ARTIFACTS_MAX_GB=%g: what is left is in use", *shown)
+    return removed_bytes
+
+
+def _chunks(store: ArtifactStore, stop: Callable[[], bool]) -> Generator[list[ListedArtifact]]:
+    """All artifacts of a store, until `stop` says so."""
+    listed = store.listed()
+    while not stop() and (chunk := list(islice(listed, CHUNK))):
+        yield chunk
+
+
+def _age_class(seconds: float) -> int:
+    """Ages that differ by less than a hundredth are of one class: some two thousand classes are all there are."""
+    return int(64 * math.log2(max(seconds, 1.0)))

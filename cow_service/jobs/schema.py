@@ -5,9 +5,11 @@ Results, references and finished stages belong to a job, and are deleted with it
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
 
@@ -17,6 +19,9 @@ SCHEMA = 2  # of our tables; 1 is that without `cow_schema`
 OLDEST_SERVING = 1
 BEFORE_SCHEMA_1 = "cow_holds"  # a table of the versions that kept jobs elsewhere
 ALIVE_SECONDS = 10.0  # since a process last told of itself
+INDEXES_LOCK = 0x434F5703  # of PostgreSQL, held while indexes are added
+
+log = logging.getLogger("cow_service")
 
 METADATA = sa.MetaData()
 JOBS = sa.Table(
@@ -48,6 +53,9 @@ JOBS = sa.Table(
     sa.Index("cow_jobs_of_status", "status", "created_at"),
     sa.Index("cow_jobs_of_owner", "owner", "created_at"),
     sa.Index("cow_jobs_ended", "ended"),
+    # Lists by kind or status are merged from ranges of one of these.
+    sa.Index("cow_jobs_of_kind", "kind", "status", "created_at"),
+    sa.Index("cow_jobs_of_owner_and_kind", "owner", "kind", "status", "created_at"),
 )
 
 
@@ -164,3 +172,31 @@ def update_tables(connection: sa.Connection, now: sa.ColumnElement[float]) -> No
                 connection.execute(sa.text(f"ALTER TABLE {table.name} ADD COLUMN {added}"))
     connection.execute(sa.delete(SCHEMAS))
     connection.execute(sa.insert(SCHEMAS).values(id=1, version=SCHEMA, oldest_serving=OLDEST_SERVING))
+
+
+def add_indexes(connection: sa.Connection) -> None:
+    """Adds the indexes that tables of an earlier version lack. Each statement of the connection must be a transaction.
+
+    They change no schema: without them lists are right, but slow. In PostgreSQL servers write meanwhile; one process
+    adds them, and others do not wait. One that could not be added (a backup that runs delays it for too long) is left
+    invalid, and is made anew at the next start.
+    """
+    if schema_of(connection) > SCHEMA:
+        return
+    indexes = [(table, index) for table in METADATA.sorted_tables for index in table.indexes]
+    if connection.dialect.name == "sqlite":
+        for _, index in indexes:
+            connection.execute(sa.schema.CreateIndex(index, if_not_exists=True))
+    elif connection.execute(sa.text(f"SELECT pg_try_advisory_lock({INDEXES_LOCK})")).scalar():
+        try:
+            valid = "SELECT relname FROM pg_index JOIN pg_class ON pg_class.oid = indexrelid WHERE indisvalid"
+            there = set(connection.execute(sa.text(valid)).scalars())
+            connection.execute(sa.text("SET statement_timeout = 0"))
+            for table, index in ((table, index) for table, index in indexes if index.name not in there):
+                columns = ", ".join(column.name for column in index.columns)
+                connection.execute(sa.text(f"DROP INDEX CONCURRENTLY IF EXISTS {index.name}"))
+                made = f"CREATE INDEX CONCURRENTLY {index.name} ON {table.name} ({columns})"
+                connection.execute(sa.text(made))
+        except SQLAlchemyError as error:
+            log.warning("an index could not be added: lists of jobs are slow (%s)", type(error).__name__)
+        connection.invalidate()  # with its session the lock and the setting end

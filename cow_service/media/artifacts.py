@@ -13,7 +13,7 @@ import os
 import re
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,12 +114,15 @@ class ArtifactStore(ABC):
         return None
 
     @abstractmethod
-    def delete(self, sha256: str, untouched_since: float) -> bool:
-        """Deletes an artifact unless it was used after that time (seconds since 1970). Returns whether it did."""
+    def delete(self, artifacts: Collection[str], untouched_since: float) -> set[str]:
+        """Deletes artifacts, given by their digests, except those used after that time (seconds since 1970).
+
+        The time of last use is looked up right before the deletion: a listing may be older. Returns what was deleted.
+        """
 
     @abstractmethod
     def listed(self) -> Iterator[ListedArtifact]:
-        """All artifacts, in no particular order."""
+        """All artifacts, in no particular order, as they are found: there may be too many to hold them all."""
 
     @contextmanager
     def batch(self, retry: RetryPolicy = try_once) -> Generator[Put]:
@@ -137,7 +140,7 @@ class ArtifactStore(ABC):
     def remove_leftovers(self, untouched_since: float) -> None:
         """Removes temporary files of processes that were killed: those not written to after that time."""
         with disk_errors():
-            for path in self.scratch_folder.rglob(f".*{TEMPORARY_SUFFIX}"):
+            for path in self.scratch_folder.glob(f".*{TEMPORARY_SUFFIX}"):
                 with suppress(FileNotFoundError):  # its process has just ended its work
                     if path.stat().st_mtime <= untouched_since:
                         path.unlink()
@@ -214,14 +217,16 @@ class DiskArtifacts(ArtifactStore):
             path = self._get(sha256)
         yield path
 
-    def delete(self, sha256: str, untouched_since: float) -> bool:
-        """Deletes the file."""
-        with disk_errors():
-            path = self._find(sha256)
-            if path is None or path.stat().st_mtime > untouched_since:
-                return False
-            path.unlink(missing_ok=True)
-        return True
+    def delete(self, artifacts: Collection[str], untouched_since: float) -> set[str]:
+        """Deletes the files."""
+        deleted = set[str]()
+        for sha256 in artifacts:
+            with disk_errors(), suppress(FileNotFoundError):  # another process has just deleted it
+                path = self._find(sha256)
+                if path is not None and path.stat().st_mtime <= untouched_since:
+                    path.unlink()
+                    deleted.add(sha256)
+        return deleted
 
     def listed(self) -> Iterator[ListedArtifact]:
         """All files that are named by a digest."""

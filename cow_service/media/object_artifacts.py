@@ -9,7 +9,7 @@ and process, and whenever they are read. Credentials and endpoints come from the
 import hashlib
 import logging
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Collection, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -31,6 +31,8 @@ RENEWED_AFTER_SECONDS = 300.0
 REQUEST_SECONDS, CONNECT_SECONDS = 8.0, 3.0  # that a request with its bytes, and a connection, may take
 RETRY_SECONDS, MAX_RETRIES = 5.0, 3  # of a request; obstore waits 0.1 s before the first retry, then twice as long
 MAX_PARALLEL = 8  # requests for one job
+LISTED_TOGETHER = 1000  # by one request; no store lists more
+DELETED_TOGETHER = 32  # as many as are asked for their times at the same time, so that none waits between the two
 CHECKED = "check"  # the object that shows that the store can be written and read
 
 log = logging.getLogger("cow_service")
@@ -124,18 +126,31 @@ class ObjectArtifacts(artifacts.ArtifactStore):
             log.warning("artifacts are streamed: the object store signs no URL (%s)", type(error).__name__)
             return None
 
-    def delete(self, sha256: str, untouched_since: float) -> bool:
-        """Deletes the object."""
-        with suppress(ArtifactNotFound), _store_errors(sha256):
-            if obstore.head(self._store, sha256)["last_modified"].timestamp() <= untouched_since:
-                self._remove(sha256)
-                return True
-        return False
+    def delete(self, artifacts: Collection[str], untouched_since: float) -> set[str]:
+        """Deletes objects, `DELETED_TOGETHER` with one request where the store can.
+
+        Their times are asked for at the same time, right before it: what is sent again after that is lost, as it
+        would be if each object had a request of its own.
+        """
+
+        def is_unused(sha256: str) -> bool:
+            with suppress(ArtifactNotFound), _store_errors(sha256):
+                return obstore.head(self._store, sha256)["last_modified"].timestamp() <= untouched_since
+            return False
+
+        names, deleted = list(artifacts), set[str]()
+        with ThreadPoolExecutor(DELETED_TOGETHER) as pool:
+            for start in range(0, len(names), DELETED_TOGETHER):
+                some = names[start : start + DELETED_TOGETHER]
+                unused = [sha256 for sha256, yes in zip(some, pool.map(is_unused, some), strict=True) if yes]
+                self._remove(*unused)
+                deleted.update(unused)
+        return deleted
 
     def listed(self) -> Iterator[artifacts.ListedArtifact]:
         """All objects that are named by a digest; a request for each thousand."""
         with _store_errors():
-            for chunk in obstore.list(self._store):
+            for chunk in obstore.list(self._store, chunk_size=LISTED_TOGETHER):
                 for one in chunk:
                     if artifacts.is_digest(one["path"]):
                         yield artifacts.ListedArtifact(one["path"], one["size"], one["last_modified"].timestamp())
@@ -186,10 +201,16 @@ class ObjectArtifacts(artifacts.ArtifactStore):
             result = obstore.put(self._store, sha256, data, attributes=attributes, use_multipart=False)
         self._note_verified(sha256, result["e_tag"])
 
-    def _remove(self, sha256: str) -> None:
-        self._verified.pop(sha256, None)
+    def _remove(self, *artifacts: str) -> None:
+        for sha256 in artifacts:
+            self._verified.pop(sha256, None)
         with _store_errors():
-            obstore.delete(self._store, sha256)
+            try:
+                obstore.delete(self._store, artifacts)
+            except FileNotFoundError:  # Google and Azure say so where another process has deleted one, and stop there
+                for sha256 in artifacts:
+                    with suppress(FileNotFoundError):
+                        obstore.delete(self._store, sha256)
 
     def _is_verified(self, found: _Object) -> bool:
         return found.e_tag is not None and self._verified.get(found.artifact.sha256) == found.e_tag
