@@ -32,6 +32,7 @@ WATCH_SECONDS = 0.5  # between two looks at each worker
 FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS = 1.0, 60.0  # after a worker that could not start; doubled each time
 POLL_SECONDS = 0.1  # how often a job that waits for such a pause checks whether it was canceled
 SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
+LOCAL_WAITING = 8  # jobs that wait for a reader on a device, which replies to a few at a time: each holds its image
 RENEW_SHARE = 0.75  # of that, from which on a worker without a job is replaced
 
 log = logging.getLogger("cow_service")
@@ -50,7 +51,7 @@ class Group:
                 generator = "cutout"
         elif name == settings.reader and places(name) is not None:  # a reader that computes on a device
             cpu = computing = settings.concurrency
-            waiting = settings.mllm_concurrency
+            waiting = min(settings.mllm_concurrency, LOCAL_WAITING)
         else:
             generator, computing = name, clips(name, settings) or 1
         share = {"concurrency": cpu, "mllm_concurrency": max(1, waiting), "generator": generator}
@@ -219,6 +220,7 @@ class WorkerPool(Computer):
                 jobs_done=one.jobs_done,
                 jobs=active.describe(one.jobs),
                 gpus=one.gpus,
+                load=one.load,
             )
             for group in self.groups
             for one in group.alive()
