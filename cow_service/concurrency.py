@@ -66,6 +66,11 @@ class PrioritySemaphore:
         self._waiting: list[_Waiter] = []
         self._numbers = itertools.count()
 
+    @property
+    def waiting(self) -> int:
+        """How many threads wait."""
+        return len(self._waiting)
+
     def acquire(self, priority: str = "", check_canceled: Callable[[], None] = _never_canceled) -> None:
         """Waits for a permit. What `check_canceled` raises meanwhile ends the wait."""
         with self._lock:

@@ -21,8 +21,8 @@ from cow_service.observability.metrics import Metrics
 from cow_service.perception.base import Perception
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
-from cow_service.readers.chat import ChatReader
-from cow_service.records import Answer, Artifact, BackendInfo, BackendKind, Look, Models, Simulation
+from cow_service.readers.chat import CallsMllm, ChatReader
+from cow_service.records import Answer, Artifact, BackendInfo, BackendKind, Look, Models, Simulation, WorkerLoad
 from cow_service.registry import Registry
 from cow_service.requests import (
     AnswerRequest,
@@ -230,6 +230,17 @@ class Service:
         most = self.settings.max_image_megapixels
         with self.cpu.held(runs.priority_of(0, runs.now()), lambda: None):
             return look(self.perception, key, image, request, nouns, most)
+
+    def load(self) -> WorkerLoad:
+        """What its work waits for just now."""
+        made = [self.readers.get(name) for name in self.readers.names() if self.readers.is_made(name)]
+        places = [reader.places for reader in made if isinstance(reader, CallsMllm)]
+        return WorkerLoad(
+            cpu_waiting=self.cpu.waiting,
+            mllm_calls=sum(one.limit.in_flight for one in places),
+            mllm_limit=sum(one.limit.limit for one in places),
+            mllm_waiting=sum(one.waiting for one in places),
+        )
 
     def models(self) -> Models:
         """Readers and generators, what each needs, and whether it is ready."""

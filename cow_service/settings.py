@@ -85,8 +85,8 @@ class Settings(BaseSettings):
     """Longest wait for one reply, seconds."""
     mllm_budget: float = Field(default=180, gt=0, le=7200)
     """Longest wait with all retries, seconds."""
-    mllm_concurrency: int = Field(default=8, ge=1, le=1024)
-    """Calls of it at the same time; others wait."""
+    mllm_concurrency: int = Field(default=64, ge=1, le=1024)
+    """Most calls of it at the same time: there are as many as it takes without refusals and longer waits."""
     reader: str = Field(default_factory=lambda values: "mllm" if values.get("mllm") else "embedded")
     """Reader where a request names none; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"

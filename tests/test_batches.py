@@ -30,7 +30,8 @@ from cow_service.cli.main import app
 from cow_service.client import AsyncClient, Client, errors
 from cow_service.client.batches import OutageTimer, Question, questions
 from cow_service.client.journal import Journal
-from cow_service.client.progress import BatchProgress
+from cow_service.client.progress import BatchProgress, describe_load
+from cow_service.records import ProcessInfo, QueueInfo, WorkerInfo, WorkerLoad, Workers
 
 COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
@@ -330,6 +331,101 @@ def test_what_passes_is_no_failure_of_a_question(kind: type[errors.CowError]) ->
     assert OutageTimer(60).pause_after(kind("not now")) is not None
 
 
+class Crowded:
+    """A server that answers so many requests at once, and refuses others as a full queue does."""
+
+    def __init__(self, accepts: int, answer: dict[str, Any]) -> None:
+        self.accepts, self.answer = accepts, answer
+        self.at_once = self.most_at_once = self.refused = 0
+        self._lock = threading.Lock()
+
+    def begin(self) -> bool:
+        with self._lock:
+            if accepted := self.at_once < self.accepts:
+                self.at_once += 1
+            self.refused += not accepted
+            self.most_at_once = max(self.most_at_once, self.at_once)
+            return accepted
+
+    def end(self, accepted: bool) -> httpx.Response:
+        if accepted:
+            with self._lock:
+                self.at_once -= 1
+            return httpx.Response(200, json=self.answer)
+        problem = {"type": "urn:cow:problem:queue-full", "title": "", "status": 503, "detail": "full"}
+        headers = {"content-type": "application/problem+json", "retry-after": "0"}
+        return httpx.Response(503, json=problem, headers=headers)
+
+    def blocking(self, request: httpx.Request) -> httpx.Response:
+        if accepted := self.begin():
+            time.sleep(0.02)
+        return self.end(accepted)
+
+    async def awaited(self, request: httpx.Request) -> httpx.Response:
+        if accepted := self.begin():
+            await asyncio.sleep(0.02)
+        return self.end(accepted)
+
+
+@pytest.mark.parametrize("blocking", [True, False])
+def test_as_many_questions_are_asked_at_once_as_the_server_takes(server: Server, blocking: bool) -> None:
+    with Client(server.address) as client:
+        (first,) = client.map(asked(1))
+    crowded, many = Crowded(20, first.result.model_dump(mode="json")), 400
+
+    async def awaited() -> int:
+        transport = httpx.MockTransport(crowded.awaited)
+        async with httpx.AsyncClient(transport=transport) as http, AsyncClient("http://x", http_client=http) as client:
+            return sum([outcome.succeeded async for outcome in client.map(asked(many))])
+
+    if blocking:
+        http = httpx.Client(transport=httpx.MockTransport(crowded.blocking))
+        with http, Client("http://x", http_client=http) as client:
+            assert sum(outcome.succeeded for outcome in client.map(asked(many))) == many
+    else:
+        assert asyncio.run(awaited()) == many
+    assert crowded.most_at_once > 12
+    assert crowded.refused < 0.1 * many  # replies this quick leave little time to hear of a refusal
+
+
+def test_what_limits_a_batch_is_shown(
+    server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("cow_service.client.progress.LOOK_SECONDS", 0.0)
+    monkeypatch.setattr("cow_service.client.progress.LINE_SECONDS", 0.0)
+    told = httpx.get(server.address + "/workers").json()
+    worker = {"name": "w", "queue": None, "memory_mb": 1, "jobs_done": 0}
+    worker["load"] = {"cpu_waiting": 2, "mllm_calls": 5, "mllm_limit": 6, "mllm_waiting": 3}
+    process = {"executor_id": "x", "seen_at": "", "role": "all", "version": "1", "workflow_version": "1"}
+    told["processes"] = [process | {"workers": [worker]}]
+
+    def between(request: httpx.Request) -> httpx.Response:
+        if request.url.path == "/workers":
+            return httpx.Response(200, json=told)
+        return httpx.request(request.method, str(request.url), headers=request.headers, content=request.read())
+
+    http = httpx.Client(transport=httpx.MockTransport(between))
+    with http, Client(server.address, http_client=http) as client:
+        list(client.map(asked(2), progress=True))
+    assert "; limited by the server's MLLM: 8 calls wait for it, of 6 at once" in capsys.readouterr().err
+
+
+def test_what_most_jobs_wait_for() -> None:
+    def limit(queued: int = 0, **load: int) -> str:
+        queue = QueueInfo(name="light", queued=queued, running=0, capacity=1, jobs_per_minute=0)
+        none = {"cpu_waiting": 0, "mllm_calls": 0, "mllm_limit": 0, "mllm_waiting": 0}
+        worker = WorkerInfo(name="w", queue=None, memory_mb=1, jobs_done=0, load=WorkerLoad(**none | load))
+        process = ProcessInfo(
+            executor_id="x", seen_at="", role="all", version="1", workflow_version="1", workers=(worker,)
+        )
+        return describe_load(Workers(processes=(process,), queues=(queue,)))
+
+    assert limit() == ""
+    assert limit(queued=3) == "limited by the server: 3 jobs are queued"
+    assert limit(queued=3, cpu_waiting=4, mllm_calls=3) == "limited by the server's CPU: 4 jobs wait for it"
+    assert "MLLM: 9 calls" in limit(cpu_waiting=4, mllm_calls=8, mllm_limit=8, mllm_waiting=1)
+
+
 def scripted(*, cancel: int = 200) -> Callable[[httpx.Request], httpx.Response]:
     """A server on which every job runs for ever."""
     job = {"id": "j", "kind": "simulate", "status": "running", "progress": 0, "created_at": "now", "generator": "x"}
@@ -574,7 +670,8 @@ def test_a_long_batch_that_is_killed_three_times(fast: Served, tmp_path: Path) -
     # Most are answered from the image alone: what is looked at is who is asked how often.
     items = [{**item, "imagine": "never" if n % 10 else "always"} for n, item in enumerate(asked(many))]
     path, out = written(tmp_path, items), tmp_path / "out"
-    url, concurrency = str(fast.http.base_url), 8
+    concurrency = 8
+    how = ("-o", str(out), "--url", str(fast.http.base_url), "--concurrency", str(concurrency))
     draw = random.Random()
     # One in each of three parts, the last of which leaves room: more results come while a process is being killed.
     moments = [draw.randrange(part * many // 10, (part + 1) * many // 10) for part in (1, 3, 5)]
@@ -585,12 +682,12 @@ def test_a_long_batch_that_is_killed_three_times(fast: Served, tmp_path: Path) -
         return results.read_bytes().count(b"\n") if results.exists() else 0
 
     for moment in moments:
-        with subprocess.Popen([*COMMAND, str(path), "-o", str(out), "--url", url], stderr=subprocess.PIPE) as process:
+        with subprocess.Popen([*COMMAND, str(path), *how], stderr=subprocess.PIPE) as process:
             eventually(lambda: count() >= moment or process.poll() is not None, within=300)  # noqa: B023
             assert process.poll() is None, process.stderr and process.stderr.read()
             process.kill()
     finished = count()
-    result = run(path, "-o", out, "--url", url)
+    result = run(path, *how)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith(f"{many} succeeded ({many - many // 10} without a simulation), 0 failed")
     outcomes = lines_of(out)

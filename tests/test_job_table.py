@@ -145,9 +145,9 @@ def test_no_list_looks_at_other_jobs(database: Database, owner: str | None, want
             steps = [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values)]
             used = [name for step in steps for name in re.findall(r"cow_jobs\w*", step)]
             assert not [step for step in steps if re.match(r"SCAN cow_jobs(?! USING)", step)]
-    of_kind = "cow_jobs_of_kind" if owner is None else "cow_jobs_of_owner_and_kind"
-    plain = "cow_jobs_of_time" if owner is None else "cow_jobs_of_owner"
-    assert {*used} - {"cow_jobs"} == {of_kind if wanted else plain}
+    # PostgreSQL may choose the other index of the kind, too, by what it knows of the owners.
+    of_kind, plain = {"cow_jobs_of_kind", "cow_jobs_of_owner_and_kind"}, {"cow_jobs_of_time", "cow_jobs_of_owner"}
+    assert set() < {*used} - {"cow_jobs"} <= (of_kind if wanted else plain)
 
 
 def test_no_owner_has_more_taken_jobs_than_they_may_have(database: Database) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from cow_service.cli.options import EXISTING, Url, argument, object_in, open_client, option, printable
+from cow_service.client.options import CONCURRENCY
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def batch(
     request: Annotated[
         str | None, option('Fields for questions that lack them: {"votes": 5}.', metavar="JSON", shown="none")
     ] = None,
-    concurrency: Annotated[int, option("Questions at the same time.", min=1)] = 8,
+    concurrency: Annotated[int, option("Most questions at the same time.", min=1)] = CONCURRENCY,
     timeout: Annotated[float | None, option("Longest wait for one question, s.", min=0.001, shown="none")] = None,
     save: Annotated[bool, option("Keep the pictures of each in OUT/items.", "--save")] = False,
     fresh: Annotated[bool, option("Draw everything afresh: take no results of earlier requests.", "--fresh")] = False,

@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 
 from cow_service.cli.batch import EXIT_INTERRUPTED, EXIT_SOME_FAILED
 from cow_service.cli.options import Texts, argument, option, printable
+from cow_service.client.options import CONCURRENCY
 from cow_service.errors import CowError
 
 INSTALL = 'pip install "cow-service[evals]"'
@@ -84,7 +85,7 @@ def run(
     base_url: Annotated[str | None, option("Where the multimodal LLM is served.", shown="the provider's")] = None,
     temperature: Annotated[float | None, option("Of its replies.", shown="the provider's")] = None,
     max_tokens: Annotated[int | None, option("Of a reply.", min=1, shown="8192")] = None,
-    concurrency: Annotated[int, option("Questions at the same time, in each arm.", min=1)] = 8,
+    concurrency: Annotated[int, option("Most questions at the same time, in each arm.", min=1)] = CONCURRENCY,
     skip_faulty: Annotated[
         bool, option("Leave out rows that cannot be asked, and columns that mean nothing.", "--skip-faulty")
     ] = False,

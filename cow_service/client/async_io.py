@@ -1,6 +1,7 @@
 """How `AsyncClient` waits: on the event loop. `sync_io.py` has the same names for `Client`, which waits in threads."""
 
 import asyncio
+import math
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
@@ -8,6 +9,7 @@ from typing import Any, TypeVar
 import httpx
 from httpx_sse import EventSource, ServerSentEvent
 
+from cow_service.adaptive import AdaptiveLimit
 from cow_service.client.protocol import is_event_stream
 
 Q = TypeVar("Q")
@@ -73,17 +75,24 @@ class AsyncIO:
         await asyncio.shield(task)
 
     async def map_concurrently(
-        self, ask: Callable[[Q], Coroutine[Any, Any, R]], questions: Iterator[Q], concurrency: int
+        self, ask: Callable[[Q, float], Coroutine[Any, Any, R]], questions: Iterator[Q], pace: AdaptiveLimit
     ) -> AsyncGenerator[R]:
-        """Asks so many questions at the same time, and yields each result as it comes."""
+        """Asks as many questions at the same time as `pace` allows, and yields each result as it comes.
+
+        `ask` is given a question and the time that `pace.begin` returned, and calls `pace.end`.
+        """
         tasks: set[asyncio.Task[R]] = set()
         try:
             while True:
-                while len(tasks) < concurrency and (question := next(questions, None)) is not None:
-                    tasks.add(asyncio.create_task(ask(question)))
-                if not tasks:
+                while (seconds := pace.seconds_to_wait()) == 0 and (question := next(questions, None)) is not None:
+                    tasks.add(asyncio.create_task(ask(question, pace.begin())))
+                if not tasks and seconds == 0:
                     return
-                done, tasks = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                if not tasks:
+                    await asyncio.sleep(seconds)
+                    continue
+                timeout = seconds if 0 < seconds < math.inf else None
+                done, tasks = await asyncio.wait(tasks, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
                     yield task.result()
         finally:

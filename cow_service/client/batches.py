@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, Generic, Literal, Self, TypeVar
 
 from cow_service import records
+from cow_service.adaptive import AdaptiveLimit
 from cow_service.client import errors
 from cow_service.client.journal import Journal, Question, QuestionLike, questions
 from cow_service.client.options import CONCURRENCY
-from cow_service.client.progress import BatchProgress, progress_shown
+from cow_service.client.progress import BatchProgress, describe_load, progress_shown
 from cow_service.client.protocol import RETRYABLE
 from cow_service.client.request import JobRequest, job_request
 from cow_service.records import JobKind
@@ -134,6 +135,7 @@ class Batch:
         own = {field.name for field in fields(BatchOptions)}
         self.options = BatchOptions(**{name: value for name, value in options.items() if name in own})
         self.journal: Journal | None = None
+        self.pace = AdaptiveLimit(self.options.concurrency)
         self.outage = OutageTimer(on_change=self._show_outage)
         self._items = items
         self._kind: JobKind = kind
@@ -201,6 +203,14 @@ class Batch:
         """Shows that one more has come."""
         self._progress.count(result.succeeded)
         self._show()
+
+    def wants_load(self) -> bool:
+        """Whether to ask the server what its jobs wait for."""
+        return self.options.progress and self._progress.is_look_due()
+
+    def show_load(self, workers: records.Workers) -> None:
+        """Shows what the server's jobs wait for."""
+        self._progress.load = describe_load(workers)
 
     def earlier_results(self, read: Callable[[JobKind, Any], R_co]) -> Iterator[BatchResult[R_co]]:
         """The results of earlier runs, each read from its JSON."""

@@ -26,12 +26,14 @@ from cow_service.client.protocol import Event, job_in, job_path, object_in, read
 from cow_service.client.request import MINIMAL, JobRequest, job_request, plain
 
 if TYPE_CHECKING:
+    from cow_service.adaptive import AdaptiveLimit
     from cow_service.client.async_io import AsyncIO
     from cow_service.client.batches import Batch, BatchResult
     from cow_service.client.journal import Question
     from cow_service.client.sync_io import BlockingIO
 
 M = TypeVar("M", bound=BaseModel)
+LOOK_TIMEOUT = 2.0  # seconds, for what a batch's progress shows beside its numbers
 OnUpdate: TypeAlias = Callable[[records.Job], None] | None
 
 
@@ -55,12 +57,13 @@ class Connection:
         until: float = math.inf,
         limit: float | None = None,
         retries: int | None = None,
+        pace: AdaptiveLimit | None = None,
         **arguments: Any,
     ) -> httpx.Response:
         """The response to a request, which is sent again where that may help (`pause_before_retry`).
 
         No attempt begins after `until`, on the monotonic clock; `limit` is how long the server may say nothing, in
-        seconds. Raises the error that the response holds (`errors.py`).
+        seconds; `pace` is told of refusals. Raises the error that the response holds (`errors.py`).
         """
         url, headers = self.endpoint.base_url + path, self.endpoint.headers(headers or {})
         attempt = 0
@@ -69,7 +72,10 @@ class Connection:
             if until < math.inf:
                 limit = max(until - time.monotonic(), 0) + protocol.TIMEOUT_MARGIN_SECONDS
             timeout = self.endpoint.limited(limit)
+            began = time.monotonic()
             outcome = await self._attempt(method, url, headers=headers, timeout=timeout, **arguments)
+            if pace is not None and protocol.is_refusal(outcome):
+                pace.refuse(began, protocol.retry_after(outcome) if isinstance(outcome, httpx.Response) else None)
             is_last = attempt > (self.retries if retries is None else retries)
             pause = None if is_last else protocol.pause_before_retry(outcome, attempt)
             if pause is None or time.monotonic() + pause > until:
@@ -152,6 +158,7 @@ class Connection:
         on_update: OnUpdate,
         *,
         cancel_abandoned: bool = True,
+        pace: AdaptiveLimit | None = None,
     ) -> Any:
         """The result of a request. The server waits for it `server_wait` seconds before the job is polled.
 
@@ -161,11 +168,12 @@ class Connection:
         until = protocol.deadline(timeout)
         job_id: str | None = None
         try:
-            response = await self._post(request, f"wait={server_wait}" if server_wait else "respond-async", until=until)
+            prefer = f"wait={server_wait}" if server_wait else "respond-async"
+            response = await self._post(request, prefer, until=until, pace=pace)
             if response.status_code != protocol.ACCEPTED:
                 return self.result(request.kind, object_in(response))
             job_id = job_in(response).id
-            return await self.poll(job_id, timeout, until, on_update, request.minimal)
+            return await self.poll(job_id, timeout, until, on_update, request.minimal, pace)
         except (errors.CowError, GeneratorExit):
             raise
         except BaseException:
@@ -182,12 +190,20 @@ class Connection:
                 job_id = job_in(await self._post(request, "respond-async", **once)).id
             await self.cancel(job_id, **once)
 
-    async def poll(self, job_id: str, timeout: float | None, until: float, on_update: OnUpdate, minimal: bool) -> Any:
+    async def poll(
+        self,
+        job_id: str,
+        timeout: float | None,
+        until: float,
+        on_update: OnUpdate,
+        minimal: bool,
+        pace: AdaptiveLimit | None = None,
+    ) -> Any:
         """The result of a job, once it has ended. Raises what it failed with, and `WaitTimeout` after `until`."""
         pause = protocol.FIRST_POLL_SECONDS
         headers = {"Prefer": MINIMAL} if minimal else {}
         while True:
-            response = await self.exchange("GET", job_path(job_id), headers, until=until)
+            response = await self.exchange("GET", job_path(job_id), headers, until=until, pace=pace)
             job = job_in(response)
             if on_update is not None:
                 on_update(job)
@@ -252,17 +268,19 @@ class Connection:
         """The results of a batch as they come, then those of earlier runs."""
         with batch:
             ask = partial(self._ask, batch)
-            concurrency = batch.options.concurrency
-            async with aclosing(self.io.map_concurrently(ask, batch.pending(), concurrency)) as results:
+            async with aclosing(self.io.map_concurrently(ask, batch.pending(), batch.pace)) as results:
                 async for result in results:
+                    if batch.wants_load():
+                        with suppress(errors.CowError):
+                            batch.show_load(await self.get(records.Workers, "/workers", limit=LOOK_TIMEOUT, retries=0))
                     batch.count(result)
                     yield result
             for result in batch.earlier_results(self.result):
                 yield result
 
-    async def _ask(self, batch: Batch, question: Question) -> BatchResult[Any]:
+    async def _ask(self, batch: Batch, question: Question, began: float) -> BatchResult[Any]:
         """The result of a question, which is written down. Raises what no question could get past (`OutageTimer`)."""
-        began, timeout = time.monotonic(), batch.options.timeout
+        timeout = batch.options.timeout
         while True:
             result: Any = None
             failed: errors.CowError | None = None
@@ -274,6 +292,7 @@ class Connection:
                     timeout,
                     lambda _: batch.outage.reset(),
                     cancel_abandoned=batch.journal is None,  # with a journal, the next start asks for the job again
+                    pace=batch.pace,
                 )
                 if (folder := batch.folder_of(question)) is not None:
                     await result.files.save(folder, result)
@@ -284,6 +303,7 @@ class Connection:
                         await self.cancel(error.job_id)
             pause = None if failed is None else batch.outage.pause_after(failed)
             if pause is None:
+                batch.pace.end(began, succeeded=failed is None)
                 return batch.keep(question, result, failed, time.monotonic() - began)
             await self.io.sleep(pause)
 

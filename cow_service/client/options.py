@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
 RETRIES = 5
-CONCURRENCY = 8  # questions of a batch at the same time
+CONCURRENCY = 64  # most questions of a batch at the same time
 
 Given = Mapping[str, Any]  # a record as a plain mapping, checked by the server
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import TypeAlias
 
-from cow_service.records import Job
+from cow_service.records import Job, Workers
 
 ProgressLike: TypeAlias = bool | Callable[[Job], None]
 
@@ -40,6 +40,21 @@ def describe(job: Job) -> str:
 
 
 LINE_SECONDS = 30.0  # between two lines, where there is no terminal
+LOOK_SECONDS = 10.0  # between two looks at what the server's jobs wait for
+
+
+def describe_load(workers: Workers) -> str:
+    """What most of the server's jobs wait for, whoever asked; empty where nothing waits or the server does not say."""
+    loads = [one.load for process in workers.processes for one in process.workers if one.load is not None]
+    cpu, calls = sum(one.cpu_waiting for one in loads), sum(one.mllm_calls for one in loads)
+    at_mllm, queued = calls + sum(one.mllm_waiting for one in loads), sum(queue.queued for queue in workers.queues)
+    if at_mllm and at_mllm >= cpu:
+        return (
+            f"limited by the server's MLLM: {at_mllm} calls wait for it, of {sum(x.mllm_limit for x in loads)} at once"
+        )
+    if cpu:
+        return f"limited by the server's CPU: {cpu} jobs wait for it"
+    return f"limited by the server: {queued} jobs are queued" if queued else ""
 
 
 @dataclass
@@ -51,6 +66,8 @@ class BatchProgress:
     failed: int = 0
     earlier: int = 0  # of those, found in the folder
     note: str = ""  # what the batch waits for, where it waits
+    load: str = ""  # what the server's jobs wait for, where it says so
+    looked_at: float = field(default_factory=time.monotonic)  # the server's load
     began: float = field(default_factory=time.monotonic)
 
     @property
@@ -64,13 +81,20 @@ class BatchProgress:
         self.failed += not succeeded
         self.earlier += earlier
 
+    def is_look_due(self) -> bool:
+        """Whether to ask the server for its load; not again for a while."""
+        due = time.monotonic() - self.looked_at >= LOOK_SECONDS
+        if due:
+            self.looked_at = time.monotonic()
+        return due
+
     def __str__(self) -> str:
         of = "" if self.total is None else f"/{self.total}"
         rate = (self.done - self.earlier) / max(time.monotonic() - self.began, 1e-6)
         left = ""
         if self.total is not None and rate:
             left = f", {timedelta(seconds=round((self.total - self.done) / rate))} left"
-        note = f"; {self.note}" if self.note else ""
+        note = f"; {self.note or self.load}" if self.note or self.load else ""
         return f"{self.done}{of} done, {self.failed} failed, {rate * 60:.3g}/min{left}{note}"
 
 

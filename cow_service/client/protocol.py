@@ -99,22 +99,25 @@ _BROKEN_CONNECTION = (httpx.NetworkError, httpx.TimeoutException, httpx.RemotePr
 
 def pause_before_retry(outcome: httpx.Response | httpx.HTTPError, attempts: int) -> float | None:
     """Seconds to wait after so many attempts; None where another would have the same outcome."""
-    if isinstance(outcome, httpx.HTTPError):
-        if not isinstance(outcome, _BROKEN_CONNECTION):
-            return None
-    else:
-        code = errors.code_of(outcome)
-        if code not in RETRYABLE_CODES if code is not None else outcome.status_code not in RETRYABLE_STATUS:
-            return None
-        retry_after = _retry_after(outcome.headers.get("retry-after", ""))
-        if retry_after is not None:
-            return min(retry_after, MAX_RETRY_AFTER_SECONDS) + random.uniform(0, 0.25)
+    if not is_refusal(outcome):
+        return None
+    if isinstance(outcome, httpx.Response) and (seconds := retry_after(outcome)) is not None:
+        return min(seconds, MAX_RETRY_AFTER_SECONDS) + random.uniform(0, 0.25)
     pause = min(FIRST_BACKOFF_SECONDS * BACKOFF_GROWTH ** (attempts - 1), MAX_BACKOFF_SECONDS)
     return pause * random.uniform(0.75, 1.25)
 
 
-def _retry_after(header: str) -> float | None:
+def is_refusal(outcome: httpx.Response | httpx.HTTPError) -> bool:
+    """Whether the server has not taken a request, and may take it later."""
+    if isinstance(outcome, httpx.HTTPError):
+        return isinstance(outcome, _BROKEN_CONNECTION)
+    code = errors.code_of(outcome)
+    return code in RETRYABLE_CODES if code is not None else outcome.status_code in RETRYABLE_STATUS
+
+
+def retry_after(response: httpx.Response) -> float | None:
     """The header `Retry-After`, a number or a date (RFC 9110), as seconds from now."""
+    header = response.headers.get("retry-after", "")
     if header.isascii() and header.isdecimal():
         return float(header)
     try:

@@ -14,11 +14,13 @@ from typing import Any, TypeVar
 import httpx
 from httpx_sse import EventSource, ServerSentEvent
 
+from cow_service.adaptive import AdaptiveLimit
 from cow_service.client.protocol import is_event_stream
 from cow_service.errors import CowError
 
 Q = TypeVar("Q")
 R = TypeVar("R")
+MAX_WAIT_SECONDS = 1.0  # before a thread that waits for a place looks again
 END_SECONDS = 0.5  # that threads are given to end before their connections are closed
 
 
@@ -121,23 +123,35 @@ class BlockingIO:
             _thread.stop = stop
 
     async def map_concurrently(
-        self, ask: Callable[[Q], Coroutine[Any, Any, R]], questions: Iterator[Q], concurrency: int
+        self, ask: Callable[[Q, float], Coroutine[Any, Any, R]], questions: Iterator[Q], pace: AdaptiveLimit
     ) -> AsyncGenerator[R]:
-        """Asks so many questions at the same time, in threads that end with the process; yields results as they come.
+        """Asks as many questions at the same time as `pace` allows, and yields results as they come.
 
-        Raises what `ask` raises. Whoever stops in between leaves jobs on the server which a batch with a journal finds
-        again; without one they are canceled.
+        It does so in threads that end with the process. `ask` is as in `AsyncIO.map_concurrently`, and what it raises
+        is raised. Whoever stops in between leaves jobs on the server which a batch with a journal finds again; without
+        one they are canceled.
         """
         todo: SimpleQueue[Q | None] = SimpleQueue()
         done: SimpleQueue[tuple[R] | BaseException] = SimpleQueue()
-        stop = threading.Event()
+        stop, ended, turn = threading.Event(), threading.Event(), threading.Lock()
+
+        def begin() -> float:
+            """Waits for a place, in turn. Raises `Stopped`."""
+            with turn:
+                while (seconds := pace.seconds_to_wait()) > 0 and not stop.is_set():
+                    ended.clear()
+                    ended.wait(min(seconds, MAX_WAIT_SECONDS))
+                if stop.is_set():
+                    raise Stopped
+                return pace.begin()
 
         def work() -> None:
             """One thread: question after question, until there is none or the batch has ended."""
             _thread.stop = stop
             try:
                 while (question := todo.get()) is not None and not stop.is_set():
-                    done.put((run(ask(question)),))
+                    done.put((run(ask(question, begin())),))
+                    ended.set()
             except Stopped:
                 pass
             except BaseException as error:  # noqa: BLE001 - it is raised again in the caller's thread
@@ -150,12 +164,12 @@ class BlockingIO:
             return len(handed_out)
 
         # Daemons: an interrupt must not wait for jobs that take minutes.
-        threads = [threading.Thread(target=work, daemon=True) for _ in range(concurrency)]
+        threads = [threading.Thread(target=work, daemon=True) for _ in range(pace.most)]
         for thread in threads:
             thread.start()
         try:
             # Questions are taken here, in the thread of the caller's iterator, and as few as keep the threads busy.
-            unfinished = hand_out(islice(questions, 2 * concurrency))
+            unfinished = hand_out(islice(questions, 2 * pace.most))
             while unfinished:
                 result = done.get()
                 if isinstance(result, BaseException):
@@ -164,6 +178,7 @@ class BlockingIO:
                 yield result[0]
         finally:
             stop.set()
+            ended.set()
             for _ in threads:
                 todo.put(None)
             until = time.monotonic() + END_SECONDS

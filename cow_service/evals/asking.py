@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from inspect_ai import model as inspect_model
 
+from cow_service.adaptive import AdaptivePlaces
 from cow_service.client import AsyncClient
 from cow_service.client.errors import error_from
 from cow_service.errors import MllmUnavailable
@@ -211,6 +212,7 @@ class PromptAsker:
     imagination: Imagination
     pictures: Pictures
     key: str  # of the run: replies of other runs are not taken
+    waiting: Counter[str]  # whose number `mllm` is that of calls without a reply
 
     async def __call__(self, case: Case) -> CaseReplies:
         """Imagines where the arm says so, and asks. Raises `MllmUnavailable`, and what a simulation failed with."""
@@ -238,12 +240,15 @@ class PromptAsker:
     async def _ask(self, case: Case, messages: list[inspect_model.ChatMessage], purpose: str) -> Reply:
         # The repeat is part of the key by itself: it is Inspect's epoch.
         scopes = {"run": self.key, "arm": case.arm.name, "item": case.item.id, "purpose": purpose}
+        self.waiting["mllm"] += 1
         try:
             output = await self.model.generate(messages, cache=inspect_model.CachePolicy(expiry=None, scopes=scopes))
         except Exception as error:
             # Providers raise what they like; Inspect has tried again where that may help.
             told = getattr(error, "provider_message", None) or str(error)
             raise MllmUnavailable(f"{self.model} gave no reply: {told}") from error
+        finally:
+            self.waiting["mllm"] -= 1
         usage = Usage(calls=1)
         if (used := output.usage) is not None:
             cached = (used.input_tokens_cache_read or 0) + (used.input_tokens_cache_write or 0)
@@ -266,6 +271,7 @@ class AnswerAsker:
     """Asks a server. The same run never asks the same twice: requests have idempotency keys."""
 
     client: AsyncClient
+    places: AdaptivePlaces  # for its requests
     pictures: Pictures
     options: Mapping[str, Any]  # fields of the requests
     key: str  # of the run
@@ -281,7 +287,7 @@ class AnswerAsker:
         image = self.pictures.path(case.item.image)
         ask = partial(self.client.answer, image, case.question, imagine=imagine, **options)
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
-        answer = await asked_once(ask, *parts)
+        answer = await asked_once(self.places, ask, *parts)
         found = Evidence()
         if answer.simulation_problem is not None:
             problem = error_from(answer.simulation_problem.model_dump())

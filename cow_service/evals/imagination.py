@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeVar
 
+from cow_service.adaptive import AdaptivePlaces
 from cow_service.client import AsyncClient, AsyncSimulation
 from cow_service.client.errors import Canceled
 from cow_service.errors import CannotGround, CannotReadDirection, CowError, InvalidRequest, MllmBadReply
@@ -95,15 +96,18 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
     return arms
 
 
-async def asked_once(ask: Callable[..., Awaitable[Result]], *parts: str) -> Result:
-    """What `ask` returns for an `idempotency_key` of these parts.
+async def asked_once(places: AdaptivePlaces, ask: Callable[..., Awaitable[Result]], *parts: str) -> Result:
+    """What `ask` returns for an `idempotency_key` of these parts; it holds one of the places meanwhile.
 
     A job that an interrupt has canceled stays so under its key: then there is another key. Raises what `ask` raises.
     """
     for attempt in range(MAX_INTERRUPTS):
         key = hashlib.sha256("\n".join((*parts, str(attempt))).encode()).hexdigest()
         try:
-            return await ask(idempotency_key=key)
+            async with places.held() as call:
+                result = await ask(idempotency_key=key)
+                call.succeeded = True
+                return result
         except Canceled:
             continue
     raise Canceled(f"The same job was canceled {MAX_INTERRUPTS} times.")
@@ -126,9 +130,15 @@ class Evidence:
 class Imagination:
     """Simulations of items, from one server. For one event loop."""
 
-    def __init__(self, client: AsyncClient, pictures: Pictures, options: Mapping[str, Any], key: str) -> None:
-        """`options` are fields of the requests; `key` names the run: the same run never asks the same twice."""
+    def __init__(
+        self, client: AsyncClient, places: AdaptivePlaces, pictures: Pictures, options: Mapping[str, Any], key: str
+    ) -> None:
+        """`places` are for requests of the client, `options` are fields of these.
+
+        `key` names the run: the same run never asks the same twice.
+        """
         self._client = client
+        self.places = places
         self._pictures = pictures
         self._options = dict(options)
         self._key = key
@@ -182,7 +192,7 @@ class Imagination:
         options: Any = {**self._options, **({"seed": trial} if trial else {}), **changes}
         image, question = self._pictures.path(item.image), question_text(item)
         ask = partial(self._client.simulate, image, question, video=False, **options)
-        return await asked_once(ask, self._key, item.id, item.image, str(sorted(options.items())))
+        return await asked_once(self.places, ask, self._key, item.id, item.image, str(sorted(options.items())))
 
 
 async def evidence_of(simulation: AsyncSimulation, client: AsyncClient, pictures: Pictures) -> Evidence:

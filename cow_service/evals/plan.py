@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cow_service import __version__
+from cow_service.client.options import CONCURRENCY
 from cow_service.errors import InvalidRequest
 from cow_service.evals.imagination import Arm
 from cow_service.evals.items import Ask, Item, RunInfo
@@ -48,7 +49,7 @@ class Plan:
     base_url: str | None = None  # of the multimodal LLM
     temperature: float | None = None
     max_tokens: int | None = None
-    concurrency: int = 8
+    concurrency: int = CONCURRENCY
     skip_faulty: bool = False
     retry_failed: bool = False
     log_images: bool = True

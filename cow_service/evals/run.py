@@ -18,7 +18,9 @@ from inspect_ai.dataset import MemoryDataset, Sample
 from inspect_ai.model import GenerateConfig, Model, ModelOutput, get_model
 from inspect_ai.scorer import Score, Scorer, Target, mean, scorer, std
 from inspect_ai.solver import Generate, Solver, TaskState, solver
+from inspect_ai.util import AdaptiveConcurrency
 
+from cow_service.adaptive import FIRST
 from cow_service.client import Client
 from cow_service.client.progress import progress_shown
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
@@ -95,15 +97,16 @@ def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
             raise RuntimeError("The solver runs in tasks of `causalspatial` alone.")
         client, imagination = shared.clients()
         if ask == "answer":
-            asker = asking.AnswerAsker(client, shared.pictures, shared.options, shared.key)
+            asker = asking.AnswerAsker(client, imagination.places, shared.pictures, shared.options, shared.key)
         else:
-            asker = asking.PromptAsker(get_model(), imagination, shared.pictures, shared.reply_key)
+            asker = asking.PromptAsker(get_model(), imagination, shared.pictures, shared.reply_key, shared.waiting)
         try:
             asked = await asker(case)
         except Exception:
             shared.on_reply(arm, None)
             raise
         seen = asking.observation_of(case, asked)
+        await shared.show_load()
         shared.on_reply(arm, seen)
         state.store.set(runs.OBSERVATION, seen.model_dump(mode="json"))
         state.messages = asking.conversation(case, asked, shared.pictures)
@@ -189,7 +192,8 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
                 progress.add(arm, seen)
                 show()
 
-            shared.items, shared.on_reply = items, on_reply
+            shared.items, shared.on_reply, shared.concurrency = items, on_reply, wanted.concurrency
+            shared.progress = progress
             _, ended = eval_set(
                 tasks=[
                     causalspatial(data=info.data_digest, arm=arm, ask=wanted.ask, seed=wanted.seed) for arm in info.arms
@@ -201,7 +205,9 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
                 retry_immediate=False,
                 fail_on_error=False,
                 max_samples=wanted.concurrency,
-                max_connections=wanted.concurrency,
+                adaptive_connections=AdaptiveConcurrency(
+                    min=1, start=min(FIRST, wanted.concurrency), max=wanted.concurrency
+                ),
                 max_tasks=len(info.arms),
                 max_tokens=wanted.max_tokens,
                 max_retries=MAX_RETRIES,

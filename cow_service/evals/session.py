@@ -1,15 +1,22 @@
 """What every task of an evaluation shares: the server that it asks, where its pictures are kept, and its progress."""
 
 import asyncio
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import httpx
+
+from cow_service.adaptive import AdaptiveLimit, AdaptivePlaces
 from cow_service.client import AsyncClient
-from cow_service.client.progress import BatchProgress
+from cow_service.client.options import CONCURRENCY
+from cow_service.client.progress import BatchProgress, describe_load
+from cow_service.client.protocol import is_refusal, retry_after
+from cow_service.errors import CowError
 from cow_service.evals.imagination import Imagination
 from cow_service.evals.items import Item, Observation, Pictures
 from cow_service.evals.runs import PICTURES, SERVER
@@ -30,18 +37,50 @@ class Session:
     key: str  # of the run and its round: names its requests
     reply_key: str  # of the run: names its replies
     options: Mapping[str, Any]  # fields of the requests for simulations and answers
+    concurrency: int = CONCURRENCY  # most requests at the same time
     items: Sequence[Item] | None = None  # of its tasks; None: each task loads its own
     # Called with the arm of every question that has been asked, and with what came of it; None: it failed.
     on_reply: Callable[[str, Observation | None], None] = lambda arm, seen: None
+    progress: "EvalProgress | None" = None
+    waiting: Counter[str] = field(default_factory=Counter[str])
     _clients: dict[int, tuple[AsyncClient, Imagination]] = field(default_factory=dict)
 
     def clients(self) -> tuple[AsyncClient, Imagination]:
         """For the running event loop; all arms share its simulations."""
         loop = id(asyncio.get_running_loop())
         if loop not in self._clients:
-            client = AsyncClient(self.url, timeout=TIMEOUT)
-            self._clients[loop] = client, Imagination(client, self.pictures, self.options, self.key)
+            places = AdaptivePlaces(self.concurrency)
+            client = AsyncClient(self.url, timeout=TIMEOUT, http_client=_observed(places.limit))
+            self._clients[loop] = client, Imagination(client, places, self.pictures, self.options, self.key)
         return self._clients[loop]
+
+    async def show_load(self) -> None:
+        """Shows what most calls wait for, now and then."""
+        if self.progress is None or not self.progress.is_look_due():
+            return
+        client, imagination = self.clients()
+        of_mllm, places = self.waiting["mllm"], imagination.places
+        if of_mllm > places.limit.in_flight + places.waiting:
+            self.progress.load = f"limited by the MLLM: {of_mllm} calls wait for it"
+        else:
+            with suppress(CowError):
+                self.progress.load = describe_load(await client.workers())
+
+
+def _observed(limit: AdaptiveLimit) -> httpx.AsyncClient:
+    """An HTTP client that tells a limit of every refusal, also of those after which `AsyncClient` asks again."""
+
+    async def note_begin(request: httpx.Request) -> None:
+        request.extensions["begun"] = time.monotonic()
+
+    async def note_refusal(response: httpx.Response) -> None:
+        if not response.is_success:
+            await response.aread()
+            if is_refusal(response):
+                limit.refuse(response.request.extensions["begun"], retry_after(response))
+
+    hooks: dict[str, list[Any]] = {"request": [note_begin], "response": [note_refusal]}
+    return httpx.AsyncClient(limits=httpx.Limits(max_connections=None), event_hooks=hooks)
 
 
 _active: list[Session] = []

@@ -229,7 +229,7 @@ class InProcess(Computer):
     def capacity(self, queue: str) -> int:
         """Those that compute, and those that wait for an MLLM."""
         settings = self._parts.service.settings
-        return settings.concurrency + settings.mllm_concurrency
+        return settings.concurrency + (settings.mllm_concurrency if settings.mllm else 0)
 
     def compute(self, work: Work) -> JobOutcome:
         """As the base class says."""
@@ -248,6 +248,7 @@ class InProcess(Computer):
             jobs_done=self._jobs_done,
             jobs=active.describe(active.runs()),
             gpus=gpu_memory(),
+            load=self._parts.service.load(),
         )
         return (own,)
 

@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any, Protocol, runtime_checkable
 
+from cow_service.adaptive import AdaptivePlaces
+
 
 @dataclass(frozen=True)
 class Upstream:
@@ -27,6 +29,16 @@ class ChatTurn:
     def succeeded(self) -> bool:
         """Whether it is a completion."""
         return self.status == HTTPStatus.OK
+
+
+@runtime_checkable
+class CallsMllm(Protocol):
+    """A reader that calls an MLLM, so many times at once."""
+
+    @property
+    def places(self) -> AdaptivePlaces:
+        """Of its calls."""
+        ...
 
 
 @runtime_checkable

@@ -386,6 +386,15 @@ class WorkerJob(Record):
     seconds: float = Field(ge=0, description="Since it began to be computed.")
 
 
+class WorkerLoad(Record):
+    """What the jobs of a worker wait for just now."""
+
+    cpu_waiting: int = Field(ge=0, description="Jobs that wait for a place on the CPU.")
+    mllm_calls: int = Field(ge=0, description="Calls of an MLLM that have no reply yet.")
+    mllm_limit: int = Field(ge=0, description="Calls at the same time; adapts to what the MLLM takes. 0: no MLLM.")
+    mllm_waiting: int = Field(ge=0, description="Calls that wait for others to end.")
+
+
 class WorkerInfo(Record):
     """What computes jobs: a worker process, or the threads of the server itself (`COW_WORKERS=0`)."""
 
@@ -396,6 +405,7 @@ class WorkerInfo(Record):
     jobs_done: int = Field(ge=0)
     jobs: tuple[WorkerJob, ...] = Field(default=(), description="At hand; several where jobs wait for an MLLM.")
     gpus: tuple[GpuMemory, ...] = Field(default=(), description="That it uses.")
+    load: WorkerLoad | None = Field(default=None, description="Null while that is not known.")
 
 
 class ProcessInfo(Record):

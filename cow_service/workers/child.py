@@ -123,7 +123,7 @@ class WorkerProcess:
     def _beat(self) -> None:
         this = psutil.Process()
         while True:
-            self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory()))
+            self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
             time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:

@@ -13,7 +13,7 @@ from pydantic_core import to_json
 
 from cow_service.jobs.computing import JobOutcome
 from cow_service.jobs.job_table import TakenJob
-from cow_service.records import GpuMemory
+from cow_service.records import GpuMemory, WorkerLoad
 from cow_service.requests import Stage
 
 MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
@@ -78,6 +78,7 @@ class Heartbeat:
 
     memory_bytes: int
     gpus: tuple[GpuMemory, ...]
+    load: WorkerLoad
     kind: Literal["heartbeat"] = "heartbeat"
 
 

@@ -14,6 +14,7 @@ from itertools import count
 
 import psutil
 
+from cow_service.adaptive import FIRST
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import Canceled, DeviceFailed, WorkerEnded
 from cow_service.jobs.active import ActiveJobs
@@ -32,9 +33,20 @@ WATCH_SECONDS = 1.0  # between two looks at each worker
 FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS = 1.0, 60.0  # after a worker that could not start; doubled each time
 POLL_SECONDS = 0.1  # how often a job that waits for such a pause checks whether it was canceled
 SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
+BYTES_PER_PIXEL = 4.5  # of an image, that a job holds while it waits for an MLLM
+SHARE_WAITING = 0.5  # of the machine's memory, that such jobs may take all together if their images are the largest
 RENEW_SHARE = 0.75  # of that, from which on a worker without a job is replaced
 
 log = logging.getLogger("cow_service")
+
+
+def waiting_jobs(settings: Settings) -> int:
+    """Jobs that may wait for an MLLM at the same time, and compute nothing: as many as calls, if memory allows."""
+    if not settings.mllm:
+        return 0
+    largest = settings.max_image_megapixels * 1e6 * BYTES_PER_PIXEL
+    fitting = int(SHARE_WAITING * psutil.virtual_memory().total / largest)
+    return min(settings.mllm_concurrency, max(FIRST, fitting))
 
 
 class Group:
@@ -42,18 +54,19 @@ class Group:
 
     def __init__(self, name: str, settings: Settings, metrics: Metrics) -> None:
         """`settings` are those of the server, of which each worker has its share."""
-        waiting = settings.mllm_concurrency if settings.mllm else 0  # jobs that wait for an MLLM, and compute nothing
+        waiting, calls = waiting_jobs(settings), settings.mllm_concurrency
         size, cpu, computing, generator = 1, 1, 1, settings.generator
         if name == LIGHT:
-            size, waiting = settings.concurrency, math.ceil(waiting / settings.concurrency)
+            size = settings.concurrency
+            waiting, calls = math.ceil(waiting / size), math.ceil(calls / size)
             if clips(generator, settings) is not None:
                 generator = "cutout"
         elif name == settings.reader and places(name) is not None:  # a reader that computes on a device
             cpu = computing = settings.concurrency
-            waiting = settings.mllm_concurrency
+            waiting = min(settings.mllm_concurrency, FIRST)  # it replies to a few at a time
         else:
             generator, computing = name, clips(name, settings) or 1
-        share = {"concurrency": cpu, "mllm_concurrency": max(1, waiting), "generator": generator}
+        share = {"concurrency": cpu, "mllm_concurrency": calls, "generator": generator}
         self.name, self.size, self.jobs_each = name, size, computing + waiting
         self.places = PrioritySemaphore(self.size * self.jobs_each)
         self.workers: list[Worker] = []
@@ -226,6 +239,7 @@ class WorkerPool(Computer):
                 jobs_done=one.jobs_done,
                 jobs=active.describe(one.jobs),
                 gpus=one.gpus,
+                load=one.load,
             )
             for group in self.groups
             for one in group.alive()

@@ -16,7 +16,7 @@ from cow_service.concurrency import spawn
 from cow_service.errors import Canceled, CowError, JobTimeout
 from cow_service.jobs.computing import JobOutcome, KeyLocks, Work
 from cow_service.jobs.job_table import error_from_json
-from cow_service.records import GpuMemory
+from cow_service.records import GpuMemory, WorkerLoad
 from cow_service.settings import Settings
 from cow_service.workers import messages
 
@@ -55,6 +55,7 @@ class Worker:
         self.jobs_done = 0
         self.memory_bytes = 0
         self.gpus: tuple[GpuMemory, ...] = ()
+        self.load: WorkerLoad | None = None
         self.started = self.heard = time.monotonic()  # `heard`: when it last sent a heartbeat
         self._job_timeout = settings.job_timeout
         self._process, self._pipe = spawned.process, spawned.pipe
@@ -196,8 +197,9 @@ class Worker:
         try:
             while True:
                 match messages.receive_from_worker(self._pipe):
-                    case messages.Heartbeat(memory_bytes=memory_bytes, gpus=gpus):
-                        self.heard, self.memory_bytes, self.gpus = time.monotonic(), memory_bytes, gpus
+                    case messages.Heartbeat(memory_bytes=memory_bytes, gpus=gpus, load=load):
+                        self.heard, self.memory_bytes = time.monotonic(), memory_bytes
+                        self.gpus, self.load = gpus, load
                     case messages.Loaded(error=error):
                         self._load_error = None if error is None else error_from_json(error)
                         self.heard, self.is_loaded = time.monotonic(), True

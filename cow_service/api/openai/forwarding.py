@@ -12,7 +12,9 @@ from httpx_sse import EventSource
 from sse_starlette import ServerSentEvent
 
 from cow_service import __version__
+from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.api.openai.chats import as_json, wrong
+from cow_service.client.protocol import retry_after
 from cow_service.errors import MllmBadReply, MllmUnavailable, shortened
 from cow_service.readers.chat import ChatTurn, Upstream
 from cow_service.settings import Settings
@@ -29,12 +31,14 @@ Events: TypeAlias = AsyncGenerator[ServerSentEvent]
 
 
 class Forwarder:
-    """One connection pool for all chats, used from one event loop; `COW_MLLM_CONCURRENCY` of them at a time."""
+    """One connection pool for all chats, used from one event loop.
+
+    As many are sent at the same time as the MLLM's server takes, `COW_MLLM_CONCURRENCY` at most.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
-        self._permits = settings.mllm_concurrency
-        self._slots = asyncio.Semaphore(self._permits)
+        self._places = AdaptivePlaces(settings.mllm_concurrency)
         self._client: httpx.AsyncClient | None = None
 
     async def close(self) -> None:
@@ -60,24 +64,33 @@ class Forwarder:
         if self._client is None:
             self._client = httpx.AsyncClient(
                 timeout=httpx.Timeout(self._timeout, connect=CONNECT_SECONDS, pool=None),
-                limits=httpx.Limits(max_connections=None, max_keepalive_connections=self._permits),
+                limits=httpx.Limits(max_connections=None, max_keepalive_connections=self._places.limit.most),
                 headers={"User-Agent": f"cow-service/{__version__}"},
             )
         client = self._client
         request = client.build_request("POST", url, content=content, headers=headers)
-        try:
-            async with asyncio.timeout(self._budget):
-                await self._slots.acquire()
-        except TimeoutError as error:
-            raise MllmUnavailable(
-                f"{self._permits} chats were being answered (COW_MLLM_CONCURRENCY), and none of them ended within "
-                f"{self._budget:g} s (COW_MLLM_BUDGET). Ask with fewer threads."
-            ) from error
         async with AsyncExitStack() as stack:
-            stack.callback(self._slots.release)
-            with _translated():
-                response = await client.send(request, stream=True)
+            try:
+                async with asyncio.timeout(self._budget):
+                    call = await stack.enter_async_context(self._places.held())
+            except TimeoutError as error:
+                limit = self._places.limit
+                raise MllmUnavailable(
+                    f"{limit.in_flight} chats were being answered (of {limit.most} that COW_MLLM_CONCURRENCY allows, "
+                    f"as many as the server took), and there was no place within {self._budget:g} s (COW_MLLM_BUDGET). "
+                    "Ask with fewer threads."
+                ) from error
+            try:
+                with _translated():
+                    response = await client.send(request, stream=True)
+            except MllmUnavailable:
+                call.refuse()
+                raise
             stack.push_async_callback(response.aclose)
+            if response.status_code in BUSY:
+                seconds = retry_after(response)
+                call.refuse(seconds if (seconds or 0.0) < self._budget else None)  # else no other chat could be sent
+            call.succeeded = response.is_success
             is_stream = response.headers.get("content-type", "").startswith("text/event-stream")
             if response.status_code == HTTPStatus.OK and is_stream:
                 yield _events(response)

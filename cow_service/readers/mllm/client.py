@@ -23,6 +23,7 @@ from pydantic_ai.settings import ModelSettings
 from pydantic_ai.usage import RunUsage
 from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, stop_before_delay, wait_random_exponential
 
+from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmUnavailable
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.chat import ChatTurn
@@ -84,13 +85,13 @@ class _ReplyParser(Generic[T]):
 
 
 class MllmClient:
-    """Calls one model from any thread, with `COW_MLLM_CONCURRENCY` calls at a time."""
+    """Calls one model from any thread: as many calls at a time as it takes, `COW_MLLM_CONCURRENCY` at most."""
 
     def __init__(self, model: ConfiguredModel, settings: Settings) -> None:
         self.model = model
         self._name = f"The multimodal LLM '{model.name}'"
         self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
-        self._slots = asyncio.Semaphore(settings.mllm_concurrency)
+        self.places = AdaptivePlaces(settings.mllm_concurrency)
         self._instructions = load_prompt(SYSTEM_PROMPT)
         self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
         self._thread = EventLoopThread(model.model)
@@ -136,7 +137,7 @@ class MllmClient:
     async def _chat(self, body: dict[str, Any]) -> ChatTurn:
         chat = prepare_chat(body, self.model.model)
         settings = self._supported(chat.settings | ModelSettings(timeout=self._timeout, max_retries=0))
-        once = RetryingModel(self.model.model, self._slots, self._timeout, budget=0, schema=None)
+        once = RetryingModel(self.model.model, self.places, self._timeout, budget=0, schema=None)
         try:
             response = await model_request(
                 once, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
@@ -158,7 +159,7 @@ class MllmClient:
         """The parsed reply, or the error that the call came to: one failed vote must not lose the others."""
         prompt, parser, used = load_prompt(call.prompt), _ReplyParser(call.parse), RunUsage()
         schema = call.schema if self.model.supports_schema else None
-        model = RetryingModel(self.model.model, self._slots, self._timeout, self._budget, schema)
+        model = RetryingModel(self.model.model, self.places, self._timeout, self._budget, schema)
         images = [BinaryContent(image, media_type=MEDIA_TYPE) for image in call.images]
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
@@ -249,7 +250,7 @@ _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     ),
     (errors.ModelContextWindowExceededError, "the images and the question are more than it takes; send fewer frames"),
     (errors.ModelQuotaExceededError, "the account's quota is used up"),
-    (errors.ModelRateLimitError, "it takes no more requests for now (429); lower COW_MLLM_CONCURRENCY, or try later"),
+    (errors.ModelRateLimitError, "it takes no more requests for now (429); try later"),
     (errors.ModelTimeoutError, "it did not reply in time; COW_MLLM_TIMEOUT says how long to wait"),
     (errors.ModelConnectionError, "it could not be reached, or broke off; check that it runs, and COW_MLLM_BASE_URL"),
 )
@@ -260,15 +261,15 @@ _MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
 class RetryingModel(WrapperModel):
     """A model that repeats a failed request while that may help and `budget` seconds are not over; with 0, never.
 
-    Each attempt waits for one of `slots`, then takes `timeout` seconds at most. `calls` counts the attempts, `failures`
-    keeps the errors of those that failed.
+    Each attempt waits for one of `places`, then takes `timeout` seconds at most. `calls` counts the attempts, and
+    `failures` keeps the errors of those that failed.
     """
 
     def __init__(
-        self, wrapped: Model, slots: asyncio.Semaphore, timeout: float, budget: float, schema: Schema | None
+        self, wrapped: Model, places: AdaptivePlaces, timeout: float, budget: float, schema: Schema | None
     ) -> None:
         super().__init__(wrapped)
-        self._slots, self._timeout, self._budget, self._schema = slots, timeout, budget, schema
+        self._places, self._timeout, self._budget, self._schema = places, timeout, budget, schema
         self.calls = 0
         self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens
@@ -320,9 +321,17 @@ class RetryingModel(WrapperModel):
     ) -> ModelResponse:
         self.calls += 1
         try:
-            async with self._slots:
-                with anyio.fail_after(self._timeout):
-                    response = await super().request(messages, settings, parameters)
+            async with self._places.held() as call:
+                try:
+                    with anyio.fail_after(self._timeout):
+                        response = await super().request(messages, settings, parameters)
+                    call.succeeded = True
+                except (errors.ModelAPIError, TimeoutError) as error:
+                    if is_busy(error):
+                        seconds = error.retry_after if isinstance(error, errors.ModelAPIError) else None
+                        # Past the budget every other call would fail without having been made.
+                        call.refuse(seconds if (seconds or 0.0) < max(self._budget, self._timeout) else None)
+                    raise
         except errors.ContentFilterError:
             raise
         except errors.ModelAPIError as error:
@@ -336,6 +345,13 @@ class RetryingModel(WrapperModel):
             raise self.failures[-1] from error
         self.truncated = response.finish_reason == "length"
         return response
+
+
+def is_busy(error: errors.ModelAPIError | TimeoutError) -> bool:
+    """Whether fewer calls at the same time may help."""
+    if isinstance(error, errors.ModelHTTPError):
+        return error.status_code in BUSY
+    return isinstance(error, (errors.ModelTimeoutError, errors.ModelConnectionError, TimeoutError))
 
 
 def reason_of(error: errors.ModelAPIError) -> str:

@@ -42,7 +42,7 @@ class MllmReader:
 
     def __init__(self, name: str, client: MllmClient, origin: str = "") -> None:
         """`origin` says which server, or which weights."""
-        self._client = client
+        self._client, self.places = client, client.places
         self._model = client.model
         self.upstream = self._model.upstream
         self._origin = origin
