@@ -24,18 +24,9 @@ from sqlalchemy.exc import DisconnectionError, OperationalError, SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, StorageUnavailable
+from cow_service.jobs import schema
 from cow_service.jobs.packing import packed, packed_paths, unpacked
-from cow_service.jobs.schema import (
-    JOBS,
-    MAINTENANCE,
-    REFERENCES,
-    SCHEMA,
-    STAGES,
-    STORES,
-    add_indexes,
-    schema_of,
-    update_tables,
-)
+from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES
 from cow_service.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
@@ -120,14 +111,14 @@ class Database:
             # Two processes that create the same table at the same time would fail one another.
             lock = f"SELECT pg_advisory_xact_lock({TABLES_LOCK})" if self.file is None else "BEGIN IMMEDIATE"
             connection.execute(sa.text(lock))
-            update_tables(connection, self.now)
+            schema.update_tables(connection, self.now)
         with database_errors(), self._reading.connect() as connection:
-            add_indexes(connection)
+            schema.add_indexes(connection)
 
     def schema(self) -> int:
         """That of the tables; 0 where there are none. Raises `StorageUnavailable` where this version cannot use it."""
         with database_errors(), self.engine.connect() as connection:
-            return schema_of(connection)
+            return schema.schema_of(connection)
 
     def claim(self, address: str) -> None:
         """Notes where the artifacts of all jobs are. Raises `StorageUnavailable` where they are elsewhere.
