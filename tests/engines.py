@@ -32,7 +32,10 @@ def running_engine() -> JobEngine:
     engine = JobEngine(Service(Settings(data_dir=Path(folder.name), shutdown_grace=0, webhook_secret=SECRET)))
     engine.start()
 
+    calls = engine.calls
+
     def end() -> None:
+        engine.calls = calls  # tests exchange it; only this one ends what was started
         engine.close()
         folder.cleanup()
 
