@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +22,7 @@ from postgres import postgres_server
 from pydantic import SecretStr
 from servers import eventually
 
-from cow_service.errors import InternalError, InvalidRequest
+from cow_service.errors import Canceled, InternalError, InvalidRequest
 from cow_service.jobs import webhooks
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.attempts import Dispatcher
@@ -206,6 +207,17 @@ def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_wit
     assert table.taken_by("me") == {"job": job.run}
     database.store_results("job", [StoredResult("another key", "generation", "{}", ("b" * 64,))])
     assert table.succeed(job, "{}", None, ("grounding", "generation"))
+
+
+def test_results_of_a_deleted_job_lock_nobody_out(database: Database, tmp_path: Path) -> None:
+    """Not even as long as somebody holds the error, whose traceback holds the statement that failed."""
+    take_new_job(database, "job", "me")
+    JobTable(database).delete(["job"])
+    with pytest.raises(Canceled) as held:
+        database.find_result("key", "job", [StoredResult("key", "grounding", "{}", ("a" * 64,))])
+    with closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(database.url)))) as another_process:
+        assert add_job(another_process, "another job")
+    assert held
 
 
 def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(database: Database) -> None:

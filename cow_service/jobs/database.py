@@ -329,6 +329,11 @@ class Database:
                 if self.file is None:
                     connection.dbapi_connection.autocommit = False
             except BaseException:
+                # SQLite closes a connection only when its last statement is gone, and the traceback may hold that: the
+                # transaction, and with it the lock that every writer needs, would stay open as long.
+                with suppress(SQLAlchemyError, sqlite3.Error):
+                    if self.file is not None:
+                        connection.rollback()
                 connection.invalidate()  # it may be gone, or in a state that the next user does not expect
                 raise
             finally:
