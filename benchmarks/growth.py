@@ -22,7 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from profile_stages import GIVEN, PHOTO, photograph  # beside this file
+from profile_stages import EXAMPLE, GIVEN, PHOTO, photograph  # beside this file
 
 from cow_service.media.images import encode_png
 from cow_service.requests import SimulateRequest
@@ -32,6 +32,10 @@ from cow_service.settings import Settings
 MEGAPIXELS = (0.4, 1.5, 3, 6, 12, 24)
 FRAMES = (17, 33, 49, 81, 121, 161)
 OBJECTS = (1, 2, 5, 10, 20, 40)
+META = json.loads((EXAMPLE / "meta.json").read_text())
+MOVER = [  # box in the photograph, px
+    side * whole / small for side, whole, small in zip(META["bbox"], PHOTO * 2, META["image_size"] * 2, strict=True)
+]
 QUESTION = "If the ball moves to the right, what does it hit?"
 COLUMNS, CELL = 8, 90  # of the objects beside the mover; px
 
@@ -40,8 +44,7 @@ def of_size(megapixels: float) -> tuple[bytes, dict[str, Any]]:
     """A photograph of so many millions of pixels, and its mover."""
     scale = math.sqrt(megapixels * 1e6 / (PHOTO[0] * PHOTO[1]))
     image = photograph(round(PHOTO[0] * scale), round(PHOTO[1] * scale))
-    x, y = GIVEN["grounding"]["point"]
-    return image, {**GIVEN, "grounding": {"point": [x * scale, y * scale]}}
+    return image, {**GIVEN, "grounding": {"bbox": [side * scale for side in MOVER]}}
 
 
 def of_objects(count: int) -> tuple[bytes, dict[str, Any]]:

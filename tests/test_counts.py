@@ -7,6 +7,7 @@ lowers the table, too, or the next change could take it back unseen.
 from __future__ import annotations
 
 import base64
+import gc
 import json
 import math
 import sqlite3
@@ -30,8 +31,11 @@ from servers import Served
 
 from cow_service.api.app import create_app
 from cow_service.jobs.engine import JobEngine
+from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
+from cow_service.stages.run import Run
+from cow_service.vision.scene import Scene
 
 TABLE: dict[str, float] = json.loads((Path(__file__).parent / "data" / "counts.json").read_text())
 # What depends on versions of libraries, or on a clock, is held less exactly.
@@ -124,6 +128,19 @@ def passing(function: Callable[..., Any], counted: Counter[str]) -> Callable[...
         return function(*arguments, **named)
 
     return call
+
+
+def test_pixels_of_a_question_are_given_back_at_once(service: Service) -> None:
+    """A circle of references would hold a photograph, and all that was measured in it, until garbage is collected."""
+    image = ImageArtifact(artifact=service.keep_image(BALL.image).sha256)
+    request = SimulateRequest(image=image, question=BALL.meta["question"], video=False)
+    gc.collect()
+    gc.disable()
+    try:
+        service.simulate(request)
+        assert [each for each in gc.get_objects() if isinstance(each, Run | Scene)] == []
+    finally:
+        gc.enable()
 
 
 def test_modules_of_a_server() -> None:

@@ -25,11 +25,11 @@ def path(points, body: int = 0, spread: float = 0.0) -> dict:
     }  # fmt: skip
 
 
-def drawn(image, paths, mask=None, **rest) -> np.ndarray:
-    box = (60, 60, 100, 100)
-    grounding = Grounding(object="ball", point=(80, 80), bbox=box, source="request")
+def drawn(image, paths, mask=None, times=1, max_side=None, **rest) -> np.ndarray:
+    box = (60 * times, 60 * times, 100 * times, 100 * times)
+    grounding = Grounding(object="ball", point=(80 * times, 80 * times), bbox=box, source="request")
     trajectory = Trajectory.model_validate({"fps": 16, "paths": paths, "anchors": []} | rest)
-    return draw_overlay(image, grounding, MOTION, trajectory, mask)
+    return draw_overlay(image, grounding, MOTION, trajectory, mask, max_side=max_side)
 
 
 def near(canvas, colour, x: float, y: float, reach: int = 4) -> bool:
@@ -52,6 +52,19 @@ def test_every_path_its_band_and_the_contacts_are_drawn() -> None:
     assert near(canvas, (255, 255, 255), 300, 324)
     assert near(canvas, ENCOUNTERS["touches"], 400, 320, 8)
     assert not near(canvas, ENCOUNTERS["touches"], 300, 320, 8)
+
+
+def test_of_a_large_picture_it_is_drawn_at_the_size_that_is_sent() -> None:
+    ys, xs = np.mgrid[:1200, :1920]
+    mask = np.hypot(xs - 240, ys - 240) < 45
+    one = [(240 + 60.0 * i, 240.0) for i in range(9)]
+    contacts = [{"a": 0, "b": None, "time": 0.2, "point": (900, 960), "impulse": 1}]
+    large = np.repeat(np.repeat(floor(), 3, 0), 3, 1)
+    canvas = drawn(large, [path(one, spread=60)], mask, times=3, max_side=640, contacts=contacts)
+    small, contacts[0]["point"] = [(80 + 20.0 * i, 80.0) for i in range(9)], (300, 320)
+    expected = drawn(floor(), [path(small, spread=20)], mask[1::3, 1::3], contacts=contacts)
+    assert canvas.shape == expected.shape
+    assert (np.abs(canvas.astype(int) - expected).max(axis=2) > 40).mean() < 0.001
 
 
 def test_a_wide_band_leaves_the_picture_to_be_seen() -> None:

@@ -120,7 +120,7 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
         if kind == "WebP":
             exif = _read_exif(image.info.get("exif", b""))
     turn = _TRANSPOSE_TO_UPRIGHT.get(exif.get(_ORIENTATION, UPRIGHT))
-    pixels = np.asarray(rgb if turn is None else rgb.transpose(turn), np.uint8)
+    pixels = _pixels_of(rgb if turn is None else rgb.transpose(turn))
     height, width = pixels.shape[:2]
     on_film = exif.get(_FOCAL_ON_FILM, 0)
     focal = on_film / _FILM * math.hypot(width, height) if 5 <= on_film <= 2000 else None  # mm, of any lens
@@ -218,6 +218,7 @@ def _encoded(extension: str, pixels: NDArray[np.uint8], options: list[int]) -> b
     return buffer.tobytes()
 
 
+BAND = 256  # rows that are copied at a time
 NEARLY = 0.75  # of a picture's size
 
 
@@ -311,6 +312,14 @@ def _to_rgb(image: Image.Image) -> Image.Image:
         return image.convert("RGB")
     image.load()
     return image
+
+
+def _pixels_of(rgb: Image.Image) -> NDArray[np.uint8]:
+    """[H, W, 3], copied in bands: at once, pillow would make two more copies on the way."""
+    pixels = np.empty((rgb.height, rgb.width, 3), np.uint8)
+    for top in range(0, rgb.height, BAND):
+        pixels[top : top + BAND] = np.asarray(rgb.crop((0, top, rgb.width, min(top + BAND, rgb.height))))
+    return pixels
 
 
 def _strip_png(data: bytes) -> tuple[bytes, dict[int, int]]:

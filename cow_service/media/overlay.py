@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.media.images import tiled
+from cow_service.media.images import fit_within, tiled
 from cow_service.records import BBox, Grounding, Motion, Path, Trajectory
 from cow_service.records.world import MEETINGS
 
@@ -98,6 +99,8 @@ SUBPIXEL = 4  # binary places of the coordinates handed to OpenCV
 FARTHEST = 20_000  # px: OpenCV draws no farther
 
 Mask = NDArray[np.bool_]
+Removed = tuple[str, BBox, Mask]
+"""What is taken away: its name, box and mask [H, W]."""
 
 
 @dataclass(frozen=True)
@@ -118,15 +121,63 @@ def draw_overlay(
     motion: Motion,
     trajectory: Trajectory,
     mask: Mask | None = None,
-    removed: Sequence[tuple[str, BBox, Mask]] = (),
+    removed: Sequence[Removed] = (),
     placed: Sequence[Replaced] = (),
+    max_side: int | None = None,
 ) -> Image:
-    """A copy of the RGB image [H, W, 3] with the records drawn on it; sizes follow the image's.
+    """A copy of the RGB image [H, W, 3], `max_side` px long at most, with the records drawn on it; sizes follow it.
 
-    `mask` [H, W] is the mover's: its outline is drawn, and its box where there is none. What is `removed`, by name, box
-    and mask, is hatched; so is the old place of what is `placed`, whose outline is drawn at the new one.
+    `mask` [H, W] is the mover's: its outline is drawn, and its box where there is none. What is `removed` is hatched;
+    so is the old place of what is `placed`, whose outline is drawn at the new one.
     """
-    canvas = np.ascontiguousarray(image).copy()
+    canvas = fit_within(image, max_side)
+    if canvas is image:
+        return _draw(np.ascontiguousarray(image).copy(), grounding, motion, trajectory, mask, removed, placed)
+    ratio = np.array([canvas.shape[1] / image.shape[1], canvas.shape[0] / image.shape[0]])
+
+    def moved(places: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
+        """Points or boxes of the image, on the canvas."""
+        return tuple(map(tuple, (np.array(places) * np.tile(ratio, len(places[0]) // 2)).tolist())) if places else ()
+
+    def box(bbox: BBox) -> BBox:
+        ((x0, y0, x1, y1),) = moved([bbox])
+        return x0, y0, x1, y1
+
+    def shrunk(mask: Mask) -> Mask:
+        return fit_within(mask.astype(np.uint8) * np.uint8(255), max_side) >= 128
+
+    def at(record: Any, **places: Any) -> Any:
+        return record.model_copy(update=places)
+
+    paths = tuple(at(path, points=moved(path.points), band=moved(path.band)) for path in trajectory.paths)
+    contacts = tuple(at(each, point=moved([each.point])[0]) for each in trajectory.contacts)
+    encounters = tuple(at(each, bbox=box(each.bbox)) for each in trajectory.encounters)
+    return _draw(
+        canvas,
+        at(grounding, bbox=box(grounding.bbox), point=moved([grounding.point])[0]),
+        motion,
+        at(trajectory, paths=paths, contacts=contacts, encounters=encounters),
+        None if mask is None else shrunk(mask),
+        [(name, box(bbox), shrunk(gone)) for name, bbox, gone in removed],
+        [
+            Replaced(
+                each.name, each.place, box(each.old_bbox), shrunk(each.old_mask), box(each.bbox), shrunk(each.mask)
+            )
+            for each in placed
+        ],
+    )
+
+
+def _draw(
+    canvas: Image,
+    grounding: Grounding,
+    motion: Motion,
+    trajectory: Trajectory,
+    mask: Mask | None,
+    removed: Sequence[Removed],
+    placed: Sequence[Replaced],
+) -> Image:
+    """Draws records of the canvas's own pixels on it."""
     unit = max(1.0, max(canvas.shape[:2]) / 640)
     thin = max(1, round(unit))
     for _, _, gone in removed:

@@ -176,8 +176,9 @@ def _draw_overlay(image: Image, given: GeneratorInput, as_it_is: GeneratorInput)
         )
         placed.append(Replaced(each.object, each.place, old_bbox, old, bbox, mask))
     removed = [(each.name, each.bbox, each.mask.full()) for each in gone]
-    drawn = draw_overlay(image, grounding, given.motion, trajectory, mover, removed, placed)
-    return encode_jpeg(fit_within(drawn, OVERLAY_SIDE))
+    return encode_jpeg(
+        draw_overlay(image, grounding, given.motion, trajectory, mover, removed, placed, max_side=OVERLAY_SIDE)
+    )
 
 
 def _render(

@@ -99,6 +99,11 @@ def priority_of(turn: int, created_at: str) -> str:
     return f"{turn:010d} {created_at}"
 
 
+def _stored_mask(artifacts: ArtifactStore, mask: Artifact) -> Mask:
+    """A function apart from the run: a scene that knew its run would hold its pixels until garbage is collected."""
+    return decode_own(artifacts.read(mask.sha256))[..., 0] > 0
+
+
 def _no_depth(fault: str) -> InvalidRequest:
     return InvalidRequest(
         f"`depth.map` {fault}. Give a grey PNG with 16 bits, of the size of the upright image.",
@@ -167,11 +172,8 @@ class Run(Generic[Request_co]):
         changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
         for placed in (grounding, *grounding.others, *changed):
             if placed.mask is not None:
-                scene.preset_mask(placed.bbox, partial(self._stored_mask, placed.mask))
+                scene.preset_mask(placed.bbox, partial(_stored_mask, self.backends.artifacts, placed.mask))
         return scene
-
-    def _stored_mask(self, mask: Artifact) -> Mask:
-        return decode_own(self.backends.artifacts.read(mask.sha256))[..., 0] > 0
 
     @property
     def can_segment(self) -> bool:
