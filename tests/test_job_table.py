@@ -28,6 +28,7 @@ from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.attempts import Dispatcher
 from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import MAX_STARTS, JobFilters, JobTable
+from cow_service.jobs.maintenance import Maintenance
 from cow_service.jobs.schema import JOBS
 from cow_service.settings import Settings
 
@@ -218,6 +219,23 @@ def test_results_of_a_deleted_job_lock_nobody_out(database: Database, tmp_path: 
     with closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(database.url)))) as another_process:
         assert add_job(another_process, "another job")
     assert held
+
+
+def test_after_jobs_connections_are_closed(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    active = ActiveJobs()
+    parts: Any = SimpleNamespace(active=active, database=database, jobs=JobTable(database), executor="me")
+    calls: Any = SimpleNamespace(busy_executors=set)
+    tidying = Maintenance(parts, calls, SimpleNamespace(), lambda jobs, since: None)  # type: ignore[arg-type]
+    monkeypatch.setattr("cow_service.jobs.active.QUIET_SECONDS", 0.5)
+    held = [database.engine.connect() for _ in range(5)]
+    for one in held:
+        one.close()
+    tidying._close_idle_connections()
+    assert database.engine.pool.checkedin() == 5  # type: ignore[attr-defined]
+    eventually(lambda: active.is_quiet)
+    tidying._close_idle_connections()
+    assert database.engine.pool.checkedin() == 0  # type: ignore[attr-defined]
+    database.check()
 
 
 def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(database: Database) -> None:

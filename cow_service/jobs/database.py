@@ -202,6 +202,10 @@ class Database:
                     pragma(f"incremental_vacuum({min(free, VACUUM_PAGES)})")
             pragma("wal_checkpoint(PASSIVE)")  # the file is cut by it
 
+    def close_idle(self) -> None:
+        """Closes the connections that nobody uses; they are opened again as they are needed."""
+        self.engine.dispose()
+
     def close(self) -> None:
         """Closes its connections."""
         if self.stalled is not None:

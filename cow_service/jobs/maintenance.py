@@ -115,6 +115,7 @@ class Maintenance(RestingThread):
         super().__init__("cow-maintenance", parts.active, JOIN_TIMEOUT_SECONDS)
         self._parts, self._calls, self._lease, self._remove = parts, calls, lease, remove
         self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
+        self._was_quiet = False
 
     def run(self) -> None:
         """Does the work, that which may take minutes in a thread of its own: jobs are recovered meanwhile."""
@@ -122,7 +123,12 @@ class Maintenance(RestingThread):
         cleaner = threading.Thread(target=self._repeat, args=(cleaning,), name="cow-clean-up", daemon=True)
         cleaner.start()
         self._repeat(
-            {self._recover: 0.0, self._notice_cancellations: 0.0, self._release_stalled: STALLED_SECONDS},
+            {
+                self._recover: 0.0,
+                self._notice_cancellations: 0.0,
+                self._release_stalled: STALLED_SECONDS,
+                self._close_idle_connections: 0.0,
+            }
         )
         cleaner.join()
 
@@ -142,6 +148,12 @@ class Maintenance(RestingThread):
                 except Exception:
                     log.exception("maintenance failed")
             self.rest(POLL_SECONDS, QUIET_POLL_SECONDS)
+
+    def _close_idle_connections(self) -> None:
+        """Once there are no jobs for a while."""
+        was_quiet, self._was_quiet = self._was_quiet, self._active.is_quiet
+        if self._was_quiet and not was_quiet:
+            self._parts.database.close_idle()
 
     def _recover(self) -> None:
         """Has the jobs of processes that have ended done by others."""

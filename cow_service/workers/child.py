@@ -20,7 +20,7 @@ import psutil
 
 from cow_service.concurrency import leave_decisions_to_the_parent
 from cow_service.errors import CowError, unforeseen
-from cow_service.jobs.active import ActiveJob
+from cow_service.jobs.active import QUIET_SECONDS, ActiveJob
 from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import TakenJob, error_as_json
@@ -96,6 +96,7 @@ class WorkerProcess:
         self._service = Service(settings)
         self._database = Database(settings)
         self._jobs: dict[str, _Job] = {}
+        self._busy_at = time.monotonic()
         self._threads = ThreadPoolExecutor(max_workers=1024, thread_name_prefix="job")
 
     def run(self) -> None:
@@ -121,8 +122,11 @@ class WorkerProcess:
             messages.send(self._pipe, message)
 
     def _beat(self) -> None:
-        this = psutil.Process()
+        this, is_idle = psutil.Process(), False
         while True:
+            was_idle, is_idle = is_idle, not self._jobs and time.monotonic() - self._busy_at > QUIET_SECONDS
+            if is_idle and not was_idle:
+                self._database.close_idle()
             self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
             time.sleep(HEARTBEAT_SECONDS)
 
@@ -142,6 +146,7 @@ class WorkerProcess:
     def _work(self, job_id: str) -> None:
         end = self._jobs[job_id].compute(self._service, self._database)
         del self._jobs[job_id]
+        self._busy_at = time.monotonic()
         self._send(end)
 
 
