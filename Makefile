@@ -56,13 +56,17 @@ sbom: $(TOOLS)/.made ## write what the images install as CycloneDX, into dist
 	for image in cpu cuda; do $(TOOLS)/bin/cyclonedx-py requirements docker/locks/$$image.txt --pyproject pyproject.toml \
 		--output-reproducible --output-file dist/cow-$$image.cdx.json; done
 
-bench: $(VENV)/.base ## the figures of the README
+# What `make bench` compares with: the latest release, or any revision that is named.
+RELEASE ?= $(shell git describe --tags --abbrev=0 2>/dev/null)
+
+bench: $(VENV)/.base ## the figures of the README, then pairs with the last release (RELEASE=REVISION: with another one)
 	$(BIN)/python benchmarks/scenes.py examples
 	$(BIN)/python benchmarks/answers.py examples
 	$(BIN)/python benchmarks/latency.py
 	$(BIN)/python benchmarks/profile_stages.py
 	$(BIN)/python benchmarks/engine.py
 	$(BIN)/python benchmarks/chat.py
+	$(if $(RELEASE),$(BIN)/python benchmarks/turns.py $(RELEASE) .,@echo "No release to compare with: name a revision by RELEASE=.")
 
 clean: ## remove what the other targets made
 	rm -rf $(VENV) $(TOOLS) demo dist build cow_service/client/sync_client.py cow_service/client/sync_results.py

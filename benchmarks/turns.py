@@ -1,12 +1,11 @@
-"""Compares the servers of two checkouts: both run at the same time, and each request goes to one and then the other.
+"""Compares the servers of two versions: both run at the same time, and each request goes to one and then the other.
 
-    python benchmarks/turns.py CHECKOUT_A CHECKOUT_B [--runs N] [--json FILE]
+    python benchmarks/turns.py A B [--runs N] [--json FILE]
 
-A slow moment of the machine meets both, which a run of one after the other cannot promise. Of each: milliseconds until
-it is ready; median milliseconds of a `POST /simulate` with three frames and with the clip, and the CPU milliseconds of
-the server and all its processes, for a picture that it has not seen before; requests a second of one, two and four
-callers, while the other server rests. Each checkout needs the metadata of its own entry points where they differ from
-those that are installed: `pip install --no-deps --target FOLDER CHECKOUT`, of which the `.dist-info` goes into it.
+Each is the folder of a checkout, or a revision or tag of this repository. A slow moment of the machine meets both,
+which a run of one after the other cannot promise. Of each: milliseconds until it is ready; median milliseconds of a
+`POST /simulate` with three frames and with the clip, and the CPU milliseconds of the server and all its processes, for
+a picture that it has not seen before; requests a second of one, two and four callers, while the other server rests.
 """
 
 from __future__ import annotations
@@ -29,7 +28,8 @@ import httpx
 import psutil
 from latency import EXAMPLE, pictures_like
 
-# The command line of the checkout, wherever its version has it.
+ROOT = Path(__file__).resolve().parents[1]
+# The command line of a version, wherever it has it.
 COW = """
 import sys; from importlib.metadata import entry_points; sys.argv[0] = "cow"
 next(iter(entry_points(group="console_scripts", name="cow"))).load()()
@@ -40,13 +40,13 @@ PIPES: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE
 
 
 class Served:
-    """A server of a checkout with an empty data folder."""
+    """A server of an installed version with an empty data folder."""
 
-    def __init__(self, checkout: Path, resources: ExitStack) -> None:
+    def __init__(self, folder: Path, resources: ExitStack) -> None:
         data = resources.enter_context(tempfile.TemporaryDirectory())
-        environment = os.environ | {"COW_DATA_DIR": data, "PYTHONPATH": str(checkout), "COW_PORT": "0"}
+        environment = os.environ | {"COW_DATA_DIR": data, "PYTHONPATH": str(folder), "COW_PORT": "0"}
         started = time.perf_counter()
-        self._process = subprocess.Popen([sys.executable, "-c", COW, "serve"], cwd=checkout, env=environment, **PIPES)
+        self._process = subprocess.Popen([sys.executable, "-c", COW, "serve"], cwd=folder, env=environment, **PIPES)
         resources.callback(self._end)
         assert self._process.stderr is not None
         line = next(line for line in self._process.stderr if "running on" in line)
@@ -85,7 +85,16 @@ class Served:
             return len(bodies) / (time.perf_counter() - started)
 
 
-def measure(checkouts: list[Path], runs: int) -> dict[str, list[float]]:
+def installed(name: str, resources: ExitStack) -> Path:
+    """A folder with the package and its entry points, as a checkout or a revision of this repository has them."""
+    folder = Path(resources.enter_context(tempfile.TemporaryDirectory()))
+    source = str(Path(name).resolve()) if Path(name).is_dir() else f"git+{ROOT.as_uri()}@{name}"
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(folder), source]
+    subprocess.run(pip, check=True)
+    return folder
+
+
+def measure(folders: list[Path], runs: int) -> dict[str, list[float]]:
     """The figures of A and of B, by name."""
     found: dict[str, list[float]] = {}
     question = json.loads((EXAMPLE / "meta.json").read_text())["question"]
@@ -98,10 +107,10 @@ def measure(checkouts: list[Path], runs: int) -> dict[str, list[float]]:
     for turn in range(5):
         for which in (0, 1) if turn % 2 else (1, 0):
             with ExitStack() as one:
-                ready[which].append(Served(checkouts[which], one).ready_ms)
+                ready[which].append(Served(folders[which], one).ready_ms)
     found["ready, ms"] = [statistics.median(each[1:]) for each in ready]
     with ExitStack() as resources:
-        served = [Served(checkout, resources) for checkout in checkouts]
+        served = [Served(folder, resources) for folder in folders]
         for name, rest in KINDS.items():
             times: list[list[tuple[float, float]]] = [[], []]
             for turn in range(runs + 3):
@@ -125,11 +134,12 @@ def measure(checkouts: list[Path], runs: int) -> dict[str, list[float]]:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkouts", type=Path, nargs=2)
+    parser.add_argument("versions", nargs=2)
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    found = measure([checkout.resolve() for checkout in given.checkouts], given.runs)
+    with ExitStack() as resources:
+        found = measure([installed(version, resources) for version in given.versions], given.runs)
     load = os.getloadavg()[0]
     print(f"{os.cpu_count()} cores, load {load:.1f}\n{'A':>10} {'B':>10} {'B/A':>6}  figure")
     for name, (a, b) in found.items():

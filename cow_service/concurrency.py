@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import heapq
 import itertools
 import os
@@ -32,9 +33,8 @@ def on_one_core() -> Generator[None]:
         yield
         return
     cores = os.sched_getaffinity(0)
-    running_on = int(Path("/proc/thread-self/stat").read_text().rpartition(")")[2].split()[36])
     with suppress(OSError):
-        os.sched_setaffinity(0, {running_on})
+        os.sched_setaffinity(0, {ctypes.CDLL(None).sched_getcpu()})
     try:
         yield
     finally:

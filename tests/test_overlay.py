@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+
+import cv2
 import numpy as np
 import pytest
 from drawn import floor
@@ -65,6 +68,17 @@ def test_of_a_large_picture_it_is_drawn_at_the_size_that_is_sent() -> None:
     expected = drawn(floor(), [path(small, spread=20)], mask[1::3, 1::3], contacts=contacts)
     assert canvas.shape == expected.shape
     assert (np.abs(canvas.astype(int) - expected).max(axis=2) > 40).mean() < 0.001
+
+
+def test_one_thread_writes_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    writers: set[int] = set()
+    measure = cv2.getTextSize
+    monkeypatch.setattr(cv2, "getTextSize", lambda *given: (writers.add(threading.get_ident()), measure(*given))[1])
+    threads = [threading.Thread(target=drawn, args=(floor(), [path([(80, 80), (100, 80)])])) for _ in range(3)]
+    for each in threads:
+        each.start()
+        each.join()
+    assert len(writers) == 1
 
 
 def test_a_wide_band_leaves_the_picture_to_be_seen() -> None:

@@ -1,6 +1,7 @@
 """Draws the results over the input image: outline, direction, paths with their bands, contacts and encounters."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -33,6 +34,10 @@ class Label:
     below: bool  # rather than above the box
 
 
+# OpenCV loads its font anew in each thread that writes, which takes longer than all else that is drawn.
+_letters = ThreadPoolExecutor(1, "cow-letters")
+
+
 def draw_labels(
     canvas: Image, labels: Sequence[Label], unit: float, dark: Colour, points: Sequence[tuple[float, float]] = ()
 ) -> tuple[Plate, ...]:
@@ -40,6 +45,12 @@ def draw_labels(
 
     A label covers another one only where there is no other place, and as few of the points (px) as can be.
     """
+    return _letters.submit(_write, canvas, labels, unit, dark, points).result()
+
+
+def _write(
+    canvas: Image, labels: Sequence[Label], unit: float, dark: Colour, points: Sequence[tuple[float, float]]
+) -> tuple[Plate, ...]:
     height, width = canvas.shape[:2]
     weight, pad, size = max(1, round(unit)), round(3 * unit), LETTERS * unit
     placed: list[Plate] = []
