@@ -1,14 +1,19 @@
-"""The priority semaphore: never more holders than permits, lowest priority first, no permit lost."""
+"""The priority semaphore: never more holders than permits, lowest priority first, no permit lost. Cores and rest."""
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 from contextlib import suppress
 
 import pytest
 
-from cow_service.concurrency import PrioritySemaphore
+from cow_service.concurrency import PrioritySemaphore, on_one_core
+from cow_service.jobs import active
+from cow_service.jobs.active import ActiveJobs
+from cow_service.settings import WORKER_BYTES, usable_cores
 
 
 class CanceledError(Exception):
@@ -118,3 +123,45 @@ def test_never_more_holders_than_permits(permits: int) -> None:
     assert holders == 0
     assert 1 <= most <= permits
     assert semaphore._permits == permits
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="cores are chosen on Linux alone")
+def test_a_thread_is_kept_on_one_core_for_a_while() -> None:
+    cores, started = os.sched_getaffinity(0), list[set[int]]()
+    with suppress(CanceledError), on_one_core():
+        assert len(os.sched_getaffinity(0)) == 1
+        thread = threading.Thread(target=lambda: started.append(os.sched_getaffinity(0)))
+        thread.start()
+        thread.join()
+        assert started == [os.sched_getaffinity(0)]
+        raise CanceledError
+    assert os.sched_getaffinity(0) == cores
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="cores are counted by what Linux says")
+@pytest.mark.parametrize(("cores", "workers_in_memory", "expected"), [(4, 100, 4), (16, 3, 3), (2, 0, 1)])
+def test_there_are_as_many_workers_as_cores_where_memory_allows(
+    cores: int, workers_in_memory: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": int(2 * WORKER_BYTES * workers_in_memory / 4096) + 1}
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(os, "sysconf", pages.__getitem__)
+    monkeypatch.setattr("cow_service.settings.Path.read_text", lambda _: "max")  # of a container without limits
+    assert usable_cores() == expected
+
+
+def test_rest_is_long_without_jobs_and_a_job_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(active, "QUIET_SECONDS", 0.05)
+    jobs, stop = ActiveJobs(), threading.Event()
+    assert not jobs.is_quiet
+    time.sleep(0.1)
+    assert jobs.is_quiet
+    resting = threading.Thread(target=jobs.rest, args=(stop, 0.0, 600.0))
+    resting.start()
+    resting.join(0.2)
+    assert resting.is_alive()
+    with jobs.running("job", "simulate"):
+        resting.join(30)
+        assert not resting.is_alive()
+        time.sleep(0.1)
+        assert not jobs.is_quiet

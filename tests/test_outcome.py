@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 
 from cow_service.physics.draws import COLUMN, NAMES, PARAMETERS, ensemble
-from cow_service.physics.ensemble import ROBUST, SURE, Decided, Query, answers_of, decide
+from cow_service.physics.ensemble import (
+    BATCHES,
+    MAY_CHANGE,
+    MAY_CHANGE_ROBUST,
+    ROBUST,
+    SURE,
+    Decided,
+    Query,
+    _is_settled,
+    answers_of,
+    decide,
+)
 from cow_service.physics.events import KINDS, NEVER, Events, WorldEvents
 from cow_service.records import Asked, AskedForm, AskedRelation
 
@@ -158,3 +169,29 @@ class TestDraws:
 
     def test_they_are_the_same_every_time(self) -> None:
         assert ensemble(50).tobytes() == ensemble(50).tobytes()
+
+
+@pytest.mark.parametrize("agreeing", [0, 5, 12, 15, 16, 25, 34, 35, 36, 44, 45, 46, 50])
+def test_worlds_left_out_would_rarely_have_changed_the_verdict(agreeing: int) -> None:
+    """Of 50 worlds of which so many agree, some are run: how often does a stop say otherwise than all of them?"""
+    size, tries, random = 50, 400, np.random.default_rng(agreeing)
+    changed_sure = changed_robust = 0
+    whole = agreeing / size
+    for _ in range(tries):
+        worlds = random.permutation(size) < agreeing
+        looks = (count for count in BATCHES if _is_settled(told_with(worlds[:count].mean()), None, count, size))
+        share = worlds[: next(looks, size)].mean()
+        changed_sure += (share >= SURE) != (whole >= SURE)
+        changed_robust += (share >= ROBUST) != (whole >= ROBUST)
+    assert changed_sure <= tries * 2.5 * MAY_CHANGE  # it is asked twice
+    assert changed_robust <= tries * 2.5 * MAY_CHANGE_ROBUST
+
+
+def test_what_all_of_the_first_worlds_agree_on_is_settled_and_what_is_close_is_not() -> None:
+    assert _is_settled(told_with(1.0), None, 15, 50)
+    assert not _is_settled(told_with(11 / 15), None, 15, 50)
+    assert not _is_settled(told_with(21 / 30), None, 30, 50)
+
+
+def told_with(probability: float) -> Decided:
+    return Decided(probability=float(probability), sure=False, robust=False, depends_on=())
