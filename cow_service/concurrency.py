@@ -32,14 +32,16 @@ def on_one_core() -> Generator[None]:
     if sys.platform != "linux":
         yield
         return
-    cores = os.sched_getaffinity(0)
-    with suppress(OSError):
-        os.sched_setaffinity(0, {ctypes.CDLL(None).sched_getcpu()})
+    cores = set[int]()
+    with suppress(OSError, ValueError, AttributeError):
+        running_on, cores = ctypes.CDLL(None).sched_getcpu(), os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {running_on})
     try:
         yield
     finally:
-        with suppress(OSError):
-            os.sched_setaffinity(0, cores)
+        if cores:
+            with suppress(OSError):
+                os.sched_setaffinity(0, cores)
 
 
 @dataclass(order=True)

@@ -31,15 +31,20 @@ WORKER_BYTES = 400e6  # of memory for each process that computes
 def usable_cores() -> int:
     """How many processes may compute at the same time: one per core that this one may use, as far as memory allows."""
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-    if sys.platform == "win32":
-        return cores
-    memory = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     with suppress(OSError, ValueError):  # of a container, where there is one: "max" is none
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         cores = min(cores, max(1, round(float(quota) / float(period))))
+    return max(1, min(cores, int(usable_memory() / 2 / WORKER_BYTES), MAX_WORKERS))
+
+
+def usable_memory() -> float:
+    """Bytes of memory that all processes here may take: the machine's, or those of the container."""
+    import psutil  # noqa: PLC0415 # the command line's help does without it
+
+    memory = float(psutil.virtual_memory().total)
     with suppress(OSError, ValueError):
         memory = min(memory, float(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return max(1, min(cores, int(memory / 2 / WORKER_BYTES), MAX_WORKERS))
+    return memory
 
 
 class SettingsError(Exception):

@@ -7,7 +7,9 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from types import SimpleNamespace
 
+import psutil
 import pytest
 
 from cow_service.concurrency import PrioritySemaphore, on_one_core
@@ -143,11 +145,16 @@ def test_a_thread_is_kept_on_one_core_for_a_while() -> None:
 def test_there_are_as_many_workers_as_cores_where_memory_allows(
     cores: int, workers_in_memory: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pages = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": int(2 * WORKER_BYTES * workers_in_memory / 4096) + 1}
+    memory = SimpleNamespace(total=2 * WORKER_BYTES * workers_in_memory + 1)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
-    monkeypatch.setattr(os, "sysconf", pages.__getitem__)
-    monkeypatch.setattr("cow_service.settings.Path.read_text", lambda _: "max")  # of a container without limits
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+    told = {"/sys/fs/cgroup/cpu.max": "max 100000", "/sys/fs/cgroup/memory.max": "max"}
+    monkeypatch.setattr("cow_service.settings.Path.read_text", lambda path: told[str(path)])
     assert usable_cores() == expected
+    told["/sys/fs/cgroup/cpu.max"] = "150000 100000"  # of a container
+    assert usable_cores() == min(expected, 2)
+    told["/sys/fs/cgroup/memory.max"] = f"{2 * WORKER_BYTES:.0f}"
+    assert usable_cores() == 1
 
 
 def test_rest_is_long_without_jobs_and_a_job_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,8 +167,20 @@ def test_rest_is_long_without_jobs_and_a_job_ends_it(monkeypatch: pytest.MonkeyP
     resting.start()
     resting.join(0.2)
     assert resting.is_alive()
-    with jobs.running("job", "simulate"):
+    with jobs.running("job", "simulate"):  # begins with a sign of it
         resting.join(30)
         assert not resting.is_alive()
         time.sleep(0.1)
         assert not jobs.is_quiet
+
+
+def test_what_is_to_end_does_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the sign comes between a look and the rest."""
+    monkeypatch.setattr(active, "QUIET_SECONDS", -1.0)
+    jobs, stop = ActiveJobs(), threading.Event()
+    stop.set()
+    jobs.stir()
+    resting = threading.Thread(target=jobs.rest, args=(stop, 600.0, 600.0))
+    resting.start()
+    resting.join(30)
+    assert not resting.is_alive()

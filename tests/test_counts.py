@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,11 +32,10 @@ from servers import Served
 
 from cow_service.api.app import create_app
 from cow_service.jobs.engine import JobEngine
+from cow_service.pipeline import simulate
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.stages.run import Run
-from cow_service.vision.scene import Scene
 
 TABLE: dict[str, float] = json.loads((Path(__file__).parent / "data" / "counts.json").read_text())
 # What depends on versions of libraries, or on a clock, is held less exactly.
@@ -130,20 +130,17 @@ def passing(function: Callable[..., Any], counted: Counter[str]) -> Callable[...
     return call
 
 
-def alive() -> list[object]:
-    return [each for each in gc.get_objects() if isinstance(each, Run | Scene)]
-
-
 def test_pixels_of_a_question_are_given_back_at_once(service: Service) -> None:
     """A circle of references would hold a photograph, and all that was measured in it, until garbage is collected."""
     image = ImageArtifact(artifact=service.keep_image(BALL.image).sha256)
     request = SimulateRequest(image=image, question=BALL.meta["question"], video=False)
-    gc.collect()
     gc.disable()
     try:
-        before = len(alive())  # other tests of this process may hold some
-        service.simulate(request)
-        assert len(alive()) == before
+        run = service.prepare(request)
+        simulate(run)
+        alive = weakref.ref(run), weakref.ref(run.scene)
+        del run
+        assert [each() for each in alive] == [None, None]
     finally:
         gc.enable()
 

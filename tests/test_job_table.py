@@ -225,7 +225,7 @@ def test_after_jobs_connections_are_closed(database: Database, monkeypatch: pyte
     active = ActiveJobs()
     parts: Any = SimpleNamespace(active=active, database=database, jobs=JobTable(database), executor="me")
     calls: Any = SimpleNamespace(busy_executors=set)
-    tidying = Maintenance(parts, calls, SimpleNamespace(), lambda jobs, since: None)  # type: ignore[arg-type]
+    tidying = Maintenance(parts, calls, SimpleNamespace(), lambda jobs, since: None, str)  # type: ignore[arg-type]
     monkeypatch.setattr("cow_service.jobs.active.QUIET_SECONDS", 0.5)
     held = [database.engine.connect() for _ in range(5)]
     for one in held:

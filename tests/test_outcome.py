@@ -18,6 +18,7 @@ from cow_service.physics.ensemble import (
     Query,
     _is_settled,
     answers_of,
+    batches,
     decide,
 )
 from cow_service.physics.events import KINDS, NEVER, Events, WorldEvents
@@ -191,6 +192,13 @@ def test_what_all_of_the_first_worlds_agree_on_is_settled_and_what_is_close_is_n
     assert _is_settled(told_with(1.0), None, 15, 50)
     assert not _is_settled(told_with(11 / 15), None, 15, 50)
     assert not _is_settled(told_with(21 / 30), None, 30, 50)
+
+
+@pytest.mark.parametrize("size", [2, 15, 16, 17, 30, 31, 32, 50, 500])
+def test_no_world_is_run_alone_after_others(size: int) -> None:
+    ends = batches(size)
+    assert ends[-1] == size
+    assert min(after - before for before, after in zip((0, *ends), ends, strict=False)) > 1
 
 
 def told_with(probability: float) -> Decided:

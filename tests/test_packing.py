@@ -6,7 +6,7 @@ import json
 import math
 from typing import Any
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from cow_service.jobs.packing import packed, packed_paths, unpacked
@@ -23,6 +23,10 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
+@example([[]] * 16)
+@example([1.5] * 16 + ["2"])
+@example([[1.5, 2.5]] * 16 + [[1.5, True]])
+@example([[[1.5]]] * 16)
 def test_what_is_packed_comes_back_as_the_same_text(value: Any) -> None:
     text = json.dumps(value)
     for pack in (packed, packed_paths):

@@ -83,15 +83,16 @@ class AsyncIO:
         """
         tasks: set[asyncio.Task[R]] = set()
         try:
-            while True:
-                while (seconds := pace.seconds_to_wait()) == 0 and (question := next(questions, None)) is not None:
+            question = next(questions, None)
+            while tasks or question is not None:
+                seconds = math.inf  # until another one may be asked
+                while question is not None and (seconds := pace.seconds_to_wait()) == 0:
                     tasks.add(asyncio.create_task(ask(question, pace.begin())))
-                if not tasks and seconds == 0:
-                    return
+                    question, seconds = next(questions, None), math.inf
                 if not tasks:
                     await asyncio.sleep(seconds)
                     continue
-                timeout = seconds if 0 < seconds < math.inf else None
+                timeout = seconds if seconds < math.inf else None
                 done, tasks = await asyncio.wait(tasks, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
                     yield task.result()

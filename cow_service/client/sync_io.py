@@ -138,8 +138,10 @@ class BlockingIO:
         def begin() -> float:
             """Waits for a place, in turn. Raises `Stopped`."""
             with turn:
-                while (seconds := pace.seconds_to_wait()) > 0 and not stop.is_set():
-                    ended.clear()
+                while not stop.is_set():
+                    ended.clear()  # first: whatever ends from here on is heard
+                    if (seconds := pace.seconds_to_wait()) == 0:
+                        break
                     ended.wait(min(seconds, MAX_WAIT_SECONDS))
                 if stop.is_set():
                     raise Stopped

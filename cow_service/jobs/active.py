@@ -75,19 +75,17 @@ class ActiveJobs:
 
     def stir(self) -> None:
         """There is a sign of a job, or a thread that rests is to end."""
-        was_quiet, self._busy_at = self.is_quiet, time.monotonic()
-        if was_quiet:
-            with self._stirred:
-                self._stirred.notify_all()
+        with self._stirred:
+            self._busy_at = time.monotonic()
+            self._stirred.notify_all()
 
     def rest(self, stop: threading.Event, seconds: float, quiet_seconds: float) -> None:
         """Waits so long, or for the other time as long as it is quiet. `stop`, with `stir`, ends it."""
-        if not self.is_quiet:
-            stop.wait(seconds)
-            return
         with self._stirred:
-            if not stop.is_set():
+            if self.is_quiet and not stop.is_set():
                 self._stirred.wait(quiet_seconds)
+                return
+        stop.wait(seconds)
 
     @contextmanager
     def running(self, job: str, kind: JobKind, run: str = "") -> Generator[ActiveJob]:

@@ -143,7 +143,7 @@ class Dispatcher(BackgroundThread):
         self._held: Counter[str] = Counter()  # the places of each queue that are held; only the thread takes more
         self._woken = threading.Event()
         self._look = True  # at all queues: there may be jobs that wait
-        self._due = set[str]()  # queues with a new job
+        self._due: Counter[str] = Counter()  # the new jobs of each queue that none were looked for
 
     def drain(self) -> None:
         """Takes no more jobs."""
@@ -157,11 +157,16 @@ class Dispatcher(BackgroundThread):
 
     def wake(self, queue: str | None = None) -> None:
         """Has a queue filled now, as there is a new job; or all of them looked at, as there may be, or is a place."""
-        if queue is None:
-            self._look = True
-        else:
-            self._due.add(queue)
+        with self._places:
+            if queue is None:
+                self._look = True
+            else:
+                self._due[queue] += 1
         self._woken.set()
+
+    def is_short(self, queue: str) -> bool:
+        """Whether there are fewer places for jobs of a queue than new ones."""
+        return self.free_places(queue) < self._due[queue]
 
     def free_places(self, queue: str) -> int:
         """How many jobs of a queue could be taken now."""
@@ -177,15 +182,19 @@ class Dispatcher(BackgroundThread):
         """Starts what waits in the queues."""
         while not self._stop.is_set():
             self._woken.clear()
-            (look, self._look), (due, self._due) = (self._look, False), (self._due, set())
+            with self._places:
+                (look, self._look), (due, self._due) = (self._look, False), (self._due, Counter())
+            failed = True
             try:
                 for queue in self._parts.jobs.waiting_queues() if look else due:
                     self._fill(queue)
+                failed = False
             except CowError as error:
                 log.warning("no jobs are taken: %s", error.detail)
             except Exception:
                 log.exception("no jobs were taken")
-            if not self._woken.wait(self._quiet_seconds if self._parts.active.is_quiet else POLL_SECONDS):
+            is_quiet = self._parts.active.is_quiet and not failed
+            if not self._woken.wait(self._quiet_seconds if is_quiet else POLL_SECONDS):
                 self._look = True
 
     def _fill(self, queue: str) -> None:

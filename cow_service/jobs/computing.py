@@ -17,6 +17,7 @@ import psutil
 from pydantic import ValidationError
 from pydantic_core import to_json
 
+from cow_service.adaptive import FIRST as FIRST_CALLS
 from cow_service.errors import ArtifactNotFound, CowError, StorageUnavailable
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.database import Database, StoredResult
@@ -27,11 +28,14 @@ from cow_service.pipeline import answer, simulate
 from cow_service.records import Answer, WorkerInfo
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 from cow_service.service import Service
+from cow_service.settings import Settings, usable_memory
 from cow_service.stages.keys import RESULT_TYPES, StageKey, StageResult, digest_of
 from cow_service.stages.run import Progress, Run
 
 CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result checks whether it was canceled
 FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # seconds between two tries
+BYTES_PER_PIXEL = 4.5  # of an image, that a job holds while it waits for an MLLM
+SHARE_WAITING = 0.5  # of the memory, that such jobs may take all together if their images are the largest
 
 # Stages that take less than their transactions would: behind one that was computed they are not looked for, either.
 QUICK: tuple[Stage, ...] = ("grounding", "depth", "motion", "trajectory")
@@ -198,6 +202,17 @@ class JobOutcome:
     stages: set[str]  # those of the job, each of which is stored
 
 
+def waiting_jobs(settings: Settings) -> int:
+    """Jobs that may wait for an MLLM at the same time, and compute nothing: as many as calls, if memory allows."""
+    if not settings.mllm:
+        return 0
+    memory = usable_memory()
+    if settings.worker_memory_mb is not None:
+        memory = min(memory, settings.worker_memory_mb * 1e6 * settings.concurrency)
+    fitting = int(SHARE_WAITING * memory / (settings.max_image_megapixels * 1e6 * BYTES_PER_PIXEL))
+    return min(settings.mllm_concurrency, max(FIRST_CALLS, fitting))
+
+
 class Computer:
     """Computes jobs, some at the same time: this one none, which is for worker processes on the same job database."""
 
@@ -229,7 +244,7 @@ class InProcess(Computer):
     def capacity(self, queue: str) -> int:
         """Those that compute, and those that wait for an MLLM."""
         settings = self._parts.service.settings
-        return settings.concurrency + (settings.mllm_concurrency if settings.mllm else 0)
+        return settings.concurrency + waiting_jobs(settings)
 
     def compute(self, work: Work) -> JobOutcome:
         """As the base class says."""

@@ -414,7 +414,7 @@ class StalledConnections(BackgroundThread):
         while not self._stop.wait(STALLED_SECONDS / 10):
             if not self._in_use:
                 self._is_used.clear()
-                if not self._in_use:
+                if not self._in_use and not self._stop.is_set():  # `stop` sets it before this event
                     self._is_used.wait()
             late = time.monotonic() - STALLED_SECONDS
             with self._guard:  # its socket is not closed meanwhile, nor the number of that given to another one

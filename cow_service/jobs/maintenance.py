@@ -103,7 +103,9 @@ class FolderLease:
 
 
 class Maintenance(RestingThread):
-    """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time."""
+    """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time;
+    `offer` tells that a job is back in its queue.
+    """
 
     def __init__(
         self,
@@ -111,9 +113,11 @@ class Maintenance(RestingThread):
         calls: Calls,
         lease: Lease,
         remove: Callable[[list[str], float], None],
+        offer: Callable[[str], None],
     ) -> None:
         super().__init__("cow-maintenance", parts.active, JOIN_TIMEOUT_SECONDS)
         self._parts, self._calls, self._lease, self._remove = parts, calls, lease, remove
+        self._offer = offer
         self._idle: set[str] = set()  # jobs of this process that no thread worked on at the last check
         self._was_quiet = False
 
@@ -160,10 +164,12 @@ class Maintenance(RestingThread):
         executors = self._parts.jobs.executors() | self._calls.busy_executors()
         if not (others := executors - {self._parts.executor}):
             return
+        self._active.stir()  # while others have jobs, it is looked often whether they have ended
         with self._lease.ended(others) as ended:
             if ended:
                 for job_id in self._parts.jobs.recover(ended):
                     log.info("recovering %s", job_id)
+                    self._offer(job_id)
                 self._calls.recover(ended)
 
     def _notice_cancellations(self) -> None:
@@ -182,6 +188,7 @@ class Maintenance(RestingThread):
         for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
             log.warning("job %s was stalled, and goes back to its queue", job_id)
             self._parts.jobs.release(job_id, taken[job_id])
+            self._offer(job_id)
         self._idle = idle
 
     def _clean_up_in_turn(self) -> None:

@@ -6,9 +6,11 @@ What moves smoothly has second differences of a digit or two, which compress to 
 from __future__ import annotations
 
 import zlib
+from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic_core import from_json, to_json
 
 DEFLATE_LEVEL = 3  # of zlib: higher ones take several times as long and save a twentieth
@@ -40,13 +42,8 @@ def _shortened(value: Any) -> Any:
         return {key: _shortened(each) for key, each in value.items()}
     if not isinstance(value, list):
         return value
-    first = value[0] if value else None
-    row = first if isinstance(first, list) else [first]
-    if len(value) < LEAST_ROWS or not all(type(each) is float for each in row):
-        return [_shortened(each) for each in value]
-    try:
-        numbers = np.array(value, np.float64)
-    except (TypeError, ValueError):  # rows of several lengths, or something else among them
+    numbers = _numbers(value)
+    if numbers is None:
         return [_shortened(each) for each in value]
     has_negative_zero = bool((np.signbit(numbers) & (numbers == 0)).any())
     for decimals in () if has_negative_zero else range(MOST_DECIMALS + 1):
@@ -55,6 +52,19 @@ def _shortened(value: Any) -> Any:
             columns = np.diff(units.astype(np.int64), n=2, axis=0, prepend=np.zeros((2, *units.shape[1:]), np.int64))
             return {ROWS: columns.T.tolist(), DECIMALS: decimals}
     return value
+
+
+def _numbers(rows: list[Any]) -> NDArray[np.float64] | None:
+    """A long list of floats [N], or of rows of as many [N, K]; None for any other."""
+    first = rows[0] if rows else None
+    if len(rows) < LEAST_ROWS or type(first[0] if isinstance(first, list) and first else first) is not float:
+        return None
+    try:
+        numbers = np.array(rows, np.float64)
+    except (TypeError, ValueError):  # rows of several lengths, or something else among them
+        return None
+    leaves = chain.from_iterable(rows) if numbers.ndim == 2 else rows
+    return numbers if numbers.ndim < 3 and all(type(each) is float for each in leaves) else None
 
 
 def _restored(value: Any) -> Any:

@@ -3,15 +3,15 @@
 The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, or
 `SURE_OF_MISS` where a throw meets nothing, and robust where it has at least `ROBUST` of them.
 
-Worlds are run in batches, until those that are left are not likely to change that (a sequential test): what all of the
-first batch agree on is settled.
+Worlds are run in batches, until those that are left are not likely to change that (a sequential test): what nearly all
+of the first batch agree on is settled.
 """
 
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from math import ceil, comb, floor
+from math import ceil, comb, floor, sqrt
 
 import numpy as np
 
@@ -29,9 +29,10 @@ SURE = 0.7  # share of the worlds from which an answer is given
 # the heading makes worlds miss, and hardly ever hit.
 SURE_OF_MISS = 0.85
 ROBUST = 0.9
-# The chance, at most, that those which are left would change whether the answer is sure, and whether it is robust.
+# The chance, at most and at each look, that those which are left would change whether the answer is sure, and whether
+# it is robust, if they were drawn like those that were run.
 MAY_CHANGE, MAY_CHANGE_ROBUST = 0.01, 0.12
-MATTERS = 0.2  # correlation with the outcome from which a parameter is named
+MATTERS, MATTERS_OF = 0.2, 50  # correlation with the outcome from which a parameter is named, of so many worlds
 MOST_NAMED = 3
 
 KIND_OF: dict[AskedRelation, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
@@ -112,13 +113,18 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
 
 
+def batches(size: int) -> tuple[int, ...]:
+    """How many worlds of an ensemble are run before each look. None is left for last: one alone is run more finely."""
+    return (*(batch for batch in BATCHES if batch + 1 < size), size)
+
+
 def _run_until_settled(
     given: Sequence[WorldInput], queries: Sequence[Query | None], rows: Floats
 ) -> tuple[list[ObservedWorlds], list[Decided | None]]:
     """The first of some draws [K, P] in each world, as many as it takes, and what they say."""
     drawn = [DrawnWorlds.of(each, rows, EVERY) for each in given]
     worlds, decided, count = list[ObservedWorlds](), list[Decided | None](), 0
-    for most in (*(batch for batch in BATCHES if batch < len(rows)), len(rows)):
+    for most in batches(len(rows)):
         run = [each.run(slice(count, most)) for each in drawn]
         if count:
             layouts = [each.layout.of(slice(0, most)) for each in drawn]
@@ -302,11 +308,12 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
 def _depends_on(same: Mask, draws: Floats) -> tuple[Doubt, ...]:
     """Doubts whose parameters go with the answer, the closest first."""
     weights: dict[Doubt, float] = {}
+    least = MATTERS * max(1.0, sqrt(MATTERS_OF / len(draws)))  # of fewer worlds chance makes larger ones
     for place, name in enumerate(NAMES):
         column = draws[:, place]
         spread = float(same.std() * column.std())
         related = abs(float(((same - same.mean()) * (column - column.mean())).mean())) / spread if spread > 0 else 0.0
-        if related >= MATTERS:
+        if related >= least:
             doubt = PARAMETERS[name]
             weights[doubt] = max(weights.get(doubt, 0.0), related)
     ranked: Sequence[Doubt] = sorted(weights, key=lambda doubt: -weights[doubt])

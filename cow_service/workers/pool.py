@@ -12,17 +12,15 @@ from collections.abc import Callable
 from functools import partial
 from itertools import count
 
-import psutil
-
 from cow_service.adaptive import FIRST
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import Canceled, DeviceFailed, WorkerEnded
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.computing import Computer, JobOutcome, KeyLocks, Work
+from cow_service.jobs.computing import Computer, JobOutcome, KeyLocks, Work, waiting_jobs
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.observability.metrics import Metrics
 from cow_service.records import WorkerInfo
-from cow_service.settings import Settings
+from cow_service.settings import Settings, usable_memory
 from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
 from cow_service.workers.process import EndReason, Worker, WorkerGone
@@ -33,20 +31,9 @@ WATCH_SECONDS = 1.0  # between two looks at each worker
 FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS = 1.0, 60.0  # after a worker that could not start; doubled each time
 POLL_SECONDS = 0.1  # how often a job that waits for such a pause checks whether it was canceled
 SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
-BYTES_PER_PIXEL = 4.5  # of an image, that a job holds while it waits for an MLLM
-SHARE_WAITING = 0.5  # of the machine's memory, that such jobs may take all together if their images are the largest
 RENEW_SHARE = 0.75  # of that, from which on a worker without a job is replaced
 
 log = logging.getLogger("cow_service")
-
-
-def waiting_jobs(settings: Settings) -> int:
-    """Jobs that may wait for an MLLM at the same time, and compute nothing: as many as calls, if memory allows."""
-    if not settings.mllm:
-        return 0
-    largest = settings.max_image_megapixels * 1e6 * BYTES_PER_PIXEL
-    fitting = int(SHARE_WAITING * psutil.virtual_memory().total / largest)
-    return min(settings.mllm_concurrency, max(FIRST, fitting))
 
 
 class Group:
@@ -78,6 +65,7 @@ class Group:
         self._taken: dict[Worker, int] = {}
         self._closed = False
         self._failed_starts, self._next_start = 0, 0.0  # in a row; the time before which none is started
+        self._latest: Worker | None = None  # that was started
 
     def start(self) -> None:
         """Starts the first worker."""
@@ -87,8 +75,9 @@ class Group:
     def fill(self) -> None:
         """Starts the next worker of all that there may be, once those that were started have loaded."""
         with self._lock:
-            is_loaded = all(worker.is_loaded and worker.is_alive for worker in self.workers)
-            if not self._closed and is_loaded and 0 < len(self.workers) < self.size:
+            if self._closed or not all(worker.is_loaded and worker.is_alive for worker in self.workers):
+                return
+            if 0 < len(self.workers) < self.size and time.monotonic() >= self._next_start:
                 self._start()
 
     def recover(self) -> None:
@@ -98,7 +87,7 @@ class Group:
                 return
             self._remove_dead()
             if any(worker.is_loaded and worker.is_alive for worker in self.workers):
-                self._failed_starts, self.fault = 0, None
+                self.fault = None  # jobs do not wait
             elif not self.workers and time.monotonic() >= self._next_start:
                 self._start()
 
@@ -153,7 +142,9 @@ class Group:
             raise Canceled("The server is stopping.")
         names = {one.name for one in self._taken}
         name = next(name for number in count(1) if (name := f"{self.name}-{number}") not in names)
-        worker = Worker(name, self._settings, self._note_end)
+        if self._latest is not None and self._latest.is_loaded:
+            self._failed_starts = 0
+        worker = self._latest = Worker(name, self._settings, self._note_end)
         self.workers.append(worker)
         self._taken[worker] = 0
         return worker
@@ -173,11 +164,13 @@ class Group:
         pause = min(FIRST_PAUSE_SECONDS * 2**self._failed_starts, LONGEST_PAUSE_SECONDS)
         self._failed_starts, self._next_start = self._failed_starts + 1, time.monotonic() + pause
         often = "" if self._failed_starts == 1 else f" {self._failed_starts} were started in vain."
-        self.fault = (
+        fault = (
             f"The worker process {worker.name} {worker.end_reason} before it had loaded its backends.{often} Another "
             f"one is started {pause:g} s later; the log says more."
         )
-        log.warning("%s", self.fault)
+        log.warning("%s", fault)
+        if not any(one.is_loaded and one.is_alive for one in tuple(self.workers)):  # else jobs do not wait
+            self.fault = fault
 
 
 class WorkerPool(Computer):
@@ -190,7 +183,7 @@ class WorkerPool(Computer):
         self._groups: dict[str, Group] = {}
         self._closed = threading.Event()
         limit = settings.worker_memory_mb
-        self._memory_limit = limit * 1e6 if limit else SHARE_OF_MEMORY * psutil.virtual_memory().total
+        self._memory_limit = limit * 1e6 if limit else SHARE_OF_MEMORY * usable_memory()
         self._watching: threading.Thread | None = None
 
     def start(self) -> None:
