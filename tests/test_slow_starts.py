@@ -84,9 +84,10 @@ def test_a_server_that_starts_while_its_database_is_away_waits_and_says_so(tmp_p
 
 def test_a_second_worker_that_cannot_start_is_tried_more_and_more_rarely(tmp_path: Path) -> None:
     with bad_starts(tmp_path, 0, "dies", COW_CONCURRENCY="2") as served:
-        eventually(lambda: len(workers_of(served)) == 2)
+        both = eventually(lambda: found if len(found := workers_of(served)) == 2 else None)
+        eventually(lambda: len(served.http.get("/workers").json()["processes"][0]["workers"]) == 2)
         (tmp_path / "number").write_text("1000")
-        workers_of(served)[1].kill()
+        both[1].kill()
         served.http.post("/simulate", json=BODY).raise_for_status()  # by the first
         eventually(lambda: re.search("3 were started in vain. Another one is started 4 s later", served.log()))
         assert served.http.get("/readyz").is_success

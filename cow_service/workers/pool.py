@@ -75,6 +75,7 @@ class Group:
     def fill(self) -> None:
         """Starts the next worker of all that there may be, once those that were started have loaded."""
         with self._lock:
+            self._remove_dead()
             if self._closed or not all(worker.is_loaded and worker.is_alive for worker in self.workers):
                 return
             if 0 < len(self.workers) < self.size and time.monotonic() >= self._next_start:
