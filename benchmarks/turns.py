@@ -141,12 +141,14 @@ def main() -> None:
     with ExitStack() as resources:
         found = measure([installed(version, resources) for version in given.versions], given.runs)
     load = os.getloadavg()[0]
-    print(f"{os.cpu_count()} cores, load {load:.1f}\n{'A':>10} {'B':>10} {'B/A':>6}  figure")
+    a_is, b_is = (name if not Path(name).is_dir() else "the checkout" for name in given.versions)
+    print(f"{os.cpu_count()} cores, load {load:.1f}; A is {a_is}, B {b_is}\n{'A':>10} {'B':>10} {'B/A':>6}  figure")
     for name, (a, b) in found.items():
         print(f"{a:>10.1f} {b:>10.1f} {b / a:>6.2f}  {name}")
     if given.json:
         told = {name: {"a": round(a, 1), "b": round(b, 1), "ratio": round(b / a, 3)} for name, (a, b) in found.items()}
-        given.json.write_text(json.dumps({"cores": os.cpu_count(), "load": load, "figures": told}, indent=1) + "\n")
+        about = {"a": a_is, "b": b_is, "cores": os.cpu_count(), "load": load}
+        given.json.write_text(json.dumps({**about, "figures": told}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

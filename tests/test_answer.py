@@ -523,6 +523,9 @@ def test_what_no_world_can_tell_is_said_so() -> None:
     assert "did not understand" in answer_from(YES_NO, None, YES, simulated=True).notes[0]
     assert "without a simulation" in answer_from(YES_NO, HIT, None, simulated=False).notes[0]
     assert "does not tell" in answer_from(YES_NO, HIT, None, simulated=True).notes[0]
+    untold = outcome(HIT, probability=None)
+    assert "told apart" in answer_from(YES_NO, HIT, untold, simulated=True).notes[0]
+    assert "no worlds were run" in answer_from(YES_NO, HIT, untold, simulated=True, in_worlds=False).notes[0]
     among = read_alternatives(parse(IF + "will it hit the red cube or the blue mug first?"))
     other = answer_from((), FIRST, outcome(FIRST, first="green cone"), simulated=True, alternatives=among)
     assert other.not_sure

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -225,7 +226,7 @@ def test_after_jobs_connections_are_closed(database: Database, monkeypatch: pyte
     active = ActiveJobs()
     parts: Any = SimpleNamespace(active=active, database=database, jobs=JobTable(database), executor="me")
     calls: Any = SimpleNamespace(busy_executors=set)
-    tidying = Maintenance(parts, calls, SimpleNamespace(), lambda jobs, since: None, str)  # type: ignore[arg-type]
+    tidying = Maintenance(parts, calls, SimpleNamespace(), lambda jobs, since: None, lambda: None)  # type: ignore[arg-type]
     monkeypatch.setattr("cow_service.jobs.active.QUIET_SECONDS", 0.5)
     held = [database.engine.connect() for _ in range(5)]
     for one in held:
@@ -283,7 +284,7 @@ def test_pages_show_each_job_once(database: Database) -> None:
 
 @pytest.mark.parametrize("capacity", [0, 3])
 def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
-    waiting, started = list("abcdefgh"), []
+    waiting, started, told = list("abcdefgh"), [], threading.Event()
 
     def take(queue: str, executor: str, number: int, limit: int | None) -> list[str]:
         taken = waiting[:number]
@@ -294,13 +295,16 @@ def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
     settings = SimpleNamespace(running_limit_per_key=None)
     service, database = SimpleNamespace(settings=settings), SimpleNamespace(file=None)
     parts: Any = SimpleNamespace(executor="me", jobs=jobs, service=service, database=database, active=ActiveJobs())
-    dispatcher = Dispatcher(parts, lambda queue: capacity, started.append)
+    dispatcher = Dispatcher(parts, lambda queue: capacity, started.append, told.set)
     dispatcher.start()
     eventually(lambda: len(started) == capacity)
     if capacity:
         assert dispatcher.free_places("light") == 0
         dispatcher.give_place_back("light")
         eventually(lambda: len(started) == capacity + 1)
+    assert not told.is_set(), "jobs that were not new here are told by those who took them in"
+    dispatcher.wake("light")
+    assert told.wait(30), "others may have a place for a new job"
     dispatcher.stop()
     assert dispatcher.free_places("light") == dispatcher.free_places("other") == 0
     assert len(waiting) + len(started) == 8

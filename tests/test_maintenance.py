@@ -217,7 +217,9 @@ def test_a_long_listing_holds_up_no_other_maintenance(
     parts: Any = SimpleNamespace(
         service=service, database=database, jobs=JobTable(database), active=active, executor="me"
     )
-    thread = maintenance.Maintenance(parts, Calls(), maintenance.FolderLease(tmp_path), lambda _jobs, _since: None, str)
+    thread = maintenance.Maintenance(
+        parts, Calls(), maintenance.FolderLease(tmp_path), lambda _jobs, _since: None, lambda: None
+    )
     thread.start()
     try:
         eventually(lambda: canceled)

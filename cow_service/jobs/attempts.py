@@ -125,7 +125,8 @@ class Runner:
                 raise Canceled("The job is another process's, or has lost a stage.")
         except Canceled:
             with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
-                self._jobs.release(job.id, job.run)  # where it was interrupted; one that was canceled stays so
+                if self._jobs.release(job.id, job.run):  # it was interrupted; one that was canceled stays so
+                    self._notifications.send(Notification("queued"))
             return False
         metrics.jobs.labels(job.spec.kind, status).inc()
         return True
@@ -134,16 +135,24 @@ class Runner:
 class Dispatcher(BackgroundThread):
     """The places of this process, and the thread that fills them. Safe to use from every thread."""
 
-    def __init__(self, parts: EngineParts, capacity: Callable[[str], int], start: Callable[[TakenJob], None]) -> None:
-        """`capacity`: of a queue by its name; `start` begins the work on a job that was taken."""
+    def __init__(
+        self,
+        parts: EngineParts,
+        capacity: Callable[[str], int],
+        start: Callable[[TakenJob], None],
+        tell_others: Callable[[], None],
+    ) -> None:
+        """`capacity`: of a queue by its name; `start` begins the work on a job that was taken, and `tell_others` tells
+        other processes that there are jobs for which this one has no place.
+        """
         super().__init__("cow-dispatcher", STOP_SECONDS)
-        self._parts, self._capacity, self._start = parts, capacity, start
+        self._parts, self._capacity, self._start, self._tell_others = parts, capacity, start, tell_others
         self._quiet_seconds = QUIET_POSTGRES_SECONDS if parts.database.file is None else QUIET_POLL_SECONDS
         self._places = threading.Lock()
         self._held: Counter[str] = Counter()  # the places of each queue that are held; only the thread takes more
         self._woken = threading.Event()
         self._look = True  # at all queues: there may be jobs that wait
-        self._due: Counter[str] = Counter()  # the new jobs of each queue that none were looked for
+        self._due: Counter[str] = Counter()  # how many jobs are new in each queue
 
     def drain(self) -> None:
         """Takes no more jobs."""
@@ -164,10 +173,6 @@ class Dispatcher(BackgroundThread):
                 self._due[queue] += 1
         self._woken.set()
 
-    def is_short(self, queue: str) -> bool:
-        """Whether there are fewer places for jobs of a queue than new ones."""
-        return self.free_places(queue) < self._due[queue]
-
     def free_places(self, queue: str) -> int:
         """How many jobs of a queue could be taken now."""
         return 0 if self._stop.is_set() else self._capacity(queue) - self._held[queue]
@@ -187,7 +192,7 @@ class Dispatcher(BackgroundThread):
             failed = True
             try:
                 for queue in self._parts.jobs.waiting_queues() if look else due:
-                    self._fill(queue)
+                    self._fill(queue, due[queue])
                 failed = False
             except CowError as error:
                 log.warning("no jobs are taken: %s", error.detail)
@@ -197,11 +202,11 @@ class Dispatcher(BackgroundThread):
             if not self._woken.wait(self._quiet_seconds if is_quiet else POLL_SECONDS):
                 self._look = True
 
-    def _fill(self, queue: str) -> None:
-        if (places := self.free_places(queue)) <= 0:
-            return
-        limit = self._parts.service.settings.running_limit_per_key
-        taken = self._parts.jobs.take(queue, self._parts.executor, places, limit)
+    def _fill(self, queue: str, new: int) -> None:
+        places, limit = self.free_places(queue), self._parts.service.settings.running_limit_per_key
+        taken = self._parts.jobs.take(queue, self._parts.executor, places, limit) if places > 0 else []
+        if len(taken) < new:
+            self._tell_others()
         with self._places:
             self._held[queue] += len(taken)
         for job in taken:

@@ -67,7 +67,7 @@ class JobEngine:
             self._lease = FolderLease(service.settings.data_dir / "executors")
             self._notifications = PolledNotifications(self._parts, self._receive)
         self._runner = Runner(self._parts, self._computer, self._notifications, self._attempt_ended)
-        self._dispatcher = Dispatcher(self._parts, self._computer.capacity, self._runner.start)
+        self._dispatcher = Dispatcher(self._parts, self._computer.capacity, self._runner.start, self._tell_queued)
         self._maintenance = Maintenance(self._parts, self.calls, self._lease, self.remove, self._offer)
         self.processes = Processes(self._parts, self._computer, role)
         self.storage = StorageCheck(lambda: self.service.artifacts)
@@ -206,8 +206,6 @@ class JobEngine:
             is_new = self.jobs.insert(job_id, spec, owner, queue, step, partial(self._check_open, owner))
         if is_new:
             self._dispatcher.wake(queue)
-            if self._dispatcher.is_short(queue):
-                self._notifications.send(Notification("queued", job_id))
         return is_new
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
@@ -262,13 +260,14 @@ class JobEngine:
         self._dispatcher.give_place_back(job.queue)
         if has_ended:
             self.active.notify_ended(job.id)
-        else:
-            self._offer(job.id)
 
-    def _offer(self, job_id: str) -> None:
-        """A job is back in its queue."""
+    def _offer(self) -> None:
+        """Jobs are back in their queues."""
         self._dispatcher.wake()
-        self._notifications.send(Notification("queued", job_id))
+        self._tell_queued()
+
+    def _tell_queued(self) -> None:
+        self._notifications.send(Notification("queued"))
 
     def _receive(self, notification: Notification) -> None:
         """What another process has told of a job."""

@@ -235,11 +235,11 @@ class JobTable:
                 tell(connection)
         return is_mine
 
-    def release(self, job_id: str, run: str) -> None:
-        """Puts a job back into its queue, if it has not ended."""
+    def release(self, job_id: str, run: str) -> bool:
+        """Puts a job back into its queue. False where it is no longer this process's, or has ended."""
         mine = JOBS.c.id == job_id, JOBS.c.run == run, JOBS.c.status.in_(OPEN)
         with self._database.transaction() as connection:
-            connection.execute(sa.update(JOBS).where(*mine).values(_RELEASED))
+            return connection.execute(sa.update(JOBS).where(*mine).values(_RELEASED)).rowcount > 0
 
     def succeed(
         self,

@@ -104,7 +104,7 @@ class FolderLease:
 
 class Maintenance(RestingThread):
     """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time;
-    `offer` tells that a job is back in its queue.
+    `offer` tells that jobs are back in their queues.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Maintenance(RestingThread):
         calls: Calls,
         lease: Lease,
         remove: Callable[[list[str], float], None],
-        offer: Callable[[str], None],
+        offer: Callable[[], None],
     ) -> None:
         super().__init__("cow-maintenance", parts.active, JOIN_TIMEOUT_SECONDS)
         self._parts, self._calls, self._lease, self._remove = parts, calls, lease, remove
@@ -167,9 +167,10 @@ class Maintenance(RestingThread):
         self._active.stir()  # while others have jobs, it is looked often whether they have ended
         with self._lease.ended(others) as ended:
             if ended:
-                for job_id in self._parts.jobs.recover(ended):
+                for job_id in (recovered := self._parts.jobs.recover(ended)):
                     log.info("recovering %s", job_id)
-                    self._offer(job_id)
+                if recovered:
+                    self._offer()
                 self._calls.recover(ended)
 
     def _notice_cancellations(self) -> None:
@@ -187,8 +188,8 @@ class Maintenance(RestingThread):
         idle = taken.keys() - self._parts.active.runs().keys()
         for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
             log.warning("job %s was stalled, and goes back to its queue", job_id)
-            self._parts.jobs.release(job_id, taken[job_id])
-            self._offer(job_id)
+            if self._parts.jobs.release(job_id, taken[job_id]):
+                self._offer()
         self._idle = idle
 
     def _clean_up_in_turn(self) -> None:

@@ -30,7 +30,7 @@ class Notification:
     """What happened to a job. `stage` and `done` are those of its progress."""
 
     what: Literal["queued", "progress", "ended", "canceled"]
-    job_id: str
+    job_id: str = ""  # of those that are queued, nobody asks
     stage: Stage | None = None
     done: float = 0.0
 

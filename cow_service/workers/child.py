@@ -122,10 +122,9 @@ class WorkerProcess:
             messages.send(self._pipe, message)
 
     def _beat(self) -> None:
-        this, is_idle = psutil.Process(), False
+        this = psutil.Process()
         while True:
-            was_idle, is_idle = is_idle, not self._jobs and time.monotonic() - self._busy_at > QUIET_SECONDS
-            if is_idle and not was_idle:
+            if not self._jobs and time.monotonic() - self._busy_at > QUIET_SECONDS:
                 self._database.close_idle()
             self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
             time.sleep(HEARTBEAT_SECONDS)

@@ -184,6 +184,10 @@ NO_SIMULATION = "Not sure, because without a simulation there is nothing for the
 NO_OUTCOME = "Not sure, because the simulation does not tell what the question asks."
 NOT_FOUND = "Not sure, because what the question asks about was not found in the image under that name."
 NOT_TOLD = "Not sure, because nothing in the image tells what was asked: its objects could not be told apart."
+NO_WORLDS = (
+    "Not sure, because no worlds were run in which what is asked could be counted: `ensemble` is 0, or the trajectory "
+    "was given."
+)
 NO_OPTION = "The world's answer is '{said}', but not exactly one of the options says so."
 NOT_AMONG = "Not sure, because what is met first, '{said}', is not one of what the question asks about."
 NOT_IDENTIFIED = (
@@ -202,8 +206,11 @@ def answer_from(
     simulated: bool,
     alternatives: Sequence[ObjectPhrase] = (),
     unread: Unread = ALL_READ,
+    in_worlds: bool = True,
 ) -> AnswerReading:
-    """The answer, and why it is not sure. `asked` and `alternatives` are read in the question, `unread` was not."""
+    """The answer, and why it is not sure. `asked` and `alternatives` are read in the question, `unread` was not;
+    `in_worlds` says whether there is an ensemble.
+    """
     if asked is None or not simulated or outcome is None:
         words = "', '".join(unread.turning or unread.beside)[:MAX_UNREAD]
         named = NOT_ASKED.format(words=f"'{words}'" if words else "the question")
@@ -212,12 +219,12 @@ def answer_from(
     first = outcome.first
     if outcome.sure and first is not None and alternatives and not any(may_name(each, first) for each in alternatives):
         return replace(_unsure(options, NOT_AMONG.format(said=first)), reasoning=outcome.facts)
-    return choose_option(options, outcome)
+    return choose_option(options, outcome, in_worlds)
 
 
-def choose_option(options: Sequence[AnswerOption], outcome: Outcome) -> AnswerReading:
+def choose_option(options: Sequence[AnswerOption], outcome: Outcome, in_worlds: bool = True) -> AnswerReading:
     """The option that says what the world says, or its words where there are none; else not sure, and why."""
-    why = why_not_sure(outcome)
+    why = why_not_sure(outcome, in_worlds)
     if why:
         reading = _unsure(options, why)
     elif not options:
@@ -232,14 +239,14 @@ def choose_option(options: Sequence[AnswerOption], outcome: Outcome) -> AnswerRe
     return replace(reading, reasoning=outcome.facts)
 
 
-def why_not_sure(outcome: Outcome) -> str:
+def why_not_sure(outcome: Outcome, in_worlds: bool = True) -> str:
     """What keeps the world from an answer, in one sentence; empty where it gives one."""
     if outcome.asked.target is not None and outcome.object is None:
         return NOT_FOUND
     if "depth" in outcome.depends_on:
         return NOT_IN_MAP
     if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
-        return NOT_TOLD
+        return NOT_TOLD if in_worlds else NO_WORLDS
     if outcome.sure:
         return ""
     unseen: dict[Doubt, str] = {"identity": NOT_IDENTIFIED, "outline": NOT_CLEAR, "faint": TOO_FAINT}

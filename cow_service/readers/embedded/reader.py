@@ -172,10 +172,12 @@ class EmbeddedReader:
     ) -> tuple[base.AnswerReading, ...]:
         """What the world tells of the question, the same for every vote; not sure where it does not."""
         question = parse(given.question)
-        outcome = None if imagined is None else imagined.simulation.trajectory.outcome
+        trajectory = None if imagined is None else imagined.simulation.trajectory
+        outcome = None if trajectory is None else trajectory.outcome
         alternatives = read_alternatives(question)
         asked = read_asked(question) if grounding is None else grounding.asked
-        reading = answer_from(options, asked, outcome, imagined is not None, alternatives, unread(question))
+        in_worlds = trajectory is None or trajectory.ensemble > 0
+        reading = answer_from(options, asked, outcome, imagined is not None, alternatives, unread(question), in_worlds)
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
             reading = replace(reading, notes=(*reading.notes, again))

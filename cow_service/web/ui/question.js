@@ -131,7 +131,7 @@ function Settings({ settings, models }) {
       <${Whole} label="How many frames" value=${settings.frames.count ?? 4} min="1" max="64" onChange=${(count) => changeSettings({ frames: { ...settings.frames, count } })} />
       ${answering && html`<${Whole} label="Votes" value=${settings.votes} min="1" max="32" onChange=${(votes) => changeSettings({ votes })} />`}
       <${Whole} label="Length of the clip, frames" value=${settings.num_frames} min="2" max="481" onChange=${(num_frames) => changeSettings({ num_frames })} />
-      <${Whole} label="Worlds" value=${settings.ensemble} min="0" max="500" onChange=${(ensemble) => changeSettings({ ensemble })} />
+      <${Whole} label="Worlds, at most" value=${settings.ensemble} min="0" max="500" onChange=${(ensemble) => changeSettings({ ensemble })} />
       <${Whole} label="Seed" value=${settings.seed ?? ""} min="0" max=${2 ** 32 - 1} onChange=${(seed) => changeSettings({ seed })} />
     </div>
     ${answering && html`<label class="check"><input type="checkbox" checked=${settings.baseline} onChange=${(event) => changeSettings({ baseline: event.target.checked })} />
