@@ -344,3 +344,20 @@ def test_a_world_that_begins_with_the_mover_inside_another_body_is_misread() -> 
         misread = find_world_events(run_world(world, ensemble(50)), world.bodies, ensemble(50), (640, 400)).misread
         assert misread is not None
         assert least <= misread.mean() <= most
+
+
+@pytest.mark.parametrize("kind", ["projectile", "linear"])
+def test_no_draw_hangs_on_which_other_draws_there_are(kind: str) -> None:
+    """A throw out of the image is weighed, and a vehicle's depth taken, by each world's own camera and places."""
+    mover = replace(body((300, 180, 340, 205), "box", name="mover"), elongated=True)
+    bodies = (mover, body((450, 230, 500, 280)))
+    way = motion(kind, (0.8, -0.6), 100.0)
+    way = way.model_copy(update={"depth_deviation": 15.0}) if kind == "projectile" else way
+    camera = known(TrueCamera(pitch=20, focal=640))
+    camera = replace(camera, covariance=np.eye(5) * 0.01)
+    rows = ensemble(20)
+    whole = lay_out(bodies, way, camera, (640, 400), rows)
+    part = lay_out(bodies, way, camera, (640, 400), rows[5:])
+    assert np.ptp(whole.velocity, axis=0).max() > 0.01
+    assert np.allclose(whole.velocity[5:], part.velocity, rtol=1e-9)
+    assert np.allclose(np.broadcast_to(whole.bodies[0].depth_share, 20)[5:], part.bodies[0].depth_share, rtol=1e-9)

@@ -243,16 +243,15 @@ class _Picture:
 
     def depth_share(self, cameras: Cameras) -> Floats:
         """How deep the mover is along the line of sight, of its width: a vehicle is longer along its heading."""
-        motion, first = self.motion, cameras.repeated(1)
-        unit = self.standing(0, first, self.draws[:1]) if self.bodies[0].elongated else None
+        motion = self.motion
+        unit = self.standing(0, cameras, self.draws) if self.bodies[0].elongated else None
         if unit is None or motion.direction is None or motion.kind != "linear":
             return self.depth_of(self.bodies[0], self.draws)
-        way = along_floor(unit, motion, first, np.array([motion.direction]))[0]
-        sight = unit.centre[0, [0, 2]] / np.linalg.norm(unit.centre[0, [0, 2]])
-        along = abs(float(way[[0, 2]] @ sight))
-        across = math.sqrt(max(0.0, 1 - along**2))
-        share = (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
-        return np.full(len(self.draws), share)
+        way = along_floor(unit, motion, cameras, np.tile(motion.direction, (len(self.draws), 1)))[:, [0, 2]]
+        sight = unit.centre[:, [0, 2]] / np.linalg.norm(unit.centre[:, [0, 2]], axis=1, keepdims=True)
+        along = np.abs((way * sight).sum(axis=1))
+        across = np.sqrt(np.maximum(0.0, 1 - along**2))
+        return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
 
 
 @dataclass(frozen=True)

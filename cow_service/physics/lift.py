@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.physics.camera import FLAT, HORIZON, LONGEST, SHORTEST, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN, quantiles
@@ -66,7 +67,7 @@ class Cameras:
         focal, axes, height = (np.repeat(values[one], count, axis=0) for values in (self.focal, self.axes, self.height))
         return replace(self, focal=focal, axes=axes, height=height)
 
-    def of(self, draws: slice) -> Cameras:
+    def of(self, draws: slice | NDArray[np.intp]) -> Cameras:
         """Those of some draws."""
         return replace(self, focal=self.focal[draws], axes=self.axes[draws], height=self.height[draws])
 
@@ -106,12 +107,7 @@ class LiftedBody:
     depth_share: Floats | float = 1.0  # [K]: how deep it is along the line of sight, of its width
     yaw: float | None = None  # radians from right to ahead, of its width, where that was measured
 
-    def repeated(self, count: int) -> LiftedBody:
-        """As the first draw has it, so many times."""
-        centre, *halves = (np.repeat(v[:1], count, axis=0) for v in (self.centre, self.half_width, self.half_height))
-        return replace(self, centre=centre, half_width=halves[0], half_height=halves[1])
-
-    def of(self, draws: slice) -> LiftedBody:
+    def of(self, draws: slice | NDArray[np.intp]) -> LiftedBody:
         """As some draws have it."""
         share = self.depth_share[draws] if isinstance(self.depth_share, np.ndarray) else self.depth_share
         centre, half, tall = self.centre[draws], self.half_width[draws], self.half_height[draws]
@@ -292,21 +288,23 @@ def _thrown(
     mean, sigma = math.asin(motion.depth), math.radians(motion.depth_deviation)
     turn = np.full(len(draws), mean)
     if sigma > 0:
-        turns, count = mean + sigma * TURNS, len(TURNS)
-        one, facing = mover.repeated(count), np.repeat(direction[:1], count, axis=0)
-        weight = np.exp(-0.5 * TURNS**2)
+        turns = mean + sigma * TURNS
+        weight = np.tile(np.exp(-0.5 * TURNS**2), (len(draws), 1))  # [K, turns]
         if motion.cue != "trail":  # along a trail it may have come to any point of its path
-            rise = np.arcsin(np.clip(_in_plane(one, cameras.repeated(count), facing, turns)[:, 1], -1, 1))
+            each = np.repeat(np.arange(len(draws)), len(turns))
+            ways = _in_plane(mover.of(each), cameras.of(each), direction[each], np.tile(turns, len(draws)))
+            rise = np.arcsin(np.clip(ways[:, 1], -1, 1)).reshape(weight.shape)
             usual = np.exp(-0.5 * ((rise - RISE) / RISE_SIGMA) ** 2)
             weight = (weight + UNUSUAL) * (usual + UNUSUAL)  # some are thrown far into the picture, or steeply
-        aimed = np.ones(count)
+        aimed = np.ones(weight.shape)
         for other in others:
-            away = other.centre[0] - mover.centre[0]
-            bearing = math.atan2(float(away[2]), float(np.sign(direction[0, 0]) * away[0]))
-            aimed += AIMED * np.exp(-0.5 * ((turns - bearing) / AIM_SIGMA) ** 2)
+            away = other.centre - mover.centre
+            bearing = np.arctan2(away[:, 2], np.sign(direction[:, 0]) * away[:, 0])
+            aimed += AIMED * np.exp(-0.5 * ((turns - bearing[:, None]) / AIM_SIGMA) ** 2)
         weight = weight * aimed
-        below = (np.cumsum(weight) - weight / 2) / weight.sum()
-        turn = np.interp(quantiles(draws[:, COLUMN["depth"]]), below, turns)
+        below = (np.cumsum(weight, axis=1) - weight / 2) / weight.sum(axis=1, keepdims=True)
+        shares = quantiles(draws[:, COLUMN["depth"]])
+        turn = np.array([np.interp(*each, turns) for each in zip(shares, below, strict=True)])
     return _in_plane(mover, cameras, direction, np.clip(turn, -1.5, 1.5))
 
 
