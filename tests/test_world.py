@@ -12,7 +12,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.events import Events, encounters, find_world_events, seen_paths
 from cow_service.physics.recording import rotation, states
-from cow_service.physics.world import WorldInput, Worlds, run_world
+from cow_service.physics.world import DrawnWorlds, WorldInput, Worlds, run_world
 from cow_service.records import MetresPerPixel, Motion
 from cow_service.vision.masks import CroppedMask
 
@@ -158,3 +158,19 @@ class TestOnATable:
         # Of a table the box alone is known: its near edge looks wider, so that its far one is taken to be farther.
         assert heights[0] == pytest.approx(0.4 + HALF, rel=0.25)
         assert heights[-1] == pytest.approx(float(worlds.layout.bodies[0].half_height[0]), rel=0.1), "on the floor"
+
+
+def test_worlds_run_in_batches_are_those_run_at_once() -> None:
+    mover, rows = ball(-1.2, 3.0), ensemble(9)
+    bodies = (mover, post(0.2, 3.0))
+    world = WorldInput(bodies, moving(mover, 3.0), known(CAMERA, 0.02), CAMERA.size, FRAMES, FPS)
+    drawn = DrawnWorlds.of(world, rows, 2)
+    parts = drawn.run(slice(0, 4)), drawn.run(slice(4, 9))
+    joined, at_once = parts[0].joined(parts[1], drawn.layout.of(slice(0, 9))), run_world(world, rows, 2)
+    assert len({run.positions.shape for run in joined.runs}) == 1, "the batch that rests sooner is continued"
+    for one, other in zip(joined.runs, at_once.runs, strict=True):
+        frames = min(one.positions.shape[1], other.positions.shape[1])
+        np.testing.assert_allclose(one.positions[:, :frames], other.positions[:, :frames], atol=0.05)
+    touches = [find_world_events(each, bodies, rows, CAMERA.size).of[0].times["touches"] for each in (joined, at_once)]
+    assert np.isfinite(touches[1][:, 1]).any()
+    np.testing.assert_allclose(touches[0], touches[1], atol=0.07)
