@@ -20,7 +20,7 @@ from cow_service.readers.base import MotionReading, Quantity
 from cow_service.records import Grounding, LocatedObject, MetresPerPixel, Motion
 from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import read_motion
-from cow_service.stages.reconstruction import Situation
+from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.trajectory import simulate_world
 
 FPS = 16.0
@@ -122,7 +122,9 @@ def moved(reading: MotionReading | None = None, **given_: Any) -> tuple[Motion, 
     """The motion and the trajectory of a request."""
     run_, found = _run(reading, given_), read(reading, **given_).value
     obstacles = run_.scene.obstacles(GROUNDING.bbox, GROUNDING.others)
-    return found, simulate_world(Situation(run_.scene, GROUNDING, found, run_.request, obstacles))
+    return found, simulate_world(
+        situation := Situation(run_.scene, GROUNDING, found, run_.request, obstacles), *reconstruct(situation)
+    )
 
 
 def _run(reading: MotionReading | None, given_: dict[str, Any]) -> Any:

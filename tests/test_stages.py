@@ -19,7 +19,7 @@ from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
 from cow_service.stages.keys import KEY_FIELDS, key_of
 from cow_service.stages.motion import read_motion
-from cow_service.stages.reconstruction import Situation
+from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.trajectory import simulate_world
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.scene import Obstacle, Scene
@@ -54,7 +54,9 @@ def rolled(
     """The trajectory under the paper's law, whose paths are known in closed form."""
     request = run(scene, trajectory=path, num_frames=frames, fps=fps, ensemble=0).request
     ballistic = motion.model_copy(update={"law": "ballistic"})
-    return simulate_world(Situation(scene, grounded(scene, **POINT), ballistic, request, obstacles))
+    return simulate_world(
+        situation := Situation(scene, grounded(scene, **POINT), ballistic, request, obstacles), *reconstruct(situation)
+    )
 
 
 def test_a_point_grounds_the_object_under_it(scene: Scene) -> None:

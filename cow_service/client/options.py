@@ -41,6 +41,7 @@ class SimulateOptions(TypedDict, total=False):
     fps: float
     seed: int | None
     video: bool
+    live: bool
     frames: requests.FramesRequest | Given
     generator_options: Given
     priority: requests.Priority

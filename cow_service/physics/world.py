@@ -168,6 +168,11 @@ class DrawnWorlds:
             given, layout.rearranged(new_supports(goals, layout.supports)) if goals else layout, draws, every
         )
 
+    def shapes(self, part: slice) -> tuple[tuple[RigidShape, ...], ...]:
+        """The bodies of some draws at the start."""
+        layout, draws = self.layout.of(part), self.draws[part]
+        return tuple(_Draw(self.given, layout, draws, k).shapes() for k in range(len(draws)))
+
     def run(self, part: slice) -> Worlds:
         """Runs those of some draws."""
         given, every, goals = self.given, self.every, self.given.placed_before
@@ -175,7 +180,7 @@ class DrawnWorlds:
         fps, frames = CLOCK, math.ceil(given.horizon * CLOCK) + 1
         if len(self.draws) == 1:
             fps, frames = given.fps, given.frames
-        seen = tuple(_Draw(given, layout, draws, k).shapes() for k in range(len(draws)))
+        seen = self.shapes(part)
         settled = Settled(seen, ())
         if goals:
             flying = [i for i, body in enumerate(layout.bodies) if not body.stands]

@@ -543,6 +543,12 @@ class Trajectory(Record):
     placed: tuple[PlacedBefore, ...] = Field(
         default=(), description="What is put somewhere before the motion, in its order."
     )
+    live: Artifact | None = Field(
+        default=None,
+        description="JSON: the worlds as they begin, with all that a program needs to run them with another aim. Null "
+        "where the request did not ask for it (`live`), where something is put somewhere, and where nothing moves "
+        "along a direction.",
+    )
     factual: Trajectory | None = Field(
         default=None,
         description="The same motion in the scene as it is, where something is taken away, or put somewhere before; "

@@ -443,6 +443,11 @@ class SimulateRequest(Record):
         "takes seeds would give every repeat the same reply.",
     )
     video: Flag = Field(default=True, description="Whether to make the mp4 of the whole clip.")
+    live: Flag = Field(
+        default=False,
+        description="Whether the result names its worlds as they begin (`trajectory.live`), to run them elsewhere: the "
+        "page does while somebody drags.",
+    )
     frames: FramesRequest = FramesRequest()
     generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
     priority: Priority = Field(

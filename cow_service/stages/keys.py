@@ -97,7 +97,7 @@ class KeyFields:
     read_with: str | None = None  # a stage: where the reader reads for it, too, it says no less of this one
 
 
-TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "depth", "ensemble", "num_frames", "fps")
+TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "depth", "ensemble", "num_frames", "fps", "live")
 KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "grounding": KeyFields(

@@ -1,14 +1,18 @@
 """Stage 3: what the mover and everything it meets do over the clip, and how sure that is."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from cow_service.narration import warnings_of, with_facts
-from cow_service.physics.ensemble import EnsembleResult, run_ensemble
+from cow_service.physics.ballistic import FreePath
+from cow_service.physics.ensemble import EnsembleResult, Query, run_ensemble
 from cow_service.physics.events import seen_paths
+from cow_service.physics.live import live_worlds
 from cow_service.physics.recording import record_trajectory
+from cow_service.physics.world import WorldInput
 from cow_service.records import CLEAR, BBox, Doubt, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
@@ -22,16 +26,24 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
         scene = run.scene_of(grounding, motion.cue)
-        trajectory = simulate_world(Situation.of(run, scene, grounding, motion))
-    return StageResult(value=trajectory, warnings=warnings_of(run.request, grounding, trajectory))
+        situation = Situation.of(run, scene, grounding, motion)
+        reconstructed = reconstruct(situation)
+        trajectory = simulate_world(situation, *reconstructed)
+        live = live_worlds(*reconstructed[:2], run.request.ensemble) if run.request.live else None
+    warnings = warnings_of(run.request, grounding, trajectory)
+    if live is None:
+        return StageResult(value=trajectory, warnings=warnings)
+    with run.backends.artifacts.batch(run.retry_policy) as put:
+        kept = put(json.dumps(live, separators=(",", ":")).encode(), "application/json")
+    trajectory = trajectory.model_copy(update={"live": kept})
+    return StageResult(value=trajectory, warnings=warnings, artifacts=(kept.sha256,))
 
 
-def simulate_world(situation: Situation) -> Trajectory:
+def simulate_world(situation: Situation, world: WorldInput, query: Query | None, path: FreePath | None) -> Trajectory:
     """What happens over the frames of the clip, and beside it what happens in the scene as it is.
 
     Simulates what the mover and everything it meets do, many times, within what the picture leaves open.
     """
-    world, query, path = reconstruct(situation)
     given, known = situation.request.trajectory, situation.is_separated
     judged = [judge(situation, each) for each in run_ensemble(world, query, situation.request.ensemble)]
     trajectories = [record_trajectory(*each, path, given, known) for each in judged]

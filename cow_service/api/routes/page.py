@@ -26,7 +26,9 @@ MEDIA_TYPES = {
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
     ".txt": "text/plain; charset=utf-8",
+    ".wasm": "application/wasm",
 }
+ENGINE = "vendor/rapier"  # what moves the world while somebody drags: loaded then
 PRELOADS = "<!-- preloads -->"  # in the page: the place for its modules, which it would find one after another
 SIGNED_SECONDS = 60  # of a URL that is signed only to learn where the object store is
 THUMBNAIL_SIDE = 400  # px
@@ -101,10 +103,13 @@ class StaticFile:
 def static_files() -> dict[str, StaticFile]:
     """The page's files by their paths below `/web/`; the page itself is `index.html`."""
     found = _files_in(WEB)
-    modules = [path for path in sorted(found) if path.endswith(".js") and not path.startswith("docs/")]
+    late = ("docs/", "live/", ENGINE)
+    modules = [path for path in sorted(found) if path.endswith(".js") and not path.startswith(late)]
     links = "\n".join(f'    <link rel="modulepreload" href="web/{path}">' for path in modules)
     page = found["index.html"]
     found["index.html"] = StaticFile(page.body.replace(PRELOADS.encode(), links.encode()), page.media_type)
+    wasm = (WEB / f"{ENGINE}.wasm.gz").read_bytes()
+    found[f"{ENGINE}.wasm"] = StaticFile(gzip.decompress(wasm), MEDIA_TYPES[".wasm"])
     for name, example in EXAMPLES.items():
         image, small = example.file("image").read_bytes(), io.BytesIO()
         with Image.open(io.BytesIO(image)) as opened:
@@ -142,8 +147,9 @@ def page_headers(artifacts: ArtifactStore, redirects: bool) -> dict[str, str]:
     if redirects and (url := artifacts.signed_url(ANY_DIGEST, SIGNED_SECONDS)) is not None:
         parts = urlsplit(url)
         store = f" {parts.scheme}://{parts.netloc}"
+    policy = POLICY.replace("script-src 'self'", "script-src 'self' 'wasm-unsafe-eval'")
     policy = (
-        f"{POLICY}img-src 'self' blob: data:{store}; media-src 'self' blob:{store}; connect-src 'self'{store}; "
+        f"{policy}img-src 'self' blob: data:{store}; media-src 'self' blob:{store}; connect-src 'self'{store}; "
         "require-trusted-types-for 'script'; trusted-types 'none'"
     )
     own = {"Cross-Origin-Opener-Policy": "same-origin", "X-Frame-Options": "DENY"}
@@ -157,6 +163,8 @@ def is_known(request: Request, etag: str) -> bool:
 
 
 def _send_web_file(request: Request, engine: JobEngine, path: str) -> Response:
+    if not path.endswith((".html", ".svg")):  # the policy is that of documents
+        return _send(request, static_files()[path], HEADERS)
     service = engine.service
     return _send(request, static_files()[path], page_headers(service.artifacts, service.settings.artifacts_redirect))
 

@@ -51,9 +51,10 @@ async function cancelJob(id) {
 A request that is on its way is not broken off: whoever aborts meanwhile cancels its job. */
 async function submit(picture, kind, request, signal) {
   const headers = { Prefer: "respond-async", "Idempotency-Key": newIdempotencyKey() };
+  const wanted = { ...request, live: true }; // that the world moves while somebody drags
   const send = () => {
-    if (picture.sha256) return postJson(`/${kind}`, { ...request, image: { artifact: picture.sha256 } }, headers);
-    const { question, ...rest } = request;
+    if (picture.sha256) return postJson(`/${kind}`, { ...wanted, image: { artifact: picture.sha256 } }, headers);
+    const { question, ...rest } = wanted;
     const body = new FormData();
     body.append("image", picture.blob, "image");
     body.append("question", question);

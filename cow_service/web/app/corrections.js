@@ -6,12 +6,12 @@ const DIRECTED = new Set(["linear", "projectile"]);
 const SET_MOVING = new Set(["linear", "projectile", "fall"]); // kinds of motion that others may have
 const OF_ALL = ["kind", "law", "others", "metres_per_pixel"];
 const OF_DIRECTED = [...OF_ALL, "direction", "depth", "depth_deviation", "speed", "speed_deviation"];
-const OF_LINEAR = [...OF_DIRECTED, "distance", "duration", "until", "steps"];
+const OF_LINEAR = [...OF_DIRECTED, "distance", "duration", "until", "steps", "rises"];
 
 export const isDirected = (kind) => DIRECTED.has(kind);
 
 const present = (record) => Object.fromEntries(Object.entries(record).filter(([, value]) => value !== null && value !== undefined));
-const DEFAULTS = { depth: 0, depth_deviation: 0 };
+const DEFAULTS = { depth: 0, depth_deviation: 0, rises: false };
 const isDefault = (name, value) => (Array.isArray(value) && !value.length) || DEFAULTS[name] === value;
 const only = (record, names) => present(Object.fromEntries(names.filter((name) => !isDefault(name, record[name])).map((name) => [name, record[name]])));
 const plain = (words) => words.toLowerCase().trim();

@@ -39,7 +39,7 @@ export function requestOf({ question, settings, corrections }) {
 }
 
 /** Question, settings and corrections of a request that was accepted earlier. */
-export function stateOf(kind, { question, image, options, baseline, ...request }) {
+export function stateOf(kind, { question, image, options, baseline, live, ...request }) {
   const settings = { ...DEFAULT_SETTINGS, kind, baseline: baseline ?? false, frames: {}, video: kind !== "answer", rest: {} };
   const corrections = {};
   for (const name of CORRECTED) corrections[name] = request[name] ?? null;

@@ -48,6 +48,12 @@ export function encounterWords(encounter, trajectory) {
   return `${who}${MEETS[encounter.kind] ?? encounter.kind} ${encounter.object}${sure}`;
 }
 
+/** What most of so many worlds say: {yes, count}, and `first` where it is asked what is met first. */
+export function shareWords({ yes, count, first }, trajectory) {
+  if (first !== undefined) return `${yes} of ${plural(count, "world")}: ${first < 0 ? "nothing is met" : `${trajectory.bodies[first]?.object ?? "it"} first`}`;
+  return 2 * yes >= count ? `${yes} of ${plural(count, "world")}: yes` : `${count - yes} of ${plural(count, "world")}: no`;
+}
+
 /** The time of a job, for people. */
 export function when(time) {
   const then = new Date(time);

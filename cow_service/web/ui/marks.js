@@ -11,9 +11,10 @@ export function Labels({ labels, unit, size }) {
     html`<text key=${place} class=${`name ${kind}`} x=${x} y=${y + 0.78 * height} font-size=${13 * unit}>${text}</text>`)}</g>`;
 }
 
-/** The names of a world: {text, box, kind, below}. */
-export function labelsOf(trajectory) {
-  const { encounters, bodies, fps } = trajectory;
+/** The names of a world: {text, box, kind, below}; `isOld`: what happens in it is no longer so. */
+export function labelsOf(trajectory, isOld) {
+  const { bodies, fps } = trajectory;
+  const encounters = isOld ? [] : trajectory.encounters;
   const met = new Set(encounters.map((encounter) => encounter.object));
   return [
     ...encounters.map((encounter) => ({

@@ -5,7 +5,7 @@ import { useArtifact } from "../app/artifacts.js";
 import { clamp } from "../app/geometry.js";
 import { encounterWords, seconds } from "../app/words.js";
 
-const calm = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
+export const calm = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 /** The state of a player of a simulation: {frame, count, fps, playing, video, seek, toggle}. */
 export function usePlayer(simulation, isBusy) {

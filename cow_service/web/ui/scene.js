@@ -11,6 +11,7 @@ import { BoxHandles, Handle, pointIn } from "./handles.js";
 import { Arrow, Labels, Lit, Moment, Rect, World, labelsOf } from "./marks.js";
 import { Transport, usePlayer } from "./player.js";
 import { Floor, FloorLine } from "./floor.js";
+import { Foreseen, Foretold, usePreview } from "./preview.js";
 import { Filmstrip } from "./filmstrip.js";
 import { Tools } from "./tools.js";
 
@@ -46,6 +47,8 @@ export function Scene({ state }) {
   const pressed = useRef([0, 0]); // where the pointer went down, CSS px of the window
   busy.current = draft !== null;
   const player = usePlayer(simulation, () => busy.current || frame.current.querySelector("svg").contains(document.activeElement));
+  const preview = usePreview(simulation);
+  const { shown } = preview;
   const cutout = useCutout(picture, simulation?.grounding.mask ?? null, simulation?.grounding.bbox ?? null);
 
   useEffect(() => {
@@ -58,6 +61,7 @@ export function Scene({ state }) {
     if (hasSight && picture.blob) void prepare(picture); // that of an opened job is sent once it is needed
   }, [picture.url, hasSight]);
   useEffect(() => light(null), [isSeeing]);
+  useEffect(() => void (state.run || preview.end()), [state.run]); // no other film will come
 
   const camera = simulation?.trajectory.camera ? { ...simulation.trajectory.camera, ...corrections.camera } : null;
   const isTakenShown = taken?.light && taken.mask === corrections.grounding?.mask && !draft?.mover && (!simulation || state.run);
@@ -75,7 +79,7 @@ export function Scene({ state }) {
   const editing = !player.playing && tool === "select";
 
   const ownNames = new Set(corrections.objects.filter((object) => object.bbox).map((object) => object.object));
-  const world = simulation ? labelsOf(simulation.trajectory) : found.map((body) => ({ text: body.object, box: body.bbox, kind: "body" }));
+  const world = simulation ? labelsOf(simulation.trajectory, shown !== null) : found.map((body) => ({ text: body.object, box: body.bbox, kind: "body" }));
   const removed = new Set(corrections.interventions.filter((each) => each.kind === "remove").map((each) => each.object));
   const nameOf = (object) => (removed.has(object) ? `${object}, taken away` : object);
   const labels = [
@@ -130,11 +134,26 @@ export function Scene({ state }) {
     },
   };
 
+  /** Whether a drag went far enough to mean something; else nothing is foreseen any more. */
+  const isFar = (dx, dy) => {
+    const far = Math.hypot(dx, dy) >= 2 * unit;
+    if (!far) preview.end();
+    return far;
+  };
+  const dragged = (aim) => {
+    if (aim && simulation) {
+      if (player.playing) player.seek(0);
+      preview.aim(aim);
+    }
+    return false;
+  };
+  const bodyOf = (place) => simulation?.trajectory.bodies.findIndex((body) => body.object === corrections.objects[place].object) ?? -1;
+
   const moverMoves = {
-    onMove: (handle, dx, dy) => setDraft({ mover: movedBox(simulation ? corrections.grounding?.bbox ?? simulation.grounding.bbox : corrections.grounding.bbox, handle, dx, dy, size) }),
+    onMove: (handle, dx, dy) => dragged("all" === handle && { moved: { body: 0, by: [dx, dy] } }) || setDraft({ mover: movedBox(simulation ? corrections.grounding?.bbox ?? simulation.grounding.bbox : corrections.grounding.bbox, handle, dx, dy, size) }),
     onEnd: (handle, dx, dy) => {
       setDraft(null);
-      if (Math.hypot(dx, dy) < 2 * unit) return;
+      if (!isFar(dx, dy)) return;
       const box = movedBox(corrections.grounding?.bbox ?? simulation.grounding.bbox, handle, dx, dy, size);
       correct(moverWith(simulation, corrections, { bbox: box }));
     },
@@ -147,10 +166,10 @@ export function Scene({ state }) {
   };
   const pulled = (place, dx, dy) => pulledPath(base, frames, place, [dx, dy]);
   const ownObject = (place) => ({
-    onMove: (handle, dx, dy) => setDraft({ object: place, box: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) }),
+    onMove: (handle, dx, dy) => dragged(handle === "all" && bodyOf(place) > 0 && { moved: { body: bodyOf(place), by: [dx, dy] } }) || setDraft({ object: place, box: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) }),
     onEnd: (handle, dx, dy) => {
       setDraft(null);
-      if (Math.hypot(dx, dy) < 2 * unit) return;
+      if (!isFar(dx, dy)) return;
       const moved = { ...corrections.objects[place], mask: null, bbox: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) };
       correct({ objects: corrections.objects.map((object, index) => (index === place ? moved : object)) });
     },
@@ -161,10 +180,10 @@ export function Scene({ state }) {
     <div class=${`frame tool-${tool}`} ref=${frame} style=${{ aspectRatio: `${size.width} / ${size.height}`, "--ratio": size.width / size.height }}>
       <img src=${picture.url} alt=${`The picture: ${picture.name}`} draggable=${false} />
       ${player.url && html`<video key=${player.url} ref=${player.element} src=${player.url} muted playsinline preload="auto" tabindex="-1" aria-label="The imagined clip"
-        class=${player.frame > 0 || player.playing ? "" : "waiting"}></video>`}
-      <svg viewBox=${`0 0 ${size.width} ${size.height}`} role="group" aria-label="What was found" ...${drawing}>
+        class=${(player.frame > 0 || player.playing) && !shown ? "" : "waiting"}></video>`}
+      <svg viewBox=${`0 0 ${size.width} ${size.height}`} role="group" aria-label="What was found" class=${shown && !draft?.points ? "aiming" : ""} ...${drawing}>
         ${!simulation && found.map((body, place) => html`<${Rect} key=${place} box=${body.bbox} kind="body" />`)}
-        ${simulation && html`<${World} simulation=${simulation} unit=${unit} size=${size} layers=${layers} line=${points !== path.points ? lineOf({ points, visible: path.visible }) : null} />`}
+        ${simulation && !shown && html`<${World} simulation=${simulation} unit=${unit} size=${size} layers=${layers} line=${points !== path.points ? lineOf({ points, visible: path.visible }) : null} />`}
         ${cutout && !draft?.mover && !player.playing && html`<image class="outline" href=${cutout.outline} x="0" y="0" width=${size.width} height=${size.height} />`}
         ${layers.floor && camera && html`<${Floor} camera=${camera} corrections=${corrections} size=${size} unit=${unit} isEditable=${editing} />`}
         ${isTakenShown && html`<${Lit} thing=${taken} size=${size} />`}
@@ -174,7 +193,8 @@ export function Scene({ state }) {
           const box = draft?.object === place ? draft.box : object.bbox;
           return box && html`<${Rect} key=${`own ${place}`} box=${box} kind="own" />`;
         })}
-        ${simulation && html`<${Moment} simulation=${simulation} frame=${player.frame} unit=${unit} layers=${layers} cutout=${cutout?.cutout} />`}
+        ${simulation && shown && html`<${Foreseen} shown=${shown} simulation=${simulation} unit=${unit} cutout=${cutout?.cutout} />`}
+        ${simulation && !shown && html`<${Moment} simulation=${simulation} frame=${player.frame} unit=${unit} layers=${layers} cutout=${cutout?.cutout} />`}
         ${layers.names && html`<${Labels} labels=${labels} unit=${unit} size=${size} />`}
         ${shownDirection && !player.playing && html`<${Arrow} from=${origin} direction=${shownDirection} size=${size} unit=${unit} />`}
         ${origin && !player.playing && html`<circle class="point" cx=${origin[0]} cy=${origin[1]} r=${3.5 * unit} />`}
@@ -185,10 +205,10 @@ export function Scene({ state }) {
         ${editing && corrections.objects.map((object, place) => object.bbox && html`<${BoxHandles} key=${`handles ${place}`} box=${draft?.object === place ? draft.box : object.bbox}
           unit=${unit} name=${object.object} kind="of-own" ...${ownObject(place)} />`)}
         ${editing && frames.map((at, place) => html`<${Handle} key=${`way ${place}`} at=${points[at]} unit=${unit} kind="waypoint" label=${`Point ${place + 1} of the path.`}
-          onMove=${(dx, dy) => setDraft({ points: pulled(place, dx, dy) })}
+          onMove=${(dx, dy) => dragged({ points: pulled(place, dx, dy) }) || setDraft({ points: pulled(place, dx, dy) })}
           onEnd=${(dx, dy) => {
             setDraft(null);
-            if (Math.hypot(dx, dy) < 2 * unit) return;
+            if (!isFar(dx, dy)) return;
             correct({
               ...knownBeside(simulation, corrections),
               grounding: corrections.grounding ?? groundingOf(simulation.grounding),
@@ -196,13 +216,18 @@ export function Scene({ state }) {
             });
           }} />`)}
         ${editing && shownDirection && html`<${Handle} at=${tipOf(origin, shownDirection, size)} unit=${unit} kind="tip" label="Tip of the direction arrow."
-          onMove=${(dx, dy) => setDraft({ direction: aimedAt(dx, dy) })}
+          onMove=${(dx, dy) => {
+            const aimed = aimedAt(dx, dy);
+            dragged(aimed && { direction: aimed });
+            setDraft({ direction: aimed });
+          }}
           onEnd=${(dx, dy) => {
             const aimed = aimedAt(dx, dy);
-            if (aimed && Math.hypot(dx, dy) >= 2 * unit) correct({ motion: motionTowards(simulation, corrections, aimed), trajectory: null });
+            if (isFar(dx, dy) && aimed) correct({ motion: motionTowards(simulation, corrections, aimed), trajectory: null });
             setDraft(null);
           }} />`}
       </svg>
+      ${shown && html`<${Foretold} shown=${shown} trajectory=${simulation.trajectory} />`}
     </div>
     ${layers.floor && camera && html`<${FloorLine} camera=${camera} corrections=${corrections} />`}
     ${pending && html`<${NameForm} onName=${(name) => {

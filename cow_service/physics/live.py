@@ -1,0 +1,138 @@
+"""The worlds of a result as they begin, for a program that runs them again elsewhere: the page does while one drags.
+
+Coordinates are metres right, above the floor and ahead, the camera above their origin. Of what differs between worlds
+there is a list with a value for each, the likeliest world first; what is the same in all of them is one value.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from cow_service.physics import engine, events, lift
+from cow_service.physics.ballistic import GRAVITY
+from cow_service.physics.draws import COLUMN, ensemble, likeliest, quantiles
+from cow_service.physics.ensemble import EVERY, Query
+from cow_service.physics.layout import FARTHEST, VEHICLE_WIDTH
+from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
+from cow_service.vision.types import Floats
+
+DIGITS = 6  # significant: the engine computes with no more
+CONSTANTS: dict[str, float] = {
+    "gravity": GRAVITY,
+    "clock": CLOCK,
+    "every": EVERY,
+    "engine_size": engine.ENGINE_SIZE,
+    "most_gravity": engine.MOST_GRAVITY,
+    "least_steps": engine.LEAST_STEPS,
+    "least_steps_of_many": engine.LEAST_STEPS_OF_MANY,
+    "floor_friction": engine.FLOOR_FRICTION,
+    "floor_restitution": engine.FLOOR_RESTITUTION,
+    "foreseen": engine.FORESEEN,
+    "gap": engine.GAP,
+    "least_waist": engine.LEAST_WAIST,
+    "at_rest": engine.AT_REST,
+    "at_start": engine.AT_START,
+    "rests": engine.RESTS,
+    "tipped": math.cos(events.TIPPED),
+    "displaced": events.DISPLACED,
+    "low": lift.LOW,
+    "rise": lift.RISE,
+    "rise_sigma": lift.RISE_SIGMA,
+    "aimed": lift.AIMED,
+    "aim_sigma": lift.AIM_SIGMA,
+    "unusual": lift.UNUSUAL,
+    "widest_turn": float(lift.TURNS[-1]),
+    "turns": len(lift.TURNS),
+    "turn_sigma": math.radians(lift.TURN_SIGMA["request"]),
+    "vehicle_width": VEHICLE_WIDTH,
+    "farthest": FARTHEST,
+}
+"""What runs the worlds elsewhere computes with; the names are those of the constants here."""
+
+
+def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, Any] | None:
+    """The likeliest world and an ensemble of `size` worlds as JSON values; None of what no drag can change.
+
+    That is what something is put somewhere in, or what does not move along a direction.
+    """
+    motion = world.motion
+    if world.placement is not None or world.placed_before or motion.direction is None or motion.speed == 0:
+        return None
+    draws = likeliest() if size == 0 else np.concatenate([likeliest(), ensemble(size)])
+    drawn = DrawnWorlds.of(world, draws, EVERY)
+    layout, shapes = drawn.layout, drawn.shapes(slice(0, len(draws)))
+    cameras, mover = layout.cameras, layout.bodies[0]
+
+    def column(name: str, index: int) -> Any:
+        return _column(np.array([getattr(shape[index], name) for shape in shapes], np.float64))
+
+    measures = ("half_width", "half_depth", "half_height", "yaw", "density", "friction", "restitution", "base", "waist")
+    bodies: list[dict[str, Any]] = []
+    for index, seen in enumerate(world.bodies):
+        first, starts = shapes[0][index], [shape[index] for shape in shapes]
+        positions = np.array([shape.position for shape in starts])
+        bodies.append(
+            {
+                "name": seen.name,
+                "bbox": list(seen.bbox),
+                "shape": first.shape,
+                **{name: column(name, index) for name in measures},
+                "middle": None if first.middle is None else column("middle", index),
+                "position": [_column(positions[:, axis]) for axis in range(3)],
+                "velocity": [_column(np.array([shape.velocity[axis] for shape in starts])) for axis in range(3)],
+                "starts": first.starts,
+                "glides": first.glides,
+                "falls": first.falls,
+                "fixed": first.fixed,
+                "pieces": [np.round(corners, DIGITS).tolist() for corners in first.pieces],
+                "support": layout.supports[index],
+            }
+        )
+    factors = lift.speed_factors(motion, draws, "speed")
+    is_measured = mover.yaw is not None
+    return {
+        "size": list(world.size),
+        "fps": world.fps,
+        "num_frames": world.num_frames,
+        "horizon": world.horizon,
+        "constants": CONSTANTS,
+        "cameras": {
+            "focal": _column(cameras.focal),
+            "axes": [_column(cameras.axes.reshape(len(draws), 9)[:, place]) for place in range(9)],
+            "height": _column(cameras.height),
+        },
+        "bodies": bodies,
+        "mover": {
+            "start": list(world.bodies[0].start),
+            "foot": list(world.bodies[0].foot),
+            "kind": motion.kind,
+            "stands": mover.stands,
+            "rises": motion.rises,
+            "is_side_view": world.level is not None,
+            "elongated": world.bodies[0].elongated and world.level is None and not is_measured,
+            "seen_half_width": _column(mover.half_width),
+            "depth_share": _column(np.broadcast_to(mover.depth_share, len(draws))),
+            "direction": list(motion.direction),
+            "depth": motion.depth,
+            "metres_per_pixel": motion.metres_per_pixel.value,
+            "depth_sigma": math.radians(motion.depth_deviation),
+            "speed": _column(motion.speed * motion.metres_per_pixel.value * factors),
+            "turn": _column(draws[:, COLUMN["turn"]]),
+            "heading": _column(quantiles(draws[:, COLUMN["depth"]])),
+        },
+        "asked": None if query is None or not query.is_decidable else _asked(query),
+    }
+
+
+def _asked(query: Query) -> dict[str, Any]:
+    asked = query.asked.model_dump(include={"relation", "form", "negated", "every", "within"})
+    return asked | {"target": query.target, "subject": query.subject, "among": list(query.among)}
+
+
+def _column(values: Floats) -> Any:
+    """One value where all are the same, else a list of them."""
+    rounded = [float(f"{value:.{DIGITS}g}") for value in values.tolist()]
+    return rounded[0] if len(set(rounded)) == 1 else rounded

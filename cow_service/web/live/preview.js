@@ -1,0 +1,126 @@
+// Runs the worlds of a result again while somebody drags, a little in each frame of the screen.
+
+import { bodiesOf, cameraOf, countOf, meetingsOf, positionsAlong, runWorlds, sharesOf } from "./world.js";
+
+const BUDGET = 6; // ms of futures in a frame of the screen, beside the likeliest world
+const NEAREST = 0.08; // of its first depth: closer than this, a body has passed the camera
+const FUTURE_STEP = 2; // recorded positions between two points of a future's line
+const BEYOND = 0.3; // of the image: a line ends so far outside
+
+let engine = null; // a promise
+
+/** Loads the engine, once. `wasm` is a promise of its WebAssembly, `load` one of its module. */
+export function loadEngine(load, wasm) {
+  engine ??= (async () => {
+    globalThis.rapierWasm = wasm();
+    const R = await load();
+    await R.init();
+    return R;
+  })();
+  engine.catch(() => (engine = null));
+  return engine;
+}
+
+/** How far an upright axis leans in the image, degrees, clockwise; `turn` is a quaternion. */
+function leanOf(camera, position, [x, y, z, w]) {
+  const axis = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)];
+  const [[ax, ay], [bx, by]] = [-0.01, 0.01].map((side) => camera.project(position.map((value, i) => value + side * camera.height * axis[i])));
+  return (Math.atan2(bx - ax, ay - by) * 180) / Math.PI;
+}
+
+/** The path of a body of one world in the image: {points, scale, leans, visible}. `start` (px) is where the picture shows it. */
+function seen(camera, positions, turns, start) {
+  const path = positions.map((position) => camera.project(position));
+  const [x0, y0, depth] = path[0];
+  const scale = path.map(([, , z]) => depth / Math.max(z, NEAREST * depth));
+  const off = start ? [start[0] - x0, start[1] - y0] : [0, 0];
+  return { points: path.map(([x, y], i) => [x + scale[i] * off[0], y + scale[i] * off[1]]), scale, leans: turns?.map((turn, i) => leanOf(camera, positions[i], turn)) ?? null, visible: path.map(([, , z]) => z > NEAREST * depth) };
+}
+
+export class Preview {
+  /** `world` as a result has it; `tell` hears what is known so far: {number, paths, met, futures, shares}. */
+  constructor(R, world, tell) {
+    Object.assign(this, { R, world, tell, count: countOf(world), wanted: null, current: null, batch: 4, handle: 0 });
+  }
+
+  /** Takes an aim: {direction}, {moved: {body, by}}, or {points} of a path; the latest counts. */
+  aim(aim) {
+    this.wanted = aim;
+    this.handle ||= requestAnimationFrame(() => this.work());
+  }
+
+  end() {
+    cancelAnimationFrame(this.handle);
+    this.handle = 0;
+    this.wanted = this.current = null;
+  }
+
+  work() {
+    this.handle = 0;
+    if (this.wanted === null) return;
+    if (this.wanted !== this.current) this.begin();
+    const until = performance.now() + BUDGET;
+    while (this.next < this.count && performance.now() < until) this.more();
+    const { number, paths, met, futures, runs } = this;
+    this.tell({ aim: this.current, number, paths, met, futures: futures.join(""), shares: sharesOf(this.world, runs, 1, this.timing), isDone: this.next >= this.count });
+    if (this.next < this.count || this.wanted !== this.current) this.handle = requestAnimationFrame(() => this.work());
+  }
+
+  bodies(k) {
+    return bodiesOf(this.world, k, this.current);
+  }
+
+  along(k) {
+    return this.current.points ? positionsAlong(this.world, k, this.current.points) : null;
+  }
+
+  /** The likeliest world. */
+  begin() {
+    const { R, world } = this;
+    this.current = this.wanted;
+    const { fps, num_frames: frames, constants } = world;
+    const along = this.along(0);
+    const [run] = runWorlds(R, constants, [this.bodies(0)], { fps, frames, isAlone: true, along: along && [along] });
+    const camera = cameraOf(world, 0);
+    const by = this.current.moved?.by ?? [0, 0];
+    const startOf = (body) => (body ? null : this.current.moved?.body === 0 ? [world.mover.start[0] + by[0], world.mover.start[1] + by[1]] : world.mover.start);
+    const bodies = [...new Set([0, ...run.moved])];
+    this.paths = bodies.map((body) => ({ body, ...seen(camera, run.positions[body], world.bodies[body].shape === "sphere" ? null : run.turns[body], startOf(body)) }));
+    this.met = meetingsOf(world, run)[0] ?? null;
+    this.timing = { fps: constants.clock, every: constants.every };
+    Object.assign(this, { next: 1, futures: [], runs: [], number: (this.number ?? 0) + 1 });
+  }
+
+  /** Some more futures, as many as there is time for. */
+  more() {
+    const { R, world, next } = this;
+    const { constants, horizon } = world;
+    const which = Array.from({ length: Math.min(this.batch, this.count - next) }, (_, i) => next + i);
+    const began = performance.now();
+    const along = this.current.points ? which.map((k) => this.along(k)) : null;
+    const runs = runWorlds(R, constants, which.map((k) => this.bodies(k)), {
+      fps: constants.clock, frames: Math.ceil(horizon * constants.clock) + 1, every: constants.every, along, turns: world.asked?.relation === "tips",
+      pathFps: world.fps,
+    });
+    runs.forEach((run, place) => {
+      this.runs.push(run);
+      this.futures.push(this.lineOf(which[place], run.positions[0]));
+    });
+    this.next += which.length;
+    const each = (performance.now() - began) / which.length;
+    this.batch = Math.max(1, Math.min(10, Math.floor(BUDGET / Math.max(each, 0.1))));
+  }
+
+  lineOf(k, positions) {
+    const [width, height] = this.world.size;
+    const { points, visible } = seen(cameraOf(this.world, k), positions, null, this.paths[0].points[0]);
+    let text = "";
+    for (let i = 0; i < points.length; i += FUTURE_STEP) {
+      const [x, y] = points[i];
+      const isOut = !visible[i] || x < -BEYOND * width || x > (1 + BEYOND) * width || y < -BEYOND * height || y > (1 + BEYOND) * height;
+      if (isOut) break;
+      text += `${text ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`;
+    }
+    return text;
+  }
+}

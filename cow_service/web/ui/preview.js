@@ -1,0 +1,106 @@
+// The world that answers while somebody drags: the paths, the thing on its way, other futures, and what they say.
+
+import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
+import { address } from "../app/address.js";
+import { artifactBlob } from "../app/artifacts.js";
+import { lineOf } from "../app/geometry.js";
+import { shareWords } from "../app/words.js";
+import { calm } from "./player.js";
+
+const PAUSE = 0.6; // s between the end of the film and its next beginning
+const STATIONS = 5; // places where a thing is drawn at once, where less motion is wanted
+
+/** {R, Preview}: the engine and what runs it, loaded when first wanted. */
+async function loaded() {
+  const { Preview, loadEngine } = await import("../live/preview.js");
+  const R = await loadEngine(() => import("../vendor/rapier.js"), () => fetch(address("/web/vendor/rapier.wasm")));
+  return { R, Preview };
+}
+
+/** {shown, prepare, aim, end}: what is foreseen of a result while somebody drags; nothing where it has no live worlds. */
+export function usePreview(simulation) {
+  const [shown, show] = useState(null);
+  const held = useRef({ preview: null, aim: null, ready: null });
+  const live = simulation?.trajectory.live ?? null;
+  const end = () => {
+    held.current.aim = null;
+    held.current.preview?.end();
+    show(null);
+  };
+  useEffect(() => {
+    const mine = { preview: null, aim: null, ready: null };
+    held.current = mine;
+    show(null);
+    return () => mine.preview?.end();
+  }, [simulation?.id]);
+  const prepare = () => {
+    const mine = held.current;
+    if (!live || mine.ready) return;
+    mine.ready = (async () => {
+      const [{ R, Preview }, blob] = await Promise.all([loaded(), artifactBlob(live.sha256)]);
+      mine.preview = new Preview(R, JSON.parse(await blob.text()), (found) => held.current === mine && mine.aim && show(found));
+      if (mine.aim && held.current === mine) mine.preview.aim(mine.aim);
+    })();
+    mine.ready.catch((error) => console.warn("No preview:", error)); // the server computes the film all the same
+  };
+  const aim = (wanted) => {
+    prepare();
+    held.current.aim = wanted;
+    held.current.preview?.aim(wanted);
+  };
+  return { shown, prepare, aim, end, isLive: live !== null };
+}
+
+/** The frame of a film of so many that goes on and on. */
+function useFilm(count, fps) {
+  const [frame, setFrame] = useState(0);
+  useEffect(() => {
+    if (calm()) return undefined;
+    const began = performance.now();
+    let handle = requestAnimationFrame(function tick(now) {
+      const time = ((now - began) / 1000) % (count / fps + PAUSE);
+      setFrame(Math.max(0, Math.min(count - 1, Math.floor(time * fps))));
+      handle = requestAnimationFrame(tick);
+    });
+    return () => cancelAnimationFrame(handle);
+  }, [count, fps]);
+  return frame;
+}
+
+/** A thing at one frame of its path, cut out of the picture, or its box. `from` is where the picture shows it. */
+function Thing({ path, frame, box, from, cutout, ghost }) {
+  const last = Math.min(frame, path.points.length - 1);
+  if (!path.visible[last]) return null;
+  const [x, y] = path.points[last];
+  const turn = path.leans ? path.leans[last] - path.leans[0] : 0;
+  const place = `translate(${x} ${y}) rotate(${turn}) scale(${path.scale[last]}) translate(${-from[0]} ${-from[1]})`;
+  const [x0, y0, x1, y1] = box;
+  const at = { x: x0, y: y0, width: x1 - x0, height: y1 - y0 };
+  return cutout ? html`<image class=${ghost ? "ghost" : "thing"} href=${cutout} ...${at} transform=${place} />`
+    : html`<rect class=${ghost ? "ghost" : "mover thin"} ...${at} transform=${place} />`;
+}
+
+export function Foreseen({ shown, simulation, unit, cutout }) {
+  const { trajectory, grounding } = simulation;
+  const { paths, futures, met } = shown;
+  const count = trajectory.paths[0].points.length;
+  const frame = useFilm(count, trajectory.fps);
+  const bodies = trajectory.bodies;
+  const things = (at, ghost) => paths.map((path) => html`<${Thing} key=${`${path.body} ${at}`} path=${path} frame=${at} ghost=${ghost}
+    box=${path.body ? bodies[path.body].bbox : grounding.bbox} from=${path.body ? path.points[0] : path.points[0]} cutout=${path.body ? null : cutout} />`);
+  const stations = calm() ? Array.from({ length: STATIONS }, (_, place) => Math.round(((place + 1) * (count - 1)) / STATIONS)) : [frame];
+  const touched = met && bodies[met.body];
+  return html`<g class="foreseen">
+    <path class="futures" d=${futures} />
+    ${paths.map((path) => html`<g key=${path.body}><path class="halo" d=${lineOf(path)} /><path class=${path.body ? "path pushed" : "path"} d=${lineOf(path)} /></g>`)}
+    ${touched && html`<rect class="met touches" x=${touched.bbox[0]} y=${touched.bbox[1]} width=${touched.bbox[2] - touched.bbox[0]} height=${touched.bbox[3] - touched.bbox[1]} />`}
+    ${stations.map((at) => things(at, stations.length > 1))}
+  </g>`;
+}
+
+/** What the futures say so far, as a bar and in words. */
+export function Foretold({ shown, trajectory }) {
+  const { shares, isDone } = shown;
+  return html`<p class="foretold" role="status">${shares ? html`<meter min="0" max=${shares.count} value=${shares.yes}></meter> <b>${shareWords(shares, trajectory)}</b>`
+    : html`<b>${isDone ? "Let go, and the server tells what happens." : "…"}</b>`}</p>`;
+}

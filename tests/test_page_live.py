@@ -1,0 +1,109 @@
+"""The world that moves while somebody drags: the page's physics against the server's, and what a drag shows."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import pairwise
+from typing import Any
+
+import httpx
+import pytest
+from browser import Windows, arrow_tip, ask, drop, in_window, result, said
+from conftest import EXAMPLES, Server
+from live_worlds import LOAD, RUN, given_again
+from playwright.sync_api import Page, expect
+from servers import QUESTION, picture
+
+TURNS = (-2.2, -0.7, 0.5)  # radians by which the arrow is turned
+WITHIN = 0.02  # of the picture's width: paths differ by less
+
+
+def example(name: str) -> tuple[dict[str, Any], str]:
+    """The picture of an example as a file to send, and its question."""
+    folder = EXAMPLES / name
+    question = json.loads((folder / "meta.json").read_text())["question"]
+    return {"image": ("image.jpg", (folder / "image.jpg").read_bytes())}, question
+
+
+def simulated(server: Server, name: str, **corrected: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The result of an example, and its worlds."""
+    body = json.dumps({"live": True, "video": False, "frames": {"count": 1}} | corrected)
+    files, question = example(name)
+    fields = {"question": question, "request": body}
+    found = httpx.post(f"{server.address}/simulate", files=files, data=fields, timeout=60).raise_for_status().json()
+    live = found["trajectory"]["live"]
+    return found, httpx.get(f"{server.address}{live['url']}").raise_for_status().json()
+
+
+def column(value: Any, count: int) -> list[float]:
+    return value if isinstance(value, list) else [value] * count
+
+
+@pytest.mark.parametrize("name", ["ball-and-mug", "thrown-ball"])
+def test_the_page_computes_the_worlds_of_the_server(server: Server, windows: Windows, name: str) -> None:
+    page = windows.open(server.address)
+    page.evaluate(LOAD)
+    first, world = simulated(server, name)
+    motion, names = first["motion"], [body["object"] for body in first["trajectory"]["bodies"]]
+    (x, y), start = motion["direction"], first["grounding"]["point"]
+    for turn in TURNS:
+        direction = [x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn)]
+        dragged, worlds = simulated(server, name, motion=given_again(motion, direction))
+        found = page.evaluate(RUN, {"world": world, "direction": direction})
+        count = len(found["velocities"])
+        there = [column(each, count) for each in worlds["bodies"][0]["velocity"]]
+        for mine, theirs in zip(found["velocities"], zip(*there, strict=True), strict=True):
+            assert mine == pytest.approx(theirs, abs=1e-4)
+        trajectory = dragged["trajectory"]
+        met = [(each["time"], each["object"]) for each in trajectory["encounters"] if each["kind"] == "touches"]
+        assert (found["met"] is None) == (not met)
+        if found["met"] is not None:
+            assert names[found["met"]["body"]] == met[0][1]
+            assert found["met"]["time"] == pytest.approx(met[0][0], abs=0.07)
+        shift = [a - b for a, b in zip(start, found["points"][0], strict=False)]
+        until = met[0][0] if met else math.inf  # then it is seen in another size: the shift is, too
+        for frame, (point, told) in enumerate(zip(found["points"], trajectory["paths"][0]["points"], strict=False)):
+            if frame / trajectory["fps"] < until:
+                assert math.dist([a + b for a, b in zip(point, shift, strict=False)], told) < WITHIN * world["size"][0]
+        shares = found["shares"]
+        assert shares["count"] == count - 1
+        assert shares["yes"] / shares["count"] == pytest.approx(trajectory["outcome"]["probability"], abs=0.08)
+
+
+def test_worlds_are_told_only_where_they_are_asked_for_and_can_be_aimed(server: Server) -> None:
+    for name, request in (("falling-ball", {"live": True}), ("ball-and-mug", {})):
+        files, question = example(name)
+        fields = {"question": question, "request": json.dumps({"video": False} | request)}
+        found = httpx.post(f"{server.address}/simulate", files=files, data=fields, timeout=60).raise_for_status()
+        assert found.json()["trajectory"]["live"] is None
+
+
+def foretold(page: Page) -> str:
+    """What the worlds of the page say, once all have."""
+    words = page.locator(".foretold b")
+    expect(words).to_contain_text("50 worlds")
+    return words.inner_text()
+
+
+def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address, reduced_motion="no-preference")
+    drop(page, picture(31))
+    ask(page, QUESTION)
+    first = result(page)
+    assert said(page) == "Yes"
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("slider", name="Frame of the clip").fill("0")
+    start, *way = in_window(page, arrow_tip(page), (150, 40), (91, 10), (91, 10))
+    page.mouse.move(*start)
+    page.mouse.down()
+    for _, to in pairwise([start, *way]):
+        page.mouse.move(*to, steps=4)
+    assert foretold(page).endswith("of 50 worlds: no")
+    assert page.locator(".foreseen .futures").get_attribute("d")
+    assert page.locator(".world").count() == 0, "the path before is another future"
+    page.mouse.up()
+    result(page, before=first)
+    assert said(page) == "No"
+    expect(page.locator(".foretold")).to_have_count(0)
+    expect(page.get_by_role("button", name="Pause")).to_be_visible()
