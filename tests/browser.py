@@ -128,6 +128,25 @@ def drag_in_picture(page: Page, start: Point, end: Point) -> None:
     page.mouse.up()
 
 
+def touch_in_picture(page: Page, *fingers: tuple[Point, Point]) -> None:
+    """Drags by one finger or more, each between two points of the picture, px of the picture."""
+    ends = [in_window(page, *each) for each in fingers]
+    session = page.context.new_cdp_session(page)
+
+    def send(kind: str, share: float) -> None:
+        points = [
+            {"x": start[0] + share * (end[0] - start[0]), "y": start[1] + share * (end[1] - start[1]), "id": number}
+            for number, (start, end) in enumerate(ends)
+        ]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [] if kind == "touchEnd" else points})
+        page.wait_for_timeout(30)
+
+    send("touchStart", 0.0)
+    for step in range(1, 7):
+        send("touchMove", step / 6)
+    send("touchEnd", 1.0)
+
+
 def arrow_tip(page: Page) -> Point:
     """Where the handle of the arrow's tip is, px of the picture."""
     knob = page.locator(".handle.tip .knob")

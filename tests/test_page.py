@@ -15,10 +15,12 @@ from browser import (
     assert_fits,
     drag_in_picture,
     drop,
+    in_window,
     path,
     result,
     said,
     stage,
+    touch_in_picture,
 )
 from conftest import Server
 from drawn import clutter, png_bytes
@@ -59,6 +61,35 @@ def test_dragging_the_arrow_changes_path_and_answer(server: Server, windows: Win
     assert {stage(page, name) for name in FROM_MOTION_ON} == {"kept"}
     page.get_by_role("button", name="Redo").click()
     expect(page.locator(".verdict.looked .said")).to_have_text("No")
+
+
+def test_everything_is_corrected_by_touch(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address, NARROW, has_touch=True, is_mobile=True)
+    drop(page, picture(41))
+    ask(page, QUESTION)
+    first, at_first = result(page), path(page)
+    assert said(page) == "Yes"
+    knob = page.locator(".handle.waypoint .knob").last
+    way = float(knob.get_attribute("cx") or 0), float(knob.get_attribute("cy") or 0)
+    in_window(page, way)
+    scrolled = page.evaluate("scrollY")
+    touch_in_picture(page, (way, (way[0], way[1] + 40)))
+    second = result(page, before=first)
+    assert path(page) != at_first
+    expect(page.get_by_text("The path is yours.")).to_be_attached()
+
+    touch_in_picture(page, (arrow_tip(page), (101, 10)))
+    third = result(page, before=second)
+    assert said(page) == "No"
+    assert page.evaluate("scrollY") == scrolled
+
+    page.get_by_role("button", name="What moves", exact=True).tap()
+    touch_in_picture(page, ((165, 55), (210, 102)))
+    result(page, before=third)
+    touch_in_picture(page, ((225, 150), (225, 60)))
+    assert page.evaluate("scrollY") > scrolled, "beside handles the page scrolls"
+    touch_in_picture(page, ((110, 140), (20, 140)), ((130, 140), (230, 140)))
+    assert page.evaluate("visualViewport.scale") > 1.2, "two fingers zoom"
 
 
 def test_a_question_is_built_of_what_was_found(server: Server, windows: Windows) -> None:

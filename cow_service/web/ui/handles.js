@@ -1,6 +1,7 @@
 // What can be dragged over the picture, by pointer, touch and arrow keys.
 
 import { html, useRef } from "../vendor/htm-preact.js";
+import { isFree } from "../app/geometry.js";
 
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const KEY_STEP = 3; // CSS px; ten times with Shift
@@ -20,7 +21,7 @@ export function useDrag(unit, onMove, onEnd) {
   latest.current = { onMove, onEnd };
   return {
     onPointerDown(event) {
-      if (event.button) return;
+      if (event.button || !event.isPrimary) return;
       event.stopPropagation();
       event.currentTarget.setPointerCapture(event.pointerId);
       drag.current = pointIn(event.currentTarget.ownerSVGElement, event);
@@ -62,27 +63,34 @@ export function useDrag(unit, onMove, onEnd) {
   };
 }
 
+const [REACH, CORNER_REACH] = [18, 12]; // CSS px around the middle of a handle that take hold of it
+export const APART = REACH + CORNER_REACH; // CSS px: handles that are nearer would cover each other
+
 /** A round handle. `unit` is the size of a CSS pixel in pixels of the image. */
-export function Handle({ at, unit, label, kind, onMove, onEnd }) {
+export function Handle({ at, unit, label, kind, reach = REACH, onMove, onEnd }) {
   const drag = useDrag(unit, onMove, onEnd);
   return html`<g class=${`handle ${kind}`} tabindex="0" role="button" aria-label=${`${label} Arrow keys move it.`} aria-roledescription="handle" ...${drag}>
     <title>${label}</title>
-    <circle class="reach" cx=${at[0]} cy=${at[1]} r=${(kind.startsWith("corner") ? 12 : 18) * unit} />
+    <circle class="reach" cx=${at[0]} cy=${at[1]} r=${reach * unit} />
     <circle class="knob" cx=${at[0]} cy=${at[1]} r=${(kind.startsWith("corner") ? 4.5 : 6.5) * unit} />
   </g>`;
 }
 
+/** The corners of a box that lie too near to other handles. */
+export const coveredCorners = (box, others, unit) => Object.keys(CORNERS).filter((corner) => !isFree(CORNERS[corner].map((i) => box[i]), others, APART * unit));
+
 const CORNERS = { nw: [0, 1], ne: [2, 1], se: [2, 3], sw: [0, 3] };
 const CORNER_NAMES = { nw: "Upper left", ne: "Upper right", se: "Lower right", sw: "Lower left" };
 
-/** A box that can be moved, and a handle at each corner. `onMove` and `onEnd` hear (handle, dx, dy). */
-export function BoxHandles({ box, unit, name, kind, onMove, onEnd }) {
+/** A box that can be moved, and a handle at each corner that is not `covered`. `onMove` and `onEnd` hear (handle, dx, dy). */
+export function BoxHandles({ box, unit, name, kind, covered = [], onMove, onEnd }) {
   const drag = useDrag(unit, (dx, dy) => onMove("all", dx, dy), (dx, dy) => onEnd("all", dx, dy));
   const [x0, y0, x1, y1] = box;
+  const reach = Math.min(CORNER_REACH, Math.min(x1 - x0, y1 - y0) / (2.1 * unit));
   return html`<g>
     <rect class=${`grip ${kind}`} x=${x0} y=${y0} width=${Math.max(0, x1 - x0)} height=${Math.max(0, y1 - y0)} tabindex="0" role="button"
       aria-label=${`Box of ${name}. Arrow keys move it.`} aria-roledescription="handle" ...${drag} />
-    ${Object.entries(CORNERS).map(([corner, [ix, iy]]) => html`<${Handle} key=${corner} at=${[box[ix], box[iy]]} unit=${unit} kind=${`corner ${kind}`}
+    ${Object.entries(CORNERS).map(([corner, [ix, iy]]) => !covered.includes(corner) && html`<${Handle} key=${corner} at=${[box[ix], box[iy]]} unit=${unit} reach=${reach} kind=${`corner ${kind}`}
       label=${`${CORNER_NAMES[corner]} corner of ${name}.`} onMove=${(dx, dy) => onMove(corner, dx, dy)} onEnd=${(dx, dy) => onEnd(corner, dx, dy)} />`)}
   </g>`;
 }

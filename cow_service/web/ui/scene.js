@@ -2,12 +2,12 @@
 
 import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
 import { correct } from "../app/asking.js";
-import { boxBetween, directionBetween, isBox, lineOf, middleOf, movedBox, pulledPath, rounded, tipOf, waypointFrames } from "../app/geometry.js";
+import { boxBetween, directionBetween, isBox, isFree, lineOf, middleOf, movedBox, pulledPath, rounded, tipOf, waypointFrames } from "../app/geometry.js";
 import { useCutout } from "../app/pixels.js";
 import { freeName, groundingOf, isDirected, knownBeside, motionTowards, moverWith, roleOf } from "../app/corrections.js";
 import { canSee, light, pointAt, prepare, takeAsMover, thingAt } from "../app/seeing.js";
 import { get, set } from "../app/store.js";
-import { BoxHandles, Handle, pointIn } from "./handles.js";
+import { APART, BoxHandles, Handle, coveredCorners, pointIn } from "./handles.js";
 import { Arrow, Labels, Lit, Moment, Rect, World, labelsOf } from "./marks.js";
 import { Transport, usePlayer } from "./player.js";
 import { Floor, FloorLine } from "./floor.js";
@@ -34,11 +34,25 @@ function useUnit(element, width) {
   return unit;
 }
 
+/** A finger at a handle, or one that draws, does not scroll the page; two zoom it. Of `touch-action` browsers heed only the SVG's own. */
+function useTouch(svg, isDrawing) {
+  useEffect(() => {
+    const { current } = svg;
+    const hold = (event) => {
+      if (event.touches.length === 1 && (isDrawing || event.target.closest(".handle, .grip"))) event.preventDefault();
+    };
+    current.addEventListener("touchstart", hold, { passive: false });
+    return () => current.removeEventListener("touchstart", hold);
+  }, [isDrawing]);
+}
+
 export function Scene({ state }) {
   const { picture, result, corrections, tool, found, question, lit, taken } = state;
   const simulation = result?.simulation ?? null;
   const size = { width: picture.width, height: picture.height };
   const frame = useRef(null);
+  const svg = useRef(null);
+  useTouch(svg, tool !== "select");
   const unit = useUnit(frame, picture.width);
   const [layers, setLayers] = useState(LAYERS);
   const [draft, setDraft] = useState(null);
@@ -46,7 +60,7 @@ export function Scene({ state }) {
   const busy = useRef(false); // somebody drags
   const pressed = useRef([0, 0]); // where the pointer went down, CSS px of the window
   busy.current = draft !== null;
-  const player = usePlayer(simulation, () => busy.current || frame.current.querySelector("svg").contains(document.activeElement));
+  const player = usePlayer(simulation, () => busy.current || svg.current.contains(document.activeElement));
   const preview = usePreview(simulation);
   const { shown } = preview;
   const cutout = useCutout(picture, simulation?.grounding.mask ?? null, simulation?.grounding.bbox ?? null);
@@ -72,7 +86,11 @@ export function Scene({ state }) {
   const known = undirected ? null : corrections.motion?.direction ?? simulation?.motion.direction ?? null;
   const direction = draft?.direction ?? known;
   const path = simulation?.trajectory.paths[0] ?? null;
-  const frames = path ? waypointFrames(path, size) : [];
+  // Of handles that would cover each other the arrow's tip comes first, then points of the path; while one is dragged
+  // none comes or goes.
+  const tips = known && origin ? [tipOf(origin, known, size)] : [];
+  const frames = (path ? waypointFrames(path, size) : []).filter((at) => isFree(path.points[at], tips, 1.2 * APART * unit));
+  const covered = (box) => coveredCorners(box, [...tips, ...frames.map((at) => path.points[at])], unit);
   const given = corrections.trajectory?.points; // it may not be computed yet
   const base = given && given.length === path?.points.length ? given : path?.points ?? [];
   const points = draft?.points ?? base;
@@ -93,6 +111,7 @@ export function Scene({ state }) {
   const drawing = {
     onPointerDown(event) {
       if (tool === "select" || event.button) return;
+      if (!event.isPrimary) return setDraft(null); // a second finger: nothing is drawn
       event.preventDefault();
       event.currentTarget.setPointerCapture(event.pointerId);
       const at = pointIn(event.currentTarget, event).map((value) => rounded(value));
@@ -181,7 +200,7 @@ export function Scene({ state }) {
       <img src=${picture.url} alt=${`The picture: ${picture.name}`} draggable=${false} />
       ${player.url && html`<video key=${player.url} ref=${player.element} src=${player.url} muted playsinline preload="auto" tabindex="-1" aria-label="The imagined clip"
         class=${(player.frame > 0 || player.playing) && !shown ? "" : "waiting"}></video>`}
-      <svg viewBox=${`0 0 ${size.width} ${size.height}`} role="group" aria-label="What was found" class=${shown && !draft?.points ? "aiming" : ""} ...${drawing}>
+      <svg ref=${svg} viewBox=${`0 0 ${size.width} ${size.height}`} role="group" aria-label="What was found" class=${shown && !draft?.points ? "aiming" : ""} ...${drawing}>
         ${!simulation && found.map((body, place) => html`<${Rect} key=${place} box=${body.bbox} kind="body" />`)}
         ${simulation && !shown && html`<${World} simulation=${simulation} unit=${unit} size=${size} layers=${layers} line=${points !== path.points ? lineOf({ points, visible: path.visible }) : null} />`}
         ${cutout && !draft?.mover && !player.playing && html`<image class="outline" href=${cutout.outline} x="0" y="0" width=${size.width} height=${size.height} />`}
@@ -201,9 +220,9 @@ export function Scene({ state }) {
         ${draft?.from && draft.tool === "direction" && draft.direction && !origin && html`<${Arrow} from=${draft.from} direction=${draft.direction} size=${size} unit=${unit} />`}
         ${draft?.from && draft.box && html`<${Rect} box=${draft.box} kind=${draft.tool === "mover" ? "mover" : "own"} />`}
         ${pending && html`<${Rect} box=${pending.bbox} kind="own" />`}
-        ${editing && moverBox && (simulation || corrections.grounding?.bbox) && html`<${BoxHandles} box=${moverBox} unit=${unit} name=${moverName} kind="of-mover" ...${moverMoves} />`}
+        ${editing && moverBox && (simulation || corrections.grounding?.bbox) && html`<${BoxHandles} box=${moverBox} unit=${unit} name=${moverName} kind="of-mover" covered=${covered(corrections.grounding?.bbox ?? simulation.grounding.bbox)} ...${moverMoves} />`}
         ${editing && corrections.objects.map((object, place) => object.bbox && html`<${BoxHandles} key=${`handles ${place}`} box=${draft?.object === place ? draft.box : object.bbox}
-          unit=${unit} name=${object.object} kind="of-own" ...${ownObject(place)} />`)}
+          unit=${unit} name=${object.object} kind="of-own" covered=${covered(object.bbox)} ...${ownObject(place)} />`)}
         ${editing && frames.map((at, place) => html`<${Handle} key=${`way ${place}`} at=${points[at]} unit=${unit} kind="waypoint" label=${`Point ${place + 1} of the path.`}
           onMove=${(dx, dy) => dragged({ points: pulled(place, dx, dy) }) || setDraft({ points: pulled(place, dx, dy) })}
           onEnd=${(dx, dy) => {
