@@ -1,7 +1,7 @@
 // Where names go over the picture: beside their boxes, inside the picture, not over one another.
 
 const HEIGHT = 17; // CSS px of a line
-const CHARACTER = 7.4; // CSS px of a character, on the average
+const CHARACTER = 8; // CSS px of a character, on the average
 const MOST = 36; // characters of a name
 
 const short = (text) => (text.length > MOST ? `${text.slice(0, MOST - 1)}…` : text);

@@ -1,10 +1,11 @@
-// The answer with and without imagination, what it depends on, and the same question asked of others.
+// The answer, with and without imagination, what it depends on, and the same question asked of others.
 
 import { html } from "../vendor/htm-preact.js";
 import { compareWith } from "../app/asking.js";
 import { jobAddress } from "../app/address.js";
 import { DOUBTS, answerWords, percent, plural, seconds } from "../app/words.js";
 import { Shot } from "./filmstrip.js";
+import { Stages } from "./stages.js";
 
 const FIRST_WARNINGS = 2; // that are shown before somebody asks for the rest
 
@@ -25,16 +26,23 @@ function Verdict({ title, verdict, kind }) {
   </article>`;
 }
 
-function Outcome({ trajectory, said = "" }) {
+/** What share of the worlds says so, as a bar and in words. */
+function Share({ trajectory }) {
   const { outcome, ensemble } = trajectory;
-  if (!outcome) return null;
-  return html`<div class="outcome">
-    ${outcome.probability !== null && ensemble > 0 && html`<p class="probability"><meter min="0" max="1" value=${outcome.probability} aria-hidden="true"></meter>
-      <b>${percent(outcome.probability)}</b> of ${plural(ensemble, "world")}${outcome.time === null ? "" : `, after ${seconds(outcome.time)}`}${
-        outcome.time_band ? ` (${outcome.time_band.map((time) => time.toFixed(1)).join(" to ")} s)` : ""}</p>`}
-    ${outcome.depends_on.length > 0 && html`<p>It depends on ${outcome.depends_on.map((doubt) => DOUBTS[doubt] ?? doubt).join(", ")}.</p>`}
-    ${outcome.facts && outcome.facts !== said && html`<p dir="auto">${outcome.facts}</p>`}
-  </div>`;
+  if (!outcome || outcome.probability === null || !ensemble) return null;
+  const when = outcome.time === null ? "" : `, after ${seconds(outcome.time)}`;
+  const band = outcome.time_band ? ` (${outcome.time_band.map((time) => time.toFixed(1)).join(" to ")} s)` : "";
+  return html`<p class="probability"><meter min="0" max="1" value=${outcome.probability} aria-hidden="true"></meter>
+    <span><b>${percent(outcome.probability)}</b> of ${plural(ensemble, "world")}${when}${band}</span></p>`;
+}
+
+function Depends({ outcome }) {
+  if (!outcome?.depends_on.length) return null;
+  return html`<p class="depends">It depends on ${outcome.depends_on.map((doubt) => DOUBTS[doubt] ?? doubt).join(", ")}.</p>`;
+}
+
+function Facts({ outcome, said = "" }) {
+  return outcome?.facts && outcome.facts !== said && html`<p dir="auto">${outcome.facts}</p>`;
 }
 
 function Cost({ made }) {
@@ -57,22 +65,34 @@ function Warnings({ warnings }) {
     ${rest.length > 0 && html`<details><summary>${plural(rest.length, "more note")}</summary><ul>${rest.map(item)}</ul></details>`}</div>`;
 }
 
+/** Whether the answer from the picture alone says something: a multimodal LLM gave it, and another one than after looking. */
+const differs = ({ answer, baseline, usage_total: usage }) => baseline && usage.calls > 0 && baseline.answer !== answer;
+
+/** The answer first: what it is, in a sentence, and how many worlds say so. How it came about is a click away. */
 export function Result({ state }) {
   const { result, compared, models, run } = state;
   const { answer, simulation } = result;
+  const outcome = simulation?.trajectory.outcome;
   // Why nothing was imagined is told as a problem, with what can be done.
   const warnings = answer?.simulation_problem ? [] : (answer ?? simulation).warnings;
+  const baseline = answer?.baseline && html`<${Verdict} title="Without imagination" verdict=${answer.baseline} kind="baseline" />`;
+  const isCompared = answer && differs(answer);
   return html`<section class=${run ? "result old" : "result"} aria-label="Result" aria-busy=${Boolean(run)} data-job=${result.jobId}>
     ${run && html`<p class="hint">Of the request before:</p>`}
-    ${answer && html`<div class="verdicts">
-      <${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />
-      ${answer.baseline && html`<${Verdict} title="Without imagination" verdict=${answer.baseline} kind="baseline" />`}
-    </div>`}
-    ${answer && html`<${Gate} gate=${answer.gate} />`}
-    ${simulation && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p><${Outcome} trajectory=${simulation.trajectory} said=${answer?.reasoning} />`}
+    ${answer && html`<${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />`}
+    ${simulation && html`${!answer && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p>`}
+      <${Share} trajectory=${simulation.trajectory} /><${Depends} outcome=${outcome} />
+      ${!answer && html`<${Facts} outcome=${outcome} />`}`}
     ${simulation?.trajectory.placement && html`<p>${`It ends ${simulation.trajectory.placement.result.replaceAll("-", " ")}.`}</p>`}
-    <${Cost} made=${answer ?? simulation} />
+    ${isCompared && baseline}
     <${Warnings} warnings=${warnings} />
+    <details class="more"><summary>How it came about</summary>
+      ${answer && simulation && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p><${Facts} outcome=${outcome} said=${answer.reasoning} />`}
+      ${!isCompared && baseline}
+      ${answer && html`<${Gate} gate=${answer.gate} />`}
+      ${!run && html`<${Stages} result=${result} />`}
+      <${Cost} made=${answer ?? simulation} />
+    </details>
     ${models && html`<${Others} models=${models} settings=${result.settings} busy=${Boolean(run)} compared=${compared} />`}
   </section>`;
 }
@@ -84,14 +104,13 @@ function Others({ models, settings, busy, compared }) {
   const readers = usable(models.readers, settings.reader);
   const generators = usable(models.generators, settings.generator);
   if (!readers.length && !generators.length && !compared.length) return null;
-  return html`<div class="others">
-    <h3>Side by side</h3>
+  return html`<details class="others" open=${compared.length > 0}><summary>Side by side</summary>
     <div class="row">
       ${readers.map(({ name }) => html`<button key=${`reader ${name}`} disabled=${busy} onClick=${() => compareWith({ reader: name })}>Reader ${name}</button>`)}
       ${generators.map(({ name }) => html`<button key=${`generator ${name}`} disabled=${busy} onClick=${() => compareWith({ generator: name })}>Generator ${name}</button>`)}
     </div>
     <div class="columns">${compared.map((other) => html`<${Other} key=${other.label} other=${other} />`)}</div>
-  </div>`;
+  </details>`;
 }
 
 function Other({ other }) {
@@ -100,7 +119,7 @@ function Other({ other }) {
     <h3>${label}</h3>
     ${status === "running" && html`<p role="status">Running…</p><progress aria-label=${`Progress of ${label}`}></progress>`}
     ${answer && html`<p class="said" dir="auto">${answerWords(answer)}</p>${answer.reasoning && html`<p class="reasoning" dir="auto">${answer.reasoning}</p>`}`}
-    ${simulation && html`<${Outcome} trajectory=${simulation.trajectory} said=${answer?.reasoning} /><div class="filmstrip">${simulation.frames.map((frame) =>
+    ${simulation && html`<${Share} trajectory=${simulation.trajectory} /><${Depends} outcome=${simulation.trajectory.outcome} /><div class="filmstrip">${simulation.frames.map((frame) =>
       html`<span class="shot" key=${frame.index}><${Shot} sha256=${frame.sha256} alt=${`Frame ${frame.index}`} /></span>`)}</div>`}
     ${(answer || simulation) && html`<${Cost} made=${answer ?? simulation} />`}
     ${problem && html`<p class="warning">${problem.detail}</p>`}

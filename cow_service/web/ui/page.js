@@ -46,7 +46,7 @@ function Case({ state }) {
     <div class="right">
       <${Question} state=${state} />
       ${problem && html`<${ProblemNotice} problem=${problem} />`}
-      <${Stages} run=${run} result=${result} />
+      ${run && html`<${Stages} run=${run} />`}
       ${result && html`<${Result} state=${state} />`}
       <${Correct} state=${state} />
       ${state.question.trim() && html`<${Take} state=${state} />`}

@@ -44,13 +44,13 @@ export function Question({ state }) {
         void ask();
       }}>${text}</button></li>`)}
     </ul>`}
-    <${Builder} names=${[...new Set(found.map((body) => body.object).filter((name) => name && name !== "object"))]} />
     ${corrected && html`<p class="hint">Asked with your corrections: ${corrected}. <button type="button" class="plain" onClick=${() => correct(NOTHING_CORRECTED)}>Forget them</button></p>`}
     <div class="row">
       <button class="primary" disabled=${!picture || !question.trim()}>${settings.kind === "answer" ? "Ask" : "Imagine"}</button>
       ${run && html`<button type="button" onClick=${cancel}>Cancel</button>`}
+      <${Builder} names=${[...new Set(found.map((body) => body.object).filter((name) => name && name !== "object"))]} />
+      <${Settings} settings=${settings} models=${models} />
     </div>
-    <${Settings} settings=${settings} models=${models} />
   </form>`;
 }
 

@@ -16,7 +16,8 @@ import { Filmstrip } from "./filmstrip.js";
 import { Tools } from "./tools.js";
 
 const CLICK = 8; // CSS px: a pointer that moved less has clicked
-const LAYERS = { names: true, path: true, band: true, futures: true, floor: false };
+const LAYERS = { names: true, path: true, band: false, futures: null, floor: false }; // null: where they say something
+const AGREED = 0.9; // share of the worlds from which other futures say nothing new
 
 /** The size of a CSS pixel in pixels of the image, as an element is shown now. */
 function useUnit(element, width) {
@@ -54,7 +55,9 @@ export function Scene({ state }) {
   const svg = useRef(null);
   useTouch(svg, tool !== "select");
   const unit = useUnit(frame, picture.width);
-  const [layers, setLayers] = useState(LAYERS);
+  const [chosen, setLayers] = useState(LAYERS);
+  const probability = simulation?.trajectory.outcome?.probability ?? 0.5;
+  const layers = { ...chosen, futures: chosen.futures ?? Math.max(probability, 1 - probability) < AGREED };
   const [draft, setDraft] = useState(null);
   const [pending, setPending] = useState(null); // {bbox, mask} of an object that has no name yet
   const busy = useRef(false); // somebody drags
@@ -254,7 +257,7 @@ export function Scene({ state }) {
       const object = { object: freeName(name, corrections.objects), bbox: pending.bbox, mask: pending.mask ?? null, role: roleOf(name, question) };
       correct({ objects: [...corrections.objects, object] });
     }} onCancel=${() => setPending(null)} />`}
-    ${simulation && html`<${Transport} player=${player} trajectory=${simulation.trajectory} />`}
+    ${simulation ? html`<${Transport} player=${player} trajectory=${simulation.trajectory} />` : html`<div class="transport empty"></div>`}
     ${simulation && html`<${Filmstrip} simulation=${simulation} player=${player} />`}
   </section>`;
 }

@@ -34,8 +34,8 @@ function waiting({ status, position, expected_wait: wait, progress }) {
   return `Running: ${percent(progress)}`;
 }
 
-export function Stages({ run, result }) {
-  if (!run && !result) return null;
+/** Of a job in the making, or of a result. */
+export function Stages({ run = null, result = null }) {
   const stages = run ? running(run) : ended(result);
   return html`<section class="stages" aria-label="Stages">
     <ol>${stages.map(({ stage, state, text }) => html`<li key=${stage} class=${state} data-stage=${stage} data-state=${state}><span class="dot" aria-hidden="true"></span>${STAGES[stage]}

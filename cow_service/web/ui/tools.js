@@ -43,7 +43,7 @@ export function Tools({ state, layers, setLayers, hasFutures, hasFloor, isSeeing
       <button onClick=${undo} disabled=${!past.length} title="Undo (Ctrl+Z)">Undo</button>
       <button onClick=${redo} disabled=${!future.length} title="Redo (Ctrl+Shift+Z)">Redo</button>
     </div>
-    ${result?.simulation && html`<div class="layers" role="group" aria-label="What is drawn over the picture">
+    ${html`<div class=${result?.simulation ? "layers" : "layers empty"} role="group" aria-label="What is drawn over the picture">
       ${shown.map((name) => html`<label key=${name} title=${LAYER_HINTS[name]}><input type="checkbox" checked=${layers[name]}
         onChange=${(event) => setLayers({ ...layers, [name]: event.target.checked })} />${LAYER_NAMES[name]}</label>`)}
     </div>`}
