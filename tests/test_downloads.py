@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import io
 import json
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 from servers import BODY, IMAGE, Served, eventually, problem, slow
 
 from cow_service.client import Client
+from cow_service.media.share import Told, card
+from cow_service.media.video import frames_of, write_mp4
 
 ANSWERED: dict[str, Any] = {
     **BODY,
@@ -102,3 +107,53 @@ def test_an_artifact_that_is_gone_is_a_problem_and_no_broken_zip(served: Served)
     (path,) = served.data.rglob(f"{sha256}.jpg")
     path.unlink()
     problem(served.http.get(f"/jobs/{job['id']}/download"), 404, "artifact-not-found")
+
+
+def test_a_film_tells_question_and_verdict_and_a_card_is_one_moment_of_it(served: Served, answered: str) -> None:
+    clip, fps = frames_of(served.http.get(f"/jobs/{answered}/download?format=gif").content)
+    film = served.http.get(f"/jobs/{answered}/download?format=film")
+    assert film.headers["content-type"] == "video/mp4"
+    assert len(film.content) < 3 * 1024**2
+    frames, rate = frames_of(film.content)
+    height, width = frames[0].shape[:2]
+    assert height / width > 1.2 * clip[0].shape[0] / clip[0].shape[1], "words above and below"
+    assert len(frames) / rate > len(clip) / fps + 1, "it begins with the futures and ends with the verdict"
+    words = slice(-height // 8, None)
+    assert (frames[-1][words] > 128).mean() > 2 * (frames[0][words] > 128).mean(), "the verdict comes last"
+    card = served.http.get(f"/jobs/{answered}/download?format=card")
+    with Image.open(io.BytesIO(card.content)) as picture:
+        assert (picture.format, picture.size) == ("JPEG", (1200, 630))
+
+
+def test_questions_in_any_letters_stand_in_a_film() -> None:
+    white = np.full((120, 200, 3), 255, np.uint8)
+    for question in ("如果球向右移动，" * 12, "Ob die Kugel wohl über den größten Würfel fällt? " * 4, "x" * 400):
+        told = Told(question, "Not sure", 0, "", None, (), ((0.1, 0.1), (0.2, 0.2)), 1.0, 0)
+        with Image.open(io.BytesIO(card(write(white), told))) as picture:
+            assert picture.size == (1200, 630)
+
+
+def write(frame: NDArray[np.uint8]) -> bytes:
+    """An mp4 of one frame, twice."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.mp4"
+        write_mp4([frame, frame], path, fps=16, width=frame.shape[1], height=frame.shape[0])
+        return path.read_bytes()
+
+
+def test_a_page_has_live_worlds_or_says_how_to_get_them(served: Served, answered: str) -> None:
+    refused = served.http.get(f"/jobs/{answered}/download?format=page")
+    assert refused.json()["type"].endswith("download-unavailable")
+    assert "`live: true`" in refused.json()["detail"]
+    job = served.ended(served.submit(BODY | {"live": True, "question": "Will </script> <b>it</b> hit?"})["id"])
+    page = served.http.get(f"/jobs/{job['id']}/download?format=page")
+    assert page.headers["content-disposition"] == f'attachment; filename="cow-{job["id"]}.html"'
+    assert "Will &lt;/script&gt; &lt;b&gt;it&lt;/b&gt; hit?" in page.text
+    assert page.text.count("</script>") == page.text.count("<script "), "no text ends its script"
+
+
+def test_lists_tell_answers_and_what_was_given(served: Served, answered: str) -> None:
+    job = next(each for each in served.http.get("/jobs").json()["jobs"] if each["id"] == answered)
+    found = served.http.get(f"/jobs/{answered}").json()
+    assert job["answer"] == (found["result"]["option"] or found["result"]["answer"] or "Not sure") == found["answer"]
+    assert job["given"] == ["grounding", "motion", "objects", "interventions"]

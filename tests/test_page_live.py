@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -107,3 +108,40 @@ def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(se
     assert said(page) == "No"
     expect(page.locator(".foretold")).to_have_count(0)
     expect(page.get_by_role("button", name="Pause")).to_be_visible()
+
+
+def test_a_page_that_was_passed_on_computes_without_a_network(server: Server, windows: Windows, tmp_path: Path) -> None:
+    found, _ = simulated(server, "ball-and-mug")
+    job = next(each for each in jobs(server) if each["kind"] == "simulate")
+    assert httpx.get(f"{server.address}/jobs/{job['id']}").json()["result"]["id"] == found["id"]
+    file = tmp_path / "world.html"
+    file.write_bytes(httpx.get(f"{server.address}/jobs/{job['id']}/download?format=page").content)
+    page = windows.open(file.as_uri(), offline=True)
+    told = page.get_by_role("status")
+    expect(told).to_have_text("50 of 50 worlds: yes")
+    tip = page.get_by_role("button").bounding_box()
+    assert tip is not None
+    x, y = tip["x"] + tip["width"] / 2, tip["y"] + tip["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 40, y - 200, steps=5)
+    expect(told).to_have_text("50 of 50 worlds: no")
+    page.mouse.up()
+
+
+def jobs(server: Server) -> list[dict[str, Any]]:
+    return httpx.get(f"{server.address}/jobs").json()["jobs"]
+
+
+def test_examples_answer_at_once_what_the_start_page_says(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    for name in range(4):
+        page.goto(server.address)
+        example = page.locator(".examples button").nth(name)
+        answer = example.locator("b").inner_text()
+        example.click()
+        shown = result(page)
+        assert said(page) == answer
+    page.get_by_role("link", name="Jobs").click()
+    row = page.locator(".job", has=page.locator(f"a[href$='{shown}']"))
+    expect(row.locator(".answered")).to_have_text(answer)

@@ -119,7 +119,7 @@ class Runner:
             else:
                 for stage, seconds in computed.timings.items():
                     metrics.stage_seconds.labels(stage).observe(seconds)
-                given = job, computed.result, computed.trajectory_key, computed.stages, tell
+                given = job, computed.result, computed.trajectory_key, computed.stages, computed.answer, tell
                 status, stored = "succeeded", patient.wait_through(lambda: self._jobs.succeed(*given))
             if not stored:
                 raise Canceled("The job is another process's, or has lost a stage.")

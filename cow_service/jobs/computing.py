@@ -25,7 +25,7 @@ from cow_service.jobs.job_table import JobTable, TakenJob
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.observability.metrics import gpu_memory
 from cow_service.pipeline import answer, simulate
-from cow_service.records import Answer, WorkerInfo
+from cow_service.records import Answer, WorkerInfo, verdict_of
 from cow_service.requests import AnswerRequest, ImageArtifact, Stage
 from cow_service.service import Service
 from cow_service.settings import Settings, usable_memory
@@ -200,6 +200,7 @@ class JobOutcome:
     trajectory_key: str | None
     timings: dict[str, float]
     stages: set[str]  # those of the job, each of which is stored
+    answer: str  # what it comes to, in words
 
 
 def waiting_jobs(settings: Settings) -> int:
@@ -285,9 +286,9 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
             raise
         step.flush()
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
-    simulation = result.simulation if isinstance(result, Answer) else result
+    simulation, verdict = result.simulation if isinstance(result, Answer) else result, verdict_of(result)
     trajectory_key = None if simulation is None else step.trajectory_key
     if trajectory_key is not None and simulation is not None:
         bare = simulation.model_copy(update={"trajectory": None})
         result = result.model_copy(update={"simulation": bare}) if isinstance(result, Answer) else bare
-    return JobOutcome(result.model_dump_json(warnings=False), trajectory_key, computed, step.stages)
+    return JobOutcome(result.model_dump_json(warnings=False), trajectory_key, computed, step.stages, verdict)

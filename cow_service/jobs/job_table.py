@@ -33,7 +33,8 @@ VERSION = "2"  # of the workflow that computes jobs; those of another version wa
 MAX_STARTS = 20  # of a job that ends its process each time
 RATE_SECONDS = 300.0  # over which ended jobs are counted
 MIN_ENDS = 2  # in that time, from which on a rate is known
-MAX_LISTED_QUESTION = 200  # characters of a question in lists
+MAX_LISTED = 200  # characters of a question in lists, and of an answer
+GIVEN = ("grounding", "motion", "trajectory", "objects", "interventions", "camera")  # what readers find, else
 EARLIEST, LATEST = datetime(1970, 1, 1, tzinfo=UTC), datetime(9000, 1, 1, tzinfo=UTC)  # that a filter distinguishes
 CLAIM_LOCK = 0x434F5702  # of PostgreSQL, held while jobs are taken that a limit across processes applies to
 
@@ -187,6 +188,7 @@ class JobTable:
             row = spec.model_dump(include={"kind", "created_at", "priority", "turn", "generator", "webhook"})
             row |= {"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION, "starts": 0}
             row |= {"question": spec.request["question"], "image": spec.image, "spec": packed(spec.model_dump_json())}
+            row["given"] = ",".join(name for name in GIVEN if name in spec.request) or None
             added = self._database.insert(JOBS).on_conflict_do_nothing().returning(JOBS.c.id)
             if connection.execute(added, row).one_or_none() is None:
                 return False
@@ -247,12 +249,16 @@ class JobTable:
         result: str,
         trajectory_key: str | None,
         stages: Collection[str],
+        answer: str = "",
         tell: Tell = _tell_nobody,
     ) -> bool:
-        """Stores the result of a job. False where the job is no longer this process's, and where one of its stages is
-        not stored: PostgreSQL loses the latest ones in a crash, with what refers to their artifacts.
+        """Stores the result of a job, and what it comes to in words.
+
+        False where the job is no longer this process's, and where one of its stages is not stored: PostgreSQL loses the
+        latest ones in a crash, with what refers to their artifacts.
         """
         values = {"result": packed(result), "format": FORMAT, "trajectory_key": trajectory_key}
+        values["answer"] = answer if len(answer) <= MAX_LISTED else answer[: MAX_LISTED - 1] + "…"
         stored = sa.select(sa.func.count()).where(STAGES.c.job_id == job.id, STAGES.c.stage.in_(stages))
         return self._end(job.id, "succeeded", job.run, stored.scalar_subquery() == len(stages), tell, **values)
 
@@ -340,8 +346,8 @@ class JobTable:
         jobs: list[Job] = []
         for row in rows:
             job = _state(row, all_at.get(row.id)).job
-            if job.question is not None and len(job.question) > MAX_LISTED_QUESTION:
-                job = job.model_copy(update={"question": job.question[: MAX_LISTED_QUESTION - 1] + "…"})
+            if job.question is not None and len(job.question) > MAX_LISTED:
+                job = job.model_copy(update={"question": job.question[: MAX_LISTED - 1] + "…"})
             jobs.append(job)
         after = None
         if len(found) > len(rows):
@@ -436,7 +442,20 @@ _TURNS = sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.priority).where(
 _FIRST_TURN, _TURNS_OF_OWNER = _TURNS.order_by(JOBS.c.turn).limit(1), _TURNS.where(_OF_OWNER)
 _SHOWN = [
     JOBS.c[name]
-    for name in ["id", "kind", "owner", "status", "created_at", "ended", "generator", "question", "image", "error"]
+    for name in [
+        "id",
+        "kind",
+        "owner",
+        "status",
+        "created_at",
+        "ended",
+        "generator",
+        "question",
+        "answer",
+        "given",
+        "image",
+        "error",
+    ]
 ]
 
 
@@ -489,6 +508,8 @@ def _state(row: sa.Row[Any], at: At | None) -> JobState:
         stage=stage,
         progress=progress,
         question=row.question,
+        answer=row.answer or None,
+        given=tuple(row.given.split(",")) if row.given else (),
         image=row.image,
         created_at=row.created_at,
         finished_at=None if row.ended is None else max(rfc3339(row.ended), row.created_at),  # clocks may differ

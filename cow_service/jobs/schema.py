@@ -13,7 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
 
-SCHEMA = 2  # of our tables; 1 is that without `cow_schema`
+SCHEMA = 3  # of our tables; 1 is that without `cow_schema`, 2 that without answers of jobs
 # The oldest version of COW, by its own `SCHEMA`, that can serve on these tables. It stays where a version only adds
 # tables, and columns that may be null: such a change is made while older servers run.
 OLDEST_SERVING = 1
@@ -42,6 +42,8 @@ JOBS = sa.Table(
     sa.Column("starts", sa.Integer, nullable=False),  # how often it was taken
     sa.Column("generator", sa.Text, nullable=False),
     sa.Column("question", sa.Text, nullable=False),
+    sa.Column("answer", sa.Text),  # in words, for lists
+    sa.Column("given", sa.Text),  # names of what the request gave instead of the reader, with commas
     sa.Column("image", sa.String(64), nullable=False),
     sa.Column("webhook", sa.Text),
     sa.Column("spec", sa.LargeBinary, nullable=False),  # a `JobSpec` as JSON, deflated

@@ -1,11 +1,11 @@
 """Draws the results over the input image: outline, direction, paths with their bands, contacts and encounters."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import cv2
 import numpy as np
@@ -18,6 +18,8 @@ from cow_service.records.world import MEETINGS
 LETTERS = 0.42  # size of the letters, in OpenCV's unit, for a picture whose unit is 1
 STEPS = 12  # places tried above each other, in heights of a label, before covering another one is accepted
 
+Given = ParamSpec("Given")
+Made = TypeVar("Made")
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -45,7 +47,12 @@ def draw_labels(
 
     A label covers another one only where there is no other place, and as few of the points (px) as can be.
     """
-    return _letters.submit(_write, canvas, labels, unit, dark, points).result()
+    return in_letters_thread(_write, canvas, labels, unit, dark, points)
+
+
+def in_letters_thread(write: Callable[Given, Made], *args: Given.args, **more: Given.kwargs) -> Made:
+    """Calls what writes or measures letters in the thread that has them."""
+    return _letters.submit(write, *args, **more).result()
 
 
 def _write(

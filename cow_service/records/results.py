@@ -244,6 +244,14 @@ def artifacts_of(result: Simulation | Answer) -> dict[str, Sha256]:
     return simulation.pictures | ({} if simulation.video is None else {VIDEO_FILE: simulation.video.sha256})
 
 
+def verdict_of(result: Simulation | Answer) -> str:
+    """What it comes to, in words: the answer, else what the worlds say; empty where nothing is asked."""
+    if isinstance(result, Simulation):
+        outcome = result.trajectory.outcome
+        return "" if outcome is None else outcome.facts
+    return "Not sure" if result.answer is None else result.option or result.answer
+
+
 def documents_of(result: Simulation | Answer) -> dict[str, str]:
     """The result as JSON by the names of files; beside an answer its simulation."""
     if isinstance(result, Simulation):
@@ -328,6 +336,16 @@ class Job(Record):
         default=None,
         description="The request's; in lists at most 200 characters of it, the last of them `…` where it is longer. "
         "Null for jobs of earlier versions.",
+    )
+    answer: str | None = Field(
+        default=None,
+        description="What it came to, in at most 200 characters: the answer, or of a simulation what its worlds say. "
+        "Null until it has succeeded, where nothing was asked, and for jobs of earlier versions.",
+    )
+    given: tuple[str, ...] = Field(
+        default=(),
+        description="Which of `grounding`, `motion`, `trajectory`, `objects`, `interventions` and `camera` the "
+        "request gave instead of leaving it to the reader.",
     )
     image: Sha256 | None = Field(
         default=None, description="The artifact that the request's image is kept as; null for jobs of earlier versions."

@@ -57,6 +57,7 @@ EXAMPLES = {  # each has one, `image`
     name: Resources(f"examples/{name}", ".jpg", "picture")
     for name in ("ball-and-mug", "falling-ball", "bottle-passes-cylinder", "thrown-ball")
 }
+FILMS = {name: Resources(f"examples/{name}", ".mp4", "film") for name in EXAMPLES}  # each has one, `film`
 
 
 class Source(Record):

@@ -1,6 +1,7 @@
 """`GET /artifacts/{sha256}` and `GET /jobs/{id}/download`: files."""
 
 import json
+import math
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -27,6 +28,8 @@ from cow_service.api.submission import Engine, Owner
 from cow_service.errors import DownloadUnavailable, StorageUnavailable
 from cow_service.jobs.engine import JobEngine
 from cow_service.media.artifacts import extension_of
+from cow_service.media.images import decode, decode_own
+from cow_service.media.share import Told, card, film, page
 from cow_service.media.video import animation
 from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
 
@@ -75,17 +78,22 @@ BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 router = APIRouter()
 
 
-DownloadFormat = Literal["zip", "gif", "webp", "sheet"]
+DownloadFormat = Literal["zip", "film", "card", "page", "gif", "webp", "sheet"]
 # By format: what comes behind the job's id in the name of the file, and its media type.
 FILES: dict[DownloadFormat, tuple[str, str]] = {
     "zip": (".zip", "application/zip"),
+    "film": ("-film.mp4", "video/mp4"),
+    "card": (".jpg", "image/jpeg"),
+    "page": (".html", "text/html; charset=utf-8"),
     "gif": (".gif", "image/gif"),
     "webp": (".webp", "image/webp"),
     "sheet": ("-sheet.png", "image/png"),
 }
 FORMAT = Query(
-    description="`zip`: result, request, image, frames, overlay and video; `gif`, `webp`: the video as an animated "
-    "picture; `sheet`: twelve of its frames as a PNG."
+    description="`zip`: result, request, image, frames, overlay and video; `film`: an mp4 of at most 3 MB with the "
+    "question, other futures and the verdict; `card`: one moment of it as a JPEG, 1200 x 630 px; `page`: HTML whose "
+    "worlds are computed in the browser, without a network, where the request said `live: true`; `gif`, `webp`: the "
+    "video as an animated picture; `sheet`: twelve of its frames as a PNG."
 )
 MAX_CONCURRENT_DOWNLOADS = 4  # made at the same time; pictures are encoded by `COW_CONCURRENCY` of them
 
@@ -146,6 +154,9 @@ def make_zip(engine: JobEngine, job_id: str, owner: str | None) -> tuple[FilePat
         return path, stack.pop_all().close
 
 
+SHARED = {"film": film, "card": card}
+
+
 def make_animation(engine: JobEngine, job_id: str, owner: str | None, wanted: str) -> bytes:
     """The video of a job in a format of `video.FORMATS`. Blocks, and raises as `make_zip` does."""
     job, result = _find_succeeded(engine, job_id, owner)
@@ -156,11 +167,30 @@ def make_animation(engine: JobEngine, job_id: str, owner: str | None, wanted: st
             f"Nothing was imagined for the answer {job.id}, so nothing moves: its zip has all there is. {again}, "
             "with `imagine: always`, or with what `simulation_problem` says is missing."
         )
+    if wanted == "page":
+        return make_page(engine, result, simulation, again)
     if simulation.video is None:
         raise DownloadUnavailable(f"The job {job.id} has no video. {again}, with `video: true`.")
     video = engine.service.artifacts.read(simulation.video.sha256)
     with engine.service.cpu.held():
+        if wanted in SHARED:
+            return SHARED[wanted](video, Told.of(result, simulation))
         return animation(video, wanted)
+
+
+def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simulation, again: str) -> bytes:
+    """The page of a result's worlds. Raises `DownloadUnavailable` where it has none."""
+    live, read = simulation.trajectory.live, engine.service.artifacts.read
+    if live is None:
+        raise DownloadUnavailable(
+            f"The job has no live worlds. {again}, with `live: true`; what is put somewhere, and what does not move "
+            "along a direction, has none."
+        )
+    mask = simulation.grounding.mask
+    with engine.service.cpu.held():
+        image = decode(read(simulation.image.sha256), max_megapixels=math.inf).pixels
+        outline = None if mask is None else decode_own(read(mask.sha256))[..., 0]
+        return page(image, outline, read(live.sha256).decode(), simulation, Told.of(result, simulation))
 
 
 def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[Job, Simulation | Answer]:

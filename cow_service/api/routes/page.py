@@ -16,7 +16,7 @@ from cow_service.api.submission import Engine
 from cow_service.errors import NotFound
 from cow_service.jobs.engine import JobEngine
 from cow_service.media.artifacts import ArtifactStore
-from cow_service.weights.manifests import EXAMPLES
+from cow_service.weights.manifests import EXAMPLES, FILMS
 
 WEB = Path(__file__).parents[2] / "web"
 MEDIA_TYPES = {
@@ -24,6 +24,7 @@ MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".jpg": "image/jpeg",
     ".js": "text/javascript; charset=utf-8",
+    ".mp4": "video/mp4",
     ".svg": "image/svg+xml",
     ".txt": "text/plain; charset=utf-8",
     ".wasm": "application/wasm",
@@ -116,6 +117,7 @@ def static_files() -> dict[str, StaticFile]:
             opened.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
             opened.save(small, "JPEG", quality=75, optimize=True)
         found[f"examples/{name}.jpg"] = StaticFile(image, MEDIA_TYPES[".jpg"])
+        found[f"examples/{name}.mp4"] = StaticFile(FILMS[name].file("film").read_bytes(), MEDIA_TYPES[".mp4"])
         found[f"examples/{name}-small.jpg"] = StaticFile(small.getvalue(), MEDIA_TYPES[".jpg"])
     return found
 
@@ -177,6 +179,6 @@ def _send(request: Request, file: StaticFile, headers: dict[str, str]) -> Respon
     # Not with a weight of nought (RFC 9110, section 12.5.3).
     accepted = (item.partition(";") for item in request.headers.get("accept-encoding", "").lower().split(","))
     gzips = any(name.strip() == "gzip" and weight.replace(" ", "") not in NO_GZIP for name, _, weight in accepted)
-    if gzips and file.media_type != MEDIA_TYPES[".jpg"]:
+    if gzips and file.media_type not in (MEDIA_TYPES[".jpg"], MEDIA_TYPES[".mp4"]):
         return Response(file.compressed, headers=headers | {"Content-Encoding": "gzip"}, media_type=file.media_type)
     return Response(file.body, headers=headers, media_type=file.media_type)

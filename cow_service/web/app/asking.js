@@ -214,8 +214,8 @@ async function sizeOf(url) {
 
 let chosen = 0; // pictures so far: the latest counts
 
-/** Shows a picture that was dropped, pasted, chosen or photographed, and looks what is in it. */
-export async function choosePicture(blob, name, question = "") {
+/** Shows a picture that was dropped, pasted, chosen or photographed, and looks what is in it; or asks its question, where `asks`. */
+export async function choosePicture(blob, name, question = "", asks = false) {
   const number = (chosen += 1);
   const url = URL.createObjectURL(blob);
   let size = null;
@@ -231,7 +231,7 @@ export async function choosePicture(blob, name, question = "") {
   const picture = { url, blob, sha256: null, ...size, name };
   showPicture(picture, { question, corrections: NOTHING_CORRECTED });
   history.pushState(null, "", pageAddress());
-  return look(picture);
+  return asks ? ask() : look(picture);
 }
 
 let looked = null; // the job of `look`: its id, and what ends the wait for it

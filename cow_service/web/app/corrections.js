@@ -1,6 +1,7 @@
 // Corrections as a request takes them, made of what a result says and of corrections that were made before.
 
 import { isSameBox } from "./geometry.js";
+import { CORRECTED } from "./words.js";
 
 const DIRECTED = new Set(["linear", "projectile"]);
 const SET_MOVING = new Set(["linear", "projectile", "fall"]); // kinds of motion that others may have
@@ -101,11 +102,10 @@ export function freeName(name, objects) {
   }
 }
 
-const WORDS = { grounding: "what moves", motion: "its motion", trajectory: "its path", camera: "the camera" };
 
 /** What was corrected, in words; empty where nothing was. */
 export function correctedWords(corrections) {
-  const named = Object.entries(WORDS).filter(([name]) => corrections[name]).map(([, words]) => words);
+  const named = Object.entries(CORRECTED).filter(([name]) => corrections[name] && !Array.isArray(corrections[name])).map(([, words]) => words);
   if (corrections.objects.length) named.push(corrections.objects.length === 1 ? "an object" : `${corrections.objects.length} objects`);
   if (corrections.interventions.length) named.push("what is changed before");
   return named.join(", ");

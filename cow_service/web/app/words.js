@@ -6,6 +6,9 @@ export const plural = (count, one, many = `${one}s`) => `${count} ${count === 1 
 
 export const MEETS = { touches: "hits", occludes: "passes in front of", "occluded-by": "passes behind" };
 
+/** What a request can give instead of the reader, as the page calls it. */
+export const CORRECTED = { grounding: "what moves", motion: "its motion", trajectory: "its path", camera: "the camera", objects: "other objects", interventions: "what is changed before" };
+
 export const STAGES = {
   gating: "First answers",
   grounding: "Find the object",

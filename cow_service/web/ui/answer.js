@@ -6,6 +6,7 @@ import { jobAddress } from "../app/address.js";
 import { DOUBTS, answerWords, percent, plural, seconds } from "../app/words.js";
 import { Shot } from "./filmstrip.js";
 import { Stages } from "./stages.js";
+import { Share } from "./take.js";
 
 const FIRST_WARNINGS = 2; // that are shown before somebody asks for the rest
 
@@ -27,7 +28,7 @@ function Verdict({ title, verdict, kind }) {
 }
 
 /** What share of the worlds says so, as a bar and in words. */
-function Share({ trajectory }) {
+function Worlds({ trajectory }) {
   const { outcome, ensemble } = trajectory;
   if (!outcome || outcome.probability === null || !ensemble) return null;
   const when = outcome.time === null ? "" : `, after ${seconds(outcome.time)}`;
@@ -81,11 +82,12 @@ export function Result({ state }) {
     ${run && html`<p class="hint">Of the request before:</p>`}
     ${answer && html`<${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />`}
     ${simulation && html`${!answer && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p>`}
-      <${Share} trajectory=${simulation.trajectory} /><${Depends} outcome=${outcome} />
+      <${Worlds} trajectory=${simulation.trajectory} /><${Depends} outcome=${outcome} />
       ${!answer && html`<${Facts} outcome=${outcome} />`}`}
     ${simulation?.trajectory.placement && html`<p>${`It ends ${simulation.trajectory.placement.result.replaceAll("-", " ")}.`}</p>`}
     ${isCompared && baseline}
     <${Warnings} warnings=${warnings} />
+    ${simulation && !run && html`<${Share} jobId=${result.jobId} simulation=${simulation} />`}
     <details class="more"><summary>How it came about</summary>
       ${answer && simulation && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p><${Facts} outcome=${outcome} said=${answer.reasoning} />`}
       ${!isCompared && baseline}
@@ -119,7 +121,7 @@ function Other({ other }) {
     <h3>${label}</h3>
     ${status === "running" && html`<p role="status">Running…</p><progress aria-label=${`Progress of ${label}`}></progress>`}
     ${answer && html`<p class="said" dir="auto">${answerWords(answer)}</p>${answer.reasoning && html`<p class="reasoning" dir="auto">${answer.reasoning}</p>`}`}
-    ${simulation && html`<${Share} trajectory=${simulation.trajectory} /><${Depends} outcome=${simulation.trajectory.outcome} /><div class="filmstrip">${simulation.frames.map((frame) =>
+    ${simulation && html`<${Worlds} trajectory=${simulation.trajectory} /><${Depends} outcome=${simulation.trajectory.outcome} /><div class="filmstrip">${simulation.frames.map((frame) =>
       html`<span class="shot" key=${frame.index}><${Shot} sha256=${frame.sha256} alt=${`Frame ${frame.index}`} /></span>`)}</div>`}
     ${(answer || simulation) && html`<${Cost} made=${answer ?? simulation} />`}
     ${problem && html`<p class="warning">${problem.detail}</p>`}

@@ -5,7 +5,7 @@ import { openJob, shownProblem, tellAway } from "../app/asking.js";
 import { jobAddress } from "../app/address.js";
 import { call, callJson, codeOf, persist } from "../app/server.js";
 import { set } from "../app/store.js";
-import { percent, remedyOf, when } from "../app/words.js";
+import { CORRECTED, percent, remedyOf, when } from "../app/words.js";
 import { Shot } from "./filmstrip.js";
 
 const STATUSES = ["", "queued", "running", "succeeded", "failed", "canceled"];
@@ -94,6 +94,8 @@ function JobRow({ job, act }) {
     <div class="thumb">${job.image && html`<${Shot} sha256=${job.image} alt="" loading="lazy" />`}</div>
     <div class="about">
       <a href=${jobAddress(job.id)} onClick=${open} dir="auto">${job.question ?? job.id}</a>
+      ${job.answer && html`<p class="answered" dir="auto">${job.answer}</p>`}
+      ${job.given.length > 0 && html`<p class="facts">Corrected: ${job.given.map((name) => CORRECTED[name] ?? name).join(", ")}</p>`}
       <p class="facts"><span class=${`badge ${job.status}`}>${job.status}</span> ${job.kind}, ${job.generator}, <time datetime=${job.created_at}>${when(job.created_at)}</time></p>
       ${job.status === "running" && html`<p class="facts">${job.stage ?? "starting"}, ${percent(job.progress)}</p><progress max="1" value=${job.progress} aria-label="Progress"></progress>`}
       ${problem && html`<p class="warning" dir="auto">${problem.detail} ${remedyOf(problem)}</p>`}

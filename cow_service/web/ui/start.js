@@ -1,25 +1,42 @@
 // Where a picture comes from: dropped, pasted, chosen, photographed, or an example.
 
-import { html } from "../vendor/htm-preact.js";
+import { html, useEffect, useState } from "../vendor/htm-preact.js";
 import { address } from "../app/address.js";
 import { choosePicture } from "../app/asking.js";
 import { set } from "../app/store.js";
+import { calm } from "./player.js";
 
 const TYPES = "image/png,image/jpeg,image/webp";
 
+// Each with its question, and what it comes to.
 const EXAMPLES = [
-  ["ball-and-mug", "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"],
-  ["falling-ball", "If the black ball falls freely from its current position, will it land on the orange cylinder?"],
-  ["bottle-passes-cylinder", "If the red bottle moves in the direction of the arrow, will the white cylinder be occluded at some moment?"],
-  ["thrown-ball", "If the pink ball is thrown in the direction of the arrow, will it hit the white cube?"],
+  ["ball-and-mug", "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?", "Yes"],
+  ["falling-ball", "If the black ball falls freely from its current position, will it land on the orange cylinder?", "Yes"],
+  ["bottle-passes-cylinder", "If the red bottle moves in the direction of the arrow, will the white cylinder be occluded at some moment?", "Yes"],
+  ["thrown-ball", "If the pink ball is thrown in the direction of the arrow, will it hit the white cube?", "Yes"],
 ];
+const QUIET = 1000; // ms after the page is there: films come after all that somebody needs
 
-const exampleAddress = (name) => address(`/web/examples/${name}.jpg`);
+const exampleAddress = (name) => address(`/web/examples/${name}`);
 
+/** Shows an example and asks its question. */
 async function takeExample(name, question) {
-  const response = await fetch(exampleAddress(name));
-  if (response.ok) await choosePicture(await response.blob(), `${name}.jpg`, question);
-  else set({ problem: { code: "no-example", title: "That example is not there.", detail: `The server answered ${response.status}.`, errors: [] } });
+  const response = await fetch(exampleAddress(`${name}.jpg`));
+  if (!response.ok) return set({ problem: { code: "no-example", title: "That example is not there.", detail: `The server answered ${response.status}.`, errors: [] } });
+  await choosePicture(await response.blob(), `${name}.jpg`, question, true);
+  return undefined;
+}
+
+/** The still of an example, which then moves by itself where that is wanted. */
+function Moving({ name }) {
+  const [plays, setPlays] = useState(false);
+  useEffect(() => {
+    if (calm()) return undefined;
+    const timer = setTimeout(() => setPlays(true), QUIET);
+    return () => clearTimeout(timer);
+  }, []);
+  return html`<span class="moving"><img src=${exampleAddress(`${name}-small.jpg`)} alt="" width="400" height="300" />
+    ${plays && html`<video src=${exampleAddress(`${name}.mp4`)} muted autoplay loop playsinline tabindex="-1" aria-hidden="true"></video>`}</span>`;
 }
 
 function chosen(event) {
@@ -42,7 +59,7 @@ export function Start() {
     <p>Give a picture and ask what would happen. The service finds what moves, computes where it goes, shows it, and answers after it has looked.</p>
     <div class="drop"><p>Drop or paste a picture here</p><${Choose} /></div>
     <h2>Or try one of these</h2>
-    <ul class="examples">${EXAMPLES.map(([name, question]) => html`<li key=${name}><button onClick=${() => takeExample(name, question)}>
-      <img src=${exampleAddress(`${name}-small`)} alt="" width="400" height="300" /><span>${question}</span></button></li>`)}</ul>
+    <ul class="examples">${EXAMPLES.map(([name, question, answer]) => html`<li key=${name}><button onClick=${() => takeExample(name, question)}>
+      <${Moving} name=${name} /><span>${question}</span> <b>${answer}</b></button></li>`)}</ul>
   </section>`;
 }

@@ -10,8 +10,10 @@ import { call } from "../app/server.js";
 import { set } from "../app/store.js";
 
 const FORMS = { curl: "curl", python: "Python", json: "JSON" };
+const SHARED = { film: ["Film to share", "The film with question, other futures and verdict, at most 3 MB"], card: ["Picture of it", "One moment with question and verdict, as pages show it for a link"],
+  page: ["Page to play with", "An HTML file whose arrow can be dragged, also without a network"] };
 const FILES = { zip: "Everything (zip)", gif: "GIF", webp: "WebP", sheet: "Contact sheet" };
-const ENDINGS = { zip: "zip", gif: "gif", webp: "webp", sheet: "png" };
+const ENDINGS = { zip: "zip", gif: "gif", webp: "webp", sheet: "png", film: "mp4", card: "jpg", page: "html" };
 
 async function copy(text, done) {
   try {
@@ -32,6 +34,14 @@ async function saved(work) {
 }
 
 const download = (path, name) => saved(async () => saveAs(await (await call(path)).blob(), name));
+
+/** Buttons for what is passed on of a result. */
+export function Share({ jobId, simulation }) {
+  const has = { film: simulation.video, card: simulation.video, page: simulation.trajectory.live };
+  const wanted = Object.entries(SHARED).filter(([format]) => has[format]);
+  return wanted.length > 0 && html`<div class="row" role="group" aria-label="To share">${wanted.map(([format, [label, title]]) => html`<button key=${format} title=${title}
+    onClick=${() => download(`/jobs/${jobId}/download?format=${format}`, `cow-${jobId}.${ENDINGS[format]}`)}>${label}</button>`)}</div>`;
+}
 
 function Code({ state }) {
   const [form, setForm] = useState("curl");

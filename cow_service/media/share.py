@@ -1,0 +1,279 @@
+"""What people pass on of a result: its film with question, futures and verdict, and a still of the same for a link."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+
+import cv2
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from cow_service.media.images import encode_jpeg, fit_within
+from cow_service.media.overlay import DARK, LIGHT, PATH, Image, in_letters_thread
+from cow_service.media.video import frames_of, write_mp4
+from cow_service.records import Answer, Simulation, verdict_of
+
+SIDES = 720, 480, 320  # px: the first whose film is small enough for a chat
+PICTURE = 1280  # px, of the picture in a page
+MOST_BYTES = 3 * 1024**2
+CARD = 1200, 630  # px: what pages show of a link
+FUTURES, VERDICT = 1.4, 2.0  # s for which the futures fade before the film, and for which the verdict stays after it
+AFTER = 0.6  # s that the film goes on once nothing moves
+MARGIN, LINE, LETTER, LARGE = 0.03, 1.35, 0.036, 0.052  # of the width; of a letter; of the width; of a verdict's
+MOST_LINES = 3
+GREY, GREEN = (170, 178, 175), (95, 208, 186)
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a film says beside its pictures."""
+
+    question: str
+    verdict: str
+    worlds: int  # that were run
+    agreeing: str  # how many of them say so; empty where none were counted
+    share: float | None
+    futures: tuple[tuple[tuple[float, float], ...], ...]  # of the picture's width: the mover in other worlds
+    path: tuple[tuple[float, float], ...]
+    until: float  # s: nothing moves afterwards
+    shown: int  # the frame of the still
+
+    @staticmethod
+    def of(result: Simulation | Answer, simulation: Simulation) -> Told:
+        """Of a job's result and its simulation, which has a video."""
+        trajectory, width = simulation.trajectory, simulation.image.width
+        outcome, path = trajectory.outcome, trajectory.paths[0]
+        share = None if outcome is None or not trajectory.ensemble else outcome.probability
+        agreeing = ""
+        if outcome is not None and share is not None:
+            share = max(share, 1 - share) if outcome.asked.form in ("whether", "when", "changes") else share
+            agreeing = f"{round(share * trajectory.ensemble)} of {trajectory.ensemble} simulated worlds agree"
+        seen = path.points[: path.visible.index(False)] if False in path.visible else path.points
+        met = [each.first_frame for each in trajectory.encounters]
+        return Told(
+            question=result.question,
+            verdict=verdict_of(result) or simulation.motion.sentence,
+            worlds=trajectory.ensemble,
+            agreeing=agreeing,
+            share=share,
+            futures=tuple(tuple((x / width, y / width) for x, y in future) for future in path.futures),
+            path=tuple((x / width, y / width) for x, y in seen),
+            until=trajectory.moving_until or trajectory.num_frames / trajectory.fps,
+            shown=met[0] if met else min(len(seen), trajectory.num_frames) // 2,
+        )
+
+
+def film(video: bytes, told: Told) -> bytes:
+    """An mp4: the futures fade over the first frame, the film plays, and the verdict is told. At most `MOST_BYTES`."""
+    made = b""
+    for side in SIDES:
+        frames, fps = frames_of(video, side)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "film.mp4"
+            sheet = _Sheet.of(frames[0], told)
+            height, width = sheet.shape
+            write_mp4(sheet.pictures(frames, fps), path, fps=fps, width=width, height=height)
+            made = path.read_bytes()
+        if len(made) <= MOST_BYTES:
+            break
+    return made
+
+
+def card(video: bytes, told: Told) -> bytes:
+    """A JPEG of `CARD`: one moment with the path and other futures, question and verdict."""
+    frames, _ = frames_of(video, SIDES[0])
+    sheet, canvas = _Sheet.of(frames[0], told), np.full((CARD[1], CARD[0], 3), DARK[0], np.uint8)
+    frame = frames[min(told.shown, len(frames) - 1)].copy()
+    sheet.draw_futures(frame, 0.5)
+    sheet.draw_path(frame)
+    picture = sheet.around(frame, True)
+    scale = min(CARD[0] / picture.shape[1], CARD[1] / picture.shape[0])
+    size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
+    x, y = (CARD[0] - size[0]) // 2, (CARD[1] - size[1]) // 2
+    canvas[y : y + size[1], x : x + size[0]] = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC)
+    return encode_jpeg(canvas)
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """A frame with the question above it and the verdict below."""
+
+    told: Told
+    frame: tuple[int, int]  # px: height and width of the film
+    lines: tuple[str, ...]  # of the question
+
+    @staticmethod
+    def of(frame: Image, told: Told) -> _Sheet:
+        height, width = frame.shape[:2]
+        at_most = width * (1 - 2 * MARGIN)
+        lines = in_letters_thread(_wrapped, told.question, LETTER * width, at_most)
+        return _Sheet(told, (height, width), lines)
+
+    @property
+    def above(self) -> int:
+        """Height of the question, px."""
+        width = self.frame[1]
+        return round(2 * MARGIN * width + LINE * LETTER * width * len(self.lines))
+
+    @property
+    def below(self) -> int:
+        """Height of the verdict, px."""
+        width = self.frame[1]
+        return round(2.4 * MARGIN * width + LINE * (LARGE + LETTER) * width)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width, px."""
+        return self.above + self.frame[0] + self.below, self.frame[1]
+
+    def pictures(self, frames: Sequence[Image], fps: float) -> Iterator[Image]:
+        """All of the film, one after another."""
+        fading = round(FUTURES * fps) if self.told.futures else 0
+        for number in range(fading):
+            first = frames[0].copy()
+            self.draw_futures(first, 1 - number / fading)
+            yield self.around(first, False)
+        last = min(len(frames), round((self.told.until + AFTER) * fps) + 1)
+        for frame in frames[:last]:
+            yield self.around(frame, False)
+        told = self.around(frames[last - 1], True)
+        for _ in range(round(VERDICT * fps)):
+            yield told
+
+    def around(self, frame: Image, is_told: bool) -> Image:
+        """A frame with its words, the verdict among them where it is told."""
+        canvas = np.full((*self.shape, 3), DARK[0], np.uint8)
+        canvas[self.above : self.above + self.frame[0]] = frame
+        in_letters_thread(self._write, canvas, is_told)
+        return canvas
+
+    def _write(self, canvas: Image, is_told: bool) -> None:
+        told, width = self.told, self.frame[1]
+        margin, letter, large = MARGIN * width, LETTER * width, LARGE * width
+        for place, line in enumerate(self.lines):
+            _put(canvas, line, margin, margin + (place + 0.8) * LINE * letter, letter, LIGHT)
+        top = self.above + self.frame[0] + margin
+        if not is_told:
+            waiting = f"{told.worlds} imagined futures" if told.worlds else ""
+            _put(canvas, waiting, margin, top + 0.8 * LINE * large, letter, GREY)
+            return
+        verdict = _cut(told.verdict, large, width - 2 * margin)
+        _put(canvas, verdict, margin, top + 0.8 * LINE * large, large, LIGHT, bold=True)
+        line = top + LINE * large
+        if told.share is not None:
+            x0, x1, y = round(margin), round(margin + 0.3 * width), round(line + 0.65 * letter)
+            for end, colour in ((x1, (70, 78, 76)), (round(x0 + told.share * (x1 - x0)), GREEN)):
+                cv2.rectangle(canvas, (x0, y - round(letter / 5)), (end, y + round(letter / 5)), colour, -1)
+            margin += 0.33 * width
+        _put(canvas, told.agreeing, margin, line + LINE * letter * 0.8, letter, GREY)
+
+    def draw_futures(self, frame: Image, opacity: float) -> None:
+        """Other worlds' paths of the mover, translucent."""
+        layer = frame.copy()
+        for future in self.told.futures:
+            _line(layer, future, frame.shape[1], max(1, round(frame.shape[1] / 400)))
+        cv2.addWeighted(layer, opacity, frame, 1 - opacity, 0, frame)
+
+    def draw_path(self, frame: Image) -> None:
+        """The path of the world that is shown."""
+        _line(frame, self.told.path, frame.shape[1], max(2, round(frame.shape[1] / 240)))
+
+
+# Of the page that is passed on as a file: each module after those that it imports.
+MODULES = "app/geometry.js", "app/words.js", "live/world.js", "live/preview.js", "live/file.js", "vendor/rapier.js"
+WEB = Path(__file__).parents[1] / "web"
+
+
+def page(image: Image, mask: NDArray[np.uint8] | None, world: str, simulation: Simulation, told: Told) -> bytes:
+    """HTML that needs no network: the picture, and its worlds, which are computed anew while somebody drags the arrow.
+
+    `image` [H, W, 3] and `mask` [H, W] are those of the simulation, `world` the JSON of `trajectory.live`.
+    """
+    shown = fit_within(image, PICTURE)
+    x0, y0, x1, y1 = (round(value) for value in simulation.grounding.bbox)
+    x0, y0 = max(0, x0), max(0, y0)
+    opaque = np.full(image.shape[:2], 255, np.uint8) if mask is None else mask
+    cutout = io.BytesIO()
+    PIL.Image.fromarray(np.dstack([image, opaque])[y0:y1, x0:x1]).save(cutout, "PNG")
+    parts = {name.rpartition("/")[2]: (WEB / name).read_text() for name in MODULES}
+    parts["wasm"] = base64.b64encode((WEB / "vendor" / "rapier.wasm.gz").read_bytes()).decode()
+    parts["world"] = world
+    parts["shown"] = json.dumps({"bbox": [x0, y0, x1, y1], "cutout": _data_url(cutout.getvalue(), "png")})
+    scripts = [f'<script type="text/plain" id="{name}">{_inside(text)}</script>' for name, text in parts.items()]
+    words = {"question": told.question, "verdict": told.verdict}
+    template = Template((WEB / "live" / "file.html").read_text())
+    return template.substitute(
+        {name: html.escape(text) for name, text in words.items()},
+        image=_data_url(encode_jpeg(shown), "jpeg"),
+        width=simulation.image.width,
+        height=simulation.image.height,
+        worlds=len(json.loads(world)["mover"]["turn"]) - 1 if told.worlds else 1,
+        data="\n".join(scripts),
+    ).encode()
+
+
+def _data_url(data: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _inside(text: str) -> str:
+    """A text as it can stand in a script element."""
+    return text.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+def _line(canvas: Image, points: Sequence[tuple[float, float]], width: int, thickness: int) -> None:
+    corners = np.clip(np.array(points) * width, -20_000, 20_000).round().astype(np.int32).reshape(-1, 1, 2)
+    cv2.polylines(canvas, [corners], False, PATH, thickness, cv2.LINE_AA)
+
+
+def _face(text: str) -> cv2.FontFace:
+    """A font that has the letters of a text."""
+    return cv2.FontFace("sans" if all(ord(letter) < 0x500 for letter in text) else "uni")
+
+
+def _across(text: str, letter: float) -> float:
+    """Width of a text, px."""
+    left, _, width, _ = cv2.getTextSize((1, 1), text, (0, 0), _face(text), round(letter), 400)
+    return left + width
+
+
+def _put(
+    canvas: Image, text: str, x: float, y: float, letter: float, colour: tuple[int, int, int], bold: bool = False
+) -> None:
+    if text:
+        cv2.putText(canvas, text, (round(x), round(y)), colour, _face(text), round(letter), 700 if bold else 400)
+
+
+def _cut(text: str, letter: float, width: float) -> str:
+    """As much of a text as fits into a width (px)."""
+    if _across(text, letter * 1.08) <= width:
+        return text
+    while text and _across(text + "…", letter * 1.08) > width:
+        text = text[:-1]
+    return text.rstrip() + "…"
+
+
+def _wrapped(text: str, letter: float, width: float) -> tuple[str, ...]:
+    """Lines of a text, at most `MOST_LINES`, that fit into a width (px)."""
+    lines, words = [""], text.split()
+    if len(words) == 1:  # a script without spaces
+        words = list(text)
+    joint = " " if " " in text.strip() else ""
+    for word in words:
+        longer = f"{lines[-1]}{joint}{word}" if lines[-1] else word
+        if _across(longer, letter) <= width or not lines[-1]:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    if len(lines) > MOST_LINES:
+        lines = [*lines[: MOST_LINES - 1], joint.join(lines[MOST_LINES - 1 :])]
+    return tuple(_cut(line, letter / 1.08, width) for line in lines)

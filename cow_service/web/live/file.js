@@ -1,0 +1,91 @@
+// The page of one world that is passed on as a file: its arrow is dragged, and the worlds are computed on the spot.
+
+import { directionBetween, lineOf, tipOf } from "../app/geometry.js";
+import { shareWords } from "../app/words.js";
+import { Preview, loadEngine } from "./preview.js";
+
+const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+const KEY_STEP = 0.01; // of the picture's longer side
+const PAUSE = 0.6; // s between the end of the film and its next beginning
+const NAMESPACE = "http://www.w3.org/2000/svg";
+
+const svg = document.querySelector("svg");
+const told = document.getElementById("told");
+
+function drawn(name, attributes) {
+  const element = document.createElementNS(NAMESPACE, name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  svg.append(element);
+  return element;
+}
+
+/** `shown` is {bbox, cutout}: the box of what moves, and its picture. */
+export async function show(world, shown, load, wasm) {
+  const size = { width: world.size[0], height: world.size[1] };
+  const unit = Math.max(size.width, size.height) / 700;
+  const trajectory = { bodies: world.bodies.map(({ name }) => ({ object: name })) };
+  const origin = world.mover.start;
+  const [futures, halo, path, pushed, met] = ["futures", "halo", "path", "path pushed", "met"].map((name) => drawn("path", { class: name }));
+  const [x0, y0, x1, y1] = shown.bbox;
+  const thing = drawn("image", { href: shown.cutout, x: x0, y: y0, width: x1 - x0, height: y1 - y0 });
+  const arrow = drawn("path", { class: "arrow" });
+  const reach = drawn("circle", { class: "reach", r: 24 * unit, tabindex: 0, role: "button", "aria-label": "Tip of the direction arrow. Arrow keys move it." });
+  const tip = drawn("circle", { class: "tip", r: 7 * unit });
+  let direction = world.mover.direction;
+  let found = null;
+
+  const preview = new Preview(await loadEngine(load, wasm), world, (now) => {
+    found = now;
+    const line = (paths) => paths.map(lineOf).join("");
+    futures.setAttribute("d", now.futures);
+    halo.setAttribute("d", line(now.paths));
+    path.setAttribute("d", line(now.paths.slice(0, 1)));
+    pushed.setAttribute("d", line(now.paths.slice(1)));
+    const box = now.met ? world.bodies[now.met.body].bbox : null;
+    met.setAttribute("d", box ? `M${box[0]} ${box[1]}H${box[2]}V${box[3]}H${box[0]}Z` : "");
+    if (now.shares) {
+      const meter = Object.assign(document.createElement("meter"), { min: 0, max: now.shares.count, value: now.shares.yes });
+      told.replaceChildren(meter, shareWords(now.shares, trajectory));
+    }
+  });
+  const aim = (to) => {
+    const [x, y] = tipOf(origin, to, size);
+    direction = to;
+    arrow.setAttribute("d", `M${origin}L${x} ${y}`);
+    for (const each of [reach, tip]) Object.entries({ cx: x, cy: y }).forEach(([key, value]) => each.setAttribute(key, value));
+    preview.aim({ direction: to });
+  };
+  const point = ({ clientX, clientY }) => {
+    const at = new DOMPoint(clientX, clientY).matrixTransform(svg.getScreenCTM().inverse());
+    return [at.x, at.y];
+  };
+  svg.addEventListener("touchstart", (event) => event.target === reach && event.touches.length === 1 && event.preventDefault(), { passive: false });
+  reach.addEventListener("pointerdown", (event) => reach.setPointerCapture(event.pointerId));
+  reach.addEventListener("pointermove", (event) => {
+    const to = reach.hasPointerCapture(event.pointerId) && directionBetween(origin, point(event));
+    if (to) aim(to);
+  });
+  reach.addEventListener("keydown", (event) => {
+    const step = KEYS[event.key];
+    if (!step) return;
+    event.preventDefault();
+    const far = KEY_STEP * Math.max(size.width, size.height) * (event.shiftKey ? 4 : 1);
+    const [x, y] = tipOf(origin, direction, size);
+    aim(directionBetween(origin, [x + step[0] * far, y + step[1] * far]) ?? direction);
+  });
+  const began = performance.now();
+  const isCalm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  requestAnimationFrame(function film(now) {
+    const [mover] = found?.paths ?? [];
+    if (mover) {
+      const time = isCalm ? Infinity : ((now - began) / 1000) % (world.num_frames / world.fps + PAUSE);
+      const at = Math.max(0, Math.min(mover.points.length - 1, Math.floor(time * world.fps)));
+      const [x, y] = mover.points[at];
+      const turn = mover.leans ? mover.leans[at] - mover.leans[0] : 0;
+      thing.setAttribute("transform", `translate(${x} ${y}) rotate(${turn}) scale(${mover.scale[at]}) translate(${-origin[0]} ${-origin[1]})`);
+      thing.style.visibility = mover.visible[at] ? "" : "hidden";
+    }
+    requestAnimationFrame(film);
+  });
+  aim(direction);
+}
