@@ -189,12 +189,14 @@ def decode_depth(data: bytes, *, max_megapixels: float) -> NDArray[np.uint16]:
 
 
 def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.bool_], *, level: int = 1) -> bytes:
-    """Encode [H, W, 3] RGB, [H, W] grey of 8 or 16 bits or an [H, W] boolean mask (one bit per pixel) as PNG.
+    """Encode [H, W, 3] RGB, [H, W, 4] RGBA, [H, W] grey of 8 or 16 bits or an [H, W] mask (one bit each) as PNG.
 
     `level` is zlib's, 0 (none) to 9 (smallest). Raises `ValueError` for other shapes.
     """
-    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3) or pixels.size == 0:
-        raise ValueError(f"Pixels of shape {pixels.shape} cannot be encoded: give [H, W, 3] RGB or [H, W].")
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)) or pixels.size == 0:
+        raise ValueError(
+            f"Pixels of shape {pixels.shape} cannot be encoded: give [H, W, 3] RGB, [H, W, 4] RGBA or [H, W]."
+        )
     options = [cv2.IMWRITE_PNG_COMPRESSION, level]
     if pixels.dtype == np.bool_:
         return _encoded(".png", pixels.view(np.uint8) * np.uint8(255), [*options, cv2.IMWRITE_PNG_BILEVEL, 1])
@@ -211,7 +213,8 @@ def encode_jpeg(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _encoded(extension: str, pixels: NDArray[np.uint8], options: list[int]) -> bytes:
-    ordered = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
+    order = None if pixels.ndim < 3 else cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
+    ordered = pixels if order is None else cv2.cvtColor(pixels, order)
     encoded, buffer = cv2.imencode(extension, ordered, options)
     if not encoded:
         raise errors.InternalError(f"Pixels of shape {pixels.shape} could not be encoded as {extension}.")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -14,8 +13,6 @@ from string import Template
 
 import cv2
 import numpy as np
-import PIL.Image
-from numpy.typing import NDArray
 
 from cow_service.media.images import encode_jpeg, fit_within
 from cow_service.media.overlay import DARK, LIGHT, PATH, Image, in_letters_thread
@@ -193,36 +190,25 @@ MODULES = "app/geometry.js", "app/words.js", "live/world.js", "live/preview.js",
 WEB = Path(__file__).parents[1] / "web"
 
 
-def page(image: Image, mask: NDArray[np.uint8] | None, world: str, simulation: Simulation, told: Told) -> bytes:
-    """HTML that needs no network: the picture, and its worlds, which are computed anew while somebody drags the arrow.
+def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
+    """HTML that needs no network: the picture [H, W, 3], and its worlds, computed anew while somebody drags the arrow.
 
-    `image` [H, W, 3] and `mask` [H, W] are those of the simulation, `world` the JSON of `trajectory.live`.
+    `world` is the JSON of `trajectory.live`.
     """
-    shown = fit_within(image, PICTURE)
-    x0, y0, x1, y1 = (round(value) for value in simulation.grounding.bbox)
-    x0, y0 = max(0, x0), max(0, y0)
-    opaque = np.full(image.shape[:2], 255, np.uint8) if mask is None else mask
-    cutout = io.BytesIO()
-    PIL.Image.fromarray(np.dstack([image, opaque])[y0:y1, x0:x1]).save(cutout, "PNG")
     parts = {name.rpartition("/")[2]: (WEB / name).read_text() for name in MODULES}
     parts["wasm"] = base64.b64encode((WEB / "vendor" / "rapier.wasm.gz").read_bytes()).decode()
     parts["world"] = world
-    parts["shown"] = json.dumps({"bbox": [x0, y0, x1, y1], "cutout": _data_url(cutout.getvalue(), "png")})
     scripts = [f'<script type="text/plain" id="{name}">{_inside(text)}</script>' for name, text in parts.items()]
     words = {"question": told.question, "verdict": told.verdict}
     template = Template((WEB / "live" / "file.html").read_text())
     return template.substitute(
         {name: html.escape(text) for name, text in words.items()},
-        image=_data_url(encode_jpeg(shown), "jpeg"),
+        image="data:image/jpeg;base64," + base64.b64encode(encode_jpeg(fit_within(image, PICTURE))).decode(),
         width=simulation.image.width,
         height=simulation.image.height,
         worlds=len(json.loads(world)["mover"]["turn"]) - 1 if told.worlds else 1,
         data="\n".join(scripts),
     ).encode()
-
-
-def _data_url(data: bytes, kind: str) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def _inside(text: str) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cow_service.physics import engine, events, lift
-from cow_service.physics.ballistic import GRAVITY
+from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.physics.draws import COLUMN, ensemble, likeliest, quantiles
 from cow_service.physics.ensemble import EVERY, Query
 from cow_service.physics.layout import FARTHEST, VEHICLE_WIDTH
@@ -91,6 +91,7 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
                 "support": layout.supports[index],
             }
         )
+    courses = [shape[0].course for shape in shapes]
     factors = lift.speed_factors(motion, draws, "speed")
     is_measured = mover.yaw is not None
     return {
@@ -123,7 +124,25 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
             "turn": _column(draws[:, COLUMN["turn"]]),
             "heading": _column(quantiles(draws[:, COLUMN["depth"]])),
         },
+        "course": _course([course for course in courses if course is not None]),
         "asked": None if query is None or not query.is_decidable else _asked(query),
+    }
+
+
+def _course(courses: list[Course]) -> dict[str, Any] | None:
+    """What the mover does until it meets something, where it has several legs or an end; null: a leg goes on."""
+    if not courses:
+        return None
+    legs = zip(*(course.legs for course in courses), strict=True)
+    return {
+        "halts": courses[0].halts,
+        "legs": [
+            {
+                "duration": None if math.isinf(leg[0].duration) else _column(np.array([each.duration for each in leg])),
+                "velocity": [_column(np.array([each.velocity[axis] for each in leg])) for axis in range(3)],
+            }
+            for leg in legs
+        ],
     }
 
 

@@ -1,13 +1,17 @@
 """Stage 3: what the mover and everything it meets do over the clip, and how sure that is."""
 
+import base64
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from cow_service.media.images import encode_png, fit_within
 from cow_service.narration import warnings_of, with_facts
 from cow_service.physics.ballistic import FreePath
+from cow_service.physics.bodies import SeenBody
 from cow_service.physics.ensemble import EnsembleResult, Query, run_ensemble
 from cow_service.physics.events import seen_paths
 from cow_service.physics.live import live_worlds
@@ -18,7 +22,9 @@ from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
+from cow_service.vision.scene import Scene
 
+SPRITE_SIDE = 256  # px, at most: sprites are seen while somebody drags
 FEW_WORLDS = 0.2  # share of the worlds: what is touched in no more of them turns no answer that is clear
 
 
@@ -30,6 +36,8 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
         reconstructed = reconstruct(situation)
         trajectory = simulate_world(situation, *reconstructed)
         live = live_worlds(*reconstructed[:2], run.request.ensemble) if run.request.live else None
+        for body, told in zip(reconstructed[0].bodies, [] if live is None else live["bodies"], strict=False):
+            told["sprite"] = _sprite(scene, body)
     warnings = warnings_of(run.request, grounding, trajectory)
     if live is None:
         return StageResult(value=trajectory, warnings=warnings)
@@ -37,6 +45,14 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
         kept = put(json.dumps(live, separators=(",", ":")).encode(), "application/json")
     trajectory = trajectory.model_copy(update={"live": kept})
     return StageResult(value=trajectory, warnings=warnings, artifacts=(kept.sha256,))
+
+
+def _sprite(scene: Scene, body: SeenBody) -> dict[str, Any]:
+    """A body cut out of the image without what is drawn over it: a PNG as data URL, and its box (px)."""
+    mask = body.mask
+    cut = np.dstack([scene.undrawn[mask.rows, mask.columns], mask.patch.astype(np.uint8) * np.uint8(255)])
+    png = base64.b64encode(encode_png(fit_within(cut, SPRITE_SIDE))).decode()
+    return {"href": f"data:image/png;base64,{png}", "box": list(mask.bbox)}
 
 
 def simulate_world(situation: Situation, world: WorldInput, query: Query | None, path: FreePath | None) -> Trajectory:

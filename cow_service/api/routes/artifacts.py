@@ -28,7 +28,7 @@ from cow_service.api.submission import Engine, Owner
 from cow_service.errors import DownloadUnavailable, StorageUnavailable
 from cow_service.jobs.engine import JobEngine
 from cow_service.media.artifacts import extension_of
-from cow_service.media.images import decode, decode_own
+from cow_service.media.images import decode
 from cow_service.media.share import Told, card, film, page
 from cow_service.media.video import animation
 from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
@@ -186,11 +186,9 @@ def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simula
             f"The job has no live worlds. {again}, with `live: true`; what is put somewhere, and what does not move "
             "along a direction, has none."
         )
-    mask = simulation.grounding.mask
     with engine.service.cpu.held():
         image = decode(read(simulation.image.sha256), max_megapixels=math.inf).pixels
-        outline = None if mask is None else decode_own(read(mask.sha256))[..., 0]
-        return page(image, outline, read(live.sha256).decode(), simulation, Told.of(result, simulation))
+        return page(image, read(live.sha256).decode(), simulation, Told.of(result, simulation))
 
 
 def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[Job, Simulation | Answer]:

@@ -42,7 +42,13 @@ export function directionBetween([ax, ay], [bx, by], least = 6) {
 /** How far the tip of the arrow is from the object: the same share of the picture as in the server's overlay. */
 export const arrowReach = ({ width, height }) => 0.14 * Math.max(width, height);
 
-export const tipOf = ([x, y], [dx, dy], size) => [x + dx * arrowReach(size), y + dy * arrowReach(size)];
+/** The tip of an arrow, inside the picture as long as that leaves something of the arrow. */
+export function tipOf([x, y], [dx, dy], size) {
+  const most = arrowReach(size);
+  const room = (at, step, end) => (step > 0 ? (0.98 * end - at) / step : step < 0 ? (0.02 * end - at) / step : most);
+  const reach = clamp(Math.min(room(x, dx, size.width), room(y, dy, size.height)), 0.35 * most, most);
+  return [x + dx * reach, y + dy * reach];
+}
 
 const HANDLE_DISTANCE = 0.06; // of the image's longer side: between two handles of a path
 

@@ -19,15 +19,14 @@ function drawn(name, attributes) {
   return element;
 }
 
-/** `shown` is {bbox, cutout}: the box of what moves, and its picture. */
-export async function show(world, shown, load, wasm) {
+/** Shows a world; `load` and `wasm` bring the engine. */
+export async function show(world, load, wasm) {
   const size = { width: world.size[0], height: world.size[1] };
   const unit = Math.max(size.width, size.height) / 700;
   const trajectory = { bodies: world.bodies.map(({ name }) => ({ object: name })) };
   const origin = world.mover.start;
   const [futures, halo, path, pushed, met] = ["futures", "halo", "path", "path pushed", "met"].map((name) => drawn("path", { class: name }));
-  const [x0, y0, x1, y1] = shown.bbox;
-  const thing = drawn("image", { href: shown.cutout, x: x0, y: y0, width: x1 - x0, height: y1 - y0 });
+  const things = world.bodies.map(({ sprite: { href, box: [x0, y0, x1, y1] } }) => drawn("image", { href, x: x0, y: y0, width: x1 - x0, height: y1 - y0, visibility: "hidden" }));
   const arrow = drawn("path", { class: "arrow" });
   const reach = drawn("circle", { class: "reach", r: 24 * unit, tabindex: 0, role: "button", "aria-label": "Tip of the direction arrow. Arrow keys move it." });
   const tip = drawn("circle", { class: "tip", r: 7 * unit });
@@ -76,15 +75,16 @@ export async function show(world, shown, load, wasm) {
   const began = performance.now();
   const isCalm = matchMedia("(prefers-reduced-motion: reduce)").matches;
   requestAnimationFrame(function film(now) {
-    const [mover] = found?.paths ?? [];
-    if (mover) {
-      const time = isCalm ? Infinity : ((now - began) / 1000) % (world.num_frames / world.fps + PAUSE);
-      const at = Math.max(0, Math.min(mover.points.length - 1, Math.floor(time * world.fps)));
-      const [x, y] = mover.points[at];
-      const turn = mover.leans ? mover.leans[at] - mover.leans[0] : 0;
-      thing.setAttribute("transform", `translate(${x} ${y}) rotate(${turn}) scale(${mover.scale[at]}) translate(${-origin[0]} ${-origin[1]})`);
-      thing.style.visibility = mover.visible[at] ? "" : "hidden";
-    }
+    const time = isCalm ? Infinity : ((now - began) / 1000) % (world.num_frames / world.fps + PAUSE);
+    things.forEach((thing, body) => {
+      const path = found?.paths.find((each) => each.body === body);
+      const at = path ? Math.max(0, Math.min(path.points.length - 1, Math.floor(time * world.fps))) : 0;
+      thing.setAttribute("visibility", path?.visible[at] ? "visible" : "hidden");
+      if (!path) return;
+      const [x, y] = path.points[at];
+      const turn = path.leans ? path.leans[at] - path.leans[0] : 0;
+      thing.setAttribute("transform", `translate(${x} ${y}) rotate(${turn}) scale(${path.scale[at]}) translate(${-path.from[0]} ${-path.from[1]})`);
+    });
     requestAnimationFrame(film);
   });
   aim(direction);

@@ -151,10 +151,12 @@ export function bodiesOf(world, k, { direction = null, moved = null } = {}) {
     seen: at(body.half_width, k),
   }));
   bodies[0].seen = at(world.mover.seen_half_width, k);
+  bodies[0].course = courseOf(world, k);
   if (moved) move(world, k, bodies, moved);
   if (direction) {
     const mover = bodies[0];
     mover.velocity = velocityOf(world, k, bodies, direction);
+    if (mover.course) mover.course.legs[0].velocity = mover.velocity;
     const [x, , z] = mover.velocity;
     const fast = Math.hypot(x, z);
     if (world.mover.elongated && fast > 0) { // longer along its heading than across, as wide as it is seen
@@ -166,6 +168,27 @@ export function bodiesOf(world, k, { direction = null, moved = null } = {}) {
     }
   }
   return bodies;
+}
+
+/** What the mover of one world does until it meets something: {halts, legs: [{until (s), velocity}]}; null where it just goes on. */
+function courseOf({ course }, k) {
+  let until = 0;
+  return course && { halts: course.halts, legs: course.legs.map(({ duration, velocity }) => {
+    until += duration === null ? Infinity : at(duration, k);
+    return { until, velocity: vector(velocity, k) };
+  }) };
+}
+
+/** The mean velocity of a course between two times (s): with it, steps of any length lead to the same places. */
+function meanVelocity({ legs }, start, end) {
+  let begin = 0;
+  let moved = [0, 0, 0];
+  for (const { until, velocity } of legs) {
+    const inside = Math.min(end, until) - Math.max(start, begin);
+    if (inside > 0) moved = plus(moved, scaled(velocity, inside));
+    begin = until;
+  }
+  return scaled(moved, 1 / (end - start));
 }
 
 /** A body that is dragged over the picture stays at its height above the floor: nearer it is smaller. What it carries comes with it. */
@@ -252,7 +275,7 @@ export function runWorlds(R, constants, worlds, { fps, frames, every = 1, isAlon
         for (let n = 0; n < each.numColliders(); n += 1) owner.set(each.collider(n).handle, [k, i]);
       });
       return {
-        bodies, rigid, origin, meetings: [], touching: new Map(), glides: new Set(bodies.flatMap((body, i) => (body.glides && body.starts ? [i] : []))),
+        course: along ? null : bodies[0].course, bodies, rigid, origin, meetings: [], touching: new Map(), glides: new Set(bodies.flatMap((body, i) => (body.glides && body.starts ? [i] : []))),
         gone: new Set(), moved: new Set(bodies.flatMap((body, i) => (body.starts ? [i] : []))),
         positions: bodies.map((body) => [body.position]), velocities: bodies.map((body) => body.velocity), turns: bodies.map(() => [[0, 0, 0, 1]]),
       };
@@ -267,11 +290,12 @@ export function runWorlds(R, constants, worlds, { fps, frames, every = 1, isAlon
           const [x, y, z] = plus(scaled(pointAlong(path, ((n + 1) / (substeps * fps)) * pathFps), scale), origin);
           made[k].rigid[0].setNextKinematicTranslation({ x, y, z });
         });
+        for (const world of made) if (world.course) steer(world, n * step, step, scale);
         engine.step(queue);
         queue.drainCollisionEvents((first, second, started) => meet(made, owner, c, n * step, first, second, started));
       }
       const isStill = record(made, { scale, step: every / fps, turns, slow });
-      stillSince = isStill && !along ? stillSince + 1 : 0;
+      stillSince = isStill && !along && !made.some(({ course }) => course) ? stillSince + 1 : 0;
       if (row % CHECKED === 0) takeOut(made, scale, (CHECKED * every) / fps);
       if (stillSince >= 2 && row % CHECKED === 0) break;
     }
@@ -322,9 +346,33 @@ function meet(made, owner, c, time, first, second, started) {
   const [lower, upper] = [world.bodies[a], world.bodies[b]];
   if (time < c.at_start && (standsOn(lower, upper, c.rests) || standsOn(upper, lower, c.rests))) return;
   for (const i of [a, b]) {
-    if (!world.glides.delete(i)) continue;
-    for (let n = 0; n < world.rigid[i].numColliders(); n += 1) world.rigid[i].collider(n).setFriction(world.bodies[i].friction);
+    if (!world.glides.has(i)) continue;
+    const halts = i === 0 && world.course?.halts;
+    release(world, i);
+    if (halts) for (const stopped of [a, b].map((each) => world.rigid[each])) {
+      stopped.setLinvel({ x: 0, y: 0, z: 0 }, true);
+      stopped.setAngvel({ x: 0, y: 0, z: 0 }, true);
+    }
   }
+}
+
+/** A body glides no more: from now on it is subject to friction. */
+function release(world, i) {
+  world.glides.delete(i);
+  if (i === 0) world.course = null;
+  for (let n = 0; n < world.rigid[i].numColliders(); n += 1) world.rigid[i].collider(n).setFriction(world.bodies[i].friction);
+}
+
+/** Has the mover follow its course for one step (s). */
+function steer(world, time, step, scale) {
+  const { course, bodies: [body], rigid: [rigid] } = world;
+  if (course.legs.some(({ until }) => until > time - 1.5 * step && until < time + step)) {
+    const [x, y, z] = scaled(meanVelocity(course, time, time + step), scale);
+    rigid.setLinvel({ x, y: body.falls ? rigid.linvel().y : y, z }, true);
+    const radius = body.half_width * scale;
+    if (body.shape === ROLLS && body.falls) rigid.setAngvel({ x: z / radius, y: 0, z: -x / radius }, true);
+  }
+  if (course.legs.at(-1).until <= time) release(world, 0);
 }
 
 /** Writes down where all bodies are; returns whether none moves. */

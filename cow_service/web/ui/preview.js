@@ -67,34 +67,28 @@ function useFilm(count, fps) {
   return frame;
 }
 
-/** A thing at one frame of its path, cut out of the picture, or its box. `from` is where the picture shows it. */
-function Thing({ path, frame, box, from, cutout, ghost }) {
+/** A thing at one frame of its path, cut out of the picture. */
+function Thing({ path, frame, isGhost }) {
   const last = Math.min(frame, path.points.length - 1);
   if (!path.visible[last]) return null;
   const [x, y] = path.points[last];
   const turn = path.leans ? path.leans[last] - path.leans[0] : 0;
-  const place = `translate(${x} ${y}) rotate(${turn}) scale(${path.scale[last]}) translate(${-from[0]} ${-from[1]})`;
-  const [x0, y0, x1, y1] = box;
-  const at = { x: x0, y: y0, width: x1 - x0, height: y1 - y0 };
-  return cutout ? html`<image class=${ghost ? "ghost" : "thing"} href=${cutout} ...${at} transform=${place} />`
-    : html`<rect class=${ghost ? "ghost" : "mover thin"} ...${at} transform=${place} />`;
+  const place = `translate(${x} ${y}) rotate(${turn}) scale(${path.scale[last]}) translate(${-path.from[0]} ${-path.from[1]})`;
+  const [x0, y0, x1, y1] = path.sprite.box;
+  return html`<image class=${isGhost ? "ghost" : "thing"} href=${path.sprite.href} x=${x0} y=${y0} width=${x1 - x0} height=${y1 - y0} transform=${place} />`;
 }
 
-export function Foreseen({ shown, simulation, unit, cutout }) {
-  const { trajectory, grounding } = simulation;
+export function Foreseen({ shown, trajectory }) {
   const { paths, futures, met } = shown;
   const count = trajectory.paths[0].points.length;
   const frame = useFilm(count, trajectory.fps);
-  const bodies = trajectory.bodies;
-  const things = (at, ghost) => paths.map((path) => html`<${Thing} key=${`${path.body} ${at}`} path=${path} frame=${at} ghost=${ghost}
-    box=${path.body ? bodies[path.body].bbox : grounding.bbox} from=${path.body ? path.points[0] : path.points[0]} cutout=${path.body ? null : cutout} />`);
   const stations = calm() ? Array.from({ length: STATIONS }, (_, place) => Math.round(((place + 1) * (count - 1)) / STATIONS)) : [frame];
-  const touched = met && bodies[met.body];
+  const [x0, y0, x1, y1] = met ? trajectory.bodies[met.body].bbox : [];
   return html`<g class="foreseen">
     <path class="futures" d=${futures} />
     ${paths.map((path) => html`<g key=${path.body}><path class="halo" d=${lineOf(path)} /><path class=${path.body ? "path pushed" : "path"} d=${lineOf(path)} /></g>`)}
-    ${touched && html`<rect class="met touches" x=${touched.bbox[0]} y=${touched.bbox[1]} width=${touched.bbox[2] - touched.bbox[0]} height=${touched.bbox[3] - touched.bbox[1]} />`}
-    ${stations.map((at) => things(at, stations.length > 1))}
+    ${met && html`<rect class="met touches" x=${x0} y=${y0} width=${x1 - x0} height=${y1 - y0} />`}
+    ${stations.map((at) => paths.map((path) => html`<${Thing} key=${`${path.body} ${at}`} path=${path} frame=${at} isGhost=${stations.length > 1} />`))}
   </g>`;
 }
 

@@ -215,7 +215,7 @@ export function Scene({ state }) {
           const box = draft?.object === place ? draft.box : object.bbox;
           return box && html`<${Rect} key=${`own ${place}`} box=${box} kind="own" />`;
         })}
-        ${simulation && shown && html`<${Foreseen} shown=${shown} simulation=${simulation} unit=${unit} cutout=${cutout?.cutout} />`}
+        ${simulation && shown && html`<${Foreseen} shown=${shown} trajectory=${simulation.trajectory} />`}
         ${simulation && !shown && html`<${Moment} simulation=${simulation} frame=${player.frame} unit=${unit} layers=${layers} cutout=${cutout?.cutout} />`}
         ${layers.names && html`<${Labels} labels=${labels} unit=${unit} size=${size} />`}
         ${shownDirection && !player.playing && html`<${Arrow} from=${origin} direction=${shownDirection} size=${size} unit=${unit} />`}
