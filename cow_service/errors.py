@@ -48,7 +48,10 @@ An error's docstring is its title on the wire. Its message says what was wrong, 
 it never holds a path, a trace or a secret. The SDK raises the same classes for the same codes.
 """
 
+import json
 from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
 TYPE_PREFIX = "urn:cow:problem:"  # of the URI that a problem's code is part of: a name, not an address
@@ -304,3 +307,14 @@ def kinds(base: type[CowError] = CowError) -> dict[str, type[CowError]]:
         if kind.__module__ == __name__:
             found |= kinds(kind)
     return found | {InternalError.code: InternalError}
+
+
+@cache
+def install_line(extra: str) -> str:
+    """The command that installs an extra: in the checkout that this package runs from, where it does, else by name."""
+    try:
+        told = json.loads(distribution("cow-service").read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:
+        told = {}
+    is_checkout = told.get("dir_info", {}).get("editable", False)
+    return f'pip install -e ".[{extra}]"' if is_checkout else f'pip install "cow-service[{extra}]"'

@@ -337,7 +337,7 @@ def open_artifact_store(settings: Settings) -> ArtifactStore:
         return DiskArtifacts(Path(place).expanduser() if place else settings.data_dir / "artifacts")
     if find_spec("obstore") is None:
         raise SettingsError(
-            f"Bad settings: COW_ARTIFACTS={place!r} needs obstore, not installed: pip install 'cow-service[objects]'."
+            f"Bad settings: COW_ARTIFACTS={place!r} needs obstore, not installed: {errors.install_line('objects')}."
         )
     from cow_service.media.object_artifacts import ObjectArtifacts  # noqa: PLC0415 - an optional library
 

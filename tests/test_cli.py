@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
 from drawn import ball, block, floor, png_bytes
 from floors import TrueCamera, depth_png
 from PIL import Image, ImageSequence
@@ -17,7 +19,7 @@ from typer.testing import CliRunner
 
 from cow_service import __version__
 from cow_service.cli.main import app
-from cow_service.cli.options import FIELDS, request_body
+from cow_service.cli.options import COMMANDS, FIELDS, request_body
 from cow_service.records import Models, Simulation
 from cow_service.requests import SimulateRequest
 
@@ -275,6 +277,20 @@ def test_version_and_help(tmp_path: Path) -> None:
     shown = cow(tmp_path, "--help").stdout
     for command in ("simulate", "serve", "models", "doctor"):
         assert command in shown
+    assert re.findall(r"^(\w[\w ]+):$", shown, re.M) == ["Options", *COMMANDS]
+    listed = re.findall(r"^  (\w+) ", shown, re.M)
+    assert sorted(listed) == sorted(name for name, each in commands().items() if not each.hidden)
+
+
+def commands() -> dict[str, typer.core.TyperCommand]:
+    return vars(typer.main.get_command(app))["commands"]
+
+
+def test_a_failure_is_json_where_json_is_wanted(tmp_path: Path) -> None:
+    refused = cow(tmp_path, "simulate", str(Path(__file__)), "If it moves, what happens?", "--json")
+    assert refused.returncode == 1
+    assert json.loads(refused.stdout)["type"] == "urn:cow:problem:image-type-unsupported"
+    assert refused.stderr.startswith("image-type-unsupported: ")
 
 
 def test_a_setting_that_is_not_json_is_named(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from cow_service import __version__
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.client import AsyncClient, CowError
 from cow_service.client.errors import CannotGround
-from cow_service.errors import FieldError, InvalidRequest, Unauthorized
+from cow_service.errors import FieldError, InvalidRequest, Unauthorized, install_line
 from cow_service.mcp.arguments import REMEDIES, error_text, image_of, request_fields
 from cow_service.mcp.results import MAX_BYTES, fit_pictures
 from cow_service.mcp.server import Caller
@@ -566,7 +566,7 @@ def test_a_signal_ends_it_and_the_job_goes_on_at_the_next_start(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("code", "options", "exit_code", "told"),
     [
-        ("sys.modules['mcp'] = None", (), 1, 'pip install "cow-service[mcp]"'),
+        ("sys.modules['mcp'] = None", (), 1, install_line("mcp")),
         ("pass", ("--url", "ftp://x"), 2, "must begin with http:// or https://"),
     ],
 )

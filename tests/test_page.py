@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 
 import httpx
@@ -24,6 +25,7 @@ from browser import (
 )
 from conftest import Server
 from drawn import clutter, png_bytes
+from PIL import Image
 from playwright.sync_api import Page, Request, expect
 from servers import QUESTION, picture
 
@@ -121,6 +123,25 @@ def test_what_is_not_understood_is_told_with_questions_that_would_be(server: Ser
     instead.first.click()
     result(page)
     expect(notice).to_have_count(0)
+
+
+@pytest.mark.parametrize(("kind", "side"), [("BMP", 0), ("GIF", 0), ("PNG", 7000)])
+def test_pictures_that_the_server_does_not_take_are_sent_as_jpeg(
+    server: Server, windows: Windows, kind: str, side: int
+) -> None:
+    made = io.BytesIO()
+    with Image.open(io.BytesIO(picture(43))) as opened:
+        shown = opened if not side else opened.resize((side, side * opened.height // opened.width))
+        shown.save(made, kind)
+    page = windows.open(server.address)
+    drop(page, made.getvalue(), f"picture.{kind.lower()}", f"image/{kind.lower()}")
+    ask(page, QUESTION)
+    job = httpx.get(f"{server.address}/jobs/{result(page)}").json()
+    image = job["result"]["image"]
+    assert image["width"] * image["height"] <= 12e6
+    sent = httpx.get(f"{server.address}/artifacts/{image['sha256']}")
+    assert sent.headers["content-type"] == "image/jpeg"
+    assert said(page) in ("Yes", "Not sure")
 
 
 @pytest.mark.slow

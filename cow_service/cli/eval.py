@@ -10,9 +10,8 @@ from typer.core import TyperGroup
 from cow_service.cli.batch import EXIT_INTERRUPTED, EXIT_SOME_FAILED
 from cow_service.cli.options import Texts, argument, option, printable
 from cow_service.client.options import CONCURRENCY
-from cow_service.errors import CowError
+from cow_service.errors import CowError, install_line
 
-INSTALL = 'pip install "cow-service[evals]"'
 _OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair", "pydantic_ai", "tenacity")
 
 
@@ -161,4 +160,4 @@ def _check_installed() -> None:
 
     missing = [name for name in _OF_EXTRA if find_spec(name) is None]
     if missing:
-        raise EvalsNotInstalled(f"`cow eval` needs {', '.join(missing)}: {INSTALL}")
+        raise EvalsNotInstalled(f"`cow eval` needs {', '.join(missing)}: {install_line('evals')}")

@@ -16,7 +16,6 @@ app = typer.Typer(
     cls=Commands,
     rich_markup_mode=None,  # plain help: rich takes twice as long to import as everything else
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Look before you answer: imagine the future of an image.",
 )

@@ -44,17 +44,36 @@ class FolderNotWritable(CowError):
     code, status = "folder-not-writable", 0
 
 
+COMMANDS = {
+    "Ask": ("demo", "simulate", "answer", "batch"),
+    "Serve": ("serve", "worker", "mcp", "keys", "migrate"),
+    "Look after it": ("doctor", "models"),
+    "Measure and convert": ("eval", "tracks"),
+}  # of `cow --help`
+
+
 class Commands(TyperGroup):
     """A group of commands whose errors are a few plain lines on standard error.
 
-    Exit code 1; 2 for bad settings.
+    Exit code 1; 2 for bad settings. With `--json` standard output has the problem (RFC 9457).
     """
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """The commands in groups, by what one wants to do."""
+        for title, names in COMMANDS.items():
+            found = [(name, self.commands[name]) for name in names if name in self.commands]
+            rows = [(name, command.get_short_help_str(formatter.width - 14)) for name, command in found]
+            with formatter.section(title):
+                formatter.write_dl(rows)
 
     def invoke(self, ctx: Any) -> Any:
         """Runs a command."""
+        wants_json = "--json" in ctx.args
         try:
             return super().invoke(ctx)
         except CowError as error:
+            if wants_json:
+                typer.echo(json.dumps(error.as_problem(), ensure_ascii=False))
             typer.secho(f"{error.code}: {error.title}", fg="red", bold=True, err=True)
             typer.echo(printable(error.detail), err=True)
             if hint := HINTS.get(error.code, error.remedy):

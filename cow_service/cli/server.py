@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from cow_service.cli.options import Texts, argument, option
-from cow_service.errors import CowError, InvalidRequest
+from cow_service.errors import CowError, InvalidRequest, install_line
 
 if TYPE_CHECKING:
     from cow_service.service import Service
@@ -128,7 +128,7 @@ def mcp(
         if (error.name or "").partition(".")[0] not in ("mcp", "mcp_types"):
             raise
         raise McpNotInstalled(
-            '`cow mcp` needs the Python package `mcp`, 2.3 or later: pip install "cow-service[mcp]"'
+            f"`cow mcp` needs the Python package `mcp`, 2.3 or later: {install_line('mcp')}"
         ) from error
 
     if transport == "stdio":

@@ -16,6 +16,7 @@ from opentelemetry import trace
 from opentelemetry.context import Context
 
 from cow_service import __version__
+from cow_service.errors import install_line
 from cow_service.observability import logging as context
 from cow_service.settings import SettingsError
 
@@ -55,7 +56,7 @@ def start(environment: Mapping[str, str] = os.environ) -> bool:
         from opentelemetry.sdk.trace.export import BatchSpanProcessor  # noqa: PLC0415
     except ImportError as error:
         raise SettingsError(
-            f'Bad settings: {named} is set, but OpenTelemetry is not installed: pip install "cow-service[otel]"'
+            f"Bad settings: {named} is set, but OpenTelemetry is not installed: {install_line('otel')}"
         ) from error
     resource = Resource.create({"service.version": __version__})
     if str(resource.attributes.get("service.name", "unknown_service")).startswith("unknown_service"):

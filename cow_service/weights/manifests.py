@@ -11,7 +11,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, JsonValue
 
-from cow_service.errors import CowError
+from cow_service.errors import CowError, install_line
 from cow_service.records import Record
 
 
@@ -114,7 +114,7 @@ class Manifest(Record):
 
     def install_line(self) -> str:
         """The command that installs what this backend needs."""
-        return f'pip install "cow-service[{self.extra}]"' if self.extra else "pip install --force-reinstall cow-service"
+        return install_line(self.extra) if self.extra else "pip install --force-reinstall cow-service"
 
 
 def check_modules(name: str, unavailable: type[CowError]) -> None:

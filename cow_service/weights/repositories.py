@@ -30,7 +30,7 @@ from filelock import FileLock, Timeout
 from pydantic import AfterValidator, Field, ValidationError
 
 from cow_service import __version__
-from cow_service.errors import CowError, WeightsUnavailable
+from cow_service.errors import CowError, WeightsUnavailable, install_line
 from cow_service.records import Record
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Manifest, Source
@@ -378,7 +378,7 @@ def _hub(endpoint: str | None) -> HfApi:
     try:
         from huggingface_hub import HfApi  # noqa: PLC0415
     except ImportError as error:
-        why = 'Downloading weights needs huggingface_hub, which is not installed: pip install "cow-service[wan]".'
+        why = f"Downloading weights needs huggingface_hub, which is not installed: {install_line('wan')}."
         raise WeightsUnavailable(why) from error
     return HfApi(endpoint=endpoint, library_name="cow-service", library_version=__version__)
 

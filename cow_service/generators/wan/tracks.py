@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.errors import InvalidRequest
+from cow_service.errors import InvalidRequest, install_line
 from cow_service.records import Trajectory
 from cow_service.vision.types import Floats, Floats32
 
@@ -140,6 +140,6 @@ def write_tracks(tracks: Tracks, path: Path) -> tuple[Path, ...]:
     try:
         import torch  # noqa: PLC0415
     except ImportError as error:
-        raise InvalidRequest('.pth files need PyTorch: pip install "cow-service[wan]", or use .npz.') from error
+        raise InvalidRequest(f".pth files need PyTorch: {install_line('wan')}, or use .npz.") from error
     torch.save(zipped.getvalue(), path)
     return (path,)

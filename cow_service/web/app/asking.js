@@ -4,6 +4,7 @@ import { artifactAddress, forgetArtifacts } from "./artifacts.js";
 import { jobAddress, pageAddress } from "./address.js";
 import { follow } from "./events.js";
 import { forgetKey } from "./keys.js";
+import { sendable } from "./pixels.js";
 import { requestOf, stateOf } from "./request.js";
 import { Problem, call, callJson, codeOf, newIdempotencyKey, persist, postJson } from "./server.js";
 import { NOTHING_CORRECTED, get, set } from "./store.js";
@@ -12,7 +13,7 @@ const MOST_UNDONE = 50;
 const LINE_SECONDS = 2; // between two looks at the place in the queue
 const JOB_ID = /^[A-Za-z0-9-]{1,64}$/;
 const NOTHING_SEEN = { blind: false, lit: null, named: new Map(), taken: null };
-const NOTHING_ASKED = Object.freeze({ run: null, result: null, problem: null, compared: [], past: [], future: [], tool: "select", ...NOTHING_SEEN });
+const NOTHING_ASKED = Object.freeze({ run: null, result: null, before: null, problem: null, compared: [], past: [], future: [], tool: "select", ...NOTHING_SEEN });
 
 let running = new AbortController(); // of what the page waits for
 
@@ -115,7 +116,7 @@ async function watch(job, asked, signal, cancels) {
   const sha256 = picture?.sha256 ?? (simulation ?? answer)?.image.sha256 ?? null;
   if (picture && !picture.sha256 && sha256) set({ picture: { ...picture, sha256 } });
   if (last.status === "succeeded") {
-    set({ result: { jobId: job.id, kind: last.kind, answer, simulation, settings: asked.settings, asked }, run: null, problem });
+    set({ result: { jobId: job.id, kind: last.kind, answer, simulation, settings: asked.settings, asked }, before: get().result, run: null, problem });
   } else {
     set({ run: null, problem: last.status === "canceled" ? null : problem });
   }
@@ -217,18 +218,22 @@ let chosen = 0; // pictures so far: the latest counts
 /** Shows a picture that was dropped, pasted, chosen or photographed, and looks what is in it; or asks its question, where `asks`. */
 export async function choosePicture(blob, name, question = "", asks = false) {
   const number = (chosen += 1);
-  const url = URL.createObjectURL(blob);
-  let size = null;
+  let url = URL.createObjectURL(blob);
+  let sent = null;
   try {
-    size = await sizeOf(url);
+    sent = await sendable(blob, await sizeOf(url));
+    if (sent.blob !== blob) {
+      URL.revokeObjectURL(url);
+      url = URL.createObjectURL(sent.blob);
+    }
   } catch {
     const detail = `“${name}” is no picture that the browser can show. Take a PNG, JPEG or WebP.`;
     if (number === chosen) set({ problem: { code: "not-a-picture", title: "That is no picture.", detail, errors: [] } });
   }
-  if (size === null || number !== chosen) return URL.revokeObjectURL(url);
+  if (sent === null || number !== chosen) return URL.revokeObjectURL(url);
   begin();
   forgetLook();
-  const picture = { url, blob, sha256: null, ...size, name };
+  const picture = { url, sha256: null, ...sent, name };
   showPicture(picture, { question, corrections: NOTHING_CORRECTED });
   history.pushState(null, "", pageAddress());
   return asks ? ask() : look(picture);
@@ -309,6 +314,13 @@ export async function compareWith(change) {
   } catch (error) {
     put({ status: "failed", problem: shownProblem(error) });
   }
+}
+
+/** Puts the result before beside the one that is shown. */
+export function compareWithBefore() {
+  const { before: { jobId, answer, simulation }, compared } = get();
+  const label = "The what-if before";
+  set({ compared: [...compared.filter((each) => each.label !== label), { label, status: "succeeded", jobId, answer, simulation }] });
 }
 
 /** Reads what the server has; questions do not wait for it. */

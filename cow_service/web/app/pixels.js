@@ -8,10 +8,29 @@ const OUTLINE = [255, 196, 0]; // RGB, as in the server's overlay
 const FILL = 90; // of 255: how opaque a lit thing is
 const MOST_SIDE = 1024; // px: outlines of larger pictures are made at this size
 
-function drawn(image, width, height) {
+const SENT = new Set(["image/png", "image/jpeg", "image/webp"]); // as they are
+const MOST_PIXELS = 24e6; // of a picture that is sent as it is
+const SCALED_PIXELS = 12e6, QUALITY = 0.92; // of a JPEG that is made instead
+
+/** A picture as the server takes it: {blob, width, height}. What is larger, or of another type that the browser shows, becomes a JPEG. */
+export async function sendable(blob, { width, height }) {
+  if (SENT.has(blob.type) && width * height <= MOST_PIXELS) return { blob, width, height };
+  const scale = Math.min(1, Math.sqrt(SCALED_PIXELS / (width * height)));
+  const size = { width: Math.round(width * scale), height: Math.round(height * scale) };
+  const bitmap = await createImageBitmap(blob, { resizeWidth: size.width, resizeHeight: size.height, resizeQuality: "high" });
+  const { canvas } = drawn(bitmap, size.width, size.height, "#fff");
+  bitmap.close();
+  return { blob: await new Promise((resolve) => canvas.toBlob(resolve, "image/jpeg", QUALITY)), ...size };
+}
+
+function drawn(image, width, height, ground = null) {
   const canvas = document.createElement("canvas");
   [canvas.width, canvas.height] = [width, height];
   const context = canvas.getContext("2d", { willReadFrequently: true });
+  if (ground) {
+    context.fillStyle = ground;
+    context.fillRect(0, 0, width, height);
+  }
   context.drawImage(image, 0, 0, width, height);
   return context;
 }

@@ -46,7 +46,8 @@ let state = {
   taken: null, // the thing that was chosen last as what moves
   run: null, // {job, done: [stages], settings} while a job is in the making
   result: null, // {jobId, kind, answer, simulation, settings, asked} of the last job that succeeded
-  compared: [], // the same question by other readers and generators
+  before: null, // the result before that one, of the same picture
+  compared: [], // what stands beside the result: by another reader or generator, or the one before
   problem: null,
   away: false,
   keyWanted: null, // {reason, answer}

@@ -1,7 +1,7 @@
 // The answer, with and without imagination, what it depends on, and the same question asked of others.
 
 import { html } from "../vendor/htm-preact.js";
-import { compareWith } from "../app/asking.js";
+import { compareWith, compareWithBefore } from "../app/asking.js";
 import { jobAddress } from "../app/address.js";
 import { DOUBTS, answerWords, percent, plural, seconds } from "../app/words.js";
 import { Shot } from "./filmstrip.js";
@@ -95,19 +95,20 @@ export function Result({ state }) {
       ${!run && html`<${Stages} result=${result} />`}
       <${Cost} made=${answer ?? simulation} />
     </details>
-    ${models && html`<${Others} models=${models} settings=${result.settings} busy=${Boolean(run)} compared=${compared} />`}
+    ${models && html`<${Others} models=${models} before=${state.before} settings=${result.settings} busy=${Boolean(run)} compared=${compared} />`}
   </section>`;
 }
 
 const usable = (list, current) => list.filter((each) => each.ready !== false && !each.missing.length
   && each.name !== (current || list.find((one) => one.default)?.name));
 
-function Others({ models, settings, busy, compared }) {
+function Others({ models, before, settings, busy, compared }) {
   const readers = usable(models.readers, settings.reader);
   const generators = usable(models.generators, settings.generator);
-  if (!readers.length && !generators.length && !compared.length) return null;
+  if (!readers.length && !generators.length && !compared.length && !before) return null;
   return html`<details class="others" open=${compared.length > 0}><summary>Side by side</summary>
     <div class="row">
+      ${before && html`<button disabled=${busy} onClick=${compareWithBefore}>The what-if before</button>`}
       ${readers.map(({ name }) => html`<button key=${`reader ${name}`} disabled=${busy} onClick=${() => compareWith({ reader: name })}>Reader ${name}</button>`)}
       ${generators.map(({ name }) => html`<button key=${`generator ${name}`} disabled=${busy} onClick=${() => compareWith({ generator: name })}>Generator ${name}</button>`)}
     </div>

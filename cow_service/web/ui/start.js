@@ -6,7 +6,6 @@ import { choosePicture } from "../app/asking.js";
 import { set } from "../app/store.js";
 import { calm } from "./player.js";
 
-const TYPES = "image/png,image/jpeg,image/webp";
 
 // Each with its question, and what it comes to.
 const EXAMPLES = [
@@ -48,7 +47,7 @@ function chosen(event) {
 /** Buttons that bring a picture. */
 export function Choose({ short = false }) {
   return html`<div class="choose row">
-    <label class="button ${short ? "" : "primary"}">${short ? "Another picture" : "Choose a picture"}<input type="file" accept=${TYPES} onChange=${chosen} /></label>
+    <label class="button ${short ? "" : "primary"}">${short ? "Another picture" : "Choose a picture"}<input type="file" accept="image/*" onChange=${chosen} /></label>
     <label class="button camera">Take a photograph<input type="file" accept="image/*" capture="environment" onChange=${chosen} /></label>
   </div>`;
 }
