@@ -275,10 +275,8 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path,
 def test_version_and_help(tmp_path: Path) -> None:
     assert cow(tmp_path, "--version").stdout.strip() == f"cow {__version__}"
     shown = cow(tmp_path, "--help").stdout
-    for command in ("simulate", "serve", "models", "doctor"):
-        assert command in shown
-    assert re.findall(r"^(\w[\w ]+):$", shown, re.M) == ["Options", *COMMANDS]
-    listed = re.findall(r"^  (\w+) ", shown, re.M)
+    assert set(COMMANDS) <= set(re.findall(r"^(\w[\w ]+):$", shown, re.M))
+    listed = re.findall(r"^  (\w+) ", shown.partition("Ask:")[2], re.M)
     assert sorted(listed) == sorted(name for name, each in commands().items() if not each.hidden)
 
 
