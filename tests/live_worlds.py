@@ -9,19 +9,22 @@ LOAD = """async (address) => {
     window.R = await loadEngine(() => import("/web/vendor/rapier.js"), () => fetch("/web/vendor/rapier.wasm"));
     window.live = await import("/web/live/world.js");
 }"""
-RUN = """({ world, direction }) => {
-    const { bodiesOf, cameraOf, countOf, meetingsOf, runWorlds, sharesOf } = window.live;
+RUN = """({ world, direction = null, along = null }) => {
+    const { bodiesOf, cameraOf, countOf, meetingsOf, positionsAlong, runWorlds, sharesOf, verdictOf } = window.live;
     const begin = Array.from({ length: countOf(world) }, (_, k) => bodiesOf(world, k, { direction }));
     const { fps, num_frames: frames, constants: c, horizon } = world;
     const began = performance.now();
-    const [run] = runWorlds(window.R, c, [begin[0]], { fps, frames, isAlone: true });
+    const [run] = runWorlds(window.R, c, [begin[0]], {
+        fps, frames, isAlone: true, along: along && [positionsAlong(world, 0, along)] });
     const likeliest = performance.now();
     const timing = { fps: c.clock, every: c.every };
     const runs = runWorlds(window.R, c, begin.slice(1), { ...timing, frames: Math.ceil(horizon * c.clock) + 1 });
     const ended = performance.now();
     const points = run.positions[0].map((position) => cameraOf(world, 0).project(position));
+    const verdicts = runs.map((run, place) => verdictOf(world, run, place + 1, timing));
     return { velocities: begin.map(([mover]) => mover.velocity), points, met: meetingsOf(world, run)[0] ?? null,
-        shares: sharesOf(world, runs, 1, timing), milliseconds: [likeliest - began, ended - likeliest] };
+        moved: [...run.moved], shares: sharesOf(world, verdicts),
+        milliseconds: [likeliest - began, ended - likeliest] };
 }"""
 KEPT = ("kind", "law", "speed", "speed_deviation", "depth", "depth_deviation", "rises", "distance", "duration", "until")
 

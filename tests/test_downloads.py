@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -145,11 +146,16 @@ def test_a_page_has_live_worlds_or_says_how_to_get_them(served: Served, answered
     refused = served.http.get(f"/jobs/{answered}/download?format=page")
     assert refused.json()["type"].endswith("download-unavailable")
     assert "`live: true`" in refused.json()["detail"]
-    job = served.ended(served.submit(BODY | {"live": True, "question": "Will </script> <b>it</b> hit?"})["id"])
+    named = {"object": "mug </SCRIPT><Script>alert(1)<!-- \u2028", "bbox": [170, 60, 205, 98]}
+    asked = {"live": True, "ensemble": 1, "question": "Will </script> <b>it</b> hit?", "objects": [named]}
+    job = served.ended(served.submit(BODY | asked)["id"])
     page = served.http.get(f"/jobs/{job['id']}/download?format=page")
     assert page.headers["content-disposition"] == f'attachment; filename="cow-{job["id"]}.html"'
     assert "Will &lt;/script&gt; &lt;b&gt;it&lt;/b&gt; hit?" in page.text
-    assert page.text.count("</script>") == page.text.count("<script "), "no text ends its script"
+    text = page.text.lower()
+    assert text.count("</script") == text.count("<script ") == page.text.count("<script "), "no text ends its script"
+    (world,) = re.findall(r'id="world">(.*?)</script>', page.text)
+    assert json.loads(world)["bodies"][1]["name"] == named["object"]
 
 
 def test_lists_tell_answers_and_what_was_given(served: Served, answered: str) -> None:

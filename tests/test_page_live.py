@@ -34,7 +34,7 @@ def simulated(server: Server, name: str, **corrected: Any) -> tuple[dict[str, An
     fields = {"question": question, "request": body}
     found = httpx.post(f"{server.address}/simulate", files=files, data=fields, timeout=60).raise_for_status().json()
     live = found["trajectory"]["live"]
-    return found, httpx.get(f"{server.address}{live['url']}").raise_for_status().json()
+    return found, {} if live is None else httpx.get(f"{server.address}{live['url']}").raise_for_status().json()
 
 
 def column(value: Any, count: int) -> list[float]:
@@ -72,8 +72,46 @@ def test_the_page_computes_the_worlds_of_the_server(server: Server, windows: Win
         assert shares["yes"] / shares["count"] == pytest.approx(trajectory["outcome"]["probability"], abs=0.08)
 
 
+@pytest.mark.parametrize(
+    "ends",
+    [{"distance": 150}, {"until": "contact"}, {"duration": 0.8, "steps": [{"direction": [0, 1]}]}, {"speed": 1}],
+    ids=str,
+)
+def test_courses_end_in_the_page_as_they_do_on_the_server(
+    server: Server, windows: Windows, ends: dict[str, Any]
+) -> None:
+    page = windows.open(server.address)
+    page.evaluate(LOAD)
+    told, world = simulated(server, "ball-and-mug", motion={"direction": [0.97, 0.24], "kind": "linear"} | ends)
+    found = page.evaluate(RUN, {"world": world, "direction": told["motion"]["direction"]})
+    theirs = told["trajectory"]["paths"][0]["points"]
+    for frame in (len(theirs) // 2, len(theirs) - 1):
+        mine = found["points"][min(frame, len(found["points"]) - 1)]
+        moved = [mine[axis] - found["points"][0][axis] for axis in (0, 1)]
+        assert moved == pytest.approx([theirs[frame][axis] - theirs[0][axis] for axis in (0, 1)], abs=20)
+    share = told["trajectory"]["outcome"]["probability"]
+    assert found["shares"]["yes"] / found["shares"]["count"] == pytest.approx(share, abs=0.08)
+
+
+def test_what_follows_a_path_moves_nothing_that_it_passes_through(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    page.evaluate(LOAD)
+    told, world = simulated(server, "ball-and-mug")
+    (x, y), mug = told["grounding"]["point"], told["trajectory"]["encounters"][0]
+    x1, y1 = (mug["bbox"][0] + mug["bbox"][2]) / 2, mug["bbox"][3] - 10
+    along = [[x + (x1 - x) * share / 40, y + (y1 - y) * share / 40] for share in range(81)]
+    found = page.evaluate(RUN, {"world": world, "along": along})
+    assert (found["met"]["body"], found["moved"]) == (mug["body"], [0])
+    given = {"grounding": {"object": "yellow ball", "bbox": told["grounding"]["bbox"]}, "live": False}
+    followed, _ = simulated(server, "ball-and-mug", trajectory={"points": along, "fps": world["fps"]}, **given)
+    touches = [each for each in followed["trajectory"]["encounters"] if each["kind"] == "touches"]
+    assert [each["bbox"] for each in touches] == [mug["bbox"]]
+    assert found["met"]["time"] == pytest.approx(touches[0]["time"], abs=0.2)
+
+
 def test_worlds_are_told_only_where_they_are_asked_for_and_can_be_aimed(server: Server) -> None:
-    for name, request in (("falling-ball", {"live": True}), ("ball-and-mug", {})):
+    bound = {"live": True, "motion": {"law": "ballistic"}}
+    for name, request in (("falling-ball", {"live": True}), ("ball-and-mug", {}), ("ball-and-mug", bound)):
         files, question = example(name)
         fields = {"question": question, "request": json.dumps({"video": False} | request)}
         found = httpx.post(f"{server.address}/simulate", files=files, data=fields, timeout=60).raise_for_status()

@@ -5,9 +5,12 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 import tempfile
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from string import Template
 
@@ -16,12 +19,12 @@ import numpy as np
 
 from cow_service.media.images import encode_jpeg, fit_within
 from cow_service.media.overlay import DARK, LIGHT, PATH, Image, in_letters_thread
-from cow_service.media.video import frames_of, write_mp4
+from cow_service.media.video import frames_in, write_mp4
 from cow_service.records import Answer, Simulation, verdict_of
 
 SIDES = 720, 480, 320  # px: the first whose film is small enough for a chat
 PICTURE = 1280  # px, of the picture in a page
-MOST_BYTES = 3 * 1024**2
+SMALL_ENOUGH = 3 * 1024**2  # bytes
 CARD = 1200, 630  # px: what pages show of a link
 FUTURES, VERDICT = 1.4, 2.0  # s for which the futures fade before the film, and for which the verdict stays after it
 AFTER = 0.6  # s that the film goes on once nothing moves
@@ -50,10 +53,8 @@ class Told:
         trajectory, width = simulation.trajectory, simulation.image.width
         outcome, path = trajectory.outcome, trajectory.paths[0]
         share = None if outcome is None or not trajectory.ensemble else outcome.probability
-        agreeing = ""
-        if outcome is not None and share is not None:
-            share = max(share, 1 - share) if outcome.asked.form in ("whether", "when", "changes") else share
-            agreeing = f"{round(share * trajectory.ensemble)} of {trajectory.ensemble} simulated worlds agree"
+        says = "agree" if outcome is None or outcome.asked.form not in ("whether", "when", "changes") else "say yes"
+        agreeing = "" if share is None else f"{share:.0%} of {trajectory.ensemble} simulated worlds {says}"
         seen = path.points[: path.visible.index(False)] if False in path.visible else path.points
         met = [each.first_frame for each in trajectory.encounters]
         return Told(
@@ -70,26 +71,29 @@ class Told:
 
 
 def film(video: bytes, told: Told) -> bytes:
-    """An mp4: the futures fade over the first frame, the film plays, and the verdict is told. At most `MOST_BYTES`."""
+    """An mp4: the futures fade over the first frame, the film plays, and the verdict is told.
+
+    It is made smaller where it would not fit into a chat (`SMALL_ENOUGH`). Its frames are read as they are needed.
+    """
     made = b""
     for side in SIDES:
-        frames, fps = frames_of(video, side)
+        first, fps = next(frames_in(video, side))
+        sheet = _Sheet.of(first, told)
+        height, width = sheet.shape
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            sheet = _Sheet.of(frames[0], told)
-            height, width = sheet.shape
-            write_mp4(sheet.pictures(frames, fps), path, fps=fps, width=width, height=height)
+            pictures = sheet.pictures((frame for frame, _ in frames_in(video, side)), fps)
+            write_mp4(pictures, path, fps=fps, width=width, height=height)
             made = path.read_bytes()
-        if len(made) <= MOST_BYTES:
+        if len(made) <= SMALL_ENOUGH:
             break
     return made
 
 
 def card(video: bytes, told: Told) -> bytes:
     """A JPEG of `CARD`: one moment with the path and other futures, question and verdict."""
-    frames, _ = frames_of(video, SIDES[0])
-    sheet, canvas = _Sheet.of(frames[0], told), np.full((CARD[1], CARD[0], 3), DARK[0], np.uint8)
-    frame = frames[min(told.shown, len(frames) - 1)].copy()
+    frame, _ = deque(islice(frames_in(video, SIDES[0]), told.shown + 1), maxlen=1).pop()
+    sheet, canvas = _Sheet.of(frame, told), np.full((CARD[1], CARD[0], 3), DARK[0], np.uint8)
     sheet.draw_futures(frame, 0.5)
     sheet.draw_path(frame)
     picture = sheet.around(frame, True)
@@ -132,17 +136,18 @@ class _Sheet:
         """Height and width, px."""
         return self.above + self.frame[0] + self.below, self.frame[1]
 
-    def pictures(self, frames: Sequence[Image], fps: float) -> Iterator[Image]:
+    def pictures(self, frames: Iterator[Image], fps: float) -> Iterator[Image]:
         """All of the film, one after another."""
         fading = round(FUTURES * fps) if self.told.futures else 0
+        frame = next(frames)
         for number in range(fading):
-            first = frames[0].copy()
+            first = frame.copy()
             self.draw_futures(first, 1 - number / fading)
             yield self.around(first, False)
-        last = min(len(frames), round((self.told.until + AFTER) * fps) + 1)
-        for frame in frames[:last]:
+        yield self.around(frame, False)
+        for frame in islice(frames, round((self.told.until + AFTER) * fps)):
             yield self.around(frame, False)
-        told = self.around(frames[last - 1], True)
+        told = self.around(frame, True)
         for _ in range(round(VERDICT * fps)):
             yield told
 
@@ -197,7 +202,7 @@ def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
     """
     parts = {name.rpartition("/")[2]: (WEB / name).read_text() for name in MODULES}
     parts["wasm"] = base64.b64encode((WEB / "vendor" / "rapier.wasm.gz").read_bytes()).decode()
-    parts["world"] = world
+    parts["world"] = world.replace("<", "\\u003c")  # a JSON text that ends no script
     scripts = [f'<script type="text/plain" id="{name}">{_inside(text)}</script>' for name, text in parts.items()]
     words = {"question": told.question, "verdict": told.verdict}
     template = Template((WEB / "live" / "file.html").read_text())
@@ -206,14 +211,16 @@ def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
         image="data:image/jpeg;base64," + base64.b64encode(encode_jpeg(fit_within(image, PICTURE))).decode(),
         width=simulation.image.width,
         height=simulation.image.height,
-        worlds=len(json.loads(world)["mover"]["turn"]) - 1 if told.worlds else 1,
+        worlds=json.loads(world)["worlds"],
         data="\n".join(scripts),
     ).encode()
 
 
 def _inside(text: str) -> str:
-    """A text as it can stand in a script element."""
-    return text.replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    """A text as it can stand in a script element. Raises `ValueError` for one that would end it."""
+    if re.search(r"</script|<!--", text, re.IGNORECASE):
+        raise ValueError("A part of the page ends its own script.")
+    return text
 
 
 def _line(canvas: Image, points: Sequence[tuple[float, float]], width: int, thickness: int) -> None:

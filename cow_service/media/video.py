@@ -2,7 +2,7 @@
 
 import errno
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from fractions import Fraction
 from itertools import pairwise
@@ -143,11 +143,17 @@ WEBP_QUALITY = 80
 
 def frames_of(video: bytes, max_side: int | None = None) -> tuple[list[Pixels], float]:
     """All frames [h, w, 3] of an mp4, RGB, at most `max_side` px, and how many there are in a second."""
+    frames, rates = zip(*frames_in(video, max_side), strict=True)
+    return list(frames), rates[0]
+
+
+def frames_in(video: bytes, max_side: int | None = None) -> Iterator[tuple[Pixels, float]]:
+    """As `frames_of`, one after another, each with their rate."""
     with av.open(io.BytesIO(video), "r") as container:
         stream = container.streams.video[0]
         rate = float(stream.average_rate or 1)
-        frames = (np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in container.decode(stream))
-        return [fit_within(frame, max_side) for frame in frames], rate
+        for frame in container.decode(stream):
+            yield fit_within(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8), max_side), rate
 
 
 def gif(frames: Sequence[Pixels], fps: float) -> bytes:

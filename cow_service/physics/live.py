@@ -56,10 +56,12 @@ CONSTANTS: dict[str, float] = {
 def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, Any] | None:
     """The likeliest world and an ensemble of `size` worlds as JSON values; None of what no drag can change.
 
-    That is what something is put somewhere in, or what does not move along a direction.
+    That is what something is put somewhere in, what follows a path or passes through everything, and what does not move
+    along a direction.
     """
     motion = world.motion
-    if world.placement is not None or world.placed_before or motion.direction is None or motion.speed == 0:
+    is_bound = world.placement is not None or world.placed_before or world.prescribed is not None
+    if is_bound or motion.direction is None or motion.speed == 0:
         return None
     draws = likeliest() if size == 0 else np.concatenate([likeliest(), ensemble(size)])
     drawn = DrawnWorlds.of(world, draws, EVERY)
@@ -99,6 +101,7 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
         "fps": world.fps,
         "num_frames": world.num_frames,
         "horizon": world.horizon,
+        "worlds": size,
         "constants": CONSTANTS,
         "cameras": {
             "focal": _column(cameras.focal),

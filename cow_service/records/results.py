@@ -248,7 +248,15 @@ def verdict_of(result: Simulation | Answer) -> str:
     """What it comes to, in words: the answer, else what the worlds say; empty where nothing is asked."""
     if isinstance(result, Simulation):
         outcome = result.trajectory.outcome
-        return "" if outcome is None else outcome.facts
+        if outcome is None or outcome.asked.form in ("where", "what-happens"):
+            return "" if outcome is None else outcome.facts
+        if not outcome.sure:
+            return "Not sure"
+        if outcome.asked.form == "how-many":
+            return str(outcome.count)
+        if outcome.asked.form == "which-first":
+            return outcome.first or "Nothing"
+        return "Yes" if (outcome.probability or 0.0) >= 0.5 else "No"
     return "Not sure" if result.answer is None else result.option or result.answer
 
 

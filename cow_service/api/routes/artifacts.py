@@ -90,7 +90,7 @@ FILES: dict[DownloadFormat, tuple[str, str]] = {
     "sheet": ("-sheet.png", "image/png"),
 }
 FORMAT = Query(
-    description="`zip`: result, request, image, frames, overlay and video; `film`: an mp4 of at most 3 MB with the "
+    description="`zip`: result, request, image, frames, overlay and video; `film`: an mp4 of some 0.1 to 3 MB with the "
     "question, other futures and the verdict; `card`: one moment of it as a JPEG, 1200 x 630 px; `page`: HTML whose "
     "worlds are computed in the browser, without a network, where the request said `live: true`; `gif`, `webp`: the "
     "video as an animated picture; `sheet`: twelve of its frames as a PNG."
@@ -119,7 +119,7 @@ async def download(
     if format == "zip":
         path, release = await to_thread.run_sync(make_zip, engine, id, owner, limiter=limiter)
         return ArtifactResponse(path, release, media_type=media_type, headers=headers)
-    data = await to_thread.run_sync(make_animation, engine, id, owner, format, limiter=limiter)
+    data = await to_thread.run_sync(make_file, engine, id, owner, format, limiter=limiter)
     return Response(data, media_type=media_type, headers=headers)
 
 
@@ -154,11 +154,11 @@ def make_zip(engine: JobEngine, job_id: str, owner: str | None) -> tuple[FilePat
         return path, stack.pop_all().close
 
 
-SHARED = {"film": film, "card": card}
+SHARED = {"film": film, "card": card}  # with words of the result; other formats are of the video alone
 
 
-def make_animation(engine: JobEngine, job_id: str, owner: str | None, wanted: str) -> bytes:
-    """The video of a job in a format of `video.FORMATS`. Blocks, and raises as `make_zip` does."""
+def make_file(engine: JobEngine, job_id: str, owner: str | None, wanted: str) -> bytes:
+    """What a format other than `zip` makes of a job. Blocks, and raises as `make_zip` does."""
     job, result = _find_succeeded(engine, job_id, owner)
     again = f"Change GET /jobs/{job.id}/request and send it again"
     simulation = result.simulation if isinstance(result, Answer) else result

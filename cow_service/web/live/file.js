@@ -32,6 +32,7 @@ export async function show(world, load, wasm) {
   const tip = drawn("circle", { class: "tip", r: 7 * unit });
   let direction = world.mover.direction;
   let found = null;
+  let isAimed = false; // before, the worlds are those of the result
 
   const preview = new Preview(await loadEngine(load, wasm), world, (now) => {
     found = now;
@@ -42,16 +43,22 @@ export async function show(world, load, wasm) {
     pushed.setAttribute("d", line(now.paths.slice(1)));
     const box = now.met ? world.bodies[now.met.body].bbox : null;
     met.setAttribute("d", box ? `M${box[0]} ${box[1]}H${box[2]}V${box[3]}H${box[0]}Z` : "");
-    if (now.shares) {
+    if (!now.shares && isAimed) {
+      told.textContent = now.met ? `It meets the ${world.bodies[now.met.body].name} first.` : "It meets nothing.";
+    } else if (now.shares) {
       const meter = Object.assign(document.createElement("meter"), { min: 0, max: now.shares.count, value: now.shares.yes });
       told.replaceChildren(meter, shareWords(now.shares, trajectory));
     }
   });
-  const aim = (to) => {
+  const draw = (to) => {
     const [x, y] = tipOf(origin, to, size);
     direction = to;
     arrow.setAttribute("d", `M${origin}L${x} ${y}`);
     for (const each of [reach, tip]) Object.entries({ cx: x, cy: y }).forEach(([key, value]) => each.setAttribute(key, value));
+  };
+  const aim = (to) => {
+    isAimed = true;
+    draw(to);
     preview.aim({ direction: to });
   };
   const point = ({ clientX, clientY }) => {
@@ -87,5 +94,6 @@ export async function show(world, load, wasm) {
     });
     requestAnimationFrame(film);
   });
-  aim(direction);
+  draw(direction);
+  preview.aim({});
 }

@@ -1,6 +1,6 @@
 // Runs the worlds of a result again while somebody drags, a little in each frame of the screen.
 
-import { bodiesOf, cameraOf, countOf, meetingsOf, positionsAlong, runWorlds, sharesOf } from "./world.js";
+import { bodiesOf, cameraOf, countOf, meetingsOf, positionsAlong, runWorlds, sharesOf, verdictOf } from "./world.js";
 
 const BUDGET = 6; // ms of futures in a frame of the screen, beside the likeliest world
 const NEAREST = 0.08; // of its first depth: closer than this, a body has passed the camera
@@ -38,12 +38,12 @@ function seen(camera, positions, turns, start) {
 }
 
 export class Preview {
-  /** `world` as a result has it; `tell` hears what is known so far: {number, paths, met, futures, shares}. */
+  /** `world` as a result has it; `tell` hears what is known so far: {paths, met, futures, shares, isDone}. */
   constructor(R, world, tell) {
     Object.assign(this, { R, world, tell, count: countOf(world), wanted: null, current: null, batch: 4, handle: 0 });
   }
 
-  /** Takes an aim: {direction}, {moved: {body, by}}, or {points} of a path; the latest counts. */
+  /** Takes an aim: {direction}, {moved: {body, by}}, {points} of a path, or {} for the worlds as they are; the latest counts. */
   aim(aim) {
     this.wanted = aim;
     this.handle ||= requestAnimationFrame(() => this.work());
@@ -61,8 +61,8 @@ export class Preview {
     if (this.wanted !== this.current) this.begin();
     const until = performance.now() + BUDGET;
     while (this.next < this.count && performance.now() < until) this.more();
-    const { number, paths, met, futures, runs } = this;
-    this.tell({ aim: this.current, number, paths, met, futures: futures.join(""), shares: sharesOf(this.world, runs, 1, this.timing), isDone: this.next >= this.count });
+    const { paths, met, futures, verdicts } = this;
+    this.tell({ paths, met, futures, shares: sharesOf(this.world, verdicts), isDone: this.next >= this.count });
     if (this.next < this.count || this.wanted !== this.current) this.handle = requestAnimationFrame(() => this.work());
   }
 
@@ -90,7 +90,7 @@ export class Preview {
       .map((path) => ({ ...path, from: path.body === this.current.moved?.body ? path.points[0].map((value, i) => value - by[i]) : path.points[0] }));
     this.met = meetingsOf(world, run)[0] ?? null;
     this.timing = { fps: constants.clock, every: constants.every };
-    Object.assign(this, { next: 1, futures: [], runs: [], number: (this.number ?? 0) + 1 });
+    Object.assign(this, { next: 1, futures: "", verdicts: [] });
   }
 
   /** Some more futures, as many as there is time for. */
@@ -105,8 +105,8 @@ export class Preview {
       pathFps: world.fps,
     });
     runs.forEach((run, place) => {
-      this.runs.push(run);
-      this.futures.push(this.lineOf(which[place], run.positions[0]));
+      this.verdicts.push(verdictOf(world, run, which[place], this.timing));
+      this.futures += this.lineOf(which[place], run.positions[0]);
     });
     this.next += which.length;
     const each = (performance.now() - began) / which.length;

@@ -1,4 +1,5 @@
-// The worlds of a result run again, with another aim: the same physics as the server's, by the same engine.
+// The worlds of a result run again, with another aim: the same physics as the server's, by the same engine, but for two
+// things: bodies that overlap part faster, and those that have left the picture may come back into it.
 //
 // `world` is the JSON that a result names as `trajectory.live`, its constants with it. Coordinates are metres right, above
 // the floor and ahead, the camera above their origin. World 0 is the likeliest; the others are those of the ensemble.
@@ -19,8 +20,7 @@ const plus = (a, b) => a.map((value, i) => value + b[i]);
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
 /** How many worlds there are: the likeliest and the ensemble. */
-export const countOf = (world) => Math.max(...world.cameras.axes.concat([world.cameras.focal, world.cameras.height, world.mover.speed])
-  .map((column) => (Array.isArray(column) ? column.length : 1)));
+export const countOf = (world) => world.worlds + 1;
 
 /** The camera of one world. */
 export function cameraOf(world, k) {
@@ -275,12 +275,14 @@ export function runWorlds(R, constants, worlds, { fps, frames, every = 1, isAlon
         for (let n = 0; n < each.numColliders(); n += 1) owner.set(each.collider(n).handle, [k, i]);
       });
       return {
-        course: along ? null : bodies[0].course, bodies, rigid, origin, meetings: [], touching: new Map(), glides: new Set(bodies.flatMap((body, i) => (body.glides && body.starts ? [i] : []))),
+        isGhost: along !== null, course: along ? null : bodies[0].course, bodies, rigid, origin, meetings: [], touching: new Map(), glides: new Set(bodies.flatMap((body, i) => (body.glides && body.starts ? [i] : []))),
         gone: new Set(), moved: new Set(bodies.flatMap((body, i) => (body.starts ? [i] : []))),
         positions: bodies.map((body) => [body.position]), velocities: bodies.map((body) => body.velocity), turns: bodies.map(() => [[0, 0, 0, 1]]),
       };
     });
-    const slow = made.map(({ bodies }) => bodies.map((body) => c.at_rest * body.half_width));
+    // What glides slowly from the start is not at rest.
+    const slowOf = (body) => Math.min(c.at_rest * body.half_width, body.glides && body.starts ? norm(body.velocity) / 2 : Infinity);
+    const slow = made.map(({ bodies }) => bodies.map(slowOf));
     const follow = along && made.map(({ origin }, k) => ({ origin, path: along[k] }));
     let stillSince = 0;
     const rows = Math.floor((frames - 1) / every);
@@ -341,7 +343,7 @@ function meet(made, owner, c, time, first, second, started) {
   world.touching.set(pair, started ? before + 1 : Math.max(0, before - 1));
   if (!started || before) return;
   world.meetings.push({ time, a, b });
-  if (b === null || (!world.moved.has(a) && !world.moved.has(b))) return;
+  if (b === null || (world.isGhost && a === 0) || (!world.moved.has(a) && !world.moved.has(b))) return;
   world.moved.add(a).add(b);
   const [lower, upper] = [world.bodies[a], world.bodies[b]];
   if (time < c.at_start && (standsOn(lower, upper, c.rests) || standsOn(upper, lower, c.rests))) return;
@@ -430,11 +432,35 @@ const pointAlong = (path, place) => {
 const DECIDED = new Set(["touches", "lands", "moves", "tips", "leaves"]);
 const upright = ([x, , z]) => 1 - 2 * (x * x + z * z); // of a quaternion: how far up an upright axis still points
 
-/** When the mover and others first touch, none of what it stands on: [{body, time}], in the order of their times. */
+/** When each body of a world is set in motion, s: {body: time}. */
+function setOff(world, run) {
+  const moving = new Map(world.bodies.flatMap((body, i) => (body.starts || i === 0 ? [[i, 0]] : [])));
+  for (const { a, b, time } of run.meetings) {
+    if (b === null) continue;
+    for (const [one, other] of [[a, b], [b, a]]) if (moving.has(one) && !moving.has(other) && run.moved.has(other)) moving.set(other, time);
+  }
+  return moving;
+}
+
+/** When a body that moves and others first touch, none of what it stands on: [{body, time}], in the order of their times. */
 export function meetingsOf(world, run, subject = 0) {
   const { support } = world.bodies[subject];
-  const others = run.meetings.filter(({ a, b }) => b !== null && (a === subject || b === subject)).map(({ a, b, time }) => ({ body: a === subject ? b : a, time }));
+  const since = subject ? setOff(world, run).get(subject) ?? Infinity : 0;
+  const own = run.meetings.filter(({ a, b, time }) => b !== null && (a === subject || b === subject) && time >= since);
+  const others = own.map(({ a, b, time }) => ({ body: a === subject ? b : a, time }));
   return others.filter(({ body }, place) => body !== support && others.findIndex((each) => each.body === body) === place);
+}
+
+/** Whether the mover of a world began where no picture shows one: inside another body, or beside what carries it. */
+function isMisread(world, run, k) {
+  const [mover] = world.bodies;
+  if (world.bodies.some((body) => body.pieces.length)) return false; // drawings show what touches
+  if (mover.support !== null) {
+    const carrier = world.bodies[mover.support];
+    const [dx, dz] = [0, 2].map((axis) => at(mover.position[axis], k) - at(carrier.position[axis], k));
+    if (Math.hypot(dx, dz) > Math.max(at(carrier.half_width, k), at(carrier.half_depth, k))) return true;
+  }
+  return run.meetings.some(({ a, b, time }) => a === 0 && b !== null && time < world.constants.at_start && b !== mover.support && world.bodies[b].support !== 0);
 }
 
 /** Per body when what is asked happens with it in one world. */
@@ -445,7 +471,7 @@ function timesOf(world, run, k, { fps, every }) {
     const row = path.findIndex(holds);
     return row < 0 ? Infinity : row * step;
   };
-  const meant = (body) => (asked.target !== null ? body === asked.target : asked.among.length ? asked.among.includes(body) : body !== asked.subject && body !== 0);
+  const meant = (body) => (asked.target !== null ? body === asked.target : asked.among.length ? asked.among.includes(body) : body !== asked.subject && body !== 0 && body !== world.bodies[asked.subject].support);
   const { relation, subject } = asked;
   const camera = relation === "leaves" ? cameraOf(world, k) : null;
   const [width, height] = world.size;
@@ -474,21 +500,29 @@ function timesOf(world, run, k, { fps, every }) {
   });
 }
 
-/** What worlds say, `runs` of the worlds `from` and on: {yes, count}, {first, yes, count} where it is asked what is met first; null where they cannot say it. */
-export function sharesOf(world, runs, from, timing) {
+const FIRST_MET = ["which-first", "where", "what-happens"]; // forms of questions that are told apart by what is met first
+
+/** What one world says to the question: the body that is met first (-1: none), or 1 for yes, 0 for no, and 0.5 where it was misread; null where it cannot say. */
+export function verdictOf(world, run, k, timing) {
   const { asked } = world;
-  if (!asked || !DECIDED.has(asked.relation) || asked.form === "how-many" || asked.form === "changes" || !runs.length) return null;
-  const found = runs.map((run, place) => timesOf(world, run, from + place, timing));
-  if (["which-first", "where", "what-happens"].includes(asked.form)) {
-    const firsts = found.map((times) => (Math.min(...times) < Infinity ? times.indexOf(Math.min(...times)) : -1));
-    const counts = new Map();
-    for (const body of firsts) counts.set(body, (counts.get(body) ?? 0) + 1);
-    const [first, yes] = [...counts].sort((a, b) => b[1] - a[1] || b[0] - a[0])[0];
-    return { first, yes, count: runs.length };
-  }
-  const happens = (times) => (asked.every && asked.among.length ? Math.max(...asked.among.map((body) => times[body])) : Math.min(...times)) < Infinity;
-  const yes = found.filter((times) => happens(times) !== asked.negated).length;
-  return { yes, count: runs.length };
+  if (!asked || !DECIDED.has(asked.relation) || asked.form === "how-many" || asked.form === "changes") return null;
+  const times = timesOf(world, run, k, timing);
+  const first = Math.min(...times);
+  if (FIRST_MET.includes(asked.form)) return first < Infinity ? times.indexOf(first) : -1;
+  if (isMisread(world, run, k)) return 0.5;
+  const happens = (asked.every && asked.among.length ? Math.max(...asked.among.map((body) => times[body])) : first) < Infinity;
+  return Number(happens !== asked.negated);
+}
+
+/** What verdicts of worlds come to: {yes, count}, also {first} where it is asked what is met first; null where they say nothing. */
+export function sharesOf({ asked }, verdicts) {
+  if (!verdicts.length || verdicts[0] === null) return null;
+  const count = verdicts.length;
+  if (!FIRST_MET.includes(asked.form)) return { yes: Math.round(verdicts.reduce((sum, value) => sum + value, 0)), count };
+  const counts = new Map();
+  for (const body of verdicts) counts.set(body, (counts.get(body) ?? 0) + 1);
+  const [first, yes] = [...counts].sort((one, other) => other[1] - one[1] || other[0] - one[0])[0];
+  return { first, yes, count };
 }
 
 // --- a path that is drawn

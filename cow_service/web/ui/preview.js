@@ -17,7 +17,7 @@ async function loaded() {
   return { R, Preview };
 }
 
-/** {shown, prepare, aim, end}: what is foreseen of a result while somebody drags; nothing where it has no live worlds. */
+/** {shown, aim, end}: what is foreseen of a result while somebody drags; nothing where it has no live worlds. */
 export function usePreview(simulation) {
   const [shown, show] = useState(null);
   const held = useRef({ preview: null, aim: null, ready: null });
@@ -38,7 +38,7 @@ export function usePreview(simulation) {
     if (!live || mine.ready) return;
     mine.ready = (async () => {
       const [{ R, Preview }, blob] = await Promise.all([loaded(), artifactBlob(live.sha256)]);
-      mine.preview = new Preview(R, JSON.parse(await blob.text()), (found) => held.current === mine && mine.aim && show(found));
+      mine.preview = new Preview(R, JSON.parse(await blob.text()), (found) => held.current === mine && mine.aim && show({ of: simulation.id, ...found }));
       if (mine.aim && held.current === mine) mine.preview.aim(mine.aim);
     })();
     mine.ready.catch((error) => console.warn("No preview:", error)); // the server computes the film all the same
@@ -48,7 +48,7 @@ export function usePreview(simulation) {
     held.current.aim = wanted;
     held.current.preview?.aim(wanted);
   };
-  return { shown, prepare, aim, end, isLive: live !== null };
+  return { shown: shown?.of === simulation?.id ? shown : null, aim, end };
 }
 
 /** The frame of a film of so many that goes on and on. */

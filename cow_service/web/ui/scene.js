@@ -162,17 +162,18 @@ export function Scene({ state }) {
     if (!far) preview.end();
     return far;
   };
-  const dragged = (aim) => {
-    if (aim && simulation) {
-      if (player.playing) player.seek(0);
-      preview.aim(aim);
-    }
-    return false;
+  const foresee = (aim) => {
+    if (!simulation) return;
+    if (player.playing) player.seek(0);
+    preview.aim(aim);
   };
   const bodyOf = (place) => simulation?.trajectory.bodies.findIndex((body) => body.object === corrections.objects[place].object) ?? -1;
 
   const moverMoves = {
-    onMove: (handle, dx, dy) => dragged("all" === handle && { moved: { body: 0, by: [dx, dy] } }) || setDraft({ mover: movedBox(simulation ? corrections.grounding?.bbox ?? simulation.grounding.bbox : corrections.grounding.bbox, handle, dx, dy, size) }),
+    onMove: (handle, dx, dy) => {
+      if (handle === "all") foresee({ moved: { body: 0, by: [dx, dy] } });
+      setDraft({ mover: movedBox(corrections.grounding?.bbox ?? simulation.grounding.bbox, handle, dx, dy, size) });
+    },
     onEnd: (handle, dx, dy) => {
       setDraft(null);
       if (!isFar(dx, dy)) return;
@@ -188,7 +189,10 @@ export function Scene({ state }) {
   };
   const pulled = (place, dx, dy) => pulledPath(base, frames, place, [dx, dy]);
   const ownObject = (place) => ({
-    onMove: (handle, dx, dy) => dragged(handle === "all" && bodyOf(place) > 0 && { moved: { body: bodyOf(place), by: [dx, dy] } }) || setDraft({ object: place, box: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) }),
+    onMove: (handle, dx, dy) => {
+      if (handle === "all" && bodyOf(place) > 0) foresee({ moved: { body: bodyOf(place), by: [dx, dy] } });
+      setDraft({ object: place, box: movedBox(corrections.objects[place].bbox, handle, dx, dy, size) });
+    },
     onEnd: (handle, dx, dy) => {
       setDraft(null);
       if (!isFar(dx, dy)) return;
@@ -227,7 +231,10 @@ export function Scene({ state }) {
         ${editing && corrections.objects.map((object, place) => object.bbox && html`<${BoxHandles} key=${`handles ${place}`} box=${draft?.object === place ? draft.box : object.bbox}
           unit=${unit} name=${object.object} kind="of-own" covered=${covered(object.bbox)} ...${ownObject(place)} />`)}
         ${editing && frames.map((at, place) => html`<${Handle} key=${`way ${place}`} at=${points[at]} unit=${unit} kind="waypoint" label=${`Point ${place + 1} of the path.`}
-          onMove=${(dx, dy) => dragged({ points: pulled(place, dx, dy) }) || setDraft({ points: pulled(place, dx, dy) })}
+          onMove=${(dx, dy) => {
+            foresee({ points: pulled(place, dx, dy) });
+            setDraft({ points: pulled(place, dx, dy) });
+          }}
           onEnd=${(dx, dy) => {
             setDraft(null);
             if (!isFar(dx, dy)) return;
@@ -240,12 +247,13 @@ export function Scene({ state }) {
         ${editing && shownDirection && html`<${Handle} at=${tipOf(origin, shownDirection, size)} unit=${unit} kind="tip" label="Tip of the direction arrow."
           onMove=${(dx, dy) => {
             const aimed = aimedAt(dx, dy);
-            dragged(aimed && { direction: aimed });
+            if (aimed) foresee({ direction: aimed });
             setDraft({ direction: aimed });
           }}
           onEnd=${(dx, dy) => {
             const aimed = aimedAt(dx, dy);
-            if (isFar(dx, dy) && aimed) correct({ motion: motionTowards(simulation, corrections, aimed), trajectory: null });
+            if (!aimed) preview.end();
+            else if (isFar(dx, dy)) correct({ motion: motionTowards(simulation, corrections, aimed), trajectory: null });
             setDraft(null);
           }} />`}
       </svg>

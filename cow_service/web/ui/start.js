@@ -28,14 +28,26 @@ async function takeExample(name, question) {
 
 /** The still of an example, which then moves by itself where that is wanted. */
 function Moving({ name }) {
-  const [plays, setPlays] = useState(false);
+  const [film, setFilm] = useState(null);
   useEffect(() => {
     if (calm()) return undefined;
-    const timer = setTimeout(() => setPlays(true), QUIET);
-    return () => clearTimeout(timer);
+    const state = { url: null, isWanted: true };
+    const timer = setTimeout(async () => {
+      const response = await fetch(exampleAddress(`${name}.mp4`)).catch(() => null); // the still is enough
+      if (!response?.ok) return;
+      const url = URL.createObjectURL(await response.blob()); // of an address of its own Safari wants ranges
+      if (!state.isWanted) return URL.revokeObjectURL(url);
+      state.url = url;
+      setFilm(url);
+    }, QUIET);
+    return () => {
+      clearTimeout(timer);
+      state.isWanted = false;
+      if (state.url) URL.revokeObjectURL(state.url);
+    };
   }, []);
   return html`<span class="moving"><img src=${exampleAddress(`${name}-small.jpg`)} alt="" width="400" height="300" />
-    ${plays && html`<video src=${exampleAddress(`${name}.mp4`)} muted autoplay loop playsinline tabindex="-1" aria-hidden="true"></video>`}</span>`;
+    ${film && html`<video src=${film} muted autoplay loop playsinline tabindex="-1" aria-hidden="true"></video>`}</span>`;
 }
 
 function chosen(event) {
