@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from browser import Windows, arrow_tip, ask, drop, in_window, result, said
+from browser import Windows, arrow_tip, ask, drag_in_picture, drop, in_window, result, said
 from conftest import EXAMPLES, Server
 from live_worlds import LOAD, RUN, given_again
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 from servers import QUESTION, picture
 
 TURNS = (-2.2, -0.7, 0.5)  # radians by which the arrow is turned
@@ -121,7 +122,7 @@ def test_worlds_are_told_only_where_they_are_asked_for_and_can_be_aimed(server: 
 def foretold(page: Page) -> str:
     """What the worlds of the page say, once all have."""
     words = page.locator(".foretold b")
-    expect(words).to_contain_text("50 worlds")
+    expect(words).to_contain_text("of 50 worlds")
     return words.inner_text()
 
 
@@ -138,7 +139,7 @@ def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(se
     page.mouse.down()
     for _, to in pairwise([start, *way]):
         page.mouse.move(*to, steps=4)
-    assert foretold(page).endswith("of 50 worlds: no")
+    assert foretold(page).startswith("No: ")
     assert page.locator(".foreseen .futures").get_attribute("d")
     assert page.locator(".world").count() == 0, "the path before is another future"
     page.mouse.up()
@@ -156,14 +157,14 @@ def test_a_page_that_was_passed_on_computes_without_a_network(server: Server, wi
     file.write_bytes(httpx.get(f"{server.address}/jobs/{job['id']}/download?format=page").content)
     page = windows.open(file.as_uri(), offline=True)
     told = page.get_by_role("status")
-    expect(told).to_have_text("50 of 50 worlds: yes")
+    expect(told).to_have_text("Yes: 50 of 50 worlds")
     tip = page.get_by_role("button").bounding_box()
     assert tip is not None
     x, y = tip["x"] + tip["width"] / 2, tip["y"] + tip["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x - 40, y - 200, steps=5)
-    expect(told).to_have_text("50 of 50 worlds: no")
+    expect(told).to_have_text("No: 50 of 50 worlds")
     page.mouse.up()
 
 
@@ -183,3 +184,49 @@ def test_examples_answer_at_once_what_the_start_page_says(server: Server, window
     page.get_by_role("link", name="Jobs").click()
     row = page.locator(".job", has=page.locator(f"a[href$='{shown}']"))
     expect(row.locator(".answered")).to_have_text(answer)
+
+
+def test_a_drag_is_broken_off_and_belongs_to_its_question(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, picture(33))
+    ask(page, QUESTION)
+    first = result(page)
+    tip = arrow_tip(page)
+    start, end = in_window(page, tip, (93, 10))
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=4)
+    expect(page.locator(".result.faded")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.locator(".foretold")).to_have_count(0)
+    page.mouse.up()
+    assert arrow_tip(page) == tip
+    assert page.locator(".result").get_attribute("data-job") == first
+
+    drag_in_picture(page, tip, (93, 10))
+    dragged = result(page, before=first)
+    expect(page.get_by_text("Asked with your corrections: its motion.")).to_be_visible()
+    ask(page, QUESTION.replace("right", "left"))
+    result(page, before=dragged)
+    expect(page.get_by_text("Asked with your corrections")).to_have_count(0)
+    expect(page.locator(".sentence")).to_contain_text("to the left")
+
+
+def test_a_result_without_frames_ends_what_is_foreseen(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, picture(34))
+    ask(page, QUESTION)
+    first = result(page)
+
+    def without_simulation(route: Route) -> None:
+        found = route.fetch()
+        job = found.json()
+        if job.get("result"):
+            job["result"] |= {"simulation": None, "answer": None}
+        route.fulfill(response=found, json=job)
+
+    page.route(re.compile(r"/jobs/[\w-]+$"), without_simulation)
+    drag_in_picture(page, arrow_tip(page), (94, 10))
+    result(page, before=first)
+    assert said(page) == "Not sure"
+    expect(page.locator(".foretold")).to_have_count(0)

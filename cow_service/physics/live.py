@@ -14,8 +14,8 @@ import numpy as np
 from cow_service.physics import engine, events, lift
 from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.physics.draws import COLUMN, ensemble, likeliest, quantiles
-from cow_service.physics.ensemble import EVERY, Query
-from cow_service.physics.layout import FARTHEST, VEHICLE_WIDTH
+from cow_service.physics.ensemble import EVERY, SURE, SURE_OF_MISS, Query
+from cow_service.physics.layout import FARTHEST
 from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
 from cow_service.vision.types import Floats
 
@@ -47,7 +47,8 @@ CONSTANTS: dict[str, float] = {
     "widest_turn": float(lift.TURNS[-1]),
     "turns": len(lift.TURNS),
     "turn_sigma": math.radians(lift.TURN_SIGMA["request"]),
-    "vehicle_width": VEHICLE_WIDTH,
+    "sure": SURE,
+    "sure_of_miss": SURE_OF_MISS,
     "farthest": FARTHEST,
 }
 """What runs the worlds elsewhere computes with; the names are those of the constants here."""
@@ -56,12 +57,13 @@ CONSTANTS: dict[str, float] = {
 def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, Any] | None:
     """The likeliest world and an ensemble of `size` worlds as JSON values; None of what no drag can change.
 
-    That is what something is put somewhere in, what follows a path or passes through everything, and what does not move
-    along a direction.
+    That is what something is put somewhere in, what follows a path or passes through everything, what does not move
+    along a direction, and what is taken to be as deep as its heading says.
     """
     motion = world.motion
     is_bound = world.placement is not None or world.placed_before or world.prescribed is not None
-    if is_bound or motion.direction is None or motion.speed == 0:
+    has_heading = world.bodies[0].elongated and world.level is None and world.measured is None
+    if is_bound or has_heading or motion.direction is None or motion.speed == 0:
         return None
     draws = likeliest() if size == 0 else np.concatenate([likeliest(), ensemble(size)])
     drawn = DrawnWorlds.of(world, draws, EVERY)
@@ -95,7 +97,6 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
         )
     courses = [shape[0].course for shape in shapes]
     factors = lift.speed_factors(motion, draws, "speed")
-    is_measured = mover.yaw is not None
     return {
         "size": list(world.size),
         "fps": world.fps,
@@ -116,7 +117,6 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
             "stands": mover.stands,
             "rises": motion.rises,
             "is_side_view": world.level is not None,
-            "elongated": world.bodies[0].elongated and world.level is None and not is_measured,
             "seen_half_width": _column(mover.half_width),
             "depth_share": _column(np.broadcast_to(mover.depth_share, len(draws))),
             "direction": list(motion.direction),

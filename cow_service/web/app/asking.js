@@ -134,8 +134,10 @@ const waiting = (status, settings) => ({ job: { id: null, status, progress: 0, s
 
 /** Asks what is on the screen. The job before, if it has not ended, is canceled. */
 export async function ask() {
-  const { picture, question, settings, corrections } = get();
+  const { picture, question, settings, result } = get();
   if (!picture || !question.trim()) return;
+  if (result && result.asked.question !== question) forgetMotion(question);
+  const { corrections } = get();
   const { signal } = begin();
   const asked = { question, settings, corrections };
   set({ run: waiting("sending", settings), problem: null, compared: [] });
@@ -147,11 +149,21 @@ export async function ask() {
   });
 }
 
-/** Ends the job that the page waits for. */
+/** Another question says itself what moves and how: what was corrected of that belongs to the one before. */
+function forgetMotion(question) {
+  const { corrections, past } = get();
+  const { grounding } = corrections;
+  const isOther = grounding?.object && !question.toLowerCase().includes(grounding.object.toLowerCase());
+  if (!corrections.motion && !corrections.trajectory && !isOther) return;
+  const kept = { ...corrections, motion: null, trajectory: null, grounding: isOther ? null : grounding };
+  set({ corrections: kept, past: [...past, corrections].slice(-MOST_UNDONE), future: [] });
+}
+
+/** Ends the job that the page waits for; what is shown is the result before, and what was asked for it. */
 export function cancel() {
-  const { run } = get();
+  const { run, result } = get();
   if (run?.job.id) void cancelJob(run.job.id);
-  set({ run: null });
+  set({ run: null, ...(result ? { corrections: result.asked.corrections } : {}) });
   begin();
 }
 

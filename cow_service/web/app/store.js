@@ -48,6 +48,7 @@ let state = {
   result: null, // {jobId, kind, answer, simulation, settings, asked} of the last job that succeeded
   before: null, // the result before that one, of the same picture
   compared: [], // what stands beside the result: by another reader or generator, or the one before
+  isForeseeing: false, // somebody drags: the result is that of another world
   problem: null,
   away: false,
   keyWanted: null, // {reason, answer}

@@ -51,10 +51,12 @@ export function encounterWords(encounter, trajectory) {
   return `${who}${MEETS[encounter.kind] ?? encounter.kind} ${encounter.object}${sure}`;
 }
 
-/** What most of so many worlds say: {yes, count}, and `first` where it is asked what is met first. */
-export function shareWords({ yes, count, first }, trajectory) {
-  if (first !== undefined) return `${yes} of ${plural(count, "world")}: ${first < 0 ? "nothing is met" : `${trajectory.bodies[first]?.object ?? "it"} first`}`;
-  return 2 * yes >= count ? `${yes} of ${plural(count, "world")}: yes` : `${count - yes} of ${plural(count, "world")}: no`;
+/** What so many worlds say: {agreeing, text} of {yes, count, isSure}, and `first` where it is asked what is met first. */
+export function shareWords({ yes, count, first, isSure }, trajectory) {
+  const agreeing = first === undefined ? Math.max(yes, count - yes) : yes;
+  const name = first === undefined ? (2 * yes >= count ? "Yes" : "No") : first < 0 ? "Nothing" : trajectory.bodies[first]?.object ?? "It";
+  const says = `${agreeing} of ${plural(count, "world")}`;
+  return { agreeing, text: isSure ? `${name}: ${says}` : `Not sure: ${says} say ${name.toLowerCase()}` };
 }
 
 /** The time of a job, for people. */

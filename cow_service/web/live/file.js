@@ -46,8 +46,9 @@ export async function show(world, load, wasm) {
     if (!now.shares && isAimed) {
       told.textContent = now.met ? `It meets the ${world.bodies[now.met.body].name} first.` : "It meets nothing.";
     } else if (now.shares) {
-      const meter = Object.assign(document.createElement("meter"), { min: 0, max: now.shares.count, value: now.shares.yes });
-      told.replaceChildren(meter, shareWords(now.shares, trajectory));
+      const { agreeing, text } = shareWords(now.shares, trajectory);
+      const meter = Object.assign(document.createElement("meter"), { min: 0, max: now.shares.count, value: agreeing });
+      told.replaceChildren(meter, text);
     }
   });
   const draw = (to) => {

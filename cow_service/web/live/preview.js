@@ -83,10 +83,9 @@ export class Preview {
     const [run] = runWorlds(R, constants, [this.bodies(0)], { fps, frames, isAlone: true, along: along && [along] });
     const camera = cameraOf(world, 0);
     const by = this.current.moved?.by ?? [0, 0];
-    const startOf = (body) => (body ? null : this.current.moved?.body === 0 ? [world.mover.start[0] + by[0], world.mover.start[1] + by[1]] : world.mover.start);
     const bodies = [...new Set([0, ...run.moved])];
     // `from` is where the picture shows it.
-    this.paths = bodies.map((body) => ({ body, sprite: world.bodies[body].sprite, ...seen(camera, run.positions[body], world.bodies[body].shape === "sphere" ? null : run.turns[body], startOf(body)) }))
+    this.paths = bodies.map((body) => ({ body, sprite: world.bodies[body].sprite, ...seen(camera, run.positions[body], world.bodies[body].shape === "sphere" ? null : run.turns[body], body ? null : world.mover.start) }))
       .map((path) => ({ ...path, from: path.body === this.current.moved?.body ? path.points[0].map((value, i) => value - by[i]) : path.points[0] }));
     this.met = meetingsOf(world, run)[0] ?? null;
     this.timing = { fps: constants.clock, every: constants.every };

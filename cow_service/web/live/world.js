@@ -157,15 +157,6 @@ export function bodiesOf(world, k, { direction = null, moved = null } = {}) {
     const mover = bodies[0];
     mover.velocity = velocityOf(world, k, bodies, direction);
     if (mover.course) mover.course.legs[0].velocity = mover.velocity;
-    const [x, , z] = mover.velocity;
-    const fast = Math.hypot(x, z);
-    if (world.mover.elongated && fast > 0) { // longer along its heading than across, as wide as it is seen
-      const ratio = world.constants.vehicle_width;
-      const away = Math.hypot(mover.position[0], mover.position[2]);
-      const along = Math.abs(x * mover.position[0] + z * mover.position[2]) / away / fast;
-      const length = mover.seen / (Math.sqrt(Math.max(0, 1 - along * along)) + ratio * along);
-      Object.assign(mover, { half_width: length, half_depth: ratio * length, yaw: -Math.atan2(z, x) });
-    }
   }
   return bodies;
 }
@@ -514,15 +505,20 @@ export function verdictOf(world, run, k, timing) {
   return Number(happens !== asked.negated);
 }
 
-/** What verdicts of worlds come to: {yes, count}, also {first} where it is asked what is met first; null where they say nothing. */
-export function sharesOf({ asked }, verdicts) {
+/** What verdicts of worlds come to: {yes, count, isSure}, also {first} where it is asked what is met first; null where they say nothing. */
+export function sharesOf({ asked, mover, constants: c }, verdicts) {
   if (!verdicts.length || verdicts[0] === null) return null;
   const count = verdicts.length;
-  if (!FIRST_MET.includes(asked.form)) return { yes: Math.round(verdicts.reduce((sum, value) => sum + value, 0)), count };
+  const sureOfMiss = mover.kind === "projectile" && mover.depth_sigma > 0 ? c.sure_of_miss : c.sure; // nobody tells its heading
+  if (!FIRST_MET.includes(asked.form)) {
+    const yes = verdicts.reduce((sum, value) => sum + value, 0);
+    const isHit = asked.negated ? 2 * yes < count : 2 * yes >= count;
+    return { yes: Math.round(yes), count, isSure: Math.max(yes, count - yes) >= (isHit ? c.sure : sureOfMiss) * count };
+  }
   const counts = new Map();
   for (const body of verdicts) counts.set(body, (counts.get(body) ?? 0) + 1);
   const [first, yes] = [...counts].sort((one, other) => other[1] - one[1] || other[0] - one[0])[0];
-  return { first, yes, count };
+  return { first, yes, count, isSure: yes >= (first < 0 ? sureOfMiss : c.sure) * count };
 }
 
 // --- a path that is drawn

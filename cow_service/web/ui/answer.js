@@ -78,7 +78,7 @@ export function Result({ state }) {
   const warnings = answer?.simulation_problem ? [] : (answer ?? simulation).warnings;
   const baseline = answer?.baseline && html`<${Verdict} title="Without imagination" verdict=${answer.baseline} kind="baseline" />`;
   const isCompared = answer && differs(answer);
-  return html`<section class=${run ? "result old" : "result"} aria-label="Result" aria-busy=${Boolean(run)} data-job=${result.jobId}>
+  return html`<section class=${`result ${run ? "old" : ""} ${state.isForeseeing && !run ? "faded" : ""}`} aria-label="Result" aria-busy=${Boolean(run)} data-job=${result.jobId}>
     ${run && html`<p class="hint">Of the request before:</p>`}
     ${answer && html`<${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />`}
     ${simulation && html`${!answer && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p>`}

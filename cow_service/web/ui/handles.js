@@ -25,6 +25,15 @@ export function useDrag(unit, onMove, onEnd) {
       event.stopPropagation();
       event.currentTarget.setPointerCapture(event.pointerId);
       drag.current = pointIn(event.currentTarget.ownerSVGElement, event);
+      const target = event.currentTarget;
+      const breakOff = (key) => {
+        if (key.key !== "Escape" || !drag.current) return;
+        drag.current = null;
+        target.blur();
+        latest.current.onEnd(0, 0);
+      };
+      addEventListener("keydown", breakOff);
+      target.addEventListener("lostpointercapture", () => removeEventListener("keydown", breakOff), { once: true });
     },
     onPointerMove(event) {
       if (!drag.current) return;
@@ -45,6 +54,11 @@ export function useDrag(unit, onMove, onEnd) {
     },
     onKeyDown(event) {
       const step = KEYS[event.key];
+      if (event.key === "Escape" && (keys.current.dx || keys.current.dy)) {
+        clearTimeout(keys.current.timer);
+        keys.current = { dx: 0, dy: 0, timer: 0 };
+        latest.current.onEnd(0, 0);
+      }
       if (!step) return;
       event.preventDefault();
       event.stopPropagation();

@@ -17,7 +17,7 @@ async function loaded() {
   return { R, Preview };
 }
 
-/** {shown, aim, end}: what is foreseen of a result while somebody drags; nothing where it has no live worlds. */
+/** {shown, prepare, aim, end, isLive}: what is foreseen of a result while somebody drags; nothing where it has no live worlds. */
 export function usePreview(simulation) {
   const [shown, show] = useState(null);
   const held = useRef({ preview: null, aim: null, ready: null });
@@ -48,7 +48,7 @@ export function usePreview(simulation) {
     held.current.aim = wanted;
     held.current.preview?.aim(wanted);
   };
-  return { shown: shown?.of === simulation?.id ? shown : null, aim, end };
+  return { shown: shown?.of === simulation?.id ? shown : null, prepare, aim, end, isLive: live !== null };
 }
 
 /** The frame of a film of so many that goes on and on. */
@@ -92,9 +92,10 @@ export function Foreseen({ shown, trajectory }) {
   </g>`;
 }
 
-/** What the futures say so far, as a bar and in words. */
+/** What the futures say so far, as a bar and in words; `shown` is null where only the server can tell. */
 export function Foretold({ shown, trajectory }) {
-  const { shares, isDone } = shown;
-  return html`<p class="foretold" role="status">${shares ? html`<meter min="0" max=${shares.count} value=${shares.yes}></meter> <b>${shareWords(shares, trajectory)}</b>`
-    : html`<b>${isDone ? "Let go, and the server tells what happens." : "…"}</b>`}</p>`;
+  if (shown && !shown.shares && !shown.isDone) return null;
+  const words = shown?.shares && shareWords(shown.shares, trajectory);
+  return html`<p class="foretold" role="status">${words ? html`<meter min="0" max=${shown.shares.count} value=${words.agreeing}></meter> <b>${words.text}</b>`
+    : html`<b>Let go, and the server tells what happens.</b>`}</p>`;
 }

@@ -78,7 +78,9 @@ export function Scene({ state }) {
     if (hasSight && picture.blob) void prepare(picture); // that of an opened job is sent once it is needed
   }, [picture.url, hasSight]);
   useEffect(() => light(null), [isSeeing]);
-  useEffect(() => void (state.run || preview.end()), [state.run]); // no other film will come
+  useEffect(() => void (state.run || draft || preview.end()), [state.run]); // no other film will come
+  useEffect(() => void (draft?.direction && foresee({ direction: draft.direction })), [simulation?.id]); // still in somebody's hand
+  useEffect(() => set({ isForeseeing: shown !== null }), [shown !== null]);
 
   const camera = simulation?.trajectory.camera ? { ...simulation.trajectory.camera, ...corrections.camera } : null;
   const isTakenShown = taken?.light && taken.mask === corrections.grounding?.mask && !draft?.mover && (!simulation || state.run);
@@ -144,6 +146,7 @@ export function Scene({ state }) {
     },
     onPointerCancel: () => setDraft(null),
     onPointerDownCapture: (event) => (pressed.current = [event.clientX, event.clientY]),
+    onPointerEnter: preview.prepare,
     onPointerLeave: () => isSeeing && light(null),
     async onClick(event) {
       const [x, y] = pressed.current;
@@ -171,7 +174,6 @@ export function Scene({ state }) {
 
   const moverMoves = {
     onMove: (handle, dx, dy) => {
-      if (handle === "all") foresee({ moved: { body: 0, by: [dx, dy] } });
       setDraft({ mover: movedBox(corrections.grounding?.bbox ?? simulation.grounding.bbox, handle, dx, dy, size) });
     },
     onEnd: (handle, dx, dy) => {
@@ -222,7 +224,7 @@ export function Scene({ state }) {
         ${simulation && shown && html`<${Foreseen} shown=${shown} trajectory=${simulation.trajectory} />`}
         ${simulation && !shown && html`<${Moment} simulation=${simulation} frame=${player.frame} unit=${unit} layers=${layers} cutout=${cutout?.cutout} />`}
         ${layers.names && html`<${Labels} labels=${labels} unit=${unit} size=${size} />`}
-        ${shownDirection && !player.playing && html`<${Arrow} from=${origin} direction=${shownDirection} size=${size} unit=${unit} />`}
+        ${shownDirection && html`<${Arrow} from=${origin} direction=${shownDirection} size=${size} unit=${unit} />`}
         ${origin && !player.playing && html`<circle class="point" cx=${origin[0]} cy=${origin[1]} r=${3.5 * unit} />`}
         ${draft?.from && draft.tool === "direction" && draft.direction && !origin && html`<${Arrow} from=${draft.from} direction=${draft.direction} size=${size} unit=${unit} />`}
         ${draft?.from && draft.box && html`<${Rect} box=${draft.box} kind=${draft.tool === "mover" ? "mover" : "own"} />`}
@@ -244,7 +246,7 @@ export function Scene({ state }) {
               trajectory: { points: pulled(place, dx, dy), fps: simulation.trajectory.fps },
             });
           }} />`)}
-        ${editing && shownDirection && html`<${Handle} at=${tipOf(origin, shownDirection, size)} unit=${unit} kind="tip" label="Tip of the direction arrow."
+        ${tool === "select" && shownDirection && html`<${Handle} at=${tipOf(origin, shownDirection, size)} unit=${unit} kind="tip" label="Tip of the direction arrow."
           onMove=${(dx, dy) => {
             const aimed = aimedAt(dx, dy);
             if (aimed) foresee({ direction: aimed });
@@ -257,7 +259,7 @@ export function Scene({ state }) {
             setDraft(null);
           }} />`}
       </svg>
-      ${shown && html`<${Foretold} shown=${shown} trajectory=${simulation.trajectory} />`}
+      ${(shown || (simulation && draft && !draft.from && !preview.isLive)) && html`<${Foretold} shown=${shown} trajectory=${simulation.trajectory} />`}
     </div>
     ${layers.floor && camera && html`<${FloorLine} camera=${camera} corrections=${corrections} />`}
     ${pending && html`<${NameForm} onName=${(name) => {

@@ -25,8 +25,10 @@ const LAYER_HINTS = {
 };
 
 /** What to do now. `isSeeing`: what is clicked is outlined by the server. */
-function hintOf({ tool, lit }, isSeeing) {
-  if (!isSeeing) return tool === "select" ? null : TOOLS.find(([name]) => name === tool)[2];
+function hintOf({ tool, lit, result }, isSeeing) {
+  if (!isSeeing && tool === "select" && !result?.simulation) return "Ask what would happen; then drag the arrow, and the world answers.";
+  if (!isSeeing && tool === "select") return result.simulation.trajectory.live ? "Drag the tip of the arrow: the world answers at once." : "Drag boxes, or points of the path, where something was misread.";
+  if (!isSeeing) return TOOLS.find(([name]) => name === tool)[2];
   if (lit?.others) return `Click again for another of the ${lit.others + 1} things that lie here within each other.`;
   return lit && !lit.things.length ? "No clear outline here: draw a box." : CLICKS[tool];
 }
