@@ -2,7 +2,9 @@
 
 import { bodiesOf, cameraOf, countOf, meetingsOf, positionsAlong, runWorlds, sharesOf, verdictOf } from "./world.js";
 
-const BUDGET = 6; // ms of futures in a frame of the screen, beside the likeliest world
+const [BUDGET, PAUSED_BUDGET] = [9, 14]; // ms of work in a frame of the screen while the aim changes, and while it does not
+const MOST_AT_ONCE = 16; // worlds
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const NEAREST = 0.08; // of its first depth: closer than this, a body has passed the camera
 const FUTURE_STEP = 2; // recorded positions between two points of a future's line
 const BEYOND = 0.3; // of the image: a line ends so far outside
@@ -40,7 +42,7 @@ function seen(camera, positions, turns, start) {
 export class Preview {
   /** `world` as a result has it; `tell` hears what is known so far: {paths, met, futures, shares, isDone}. */
   constructor(R, world, tell) {
-    Object.assign(this, { R, world, tell, count: countOf(world), wanted: null, current: null, batch: 4, handle: 0 });
+    Object.assign(this, { R, world, tell, count: countOf(world), wanted: null, current: null, each: 2, handle: 0 });
   }
 
   /** Takes an aim: {direction}, {moved: {body, by}}, {points} of a path, or {} for the worlds as they are; the latest counts. */
@@ -58,9 +60,10 @@ export class Preview {
   work() {
     this.handle = 0;
     if (this.wanted === null) return;
-    if (this.wanted !== this.current) this.begin();
-    const until = performance.now() + BUDGET;
-    while (this.next < this.count && performance.now() < until) this.more();
+    const isNew = this.wanted !== this.current;
+    const until = performance.now() + (isNew ? BUDGET : PAUSED_BUDGET);
+    if (isNew) this.begin();
+    for (let left = until - performance.now(); this.next < this.count && left > this.each; left = until - performance.now()) this.more(left);
     const { paths, met, futures, verdicts } = this;
     this.tell({ paths, met, futures, shares: sharesOf(this.world, verdicts), isDone: this.next >= this.count });
     if (this.next < this.count || this.wanted !== this.current) this.handle = requestAnimationFrame(() => this.work());
@@ -93,10 +96,10 @@ export class Preview {
   }
 
   /** Some more futures, as many as there is time for. */
-  more() {
+  more(left) {
     const { R, world, next } = this;
     const { constants, horizon } = world;
-    const which = Array.from({ length: Math.min(this.batch, this.count - next) }, (_, i) => next + i);
+    const which = Array.from({ length: clamp(Math.floor(left / this.each), 1, Math.min(MOST_AT_ONCE, this.count - next)) }, (_, i) => next + i);
     const began = performance.now();
     const along = this.current.points ? which.map((k) => this.along(k)) : null;
     const runs = runWorlds(R, constants, which.map((k) => this.bodies(k)), {
@@ -108,8 +111,7 @@ export class Preview {
       this.futures += this.lineOf(which[place], run.positions[0]);
     });
     this.next += which.length;
-    const each = (performance.now() - began) / which.length;
-    this.batch = Math.max(1, Math.min(10, Math.floor(BUDGET / Math.max(each, 0.1))));
+    this.each = Math.min(BUDGET / 2, (performance.now() - began) / which.length); // ms for a world
   }
 
   lineOf(k, positions) {
