@@ -25,10 +25,10 @@ RUN --mount=type=cache,target=/root/.cache/pip \
 COPY pyproject.toml hatch_build.py README.md LICENSE ./
 COPY models models
 COPY prompts prompts
-COPY examples/ball-and-mug/image.jpg examples/ball-and-mug/
-COPY examples/falling-ball/image.jpg examples/falling-ball/
-COPY examples/bottle-passes-cylinder/image.jpg examples/bottle-passes-cylinder/
-COPY examples/thrown-ball/image.jpg examples/thrown-ball/
+COPY examples/ball-and-mug/image.jpg examples/ball-and-mug/film.mp4 examples/ball-and-mug/
+COPY examples/falling-ball/image.jpg examples/falling-ball/film.mp4 examples/falling-ball/
+COPY examples/bottle-passes-cylinder/image.jpg examples/bottle-passes-cylinder/film.mp4 examples/bottle-passes-cylinder/
+COPY examples/thrown-ball/image.jpg examples/thrown-ball/film.mp4 examples/thrown-ball/
 COPY cow_service cow_service
 RUN pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /wheels /src \
     && pip --python /opt/cow/bin/python install --no-cache-dir --no-deps --no-index /wheels/*.whl

@@ -7,10 +7,11 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http import HTTPStatus
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Response, expect, sync_playwright
 
 REQUIRED = "COW_TEST_BROWSER"  # set where a missing browser is a fault and not a reason to skip
 HOW_TO_GET_IT = "chromium is not installed: apt-get install --no-install-recommends chromium"
@@ -46,7 +47,8 @@ class Windows:
     def __init__(self, browser: Browser) -> None:
         self._browser = browser
         self._contexts: list[BrowserContext] = []
-        self._faults: list[str] = []
+        self._faults: list[tuple[str, str]] = []  # words, and the address
+        self._twice: set[str] = set()  # what the browser deleted again, after its connection had been closed
 
     def __enter__(self) -> Windows:
         return self
@@ -54,8 +56,9 @@ class Windows:
     def __exit__(self, failed: object, *_: object) -> None:
         for context in self._contexts:
             context.close()
-        if failed is None and self._faults:
-            pytest.fail("Errors in the browser:\n" + "\n".join(self._faults))
+        faults = [f"{words} ({url})" for words, url in self._faults if url not in self._twice]
+        if failed is None and faults:
+            pytest.fail("Errors in the browser:\n" + "\n".join(faults))
 
     def open(self, address: str, width: int = WIDE, requests_fail: bool = False, **options: Any) -> Page:
         """A page. `requests_fail`: the test has the server refuse something, which chromium logs as an error."""
@@ -66,10 +69,15 @@ class Windows:
 
         def logged(message: ConsoleMessage) -> None:
             if message.type == "error" and not (requests_fail and message.text.startswith(FAILED_REQUEST)):
-                self._faults.append(f"{message.text} ({message.location['url']})")
+                self._faults.append((message.text, message.location["url"]))
+
+        def answered(response: Response) -> None:
+            if response.request.method == "DELETE" and response.status == HTTPStatus.NOT_FOUND:
+                self._twice.add(response.url)
 
         context.on("console", logged)
-        context.on("weberror", lambda error: self._faults.append(str(error.error)))
+        context.on("weberror", lambda error: self._faults.append((str(error.error), "")))
+        context.on("response", answered)
         page = context.new_page()
         page.goto(address)
         return page

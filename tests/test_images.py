@@ -418,7 +418,7 @@ def test_encode_png_of_a_mask():
     np.testing.assert_array_equal(decode_own(encode_png(mask)), np.where(mask, 255, 0)[..., None].repeat(3, axis=2))
 
 
-@pytest.mark.parametrize("shape", [(4,), (4, 4, 4), (0, 4, 3)])
+@pytest.mark.parametrize("shape", [(4,), (4, 4, 5), (0, 4, 3)])
 def test_encode_png_refuses_other_shapes(shape):
     with pytest.raises(ValueError, match=r"cannot be encoded: give"):
         encode_png(np.zeros(shape, np.uint8))

@@ -129,6 +129,7 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "fps": ({}, 16, 24),
     "seed": ({}, 0, 1),
     "video": ({}, False, True),
+    "live": ({}, False, True),
     "frames.policy": ({"frames": {"count": 3}}, "initial", "uniform"),
     "frames.count": ({}, 1, 2),
     "frames.indices": ({}, [1], [2]),

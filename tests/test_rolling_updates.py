@@ -112,7 +112,7 @@ def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
     with Served(tmp_path, **address) as new:
         assert new.job(finished)["result"]["trajectory"]["law"] == "ballistic"
         assert new.ended(waiting)["status"] == "succeeded"
-        assert old.read(sa.select(SCHEMAS.c.version, SCHEMAS.c.oldest_serving)) == [(2, 1)]
+        assert old.read(sa.select(SCHEMAS.c.version, SCHEMAS.c.oldest_serving)) == [(schema.SCHEMA, 1)]
         # The older server goes on: what it writes is served here, and what is computed here it can read.
         later = write_old(old, image)
         assert new.ended(later)["status"] == "succeeded"
@@ -187,6 +187,8 @@ def hurry(connection: psycopg.Connection[Any], _: object) -> None:
 def test_an_index_that_must_wait_for_too_long_keeps_no_server_from_starting(tmp_path: Path) -> None:
     with postgres_server() as url, closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))) as old:
         with_old_tables(old)
+        with old.transaction() as connection:  # a new column has to wait for a backup, and the server with it
+            connection.execute(sa.text("ALTER TABLE cow_jobs ADD COLUMN answer TEXT, ADD COLUMN given TEXT"))
         with old.engine.connect() as backup:
             backup.execution_options(isolation_level="REPEATABLE READ").execute(sa.text("SELECT * FROM cow_jobs"))
             other = Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))
@@ -236,7 +238,7 @@ def test_a_server_that_is_too_old_says_so(tmp_path: Path, migrate: str) -> None:
         set_schema(database, 9, 8)
         told = cow("serve", "--port", "0", **own)
         assert told.returncode == 1
-        assert "of a later version of COW (schema 9), on whose tables this one (schema 2) cannot serve" in told.stderr
+        assert f"(schema 9), on whose tables this one (schema {schema.SCHEMA}) cannot serve" in told.stderr
         assert "Traceback" not in told.stderr
         assert "dbos_migrations" not in sa.inspect(database.engine).get_table_names()
 

@@ -25,6 +25,7 @@ from starlette.types import Message
 
 from cow_service.api.app import create_app
 from cow_service.api.middleware.access import Origins, hash_of
+from cow_service.errors import install_line
 from cow_service.jobs.engine import JobEngine
 from cow_service.observability import logging as context
 from cow_service.observability import logging as logs
@@ -473,7 +474,7 @@ def test_without_a_collector_the_sdk_is_not_imported() -> None:
     [
         ({"OTEL_EXPORTER_OTLP_ENDPOINT": "collector:4318"}, "OTEL_EXPORTER_OTLP_ENDPOINT must begin with http"),
         ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"}, "http/protobuf only"),
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c"}, r'pip install "cow-service\[otel\]"'),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c"}, re.escape(install_line("otel"))),
     ],
 )
 def test_traces_that_cannot_be_sent_stop_the_start(

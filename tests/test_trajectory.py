@@ -15,7 +15,7 @@ from runs import run_of
 from cow_service.records import Grounding, LocatedObject, ObjectPrior, Trajectory
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
-from cow_service.stages.reconstruction import Situation
+from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.trajectory import compute_trajectory, simulate_world
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.scene import Obstacle, Scene
@@ -243,7 +243,8 @@ def seen(mover, others, prior: ObjectPrior | None = None, **request: Any) -> Tra
     grounding = Grounding(object="ball", bbox=mover, point=middle, prior=prior, others=tuple(named), source="request")
     SEEN.preset_mask(mover, lambda: masked(mover).full())
     obstacles = [Obstacle(other.object, other.bbox, masked(other.bbox)) for other in named]
-    return simulate_world(Situation(SEEN, grounding, read_motion(run, grounding, None).value, run.request, obstacles))
+    situation = Situation(SEEN, grounding, read_motion(run, grounding, None).value, run.request, obstacles)
+    return simulate_world(situation, *reconstruct(situation))
 
 
 BAD: dict[str, dict[str, Any]] = {
