@@ -151,7 +151,7 @@ def test_a_page_has_live_worlds_or_says_how_to_get_them(served: Served, answered
     job = served.ended(served.submit(BODY | asked)["id"])
     page = served.http.get(f"/jobs/{job['id']}/download?format=page")
     assert page.headers["content-disposition"] == f'attachment; filename="cow-{job["id"]}.html"'
-    assert "Will &lt;/script&gt; &lt;b&gt;it&lt;/b&gt; hit?" in page.text
+    assert "Will &lt;/script&gt; &lt;b&gt;it&lt;/b&gt; hit? (Asked of another direction: to the right.)" in page.text
     text = page.text.lower()
     assert text.count("</script") == text.count("<script ") == page.text.count("<script "), "no text ends its script"
     (world,) = re.findall(r'id="world">(.*?)</script>', page.text)

@@ -48,8 +48,8 @@ class Told:
     shown: int  # the frame of the still
 
     @staticmethod
-    def of(result: Simulation | Answer, simulation: Simulation) -> Told:
-        """Of a job's result and its simulation, which has a video."""
+    def of(result: Simulation | Answer, simulation: Simulation, given: str) -> Told:
+        """Of a job's result and its simulation; `given` is the direction in words, where not the question tells it."""
         trajectory, width = simulation.trajectory, simulation.image.width
         outcome, path = trajectory.outcome, trajectory.paths[0]
         share = None if outcome is None or not trajectory.ensemble else outcome.probability
@@ -58,7 +58,7 @@ class Told:
         seen = path.points[: path.visible.index(False)] if False in path.visible else path.points
         met = [each.first_frame for each in trajectory.encounters]
         return Told(
-            question=result.question,
+            question=f"{result.question} (Asked of another direction: {given}.)" if given else result.question,
             verdict=verdict_of(result) or simulation.motion.sentence,
             worlds=trajectory.ensemble,
             agreeing=agreeing,

@@ -13,7 +13,9 @@ import numpy as np
 
 from cow_service.physics import engine, events, lift
 from cow_service.physics.ballistic import GRAVITY, Course
+from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import COLUMN, ensemble, likeliest, quantiles
+from cow_service.physics.engine import RigidShape
 from cow_service.physics.ensemble import EVERY, SURE, SURE_OF_MISS, Query
 from cow_service.physics.layout import FARTHEST
 from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
@@ -69,32 +71,6 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
     drawn = DrawnWorlds.of(world, draws, EVERY)
     layout, shapes = drawn.layout, drawn.shapes(slice(0, len(draws)))
     cameras, mover = layout.cameras, layout.bodies[0]
-
-    def column(name: str, index: int) -> Any:
-        return _column(np.array([getattr(shape[index], name) for shape in shapes], np.float64))
-
-    measures = ("half_width", "half_depth", "half_height", "yaw", "density", "friction", "restitution", "base", "waist")
-    bodies: list[dict[str, Any]] = []
-    for index, seen in enumerate(world.bodies):
-        first, starts = shapes[0][index], [shape[index] for shape in shapes]
-        positions = np.array([shape.position for shape in starts])
-        bodies.append(
-            {
-                "name": seen.name,
-                "bbox": list(seen.bbox),
-                "shape": first.shape,
-                **{name: column(name, index) for name in measures},
-                "middle": None if first.middle is None else column("middle", index),
-                "position": [_column(positions[:, axis]) for axis in range(3)],
-                "velocity": [_column(np.array([shape.velocity[axis] for shape in starts])) for axis in range(3)],
-                "starts": first.starts,
-                "glides": first.glides,
-                "falls": first.falls,
-                "fixed": first.fixed,
-                "pieces": [np.round(corners, DIGITS).tolist() for corners in first.pieces],
-                "support": layout.supports[index],
-            }
-        )
     courses = [shape[0].course for shape in shapes]
     factors = lift.speed_factors(motion, draws, "speed")
     return {
@@ -109,7 +85,9 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
             "axes": [_column(cameras.axes.reshape(len(draws), 9)[:, place]) for place in range(9)],
             "height": _column(cameras.height),
         },
-        "bodies": bodies,
+        "bodies": [
+            _body(seen, [shape[i] for shape in shapes], layout.supports[i]) for i, seen in enumerate(world.bodies)
+        ],
         "mover": {
             "start": list(world.bodies[0].start),
             "foot": list(world.bodies[0].foot),
@@ -132,6 +110,29 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
     }
 
 
+MEASURES = "half_width", "half_depth", "half_height", "yaw", "density", "friction", "restitution", "base", "waist"
+
+
+def _body(seen: SeenBody, starts: list[RigidShape], support: int | None) -> dict[str, Any]:
+    """A body as each world has it at the start."""
+    first = starts[0]
+    return {
+        "name": seen.name,
+        "bbox": list(seen.bbox),
+        "shape": first.shape,
+        **{name: _column([getattr(start, name) for start in starts]) for name in MEASURES},
+        "middle": None if first.middle is None else _column([start.middle or 0.0 for start in starts]),
+        "position": [_column([start.position[axis] for start in starts]) for axis in range(3)],
+        "velocity": [_column([start.velocity[axis] for start in starts]) for axis in range(3)],
+        "starts": first.starts,
+        "glides": first.glides,
+        "falls": first.falls,
+        "fixed": first.fixed,
+        "pieces": [np.round(corners, DIGITS).tolist() for corners in first.pieces],
+        "support": support,
+    }
+
+
 def _course(courses: list[Course]) -> dict[str, Any] | None:
     """What the mover does until it meets something, where it has several legs or an end; null: a leg goes on."""
     if not courses:
@@ -141,8 +142,8 @@ def _course(courses: list[Course]) -> dict[str, Any] | None:
         "halts": courses[0].halts,
         "legs": [
             {
-                "duration": None if math.isinf(leg[0].duration) else _column(np.array([each.duration for each in leg])),
-                "velocity": [_column(np.array([each.velocity[axis] for each in leg])) for axis in range(3)],
+                "duration": None if math.isinf(leg[0].duration) else _column([each.duration for each in leg]),
+                "velocity": [_column([each.velocity[axis] for each in leg]) for axis in range(3)],
             }
             for leg in legs
         ],
@@ -154,7 +155,7 @@ def _asked(query: Query) -> dict[str, Any]:
     return asked | {"target": query.target, "subject": query.subject, "among": list(query.among)}
 
 
-def _column(values: Floats) -> Any:
+def _column(values: Floats | list[float]) -> Any:
     """One value where all are the same, else a list of them."""
-    rounded = [float(f"{value:.{DIGITS}g}") for value in values.tolist()]
+    rounded = [float(f"{value:.{DIGITS}g}") for value in np.asarray(values, np.float64).tolist()]
     return rounded[0] if len(set(rounded)) == 1 else rounded

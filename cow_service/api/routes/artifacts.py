@@ -31,6 +31,7 @@ from cow_service.media.artifacts import extension_of
 from cow_service.media.images import decode
 from cow_service.media.share import Told, card, film, page
 from cow_service.media.video import animation
+from cow_service.narration import direction_words
 from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
 
 CACHE_CONTROL = "max-age=31536000, immutable"  # bytes never change under their digest
@@ -154,6 +155,13 @@ def make_zip(engine: JobEngine, job_id: str, owner: str | None) -> tuple[FilePat
         return path, stack.pop_all().close
 
 
+def _told(result: Simulation | Answer, simulation: Simulation) -> Told:
+    """What is told of a result. A question beside a motion that was given instead of it would be another one."""
+    motion = simulation.motion
+    given = direction_words(motion.direction, motion.depth) if motion.source == "request" else ""
+    return Told.of(result, simulation, given)
+
+
 SHARED = {"film": film, "card": card}  # with words of the result; other formats are of the video alone
 
 
@@ -174,7 +182,7 @@ def make_file(engine: JobEngine, job_id: str, owner: str | None, wanted: str) ->
     video = engine.service.artifacts.read(simulation.video.sha256)
     with engine.service.cpu.held():
         if wanted in SHARED:
-            return SHARED[wanted](video, Told.of(result, simulation))
+            return SHARED[wanted](video, _told(result, simulation))
         return animation(video, wanted)
 
 
@@ -188,7 +196,7 @@ def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simula
         )
     with engine.service.cpu.held():
         image = decode(read(simulation.image.sha256), max_megapixels=math.inf).pixels
-        return page(image, read(live.sha256).decode(), simulation, Told.of(result, simulation))
+        return page(image, read(live.sha256).decode(), simulation, _told(result, simulation))
 
 
 def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[Job, Simulation | Answer]:
