@@ -42,7 +42,7 @@ def distances(device: torch.device, dtype: torch.dtype) -> dict[str, float]:
             hidden_states=states,
             timestep=torch.tensor([500], device=device),
             encoder_hidden_states=given.prompt.to(dtype),
-            encoder_hidden_states_image=given.image.to(dtype),
+            encoder_hidden_states_image=image_embeds().to(device, dtype),
         ).sample[0]
     latents = pipeline.denoise(golden["noise"][None], given, SAMPLING, lambda done, steps: None)[0]
     return {

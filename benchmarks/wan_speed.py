@@ -57,7 +57,7 @@ from cow_service.generators.wan.attention import AttentionShape, TimedBackend, f
 from cow_service.generators.wan.capabilities import backends_for_auto, detect_capabilities, refusals
 from cow_service.generators.wan.pipeline import image_token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
-from cow_service.generators.wan.tracks import nearest_lengths
+from cow_service.generators.wan.tracks import MAX_FRAMES, STRIDE
 from cow_service.weights.device import choose_device
 from cow_service.weights.manifests import load_manifests
 
@@ -313,7 +313,7 @@ def case_of(arguments: argparse.Namespace) -> Case:
         steps=arguments.steps,
         runs=arguments.runs or runs,
     )
-    if nearest_lengths(case.num_frames) != (case.num_frames,):
+    if case.num_frames % STRIDE != 1 or not STRIDE < case.num_frames <= MAX_FRAMES:
         raise ValueError(f"A clip has 4n + 1 frames, 5 to 81, not {case.num_frames}.")
     if case.width % 16 or case.height % 16 or min(case.width, case.height) < 16:
         raise ValueError(f"The sides of a clip are multiples of 16 px, not {case.width} x {case.height}.")

@@ -284,6 +284,16 @@ def facts_of(mover: str, trajectory: Trajectory) -> str:
     return f"{facts.sentence()}; {round(share * trajectory.ensemble)} of {trajectory.ensemble} worlds agree."
 
 
+def shown(mover: str, trajectory: Trajectory) -> str:
+    """What a clip shows, in one sentence: as `facts_of`, without what does not happen, or happens after its end."""
+    last = (trajectory.num_frames - 1) / trajectory.fps
+    met = [each for each in trajectory.encounters if each.first_frame / trajectory.fps <= last]
+    within = [each for each in met if each.time is None or each.time <= last]
+    contacts = [each for each in trajectory.contacts if each.time <= last]
+    seen = {"encounters": tuple(within), "contacts": tuple(contacts), "outcome": None}
+    return f"{_Facts(mover, trajectory.model_copy(update=seen), only_what_happens=True).sentence()}."
+
+
 def facts_of_both(changes: Sequence[Intervention], mover: str, changed: Trajectory, factual: Trajectory) -> str:
     """What happens where something is changed first, and in the scene as it is.
 
@@ -344,8 +354,8 @@ def _direction(path: Path) -> str:
 class _Facts:
     """The parts of a sentence about a trajectory."""
 
-    def __init__(self, mover: str, trajectory: Trajectory) -> None:
-        self._trajectory = trajectory
+    def __init__(self, mover: str, trajectory: Trajectory, *, only_what_happens: bool = False) -> None:
+        self._trajectory, self._only_what_happens = trajectory, only_what_happens
         self._outcome = trajectory.outcome
         self._names = [mover, *(body.object for body in trajectory.bodies[1:])]
         self._supports = [body.support for body in trajectory.bodies] or ["floor"]
@@ -526,7 +536,7 @@ class _Facts:
     def _missed(self, body: int, met: Sequence[Encounter]) -> list[str]:
         """That what is asked about does not happen, or that nothing is touched."""
         outcome = self._outcome
-        if not self._trajectory.encounters_known:
+        if not self._trajectory.encounters_known or self._only_what_happens:
             return []
         if outcome is None or outcome.asked.relation not in _KINDS or (outcome.asked.target and not outcome.object):
             return [] if body or any(each.kind == "touches" for each in met) else [self._nothing_touched(body)]

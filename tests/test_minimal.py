@@ -18,7 +18,7 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 
 MINIMAL = {"Prefer": "return=minimal"}
-LISTS = {"states", "scale", "rotation", "band", "futures", "tracks", "tracks_visible"}
+LISTS = {"states", "scale", "rotation", "turns", "band", "futures", "tracks", "tracks_visible"}
 REMOVES = "If the blue cube is removed and the red ball moves to the right, will it leave the image? (A) Yes (B) No"
 
 
@@ -31,6 +31,7 @@ def http(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def without_lists(trajectory: dict[str, Any]) -> dict[str, Any]:
     paths = [{name: value for name, value in path.items() if name not in LISTS} for path in trajectory["paths"]]
     factual = trajectory["factual"]
+    trajectory = {name: value for name, value in trajectory.items() if name != "still_tracks"}
     return trajectory | {"paths": paths, "factual": None if factual is None else without_lists(factual)}
 
 

@@ -62,16 +62,22 @@ def pictures(simulation: Simulation) -> list[str]:
     return [frame.sha256 for frame in simulation.frames]
 
 
-@pytest.mark.parametrize("name", ["tiny-ati", "tiny-wan-move"])
+RATES = {"tiny-ati": (16, 17), "tiny-wan-move": (16, 17), "tiny-refine": (24, 25)}  # and lengths, of the models' clips
+
+
+@pytest.mark.parametrize("name", RATES)
 def test_frames_and_video(toys: Service, name: str) -> None:
     found = simulate(toys, generator=name)
     assert found.video is not None
     assert (found.video.num_frames, found.video.width % 16, found.video.height % 16) == (17, 0, 0)
-    assert found.frames[0].width / found.frames[0].height == pytest.approx(832 / 480, rel=0.1)
+    assert found.frames[0].width / found.frames[0].height == pytest.approx(832 / 480, rel=0.2)
     assert len(set(pictures(found))) > 8  # it moves
     info = found.generator
     assert (info.name, info.steps, info.seed) == (name, 4, 0)
-    assert info.options["prompt"] == found.motion.sentence
+    assert info.options["prompt"] == (
+        "The yellow ball rolls to the right and meets and pushes the blue mug after 0.8 s. The camera stays still."
+    )
+    assert (info.options["fps"], info.options["num_frames"]) == RATES[name]
     assert info.options["profile"] == "exact"
 
 
@@ -108,9 +114,13 @@ def test_options_are_recorded(toys: Service) -> None:
 @pytest.mark.parametrize(
     ("change", "pointer", "said"),
     [
-        ({"num_frames": 16, "frames": {}}, "/num_frames", "13 or 17"),
-        ({"num_frames": 2, "frames": {}}, "/num_frames", "take 5"),
-        ({"num_frames": 85, "frames": {}}, "/num_frames", "take 81"),
+        ({"num_frames": 85, "frames": {}}, "/num_frames", "85 frames at 16 per second; take 81"),
+        ({"num_frames": 155, "fps": 30, "frames": {}}, "/num_frames", "take 151"),
+        (
+            {"generator_options": {"coarse_strength": 2}},
+            "/generator_options/coarse_strength",
+            "less than or equal to 1",
+        ),
         ({"generator_options": {"steps": 0}}, "/generator_options/steps", "greater than or equal to 1"),
         ({"generator_options": {"steps": "3"}}, "/generator_options/steps", "valid integer"),
         ({"generator_options": {"speed": 1}}, "/generator_options/speed", "not permitted"),

@@ -47,11 +47,10 @@ def test_frames_and_mp4(http: httpx.Client) -> None:
 
 
 def test_a_length_that_it_cannot_make(http: httpx.Client) -> None:
-    answer = http.post("/simulate", json=body(num_frames=80))
+    answer = http.post("/simulate", json=body(num_frames=90))
     assert answer.status_code == 422
-    assert answer.json()["errors"] == [
-        {"pointer": "/num_frames", "detail": "this generator makes no clip of 80 frames; take 77 or 81"}
-    ]
+    said = "this generator makes no clip of 90 frames at 16 per second; take 81"
+    assert answer.json()["errors"] == [{"pointer": "/num_frames", "detail": said}]
 
 
 def test_what_this_machine_cannot_do(http: httpx.Client) -> None:
@@ -120,12 +119,13 @@ def test_the_tracks_of_a_simulation_as_files(simulated: Path) -> None:
     for suffix in ("pth", "npy"):
         exported = cow(simulated, "tracks", "out/simulation.json", "--out", f"tracks.{suffix}")
         assert exported.returncode == 0, exported.stderr
-        assert "5 moving and 8 static tracks over 81 frames" in exported.stdout
+        assert "5 tracks of what moves, 6 of what stays and 8 anchors over 81 frames" in exported.stdout
     simulation = Simulation.model_validate_json((simulated / "out" / "simulation.json").read_bytes())
     path, anchors = simulation.trajectory.path, simulation.trajectory.anchors
     points = np.load(simulated / "tracks.npy")[0]
     np.testing.assert_allclose(points[:, :5], np.transpose(path.tracks, (1, 0, 2)), atol=0.01)
-    np.testing.assert_allclose(points[:, 5:], np.broadcast_to(anchors, (81, 8, 2)), atol=0.01)
+    still = [point for each in simulation.trajectory.still_tracks for point in each.points]
+    np.testing.assert_allclose(points[:, 5:], np.broadcast_to([*still, *anchors], (81, 14, 2)), atol=0.01)
 
 
 @pytest.mark.parametrize(

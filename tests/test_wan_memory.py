@@ -53,7 +53,7 @@ def test_it_is_what_the_loaded_parts_take(checkpoint: Path) -> None:
     parts = assemble(make_tiny(TOY).transformer.to(torch.bfloat16), checkpoint, torch.bfloat16, torch.float32)
     models = [part for part in parts.components.values() if isinstance(part, torch.nn.Module)]
     taken = sum(weight.numel() * weight.element_size() for model in models for weight in model.parameters())
-    parameters, _ = memory._read_headers(here(checkpoint))
+    parameters, _ = memory._read_headers(here(checkpoint), tuple(ATI.parameters))
     assert need_of(profile_of(ATI, "exact"), parameters, 2).device == pytest.approx(taken, rel=0.03)
 
 
@@ -66,7 +66,7 @@ def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint: Path, m
     """There is no GPU here: its size, and what it can do, are fakes."""
     monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)
     monkeypatch.setattr(memory, "refusals", lambda wanted, machine: ())
-    parameters, _ = memory._read_headers(here(checkpoint))
+    parameters, _ = memory._read_headers(here(checkpoint), tuple(ATI.parameters))
     need = {name: need_of(profile_of(ATI, name), parameters, ATI.architecture["num_layers"]) for name in ATI.profiles}
     monkeypatch.setattr(memory, "_room", lambda device: need["fast"].device)
     monkeypatch.setattr(memory, "_host", lambda: need["small"].host)

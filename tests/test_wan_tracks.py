@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +15,19 @@ from hypothesis.extra import numpy as arrays
 
 from cow_service.errors import InvalidRequest
 from cow_service.generators.wan.conditioning import ati_condition, wan_move_latent
+from cow_service.generators.wan.profiles import WanLimits
 from cow_service.generators.wan.tracks import (
     FILE_SAMPLES,
     MAX_FRAMES,
     MAX_OTHER_TRACKS,
     Tracks,
-    nearest_lengths,
+    clip_length,
     to_ati_file,
     to_ati_tensor,
     tracks_of,
     write_tracks,
 )
+from cow_service.physics.tracks import at_rate
 from cow_service.records import Trajectory
 
 sides = st.integers(8, 4000)
@@ -86,16 +89,31 @@ def test_the_image_corners_are_where_the_model_has_them() -> None:
     np.testing.assert_allclose(tensor[0, :, 1:3], [[-832 / 480, -1], [832 / 480, 1], [0, 0]], atol=1e-6)
 
 
-@given(st.integers(1, 500))
-def test_nearest_lengths(num_frames: int) -> None:
-    legal = [4 * n + 1 for n in range(1, 21)]
-    found = nearest_lengths(num_frames)
-    assert set(found) <= set(legal)
-    if num_frames in legal:
-        assert found == (num_frames,)
-    else:
-        assert num_frames not in found
-        assert min(abs(f - num_frames) for f in found) == min(abs(f - num_frames) for f in legal)
+@given(st.integers(2, 400), st.sampled_from([1.0, 8.0, 15.0, 16.0, 24.0, 30.0, 59.94]), st.sampled_from([16.0, 24.0]))
+def test_the_models_clip_is_as_long_as_the_callers(num_frames: int, fps: float, clip_fps: float) -> None:
+    (able,) = WanLimits().nearest_lengths(num_frames, fps)
+    assert able == num_frames or (able - 1) / fps <= 5 < able / fps
+    length = clip_length(able, fps, clip_fps)
+    assert length % 4 == 1
+    assert length <= 5 * clip_fps + 1
+    assert (length - 1) / clip_fps >= (able - 1) / fps - 1e-6  # and none that is shorter is
+    assert length == 5 or (length - 5) / clip_fps < (able - 1) / fps
+
+
+@given(st.integers(2, 60), st.integers(0, 1))
+def test_a_motion_keeps_its_pace_at_another_rate(frames: int, lead: int) -> None:
+    points = [(3.0 * i + 1, 40.0) for i in range(frames + lead)]
+    shown = trajectory(points, [i < frames - 1 for i in range(frames + lead)], fps=30)
+    found = at_rate(shown, 16, 81, lead)
+    seconds = np.minimum(np.arange(81) / 16, (frames - 1) / 30)
+    told = np.array(found.path.points)
+    np.testing.assert_allclose(told[lead:, 0], 3 * (lead + 30 * seconds) + 1)
+    np.testing.assert_array_equal(told[:lead], np.array(points[:lead]).reshape(-1, 2))
+    assert np.array(found.path.tracks)[0].tolist() == told.tolist()
+    assert found.num_frames == 81 + lead
+    # What is seen at both frames around a time is seen then.
+    assert [*found.path.visible][lead:] == [math.ceil(30 * t - 1e-9) + lead < frames - 1 for t in seconds]
+    assert at_rate(shown, 30, frames, lead) is shown
 
 
 def trajectory(points: list[tuple[float, float]], visible: list[bool], **rest: object) -> Trajectory:

@@ -54,7 +54,7 @@ class SlowGenerator:
         """Every seed is another clip."""
         return GeneratorInfo(name="slow", seed=given.seed, options=given.options.model_dump())
 
-    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
+    def nearest_lengths(self, num_frames: int, fps: float) -> tuple[int, ...]:
         """Any length."""
         return (num_frames,)
 

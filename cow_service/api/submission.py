@@ -429,7 +429,8 @@ def preferences_of(headers: Headers) -> Preferences:
     )
 
 
-LEFT_OUT = ("states", "scale", "rotation", "band", "futures", "tracks", "tracks_visible")  # of `Path`, all per frame
+# Of `Path`, all per frame.
+LEFT_OUT = ("states", "scale", "rotation", "turns", "band", "futures", "tracks", "tracks_visible")
 
 
 def minimize(text: str) -> str:
@@ -439,6 +440,7 @@ def minimize(text: str) -> str:
     simulation = result.get("simulation", result) or {}  # that of an answer, which may be null
     trajectory = simulation.get("trajectory")
     while trajectory is not None:
+        trajectory.pop("still_tracks", None)
         for path in trajectory["paths"]:
             for name in LEFT_OUT:
                 path.pop(name, None)

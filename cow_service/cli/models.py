@@ -173,10 +173,11 @@ def tracks(
     simulation: Annotated[Path, argument("A simulation.json.", "SIMULATION", **EXISTING)],
     out: Annotated[Path, option("tracks.pth or .npz for ATI, tracks.npy for Wan-Move.", "--out", "-o")],
 ) -> None:
-    """Write a simulation's tracks as ATI and Wan-Move read them: of what moves, the mover's first, then the anchors."""
+    """Write a simulation's tracks as ATI and Wan-Move read them: of what moves, of what stays, then the anchors."""
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service.generators.wan.tracks import tracks_of, write_tracks  # noqa: PLC0415
+    from cow_service.generators.wan.tracks import CLIP_FPS, clip_length, tracks_of, write_tracks  # noqa: PLC0415
+    from cow_service.physics.tracks import at_rate  # noqa: PLC0415
     from cow_service.records import Simulation  # noqa: PLC0415
 
     try:
@@ -187,10 +188,15 @@ def tracks(
         raise InvalidRequest(f"{simulation.name} is not a simulation: {place}: {first['msg']}.") from error
     if not record.trajectory.path.states:
         raise InvalidRequest(f"{simulation.name} is a minimal result, without tracks: get it without `return=minimal`.")
-    found = tracks_of(record.trajectory, record.image.width, record.image.height)
+    told = record.trajectory
+    told = at_rate(told, CLIP_FPS, clip_length(told.num_frames, told.fps, CLIP_FPS))
+    found = tracks_of(told, record.image.width, record.image.height)
     with writable(out):
         written = write_tracks(found, out)
-    still = len(record.trajectory.anchors)
-    moving = found.points.shape[1] - still
+    anchors, still = len(told.anchors), sum(len(each.points) for each in told.still_tracks)
+    moving = found.points.shape[1] - still - anchors
     names = " and ".join(str(path) for path in written)
-    typer.echo(f"{moving} moving and {still} static tracks over {found.num_frames} frames: {names}")
+    typer.echo(
+        f"{moving} tracks of what moves, {still} of what stays and {anchors} anchors over {found.num_frames} frames at "
+        f"{CLIP_FPS:g} per second: {names}"
+    )

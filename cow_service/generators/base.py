@@ -31,6 +31,7 @@ class GeneratorInput:
     before: GeneratorInput | None = None
     """Where things were put elsewhere: the same from the scene as the image shows it, from which they can be cut. Its
     trajectory has one frame more, the first, in which they are still there."""
+    tracks_given: bool = False  # the mover's tracks are the caller's
     inpainter: Inpainter | None = None  # paints what moving objects hide; None leaves it to the generator
 
 
@@ -42,8 +43,8 @@ class Limits(Protocol):
 
     options_model: type[BaseModel]  # what `generator_options` of a request may hold
 
-    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
-        """`(num_frames,)` where it can make a clip of that many frames, else the lengths next to it that it can."""
+    def nearest_lengths(self, num_frames: int, fps: float) -> tuple[int, ...]:
+        """`(num_frames,)` where it can make such a clip, else the lengths next to it that it can, in frames."""
         ...
 
 

@@ -151,6 +151,7 @@ def _with_image_first(given: GeneratorInput, factual: Trajectory, put: Sequence[
             "rotation": (0.0, *rotation) if rotation else (),
             "band": (),
             "futures": (),
+            "turns": (),
             "tracks": (),
             "tracks_visible": None,
         }

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from cow_service import records
@@ -18,12 +17,13 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import FloorCamera
 from cow_service.physics.ensemble import EnsembleResult
 from cow_service.physics.placement import Placements
+from cow_service.physics.tracks import POINT_DECIMALS, pairs, spread_anchors, swept, with_tracks
 from cow_service.physics.world import Worlds
 from cow_service.records import BBox, Path, Placement, Point, Trajectory
 from cow_service.records.world import BAND_PERCENTILES
 from cow_service.requests import TrajectoryRequest
-from cow_service.vision.masks import CroppedMask, dilated, scaled_size, turning
-from cow_service.vision.types import Floats, Mask
+from cow_service.vision.masks import turning
+from cow_service.vision.types import Floats
 
 LEANS = 1.0  # degrees: with less, the box of what leans stays that of what stands upright
 MOST_LEAN = np.radians(25)
@@ -33,13 +33,9 @@ PUSHED = 2.0  # px: what something is put into or onto stays where it is if it m
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
 MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
-FUTURE_DECIMALS, BAND_DECIMALS, POINT_DECIMALS = 1, 2, 3  # px: more digits say nothing and are half of a result
+FUTURE_DECIMALS, BAND_DECIMALS = 1, 2  # px: more digits say nothing and are half of a result
 STATE_DECIMALS, SCALE_DECIMALS, ROTATION_DECIMALS = 5, 6, 3  # m and m/s; of the size at first; degrees
-WORKING_SIDE = 320  # px: paths are swept at this size
-ANCHORS = 8
-TRACKS = 5
-GRID = 14  # candidates along the longer side
-CLEARANCE = 0.02  # of the shorter side, kept between an anchor and what may move
+TURN_DECIMALS, LEAST_TURN = 4, 0.002  # of quaternions: what turns less does not
 LEAST_STAYING = 0.5  # of the worlds: what stays in fewer where it is put is refused
 
 
@@ -76,7 +72,7 @@ def record_trajectory(
         for body in shown.bodies:
             body.mask.add_to(movable)
         anchors = spread_anchors(movable)
-    return Trajectory(
+    trajectory = Trajectory(
         law="contact" if path is None else "ballistic",
         fps=world.fps,
         camera=camera,
@@ -103,6 +99,9 @@ def record_trajectory(
         faint=world.faint,
         ensemble=0 if shown.ensemble is None else len(shown.ensemble.runs),
     )
+    if given is not None and given.tracks is not None:  # the caller's are all that there is
+        return trajectory
+    return with_tracks(trajectory, [body.mask for body in shown.bodies], shown.seen[0].start)
 
 
 class _Shown:
@@ -255,7 +254,7 @@ class _Shown:
         return self.clip < float(self.events.moved[0, index]) < math.inf
 
     def _path(self, index: int) -> Path:
-        worlds, path, body = self.worlds, self.paths[index], self.bodies[index]
+        worlds, path = self.worlds, self.paths[index]
         start, scale = np.array(self.seen[index].start), path.scale[0]
         # The body's centre as placed and where its silhouette is differ a little: what is drawn starts where it is.
         points = path.points[0] + scale[:, None] * (start - path.seen[0])
@@ -275,7 +274,7 @@ class _Shown:
             rotation=tuple(turned.tolist()) if np.abs(turned).max() > 0.05 else (),
             band=band,
             futures=futures,
-            tracks=tuple(pairs(rounded(track, POINT_DECIMALS)) for track in tracks(body, start, points, scale, turned)),
+            turns=self._turns(index),
             **self._times(index),
         )
 
@@ -302,12 +301,10 @@ class _Shown:
 
     def record_free_path(self, path: FreePath, given: TrajectoryRequest | None) -> Path:
         """The mover's path as it was given, or as the ballistic law has it."""
-        times, seen = np.arange(len(path.points)) / self.world.fps, None
+        times, seen, found = np.arange(len(path.points)) / self.world.fps, None, list[Floats]()
         if given is not None and given.tracks is not None:
             found = [sampled(np.array(track), given.fps, times) for track in given.tracks]
-        else:
-            found = tracks(self.seen[0], np.array(self.seen[0].start), path.points, path.scale, np.zeros(len(times)))
-        if given is not None and given.tracks_visible is not None:
+        if given is not None and given.tracks is not None and given.tracks_visible is not None:
             frames = latest(given, times)
             seen = tuple(tuple(track[frame] for frame in frames) for track in given.tracks_visible)
         return Path(
@@ -319,6 +316,18 @@ class _Shown:
             tracks_visible=seen,
             **self._times(0),
         )
+
+    def _turns(self, index: int) -> tuple[tuple[float, float, float, float], ...]:
+        """Quaternions of how a body has turned since its first frame; none of a sphere, or of what has not turned."""
+        x, y, z, w = np.moveaxis(self.worlds.runs[0].turns[index], 1, 0)
+        a, b, c, d = -x[0], -y[0], -z[0], w[0]  # the first one, inverted: each is followed from there
+        since = np.stack([
+            w * a + x * d + y * c - z * b, w * b - x * c + y * d + z * a, w * c + x * b - y * a + z * d,
+            w * d - x * a - y * b - z * c,
+        ], axis=1)  # fmt: skip
+        if self.worlds.shapes[0][index].shape == "sphere" or np.abs(since[:, :3]).max() < LEAST_TURN:
+            return ()
+        return tuple(map(tuple, rounded(since, TURN_DECIMALS).tolist()))
 
     def _times(self, index: int) -> dict[str, Any]:
         """When a body is set in motion and knocked over, where it is: fields of its path."""
@@ -429,18 +438,6 @@ def _placement(name: str, shown: Placements, ensemble: Placements | None) -> Pla
     )
 
 
-def tracks(seen: SeenBody, start: Floats, points: Floats, scale: Floats, turned: Floats) -> list[Floats]:
-    """Several points inside a body's mask, each [F, 2] px, moved, scaled and turned as the body is."""
-    angle = np.radians(turned)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    found: list[Floats] = []
-    for x, y in points_inside(seen.mask, (float(start[0]), float(start[1]))):
-        dx, dy = x - start[0], y - start[1]
-        offset = np.stack([cosine * dx - sine * dy, sine * dx + cosine * dy], axis=1)
-        found.append(points + scale[:, None] * offset)
-    return found
-
-
 def moving_until(paths: Sequence[Path], fps: float) -> float:
     """Seconds from which nothing moves any more in the image, or the mover has left it."""
     seen = np.nonzero(np.array(paths[0].visible))[0]
@@ -457,68 +454,3 @@ def moving_until(paths: Sequence[Path], fps: float) -> float:
 def rounded(values: Floats, decimals: int) -> Floats:
     """Values with so many decimals; none of them is a negative zero."""
     return np.round(values, decimals) + 0.0
-
-
-def pairs(points: Floats) -> tuple[Point, ...]:
-    """Rows [F, 2] as tuples."""
-    return tuple((x, y) for x, y in points.tolist())
-
-
-def swept(masks: Sequence[CroppedMask], starts: Sequence[Floats], paths: Sequence[Path]) -> Mask:
-    """Mask [H, W] of every place that bodies cover on their paths: those of `masks`, first at `starts` [2] (px)."""
-    height, width = masks[0].shape
-    factor = min(1.0, WORKING_SIDE / max(height, width))
-    size = scaled_size(width, height, factor)
-    canvas = np.zeros((size[1], size[0]), np.uint8)
-    for mask, start, path in zip(masks, starts, paths, strict=True):
-        contours, _ = cv2.findContours(mask.patch.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        if not contours:
-            continue
-        outline = np.asarray(max(contours, key=len)[:, 0], np.float64) - start
-        outline += np.array([mask.columns.start, mask.rows.start])
-        for point, scale in zip(path.points, path.scale, strict=True):
-            moved = (np.array(point) + scale * outline) * factor
-            if np.all(np.abs(moved) < 4 * max(size)):
-                cv2.fillPoly(canvas, [np.round(moved).astype(np.int32)], 1)
-    return cv2.resize(canvas, (width, height), interpolation=cv2.INTER_NEAREST) > 0
-
-
-def spread_anchors(movable: Mask, count: int = ANCHORS) -> tuple[tuple[float, float], ...]:
-    """At most `count` points (px), far from each other, off a mask [H, W] of everything that may move."""
-    height, width = movable.shape
-    side = 2 * max(2, int(CLEARANCE * min(height, width))) + 1
-    blocked = dilated(movable, side)
-    step = max(height, width) / GRID
-    xs = np.arange(step / 2, width, step)
-    ys = np.arange(step / 2, height, step)
-    grid = np.array([(x, y) for y in ys for x in xs if not blocked[int(y), int(x)]]).reshape(-1, 2)
-    chosen = _farthest(grid, np.array([0.0, 0.0]), count)
-    return tuple((float(x), float(y)) for x, y in chosen)
-
-
-def points_inside(
-    mask: CroppedMask, centre: tuple[float, float], count: int = TRACKS
-) -> tuple[tuple[float, float], ...]:
-    """The centre and points inside a mask away from its rim (px), spread out; at least one point."""
-    if not mask.area:
-        return (centre,)
-    deep = cv2.distanceTransform(np.pad(mask.patch, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    rows, columns = np.nonzero(deep >= 0.35 * deep.max())
-    candidates = np.stack([columns + mask.columns.start + 0.5, rows + mask.rows.start + 0.5], axis=1)
-    start = candidates[int(np.linalg.norm(candidates - np.array(centre), axis=1).argmin())]
-    return tuple((float(x), float(y)) for x, y in [start, *_farthest(candidates, start, count - 1)])
-
-
-def _farthest(candidates: Floats, start: Floats, count: int) -> list[Floats]:
-    """Up to `count` candidates [N, 2], each as far as can be from `start` and from those before it."""
-    chosen: list[Floats] = []
-    if not len(candidates):
-        return chosen
-    gap = np.linalg.norm(candidates - start, axis=1)
-    for _ in range(count):
-        best = int(gap.argmax())
-        if gap[best] < 1.0:
-            break
-        chosen.append(candidates[best])
-        gap = np.minimum(gap, np.linalg.norm(candidates - candidates[best], axis=1))
-    return chosen

@@ -366,6 +366,11 @@ class Path(Record):
         description="Per frame: degrees turned in the image since the first frame, clockwise; empty: not turned"
         f"{_MINIMAL}.",
     )
+    turns: tuple[tuple[float, float, float, float], ...] = Field(
+        default=(),
+        description="Per frame: quaternion [x, y, z, w] of how its pose has turned since the first frame, about the "
+        f"axes right, up and ahead over the floor; empty: not turned, and of spheres{_MINIMAL}.",
+    )
     band: tuple[BBox, ...] = Field(
         default=(),
         description="Per frame: [x0, y0, x1, y1], px, the 10th and 90th percentile of the point over the ensemble; "
@@ -381,10 +386,22 @@ class Path(Record):
         default=None, ge=0, description="Seconds until its upright axis leans by more than 45 degrees; null: never."
     )
     tracks: tuple[tuple[Point, ...], ...] = Field(
-        default=(), description=f"Several points inside the body's mask, each [x, y] per frame, px{_MINIMAL}."
+        default=(), description=f"Several points on the body's surface, each [x, y] per frame, px{_MINIMAL}."
     )
     tracks_visible: tuple[tuple[bool, ...], ...] | None = Field(
-        default=None, description=f"Per track and frame, where it was given: the point can be seen{_MINIMAL}."
+        default=None,
+        description="Per track and frame: nothing hides the point, and it faces the camera; it may be outside the "
+        f"image. Null: nothing ever hides one{_MINIMAL}.",
+    )
+
+
+class StillTracks(Record):
+    """Points on a body that stays where it is: what moves may hide them for a while."""
+
+    body: int = Field(ge=0, description="Which of `Trajectory.bodies`.")
+    points: tuple[Point, ...] = Field(description="[x, y], px, at every frame.")
+    visible: tuple[tuple[bool, ...], ...] | None = Field(
+        default=None, description=f"Per point and frame: nothing hides it. Null: nothing ever does{_MINIMAL}."
     )
 
 
@@ -523,7 +540,10 @@ class Trajectory(Record):
     moving_until: float | None = Field(
         default=None, ge=0, description="Seconds from which nothing moves any more, or the mover has left the image."
     )
-    anchors: tuple[Point, ...] = Field(description="Static points that hold the camera still, px.")
+    still_tracks: tuple[StillTracks, ...] = Field(
+        default=(), description="Of the bodies that stay where they are; empty in results of older versions."
+    )
+    anchors: tuple[Point, ...] = Field(description="Static points on the background that hold the camera still, px.")
     encounters: tuple[Encounter, ...] = ()
     faint: tuple[BBox, ...] = Field(
         default=(),

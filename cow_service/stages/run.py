@@ -49,8 +49,9 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
         raise InvalidRequest(
             f"`generator_options` are not valid for this generator. It takes: {known}.", errors=fields
         ) from error
-    if request.num_frames not in (legal := generator.nearest_lengths(request.num_frames)):
-        detail = f"this generator makes no clip of {request.num_frames} frames; take {' or '.join(map(str, legal))}"
+    if request.num_frames not in (legal := generator.nearest_lengths(request.num_frames, request.fps)):
+        asked, able = f"{request.num_frames} frames at {request.fps:g} per second", " or ".join(map(str, legal))
+        detail = f"this generator makes no clip of {asked}; take {able}"
         raise InvalidRequest(f"`num_frames`: {detail}.", errors=(FieldError("/num_frames", detail),))
     last = request.num_frames - 1
     faults = tuple(

@@ -12,12 +12,12 @@ import numpy as np
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.physics.camera import NEAREST, FloorCamera
+from cow_service.physics.tracks import TOUCHING, is_in_front
 from cow_service.records import FALLING_KINDS, BBox, Body, Path, Shape
 from cow_service.vision.inpainting import push_pull
 from cow_service.vision.masks import eroded, hull, resized_mask, turning, window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
 EDGE_SIGMA = 0.5  # px: Gaussian that softens the sprite's edge; moving it blurs it further
 MARGIN = 4  # px around the mask that the soft edge takes
 SHADING_SIGMA = 0.1  # of a ball's width: coarser than this is its shading, finer is what is printed on it
@@ -41,17 +41,12 @@ class Extent:
     def is_in_front_of(self, other: Extent, eye: float) -> bool:
         """Whether it covers the other one in the image; `eye` is the camera's height above the floor (m).
 
-        What is wholly above another's top is in front where the camera looks down on that top. Else the nearer one is;
-        without a camera the one that stands lower in the image.
+        As `tracks.is_in_front` says; without a camera the one that stands lower in the image.
         """
         if self.depth is None or other.depth is None:
             return self.airborne or (not other.airborne and self.bbox[3] >= other.bbox[3])
-        slack = TOUCHING * min(self.top - self.bottom, other.top - other.bottom)
-        if self.bottom >= other.top - slack and eye > other.top:
-            return True
-        if other.bottom >= self.top - slack and eye > self.top:
-            return False
-        return self.depth <= other.depth
+        here, there = (self.depth, self.bottom, self.top), (other.depth, other.bottom, other.top)
+        return bool(is_in_front(here, there, eye))
 
 
 @dataclass(frozen=True)

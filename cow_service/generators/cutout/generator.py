@@ -17,7 +17,7 @@ from cow_service.physics.ballistic import has_passed
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
 from cow_service.vision.masks import scaled_size, three_channels
-from cow_service.vision.types import Floats32, Image
+from cow_service.vision.types import Floats32, Image, Mask
 
 
 class CutoutGenerator:
@@ -31,7 +31,7 @@ class CutoutGenerator:
         """The same image, trajectory and version give the same frames; the seed changes nothing."""
         return GeneratorInfo(name="cutout", revision=__version__, seed=given.seed, options=given.options.model_dump())
 
-    def nearest_lengths(self, num_frames: int) -> tuple[int, ...]:
+    def nearest_lengths(self, num_frames: int, fps: float) -> tuple[int, ...]:
         """Any length."""
         return (num_frames,)
 
@@ -75,12 +75,31 @@ def compose(layers: Layers, index: int) -> Image:
         share = three_channels(seen if shade.surface is None else 1 - seen) if others else 1.0
         window = frame[shade.window]
         window[:] = cv2.multiply(window, 1 - shade.dark * share, dtype=cv2.CV_8U)
+    for window, pixels in _drawn(layers, index):
+        shown = frame[window]
+        mixed = cv2.multiply(shown, three_channels(1 - pixels[..., 3]), dtype=cv2.CV_32F) + pixels[..., :3]
+        shown[:] = cv2.convertScaleAbs(mixed)
+    return frame
+
+
+def moving_mask(layers: Layers, index: int) -> Mask:
+    """Where the bodies that move are seen in the clip frame of an index [h, w]: what hides them is left out."""
+    mask = np.zeros(layers.image.shape[:2], bool)
+    for window, pixels in _drawn(layers, index):
+        mask[window] |= pixels[..., 3] > 0.5
+    return mask
+
+
+def _drawn(layers: Layers, index: int) -> Iterator[tuple[Window, Floats32]]:
+    """What is drawn over the background, in that order: windows, and colours times alpha with alpha in them."""
     for body, sprite in _far_to_near(layers, index):
-        _draw(layers, frame, body, sprite, index)
+        pieces = [(body, sprite)]
         for container in layers.containers:
             if container.moving is not None and container.sprite is not None and container.covers(body, index):
-                _draw(layers, frame, container.moving, container.sprite, index)
-    return frame
+                pieces.append((container.moving, container.sprite))
+        for piece in pieces:
+            if (found := _seen(layers, *piece, index)) is not None:
+                yield found
 
 
 def _far_to_near(layers: Layers, index: int) -> list[tuple[MovingBody, Sprite]]:
@@ -100,14 +119,14 @@ def _far_to_near(layers: Layers, index: int) -> list[tuple[MovingBody, Sprite]]:
     return sorted(there, key=cmp_to_key(order))
 
 
-def _draw(layers: Layers, frame: Image, body: MovingBody, sprite: Sprite, index: int) -> None:
-    """Draws a body over a frame, but for what still bodies hide of it."""
+def _seen(layers: Layers, body: MovingBody, sprite: Sprite, index: int) -> tuple[Window, Floats32] | None:
+    """A body at a frame, but for what still bodies hide of it; None where nothing is seen."""
     path, extent = body.path, body.extent(index)
     rotation = path.rotation[index] if path.rotation else 0.0
     point = layers.factor * np.array(path.points[index])
-    found = sprite.at(point, path.scale[index], rotation, (frame.shape[1], frame.shape[0]))
+    found = sprite.at(point, path.scale[index], rotation, (layers.image.shape[1], layers.image.shape[0]))
     if found is None:
-        return
+        return None
     hiding = [other for other in layers.still if not extent.is_in_front_of(other.extent, layers.eye)]
     for container in layers.containers:
         if container.takes(body, index):  # then its front wall alone hides the body
@@ -117,9 +136,7 @@ def _draw(layers: Layers, frame: Image, body: MovingBody, sprite: Sprite, index:
     for other in hiding:
         if _overlap(window, other):
             _hide(pixels, window, other)
-    shown = frame[window]
-    mixed = cv2.multiply(shown, three_channels(1 - pixels[..., 3]), dtype=cv2.CV_32F) + pixels[..., :3]
-    shown[:] = cv2.convertScaleAbs(mixed)
+    return window, pixels
 
 
 def _overlap(window: Window, other: StillBody) -> bool:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from cow_service.generators.wan.capabilities import AUTO, backends_for_auto, detect_capabilities
 from cow_service.generators.wan.checkpoints import TEXT_LENGTH, diffusers_config
+from cow_service.generators.wan.conditioning import CELL
 from cow_service.generators.wan.memory import has_failed, wait_until_done
 from cow_service.generators.wan.pipeline import token_count
 from cow_service.generators.wan.profiles import Acceleration, Profile
@@ -64,10 +65,12 @@ class TimedBackend:
         return f"{self.name} {1000 * self.seconds:.3g} ms" + ("" if self.usable else f", off by {self.error:.2g}")
 
 
-def shape_of(architecture: Mapping[str, Any], width: int, height: int, num_frames: int = FRAMES) -> AttentionShape:
+def shape_of(
+    architecture: Mapping[str, Any], width: int, height: int, num_frames: int = FRAMES, cell: int = CELL
+) -> AttentionShape:
     """The shape at which a model attends to a clip of that size (px)."""
     config = diffusers_config(architecture)
-    tokens = token_count(width, height, num_frames)
+    tokens = token_count(width, height, num_frames, cell)
     return AttentionShape(tokens, config["num_attention_heads"], config["attention_head_dim"])
 
 
@@ -122,16 +125,17 @@ def with_attention(
     height: int,
     device: torch.device,
     kept: Path | None = None,
+    cell: int = CELL,
 ) -> Profile:
     """The profile with the backend that `attention: auto` chooses on this device; any other profile as it is.
 
-    `width`, `height`: px of a clip. `kept`: file of earlier choices. Without it another start of the same versions on
-    the same GPU might choose another backend, and cached clips would not be found.
+    `width`, `height`: px of a clip, `cell`: of its latent cells. `kept`: file of earlier choices. Without it another
+    start of the same versions on the same GPU might choose another backend, and cached clips would not be found.
     """
     wanted = profile.acceleration
     if wanted.attention != AUTO:
         return profile
-    machine, shape = detect_capabilities(device), shape_of(architecture, width, height)
+    machine, shape = detect_capabilities(device), shape_of(architecture, width, height, cell=cell)
     names = tuple(name for name in backends_for_auto(wanted, machine) if _fetched(name) is None)
     situation = repr((machine.name, torch.__version__, diffusers.__version__, profile.dtype, tuple(shape), names))
     before: dict[str, str] = {}

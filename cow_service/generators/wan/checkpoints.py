@@ -98,6 +98,7 @@ def diffusers_config(architecture: Architecture) -> dict[str, Any]:
     """The model's arguments in diffusers from the names of the original configuration (`dim`, `num_heads`, ...)."""
     if architecture.get("text_len", TEXT_LENGTH) != TEXT_LENGTH:
         raise CheckpointInvalid(f"`text_len` is {architecture['text_len']}: the model takes {TEXT_LENGTH} tokens only.")
+    takes_image = architecture.get("model_type", "i2v") == "i2v"
     return {
         "patch_size": (1, 2, 2),
         "num_attention_heads": architecture["num_heads"],
@@ -109,8 +110,8 @@ def diffusers_config(architecture: Architecture) -> dict[str, Any]:
         "ffn_dim": architecture["ffn_dim"],
         "num_layers": architecture["num_layers"],
         "eps": architecture.get("eps", 1e-6),
-        "image_dim": architecture.get("image_dim", IMAGE_DIM),
-        "added_kv_proj_dim": architecture["dim"],
+        "image_dim": architecture.get("image_dim", IMAGE_DIM) if takes_image else None,
+        "added_kv_proj_dim": architecture["dim"] if takes_image else None,
     }
 
 
@@ -145,18 +146,18 @@ def _configuration(folder: Path | None, architecture: Architecture) -> dict[str,
     if file is None or not file.is_file():
         return diffusers_config(architecture)
     config = _json(file)
-    kind = config.get("_class_name")
+    kind, model = config.get("_class_name"), architecture.get("model_type", "i2v")
     if kind == "WanTransformer3DModel":
-        if config.get("in_channels") != IN_CHANNELS or config.get("image_dim") is None:
-            raise CheckpointInvalid(
-                "The model of config.json takes no image: `in_channels` is not 36, or no `image_dim`."
-            )
+        takes_image = model == "i2v"
+        channels = IN_CHANNELS if takes_image else architecture["in_dim"]
+        if config.get("in_channels") != channels or (config.get("image_dim") is not None) != takes_image:
+            lacking = "takes no image" if takes_image else f"is not of the type '{model}'"
+            dim = "no `image_dim`" if takes_image else "it has an `image_dim`"
+            raise CheckpointInvalid(f"The model of config.json {lacking}: `in_channels` is not {channels}, or {dim}.")
         return {name: value for name, value in config.items() if not name.startswith("_")}
     if kind == "WanModel":
-        if config.get("model_type", "i2v") != "i2v":
-            raise CheckpointInvalid(
-                f"`model_type` in config.json is '{config['model_type']}', not 'i2v': no image input."
-            )
+        if config.get("model_type", model) != model:
+            raise CheckpointInvalid(f"`model_type` in config.json is '{config['model_type']}', not '{model}'.")
         return diffusers_config(config)
     raise CheckpointInvalid(f"config.json is of class '{kind}': neither WanModel nor WanTransformer3DModel.")
 

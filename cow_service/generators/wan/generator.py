@@ -1,20 +1,30 @@
-"""The generator behind `ati`, `wan-move` and their toy-sized twins: one clip from image, tracks and sentence."""
+"""The generator behind `ati`, `wan-move`, `refine` and their toy-sized twins: one clip of a video model.
+
+What a model is told comes from the world: tracks of all bodies, what happens in words, and, where it refines one, the
+compositor's clip. All of it has the model's own frame rate; the frames that are shown are those nearest in time.
+"""
 
 import logging
 import math
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from typing import TypeAlias, cast
 
+import cv2
+import numpy as np
 import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_max_pool2d
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import GeneratorInput
-from cow_service.generators.wan.conditioning import TrackConditioning
+from cow_service.generators.cutout.generator import compose, moving_mask
+from cow_service.generators.cutout.layers import CutoutOptions, take_apart
+from cow_service.generators.wan.conditioning import CELL, TrackConditioning
 from cow_service.generators.wan.memory import within_memory
 from cow_service.generators.wan.pipeline import (
     TEXT_LENGTH,
@@ -27,20 +37,24 @@ from cow_service.generators.wan.pipeline import (
 )
 from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, WanOptions
 from cow_service.generators.wan.ranks import RankGroup
-from cow_service.generators.wan.tracks import tracks_of
-from cow_service.records import GeneratorInfo
+from cow_service.generators.wan.tracks import STRIDE, clip_length, tracks_of
+from cow_service.narration import shown
+from cow_service.physics.tracks import Density, at_rate, with_tracks
+from cow_service.records import GeneratorInfo, Trajectory
 from cow_service.settings import Settings
-from cow_service.vision.types import Image
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.types import Image, Mask
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import Manifest
 
+CAMERA = "The camera stays still."
+_STRENGTHS = "coarse_strength", "object_strength"
 USUAL_SIDES = 832, 480  # their ratio
-SIDE_MULTIPLE = 16  # px: the sides of a clip are multiples of it
-MAX_SIDE = 1024 * SIDE_MULTIPLE  # px: the model has 1024 positions each way
+PATCH = 2  # latent cells, each way: the sides of a clip are multiples of it
+POSITIONS = 1024  # of tokens, that the model has each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
 # Frames of the two clips to compile for: the longest, which is the default of most requests, then any other.
 COMPILED_FRAMES = (81, 17)
-CONDITION_CHANNELS = 20
 
 ClipSize: TypeAlias = tuple[int, int, int]  # width and height (px), frames
 
@@ -49,17 +63,17 @@ _DEVICES: dict[str, PrioritySemaphore] = {}  # by name: each makes one clip at a
 log = logging.getLogger("cow_service")
 
 
-def clip_size(max_area: int, width: int, height: int) -> tuple[int, int]:
-    """An area (px) at an aspect ratio, sides rounded down to multiples of 16 px."""
-    sides = math.sqrt(max_area * width / height), math.sqrt(max_area * height / width)
+def clip_size(max_area: int, width: int, height: int, cell: int = CELL) -> tuple[int, int]:
+    """An area (px) at an aspect ratio, sides rounded down to multiples of two cells (px)."""
+    sides, multiple = (math.sqrt(max_area * width / height), math.sqrt(max_area * height / width)), PATCH * cell
     # The small term keeps an exact 480 from becoming 464 when the root is a hair below it.
-    clip_width, clip_height = (max(SIDE_MULTIPLE, int(side / SIDE_MULTIPLE + 1e-6) * SIDE_MULTIPLE) for side in sides)
+    clip_width, clip_height = (max(multiple, int(side / multiple + 1e-6) * multiple) for side in sides)
     return clip_width, clip_height
 
 
 @dataclass(eq=False)
 class WanGenerator(WanLimits):
-    """Wan2.1 image-to-video, conditioned on tracks. One clip at a time on its device; others wait."""
+    """Wan image-to-video, conditioned on tracks or refining a clip. One clip at a time on its device; others wait."""
 
     concurrency = 1
     fingerprint: str = field(init=False)  # SHA-256 of everything that decides a clip besides its input
@@ -72,12 +86,16 @@ class WanGenerator(WanLimits):
     group: RankGroup | None  # of processes that denoise with this one
     device: torch.device
     profile: Profile  # that of the settings, with the attention backend that was chosen
-    conditioning: TrackConditioning
+    conditioning: TrackConditioning | None  # of a model that takes tracks
 
     def __post_init__(self) -> None:
         own, source = self.settings.checkpoints.get(self.manifest.name), self.manifest.sources.get("transformer")
         self._repository = own.name if own is not None else None if source is None else source.repository
-        self._max_area = int(self.manifest.defaults["max_area"])  # px per frame
+        defaults = self.manifest.defaults
+        self._max_area, self._fps = int(defaults["max_area"]), float(defaults["fps"])  # px per frame; of the model's
+        self._cell, self._channels = self.pipeline.vae_scale_factor_spatial, self.pipeline.vae.config.z_dim
+        sides = (float(defaults.get(f"track_{name}", 1)) for name in ("spacing", "least", "most"))
+        self._spacing, self._least, self._most = sides
         self._embeddings = EmbeddingCache(self.pipeline)
         self._negative_prompt = str(self.manifest.defaults.get("negative_prompt", ""))
         threads = self.manifest.defaults.get("threads")
@@ -96,8 +114,8 @@ class WanGenerator(WanLimits):
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Of a clip, at the image's aspect ratio, in multiples of 16 px. Raises `InvalidRequest` if too narrow."""
-        clip_width, clip_height = clip_size(self._max_area, width, height)
-        if max(clip_width, clip_height) > MAX_SIDE:
+        clip_width, clip_height = clip_size(self._max_area, width, height, self._cell)
+        if max(clip_width, clip_height) > POSITIONS * PATCH * self._cell:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
             raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))
         return clip_width, clip_height
@@ -128,7 +146,7 @@ class WanGenerator(WanLimits):
     def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
         options = cast(WanOptions, given.options)  # the generator's own `options_model`
-        sampling, prompt, negative = self._chosen(options, given.motion.sentence)
+        sampling, prompt, negative = self._chosen(options, given)
         changed = self.profile.acceleration.model_dump(exclude_defaults=True, mode="json").items()
         return GeneratorInfo(
             name=self.manifest.name,
@@ -148,7 +166,10 @@ class WanGenerator(WanLimits):
                 "prompt": prompt,
                 "negative_prompt": negative or "",
                 "clean_cues": options.clean_cues,
+                "fps": self._fps,
+                "num_frames": self._length(given),
             }
+            | {name: value for name in _STRENGTHS if (value := getattr(sampling, name))}
             | {f"{part}_revision": revision for part, revision in self.revisions.items() if part != "transformer"}
             | {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in changed},
         )
@@ -161,34 +182,60 @@ class WanGenerator(WanLimits):
         `progress` is called after every denoising step; once it has raised, nothing more is computed.
         """
         width, height = self.size(given.scene.width, given.scene.height)
-        what = f"A clip of {given.trajectory.num_frames} frames at {width} x {height}"
+        length, fps = self._length(given), given.trajectory.fps
+        what = f"A clip of {length} frames at {width} x {height}"
         with self._own_device(what, lambda: progress(0.0)):
-            video = self._make_clip(given, width, height, progress)
+            sampling, prompt, negative = self._chosen(cast(WanOptions, given.options), given)
+            slowed = replace(given, trajectory=at_rate(given.trajectory, self._fps, length))
+            if given.before is not None:
+                before = at_rate(given.before.trajectory, self._fps, length, lead=1)
+                slowed = replace(slowed, before=replace(given.before, trajectory=before))
+            video = self._make_clip(slowed, width, height, sampling, prompt, negative, progress)
         progress(1.0)
         for index in indices:
-            yield video[index]
+            yield video[min(round(index * self._fps / fps), length - 1)]
 
-    def _make_clip(self, given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> Image:
-        """All frames [F, height, width, 3]."""
+    def _length(self, given: GeneratorInput) -> int:
+        """Frames of the model's clip."""
+        return clip_length(given.trajectory.num_frames, given.trajectory.fps, self._fps)
+
+    def _make_clip(
+        self,
+        given: GeneratorInput,
+        width: int,
+        height: int,
+        sampling: Sampling,
+        prompt: str,
+        negative: str | None,
+        progress: Callable[[float], None],
+    ) -> Image:
+        """All frames [F, height, width, 3] of a trajectory at the model's frame rate."""
         # Drawn on the CPU: a seed gives the same noise whatever the device.
-        random = torch.Generator().manual_seed(given.seed)
-        noise = torch.randn(latent_shape(width, height, given.trajectory.num_frames), generator=random)
+        random, length = torch.Generator().manual_seed(given.seed), given.trajectory.num_frames
+        noise = torch.randn(latent_shape(width, height, length, self._channels, self._cell), generator=random)
         progress(0.0)
         try:
             scene, options = given.scene, cast(WanOptions, given.options)
-            sampling, prompt, negative = self._chosen(options, given.motion.sentence)
+            coarse = coarse_clip(given, width, height, progress) if sampling.held_steps else None
+            if coarse is not None and sampling.first_step == sampling.steps:
+                return coarse.frames  # nothing is left to sample
             first_frame = scene.clean if options.clean_cues else scene.image
-            image = self._embeddings.image(first_frame, width, height, given.trajectory.num_frames)
-            tracks = tracks_of(given.trajectory, scene.width, scene.height)
-            # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
-            tracks = tracks.scaled(width / scene.width, height / scene.height)
-            condition, unconditional = self.conditioning(image.condition, tracks, width, height)
+            image = self._embeddings.image(first_frame, width, height, length)
+            condition = unconditional = image.condition
+            if self.conditioning is not None:
+                density = Density(self._spacing * scene.width / width, int(self._least), int(self._most))
+                tracks = tracks_of(with_surface_tracks(given, density), scene.width, scene.height)
+                # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
+                tracks = tracks.scaled(width / scene.width, height / scene.height)
+                condition, unconditional = self.conditioning(image.condition, tracks, width, height)
             conditioning = Conditioning(
                 prompt=self._embeddings.text(prompt),
                 negative_prompt=None if negative is None else self._embeddings.text(negative),
                 image=image.embeds,
                 condition=condition,
                 unconditional=unconditional,
+                coarse=None if coarse is None else self.pipeline.encode(coarse.frames),
+                moving=None if coarse is None else latent_mask(coarse.moving, noise.shape),
             )
             if self.profile.acceleration.offload == "model":  # else the last encoder stays beside the transformer
                 self.pipeline.maybe_free_model_hooks()
@@ -201,13 +248,53 @@ class WanGenerator(WanLimits):
             self.pipeline.vae.clear_cache()  # features of a clip that was not decoded to its end
             self.pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure
 
-    def _chosen(self, options: WanOptions, sentence: str) -> tuple[Sampling, str, str | None]:
+    def _chosen(self, options: WanOptions, given: GeneratorInput) -> tuple[Sampling, str, str | None]:
         """Sampling, prompt and negative prompt, None where no step is guided: the request's, else the model's."""
-        update = options.model_dump(include={"steps", "shift", "guidance_scale"}, exclude_none=True)
+        update = options.model_dump(include={"steps", "shift", "guidance_scale", *_STRENGTHS}, exclude_none=True)
         sampling = self.profile.sampling.model_copy(update=update)
-        prompt = sentence if options.prompt is None else options.prompt
+        prompt = options.prompt
+        if prompt is None:
+            prompt = f"{shown(given.grounding.object, given.trajectory)} {CAMERA}"
         negative = self._negative_prompt if options.negative_prompt is None else options.negative_prompt
         return sampling, prompt, negative if sampling.is_guided else None
+
+
+@dataclass(frozen=True)
+class CoarseClip:
+    """The compositor's clip, at the size and frame rate of a video model."""
+
+    frames: Image  # [F, height, width, 3]
+    moving: Mask  # [F, height, width]: where what moves is seen
+
+
+def coarse_clip(given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> CoarseClip:
+    """Of an input whose trajectory has the model's frame rate."""
+    options = CutoutOptions(clean_cues=cast(WanOptions, given.options).clean_cues)
+    source, earlier = (given, 0) if given.before is None else (given.before, 1)
+    layers = take_apart(replace(source, options=options), lambda done: progress(0.0))
+    frames, masks = list[Image](), list[Mask]()
+    for index in range(earlier, earlier + given.trajectory.num_frames):
+        progress(0.0)
+        frame, mask = compose(layers, index), moving_mask(layers, index).astype(np.uint8)
+        frames.append(np.asarray(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), np.uint8))
+        masks.append(np.asarray(cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST), bool))
+    return CoarseClip(np.stack(frames), np.stack(masks))
+
+
+def latent_mask(moving: Mask, shape: Sequence[int]) -> Tensor:
+    """Which latent cells of `shape` [1, C, T, h, w] hold a part of a mask [F, height, width]: [1, 1, T, h, w]."""
+    frames = torch.from_numpy(moving)
+    grouped = torch.cat([frames[:1], frames[1:].unflatten(0, (-1, STRIDE)).any(dim=1)]).float()
+    return adaptive_max_pool2d(grouped, tuple(shape[3:]))[None, None] > 0
+
+
+def with_surface_tracks(given: GeneratorInput, density: Density) -> Trajectory:
+    """The trajectory with as many tracks as a model takes; the caller's own stay as they are, and alone."""
+    if given.tracks_given:
+        return given.trajectory
+    mover = CroppedMask.of(given.scene.silhouette(given.grounding.bbox))
+    masks = [mover, *(each.mask for each in given.obstacles)]
+    return with_tracks(given.trajectory, masks, given.grounding.point, density)
 
 
 def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling, sizes: Iterable[ClipSize]) -> None:
@@ -218,12 +305,14 @@ def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling
     """
     step = sampling.model_copy(update={"steps": 1})
     config, device = pipeline.transformer.config, pipeline.compute_device
-    text = torch.zeros(1, TEXT_LENGTH, config.text_dim, device=device)
-    image = torch.zeros(1, image_token_count(pipeline.image_encoder), config.image_dim, device=device)
+    text, image = torch.zeros(1, TEXT_LENGTH, config.text_dim, device=device), None
+    if pipeline.image_encoder is not None:
+        image = torch.zeros(1, image_token_count(pipeline.image_encoder), config.image_dim, device=device)
     for size in sizes:
         begun = time.perf_counter()
-        noise = torch.zeros(latent_shape(*size))
-        condition = torch.zeros(CONDITION_CHANNELS, *noise.shape[2:])
+        noise = torch.zeros(latent_shape(*size, config.out_channels, pipeline.vae_scale_factor_spatial))
+        more = config.in_channels - config.out_channels
+        condition = torch.zeros(more, *noise.shape[2:]) if more else noise[0, :, :1]
         given = Conditioning(text, text if step.is_guided else None, image, condition, condition)
         denoise(noise, given, step, lambda done, total: None)
         log.info("compiled for %d x %d px and %d frames in %.1f s", *size, time.perf_counter() - begun)

@@ -37,11 +37,11 @@ CODE_FOLDER = "TORCHINDUCTOR_CACHE_DIR"
 log = logging.getLogger("cow_service")
 
 
-def load(name: str, track_conditioning: conditioning.TrackConditioning, settings: Settings) -> WanGenerator:
-    """The generator of a manifest. One without sources is built with random weights, at the sizes that it gives.
+def load(name: str, track_conditioning: conditioning.TrackConditioning | None, settings: Settings) -> WanGenerator:
+    """The generator of a manifest; without `track_conditioning` it takes no tracks.
 
-    Raises `WeightsUnavailable`, `CheckpointInvalid`, `GeneratorOutOfMemory`, or `GeneratorUnavailable` for what this
-    machine cannot do.
+    One without sources is built with random weights, at the sizes that it gives. Raises `WeightsUnavailable`,
+    `CheckpointInvalid`, `GeneratorOutOfMemory`, or `GeneratorUnavailable` for what this machine cannot do.
     """
     # Compiled code is kept for the next start. First of all: PyTorch sets a folder of its own when it is first used.
     os.environ.setdefault(CODE_FOLDER, str(settings.data_dir / "compiled"))
@@ -55,10 +55,11 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
     check_machine(manifest, settings.profile, folders, device)
     acceleration.check_device(profile.acceleration, device)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
-    size = clip_size(int(manifest.defaults["max_area"]), *USUAL_SIDES)
+    cell = int(manifest.defaults.get("vae_stride", conditioning.CELL))
+    size = clip_size(int(manifest.defaults["max_area"]), *USUAL_SIDES, cell)
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
         kept = settings.data_dir / "attention.json"
-        profile = with_attention(profile, manifest.architecture, *size, device, kept)
+        profile = with_attention(profile, manifest.architecture, *size, device, kept, cell)
         weights = replace(weights, profile=profile)
         pipeline, group = weights.load_pipeline(device)
     generator = WanGenerator(
@@ -79,8 +80,11 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning, settings
 
 create_ati = partial(load, "ati", conditioning.ati)
 create_wan_move = partial(load, "wan-move", conditioning.wan_move)
+create_refine = partial(load, "refine", None)
+create_refine_5b = partial(load, "refine-5b", None)
 create_tiny_ati = partial(load, "tiny-ati", conditioning.ati)
 create_tiny_wan_move = partial(load, "tiny-wan-move", conditioning.wan_move)
+create_tiny_refine = partial(load, "tiny-refine", None)
 
 
 def load_rank(name: str, profile: Profile, settings: Settings, device: torch.device) -> WanTransformer3DModel:
@@ -175,25 +179,28 @@ def assemble(
 ) -> WanTrackPipeline:
     """The pipeline of a transformer and the other parts in the diffusers folder `base`, all still on the CPU.
 
-    The image encoder has `IMAGE_ENCODER_DTYPE`, whatever `dtype` is.
+    The image encoder, of a model that takes one, has `IMAGE_ENCODER_DTYPE`, whatever `dtype` is.
     Raises `CheckpointInvalid` naming the part and what does not fit.
     """
     text_encoder = _model(UMT5EncoderModel, base, "text_encoder", dtype)
-    image_encoder = _model(CLIPVisionModel, base, "image_encoder", getattr(torch, IMAGE_ENCODER_DTYPE))
+    vae = _model(AutoencoderKLWan, base, "vae", vae_dtype)
     sizes: Any = transformer.config
-    for name, wanted, found in (
-        ("text_encoder", sizes.text_dim, text_encoder.config.d_model),
-        ("image_encoder", sizes.image_dim, image_encoder.config.hidden_size),
-    ):
+    widths = [("text_encoder", sizes.text_dim, text_encoder.config.d_model), ("vae", sizes.out_channels, vae.z_dim)]
+    image_encoder = image_processor = None
+    if sizes.image_dim is not None:
+        image_encoder = _model(CLIPVisionModel, base, "image_encoder", getattr(torch, IMAGE_ENCODER_DTYPE))
+        image_processor = _part(CLIPImageProcessor, base, "image_processor")
+        widths.append(("image_encoder", sizes.image_dim, image_encoder.config.hidden_size))
+    for name, wanted, found in widths:
         if wanted != found:
             raise CheckpointInvalid(f"'{name}' is {found} wide, and the transformer takes {wanted}.")
     return compose(
         transformer=transformer,
-        vae=_model(AutoencoderKLWan, base, "vae", vae_dtype),
+        vae=vae,
         text_encoder=text_encoder,
         image_encoder=image_encoder,
         tokenizer=_part(AutoTokenizer, base, "tokenizer"),
-        image_processor=_part(CLIPImageProcessor, base, "image_processor"),
+        image_processor=image_processor,
     )
 
 

@@ -4,7 +4,7 @@ import gc
 import math
 import os
 import traceback
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,6 @@ BLOCKS_AT_ONCE = 2  # of the transformer's, with `offload: group`: one computes 
 # Of blocks that are moved one by one and pinned for it: PyTorch rounds every pinned tensor up to a power of two. In the
 # 14B model's blocks, 10 matrices of 52 MB take 67 MB each, and 2 of 142 MB 268 MB.
 PINNED = 1.5
-BASE_PARTS = ("text_encoder", "image_encoder", "vae")
 CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container, in bytes or "max"
 
 
@@ -42,7 +41,7 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
     loaded = {
         "transformer": parameters["transformer"] * BYTES[profile.dtype],
         "text_encoder": parameters["text_encoder"] * BYTES[profile.dtype],
-        "image_encoder": parameters["image_encoder"] * BYTES[IMAGE_ENCODER_DTYPE],
+        "image_encoder": parameters.get("image_encoder", 0) * BYTES[IMAGE_ENCODER_DTYPE],
         "vae": parameters["vae"] * BYTES[profile.vae_dtype],
     }
     kept = loaded | ({"transformer": parameters["transformer"]} if wanted.fp8 != "none" else {})  # a byte each in fp8
@@ -66,7 +65,7 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
     """
     with naming_option(f"device: {device}"):
         machine = detect_capabilities(device)
-    parameters, has_float8 = _read_headers(folders)
+    parameters, has_float8 = _read_headers(folders, tuple(manifest.parameters))
 
     def lacking(profile: Profile) -> str:
         if sentences := refusals(profile.acceleration, machine):
@@ -95,18 +94,18 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
         )
 
 
-def _read_headers(folders: Mapping[str, Path]) -> tuple[dict[str, int], bool]:
+def _read_headers(folders: Mapping[str, Path], parts: Sequence[str]) -> tuple[dict[str, int], bool]:
     """How many numbers each part has, nothing where one is not here, and whether the transformer has some in float8."""
     counts: dict[str, int] = {}
     has_float8 = False
     with suppress(CheckpointInvalid, OSError, KeyError):  # loading says why
         files = {"transformer": checkpoint_files(folders["transformer"])[1]}
-        files |= {part: tuple((folders["base"] / part).glob("*.safetensors")) for part in BASE_PARTS}
+        files |= {part: tuple((folders["base"] / part).glob("*.safetensors")) for part in parts if part not in files}
         for part, some in files.items():
             entries = [each for file in some for each in read_headers([file]).values()]
             has_float8 = has_float8 or any(each.dtype in FLOAT8 for each in entries)
             counts[part] = sum(math.prod(each.shape) for each in entries)
-    return counts if len(counts) > len(BASE_PARTS) and all(counts.values()) else {}, has_float8
+    return counts if len(counts) == len(parts) and all(counts.values()) else {}, has_float8
 
 
 def _room(device: torch.device) -> int:

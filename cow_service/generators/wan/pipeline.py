@@ -38,32 +38,40 @@ Share: TypeAlias = Callable[[Branch, Callable[[], Tensor], Tensor], Tensor]
 class ImageEmbedding:
     """The first frame as the model takes it."""
 
-    embeds: Tensor  # [1, tokens, C] of the image encoder
-    condition: Tensor  # [20, T, h, w] float32: 4 mask channels, 16 latent channels
+    embeds: Tensor | None  # [1, tokens, C] of the image encoder; None of a model without one
+    condition: Tensor  # float32, as `Conditioning.condition`; of [20, T, h, w] the first 4 are mask channels
 
 
 @dataclass(frozen=True)
 class Conditioning:
-    """All that conditions the denoising of one clip."""
+    """All that conditions the denoising of one clip.
+
+    A condition is what a model takes beside the noise: [20, T, h, w] as more channels, or, of Wan2.2-TI2V, the first
+    latent frame [C, 1, h, w], which then has no noise in it.
+    """
 
     prompt: Tensor  # [1, 512, C] text embeddings
     negative_prompt: Tensor | None  # [1, 512, C]; None where no step is guided
-    image: Tensor  # [1, tokens, C] of the image encoder
-    condition: Tensor  # [20, T, h, w] of the guided pass
-    unconditional: Tensor  # [20, T, h, w] of the unconditional pass
+    image: Tensor | None  # [1, tokens, C] of the image encoder
+    condition: Tensor  # of the guided pass
+    unconditional: Tensor  # of the unconditional pass
+    coarse: Tensor | None = None  # [1, C, T, h, w]: latents of the clip that sampling begins with
+    moving: Tensor | None = None  # [1, 1, T, h, w], bool: where something moves in it
 
 
 Denoise: TypeAlias = Callable[[Tensor, Conditioning, Sampling, StepCallback], Tensor]
 
 
-def latent_shape(width: int, height: int, num_frames: int) -> tuple[int, int, int, int, int]:
-    """[1, 16, T, h, w] for a clip of this size (px, multiples of 16) and length (4n + 1 frames)."""
-    return 1, LATENT_CHANNELS, (num_frames - 1) // 4 + 1, height // 8, width // 8
+def latent_shape(
+    width: int, height: int, num_frames: int, channels: int = LATENT_CHANNELS, cell: int = 8
+) -> tuple[int, int, int, int, int]:
+    """[1, C, T, h, w] for a clip of this size (px, multiples of two cells) and length (4n + 1 frames)."""
+    return 1, channels, (num_frames - 1) // 4 + 1, height // cell, width // cell
 
 
-def token_count(width: int, height: int, num_frames: int) -> int:
+def token_count(width: int, height: int, num_frames: int, cell: int = 8) -> int:
     """Tokens of such a clip, in every layer of the transformer: its patches are 2 x 2 latent cells."""
-    _, _, frames, rows, columns = latent_shape(width, height, num_frames)
+    _, _, frames, rows, columns = latent_shape(width, height, num_frames, cell=cell)
     return frames * (rows // 2) * (columns // 2)
 
 
@@ -76,9 +84,15 @@ def image_token_count(image_encoder: Any) -> int:
 def compose(**parts: Any) -> "WanTrackPipeline":
     """A pipeline of `transformer`, `vae`, `text_encoder`, `image_encoder`, `tokenizer` and `image_processor`.
 
-    The parent class requires a scheduler, which is not used: every clip is sampled with one of its own.
+    Wan2.2-TI2V has no image encoder, and no channels for a condition. The parent class requires a scheduler, which is
+    not used: every clip is sampled with one of its own.
     """
-    return WanTrackPipeline(scheduler=FlowMatchEulerDiscreteScheduler(), **parts)
+    config = parts["transformer"].config
+    return WanTrackPipeline(
+        scheduler=FlowMatchEulerDiscreteScheduler(),
+        expand_timesteps=config.in_channels == config.out_channels,
+        **parts,
+    )
 
 
 class WanTrackPipeline(WanImageToVideoPipeline):
@@ -100,17 +114,18 @@ class WanTrackPipeline(WanImageToVideoPipeline):
     @torch.no_grad()
     def embed_image(self, image: NDArray[np.uint8], width: int, height: int, num_frames: int) -> ImageEmbedding:
         """Both encodings of the first frame, RGB [H, W, 3] of any size, for a clip of `width` x `height` px."""
-        device = self.compute_device
+        device, embeds = self.compute_device, None
         picture = Image.fromarray(image)
-        # The image encoder takes a square: the whole image is squeezed, as in the public implementation. The pipeline's
-        # own processor would crop its centre.
-        side = self.image_encoder.config.image_size
-        embeds = self.encode_image(picture.resize((side, side), Image.Resampling.BICUBIC), device)
+        if self.image_encoder is not None:
+            # It takes a square: the whole image is squeezed, as in the public implementation. The pipeline's own
+            # processor would crop its centre.
+            side = self.image_encoder.config.image_size
+            embeds = self.encode_image(picture.resize((side, side), Image.Resampling.BICUBIC), device)
         pixels = self.video_processor.preprocess(picture, height=height, width=width).to(device, torch.float32)
-        _, condition = self.prepare_latents(
+        _, condition, *_ = self.prepare_latents(
             pixels,
             batch_size=1,
-            num_channels_latents=LATENT_CHANNELS,
+            num_channels_latents=self.vae.config.z_dim,
             height=height,
             width=width,
             num_frames=num_frames,
@@ -125,17 +140,29 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         return denoise(self.transformer, self.compute_device, noise, given, sampling, on_step)
 
     @torch.no_grad()
+    def encode(self, video: NDArray[np.uint8]) -> Tensor:
+        """Latents [1, C, T, h, w], float32, of frames RGB [F, height, width, 3]."""
+        pixels = torch.from_numpy(video).permute(3, 0, 1, 2)[None].to(self.compute_device, self.vae.dtype) / 127.5 - 1
+        latents = self.vae.encode(pixels, return_dict=False)[0].mode().float()
+        mean, std = self._scale(latents)
+        return (latents - mean) / std
+
+    @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.uint8]:
-        """Frames RGB [F, height, width, 3] of latents [1, 16, T, h, w]."""
-        vae = self.vae
-        latents = latents.to(self.compute_device, vae.dtype)
-        mean, std = (
-            torch.tensor(values, device=latents.device, dtype=latents.dtype).view(1, -1, 1, 1, 1)
-            for values in (vae.config.latents_mean, vae.config.latents_std)
-        )
-        video = vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
+        """Frames RGB [F, height, width, 3] of latents [1, C, T, h, w]."""
+        latents = latents.to(self.compute_device, self.vae.dtype)
+        mean, std = self._scale(latents)
+        video = self.vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
         pixels = (video.float() / 2 + 0.5).clamp(0, 1).mul(255).round().to(torch.uint8)
         return pixels.permute(1, 2, 3, 0).cpu().numpy()
+
+    def _scale(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the VAE's latents, [1, C, 1, 1, 1] each."""
+        mean, std = (
+            torch.tensor(values, device=like.device, dtype=like.dtype).view(1, -1, 1, 1, 1)
+            for values in (self.vae.config.latents_mean, self.vae.config.latents_std)
+        )
+        return mean, std
 
 
 class EmbeddingCache:
@@ -194,22 +221,48 @@ def denoise(
     on_step: StepCallback,
     share: Share = lambda branch, compute, like: compute(),
 ) -> Tensor:
-    """Latents [1, 16, T, h, w] from such noise. `on_step(done, total)` follows each step, and may raise to cancel."""
+    """Latents [1, C, T, h, w] from such noise. `on_step(done, total)` follows each step, and may raise to cancel.
+
+    Where the conditioning has a coarse clip, sampling begins with that clip and noise, and puts it back for a while
+    where something moves (Time-to-Move, arXiv 2511.08633).
+    """
     dtype = cast(torch.dtype, transformer.dtype)  # found by a walk over all weights: once per clip
     schedule = make_schedule(sampling, device)
-    latents = noise.to(device, torch.float32)
-    guided, unguided = (part.to(latents)[None] for part in (given.condition, given.unconditional))
-    image, prompt = given.image.to(device, dtype), given.prompt.to(device, dtype)
+    first, held = (sampling.first_step, sampling.held_steps) if given.coarse is not None else (0, 0)
+    schedule.set_begin_index(first)
+    noise = noise.to(device, torch.float32)
+    guided, unguided = (part.to(noise)[None] for part in (given.condition, given.unconditional))
+    prompt, image = given.prompt.to(device, dtype), None if given.image is None else given.image.to(device, dtype)
     negative = None if given.negative_prompt is None else given.negative_prompt.to(device, dtype)
+    coarse = None if given.coarse is None else given.coarse.to(noise)
+    moving = None if given.moving is None else given.moving.to(device)
+    has_channels = transformer.config.in_channels > noise.shape[1]
+
+    def coarse_at(step: int) -> Tensor:
+        """The coarse clip with the noise that latents have before a step."""
+        assert coarse is not None
+        sigma = float(schedule.sigmas[step])
+        return (1 - sigma) * coarse + sigma * noise
+
+    def taken(condition: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+        """What the transformer takes: latents with the condition, and the times that tell how noisy they are."""
+        if has_channels:
+            return torch.cat([latents, condition], dim=1), time.expand(1)
+        times = time.expand(latents[0, 0, :, ::2, ::2].shape).clone()  # one for each token
+        times[0] = 0
+        return torch.cat([condition, latents[:, :, 1:]], dim=2), times.flatten()[None]
+
+    latents = noise if coarse is None else coarse_at(first)
 
     def velocity_of(branch: Branch, condition: Tensor, time: Tensor, text: Tensor) -> Tensor:
         """[1, 16, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
 
         def compute() -> Tensor:
+            states, times = taken(condition, time)
             with transformer.cache_context(branch):
                 return transformer(
-                    hidden_states=torch.cat([latents, condition], dim=1).to(dtype),
-                    timestep=time.expand(1),
+                    hidden_states=states.to(dtype),
+                    timestep=times,
                     encoder_hidden_states=text,
                     encoder_hidden_states_image=image,
                     return_dict=False,
@@ -218,16 +271,19 @@ def denoise(
         return share(branch, compute, latents)
 
     branches = 1 if negative is None else 2
-    reset_cache(transformer, sampling.steps, branches)
+    total = sampling.steps - first
+    reset_cache(transformer, total, branches)
     try:
-        for step, time in enumerate(schedule.timesteps):
+        for step, time in enumerate(schedule.timesteps[first:], first):
             velocity = velocity_of("cond", guided, time, prompt)
             if negative is not None and sampling.is_guided:
                 plain = velocity_of("uncond", unguided, time, negative)
                 velocity = plain + sampling.guidance_scale * (velocity - plain)
             latents = schedule.step(velocity, time, latents, return_dict=False)[0]
+            if step < held:
+                latents = torch.where(cast(Tensor, moving), coarse_at(step + 1), latents)
             wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
-            on_step(step + 1, sampling.steps)
+            on_step(step + 1 - first, total)
     finally:  # what was kept for the next step would lie in memory while the clip is decoded
-        reset_cache(transformer, sampling.steps, branches)
-    return latents
+        reset_cache(transformer, total, branches)
+    return latents if has_channels else torch.cat([guided, latents[:, :, 1:]], dim=2)

@@ -3,17 +3,28 @@
 Without the model's libraries: a server that has none checks requests and passes them on.
 """
 
+import math
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import GeneratorUnavailable
-from cow_service.generators.wan.tracks import nearest_lengths
 from cow_service.records import Record
 from cow_service.weights.manifests import Manifest
 
 Precision = Literal["float32", "bfloat16", "float16"]
+LONGEST_SECONDS = 5.0  # 81 frames at 16 per second
 IMAGE_ENCODER_DTYPE: Precision = "float32"  # in every profile: the public implementations do not run it in bfloat16
+
+
+COARSE = (
+    "Share of the denoising steps that the clip of `cutout` stands in for, rounded up to whole steps: sampling begins "
+    "later, from that clip with noise. 0 does without it; at 1 the clip is that of `cutout`."
+)
+OBJECT = (
+    "Share of the steps until which what moves is put back as it is in the clip of `cutout`. From `coarse_strength` on "
+    "it counts; the larger, the closer to its path, and the stiffer."
+)
 
 
 class Sampling(Record):
@@ -29,6 +40,18 @@ class Sampling(Record):
     guidance_scale: float = Field(
         ge=0, le=30, description="How strongly the prompt steers; at 1 the second pass of each step falls away."
     )
+    coarse_strength: float = Field(default=0.0, ge=0, le=1, description=COARSE)
+    object_strength: float = Field(default=0.0, ge=0, le=1, description=OBJECT)
+
+    @property
+    def first_step(self) -> int:
+        """The step that sampling begins with, where there is a coarse clip."""
+        return math.ceil(self.coarse_strength * self.steps - 1e-6)
+
+    @property
+    def held_steps(self) -> int:
+        """How many steps what moves is kept as in the coarse clip."""
+        return max(self.first_step, math.ceil(self.object_strength * self.steps - 1e-6))
 
     @property
     def is_guided(self) -> bool:
@@ -143,7 +166,9 @@ class WanOptions(BaseModel):
     steps: int | None = Field(default=None, ge=1, le=200, description="Denoising steps.")
     shift: float | None = Field(default=None, gt=0, le=50, description="Shift of the noise schedule.")
     guidance_scale: float | None = Field(default=None, ge=0, le=30, description="1 does without guidance.")
-    prompt: str | None = Field(default=None, max_length=4000, description="By default the sentence of the motion.")
+    coarse_strength: float | None = Field(default=None, ge=0, le=1, description=COARSE)
+    object_strength: float | None = Field(default=None, ge=0, le=1, description=OBJECT)
+    prompt: str | None = Field(default=None, max_length=4000, description="By default what happens in the clip.")
     negative_prompt: str | None = Field(default=None, max_length=4000, description="By default that of the model.")
     clean_cues: bool = Field(default=True, description="Take drawn arrows and boxes out of the first frame.")
 
@@ -153,4 +178,6 @@ class WanLimits:
 
     options_model = WanOptions
 
-    nearest_lengths = staticmethod(nearest_lengths)
+    def nearest_lengths(self, num_frames: int, fps: float) -> tuple[int, ...]:
+        """Any that lasts no longer than the models' longest clip: the model's own has another rate and length."""
+        return (min(num_frames, math.floor(LONGEST_SECONDS * fps + 1e-6) + 1),)

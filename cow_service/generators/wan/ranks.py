@@ -66,7 +66,8 @@ class Share:
 
     def unpack(self) -> tuple[Tensor, Conditioning]:
         """The noise and the conditioning, on the CPU."""
-        tensors: dict[str, Any] = {"negative_prompt": None, **load(self.tensors)}
+        absent: dict[str, Any] = dict.fromkeys(("negative_prompt", "image", "coarse", "moving"))
+        tensors = absent | load(self.tensors)
         return tensors.pop("noise"), Conditioning(**tensors)
 
 

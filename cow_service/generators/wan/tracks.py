@@ -1,8 +1,8 @@
 """Tracks in the forms that ATI and Wan-Move read, made from a trajectory, and their files. No PyTorch but for `.pth`.
 
-A trajectory is sampled at the frames of its clip, in pixels of the input image. ATI's file form has 121 samples,
-1.5 for each frame of its 81-frame clip: 24 per second where the clip has 16. Wan-Move has one sample per frame. After
-its last frame a track stays where it is.
+A trajectory is sampled at the frames of the model's clip, in pixels of the input image. ATI's file form has 121
+samples, 1.5 for each frame of its 81-frame clip: 24 per second where the clip has 16. Wan-Move has one sample per
+frame. After its last frame a track stays where it is.
 
 ATI's `.pth` is a saved string of bytes: the `.npz` file, whose array is called `array`. Wan-Move keeps positions in one
 `.npy` file and visibility in another.
@@ -11,6 +11,7 @@ Sources: the public implementations of ATI (arXiv 2505.22944) and Wan-Move (arXi
 """
 
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,11 +23,12 @@ from cow_service.records import Trajectory
 from cow_service.vision.types import Floats, Floats32
 
 MAX_FRAMES = 81  # of a Wan2.1 clip
+CLIP_FPS = 16.0  # at which Wan2.1 was trained
 STRIDE = 4  # clip frames per latent frame, after the first
 FILE_SAMPLES = 121
 FILE_UNITS_PER_PIXEL = 8
 SAMPLES_PER_FRAME = 1.5
-MAX_OTHER_TRACKS = 40  # of the bodies that the mover sets moving: memory and time of a clip grow with their number
+MAX_OTHER_TRACKS = 40
 
 Bools = NDArray[np.bool_]
 
@@ -48,18 +50,17 @@ class Tracks:
         return Tracks((self.points * np.array([x, y])).astype(np.float32), self.visible)
 
 
-def nearest_lengths(num_frames: int) -> tuple[int, ...]:
-    """`(num_frames,)` where a clip may have that many frames (4n + 1, 5 to 81), else the legal lengths next to it."""
-    if num_frames >= MAX_FRAMES:
-        return (MAX_FRAMES,)
-    below = max((num_frames - 1) // STRIDE * STRIDE + 1, STRIDE + 1)
-    return (below,) if below >= num_frames else (below, below + STRIDE)
+def clip_length(num_frames: int, fps: float, clip_fps: float) -> int:
+    """Frames, 4n + 1 and at least 5, of the shortest clip at `clip_fps` that is as long as so many frames at `fps`."""
+    steps = (num_frames - 1) * clip_fps / fps
+    return max(1, math.ceil(steps / STRIDE - 1e-6)) * STRIDE + 1
 
 
 def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
-    """The tracks of every body that moves, the mover's first, then the anchors, on an image of this size (px).
+    """The tracks of every body that moves, the mover's first, of those that stay, then the anchors.
 
-    Points outside the image are not visible. The bodies after the mover share `MAX_OTHER_TRACKS`.
+    On an image of this size (px), at the frames of the trajectory. Points outside the image are not visible. The bodies
+    that are set in motion share three times as many tracks as the mover has, or `MAX_OTHER_TRACKS`.
     """
     frames = trajectory.num_frames
     parts: list[Tracks] = []
@@ -72,8 +73,13 @@ def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
         if path.tracks_visible is not None:
             visible &= np.array(path.tracks_visible, bool).reshape(-1, frames).T
         parts.append(Tracks(points.astype(np.float32), visible))
-    least = max(1, MAX_OTHER_TRACKS // max(1, len(parts) - 1))
-    parts[1:] = [Tracks(part.points[:, :least], part.visible[:, :least]) for part in parts[1 : MAX_OTHER_TRACKS + 1]]
+    most = max(MAX_OTHER_TRACKS, 3 * parts[0].points.shape[1])  # memory and time of a clip grow with their number
+    least = max(1, most // max(1, len(parts) - 1))
+    parts[1:] = [Tracks(part.points[:, :least], part.visible[:, :least]) for part in parts[1 : most + 1]]
+    for still in trajectory.still_tracks:
+        points = np.array(still.points, np.float64).reshape(1, -1, 2).repeat(frames, axis=0)
+        seen = True if still.visible is None else np.array(still.visible, bool).reshape(-1, frames).T
+        parts.append(Tracks(points.astype(np.float32), _inside(points, width, height) & seen))
     anchors = np.array(trajectory.anchors, np.float32).reshape(1, -1, 2).repeat(frames, axis=0)
     parts.append(Tracks(anchors, _inside(anchors.astype(np.float64), width, height)))
     return Tracks(
