@@ -19,7 +19,10 @@ from typing import Any
 
 # Each line of its input is a request: to fork, or to wait for a process; it says the process's number, or exit code.
 TEMPLATE = """
-import gc, importlib, json, os, sys
+import functools, gc, importlib.metadata, json, os, sys
+# Inspect asks for each of its tasks; half a second each time.
+importlib.metadata.packages_distributions = functools.cache(importlib.metadata.packages_distributions)
+importlib.metadata.packages_distributions()
 from cow_service.cli.main import app
 for name in sys.argv[1:]:
     importlib.import_module(name)

@@ -47,8 +47,6 @@ IMPORTED = (
     *("cow_service.evals.run", "cow_service.evals.report.figures", "cow_service.server", "cow_service.workers.pool"),
     *("inspect_ai.model._providers.openai_compatible", "inspect_ai.model._providers.anthropic", "acp", "json_repair"),
 )
-# For runs that imagine nothing: the server in them needs no worker processes.
-NO_WORKERS = {"COW_WORKERS": "false"}
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +90,7 @@ def checked(done: subprocess.CompletedProcess[str], code: int = 0) -> subprocess
     return done
 
 
-# What is asked with and what the refusal says. One process asks them all: each new one would import Inspect again.
+# What is asked with and what the refusal says.
 REFUSED = {
     ("--arm", "sometimes"): "There is no arm 'sometimes'",
     ("--arm", "oracle"): "needs pictures of what really happens",
@@ -104,26 +102,6 @@ REFUSED = {
     ("--prices", "nothing.yaml"): "The prices 'nothing.yaml' cannot be read",
     ("--mllm", "nobody/nothing"): "--mllm nobody/nothing cannot be used",
 }
-ASK_ALL = """
-import json, sys
-from typer.testing import CliRunner
-from cow_service.cli.main import app
-told = []
-for arguments in json.loads(sys.argv[1]):
-    done = CliRunner().invoke(app, arguments)
-    told.append([done.exit_code, done.stderr])
-print(json.dumps(told), file=sys.__stdout__)
-"""
-
-
-def refusals(out: Path, asked: list[list[str]]) -> list[tuple[int, str]]:
-    """Exit code and standard error of `cow eval` with each of the arguments, into a folder of its own."""
-    commands = [["eval", str(EXAMPLES), "--out", f"{out}-{n}", *arguments] for n, arguments in enumerate(asked)]
-    done = subprocess.run(
-        [sys.executable, "-c", ASK_ALL, json.dumps(commands)],
-        cwd=out.parent, env=environment(), capture_output=True, text=True, check=True, timeout=300,
-    )  # fmt: skip
-    return [(code, told) for code, told in json.loads(done.stdout.splitlines()[-1])]
 
 
 @dataclass(frozen=True)
@@ -141,7 +119,8 @@ class Done:
 def done(tmp_path_factory: pytest.TempPathFactory, items: list[Item], imported: Template) -> Iterator[Done]:
     out = tmp_path_factory.mktemp("all") / "run"
     with truth_mllm(items, without=0.3, with_frames=1.0) as mllm:
-        told = evaluated(imported, out, "--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS), mllm=mllm)
+        asked = ("--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS))
+        told = evaluated(imported, out, *asked, mllm=mllm, COW_CONCURRENCY="2")
         run = read_run(out)
         yield Done(run, {each.arm: each for each in summarize([run])}, mllm, out, told.stdout)
 
@@ -286,27 +265,31 @@ def test_failures_are_kept_with_their_reason_and_retried_on_request(
     mllm.refuses = items[0].question[0][:40]
     asked, limited = items[:6], ("--arm", "never", "--limit", "6")
     refused = [item.id for item in asked if mllm.refuses in item.question[0]]
-    first = evaluated(imported, tmp_path / "run", *limited, mllm=mllm, code=3, **NO_WORKERS)
+    first = evaluated(imported, tmp_path / "run", *limited, mllm=mllm, code=3)
     assert f"{len(refused)} questions failed" in first.stderr or f"{len(refused)} question failed" in first.stderr
     failed = {each.item: each.failure for each in read_run(tmp_path / "run").observations if each.failure}
     assert set(failed) == set(refused)
     assert "The model is away." in str(failed[refused[0]])
     mllm.refuses = ""
-    evaluated(imported, tmp_path / "run", *limited, mllm=mllm, code=3, **NO_WORKERS)
+    evaluated(imported, tmp_path / "run", *limited, mllm=mllm, code=3)
     assert sum(mllm.asked.values()) == len(asked) - len(refused), "failures are not asked again by themselves"
-    evaluated(imported, tmp_path / "run", *limited, "--retry-failed", mllm=mllm, **NO_WORKERS)
+    evaluated(imported, tmp_path / "run", *limited, "--retry-failed", mllm=mllm)
     assert sum(mllm.asked.values()) == len(asked)
     assert [each.failure for each in read_run(tmp_path / "run").observations if each.failure] == []
 
 
-def test_what_cannot_be_asked_is_refused_before_the_first_call(tmp_path: Path, mllm: TruthMllm) -> None:
+def test_what_cannot_be_asked_is_refused_before_the_first_call(
+    tmp_path: Path, mllm: TruthMllm, imported: Template
+) -> None:
     own = ["--mllm", MODEL, "--base-url", mllm.address]
     asked = [[*([] if "--mllm" in arguments else own), *arguments] for arguments in REFUSED]
-    found = refusals(tmp_path / "run", [*asked, ["--ask", "prompt"]])
+    asked.append(["--ask", "prompt"])
     expected = [*REFUSED.values(), "--ask prompt asks a multimodal LLM: name it with --mllm"]
-    for (code, told), message in zip(found, expected, strict=True):
-        assert code == 1, told
-        assert message in told
+    for number, (arguments, message) in enumerate(zip(asked, expected, strict=True)):
+        out = tmp_path / f"run-{number}"
+        done = imported.begin(arguments_of(EXAMPLES, out, *arguments), tmp_path, environment()).done()
+        checked(done, 1)
+        assert message in done.stderr
     assert not mllm.asked
     assert not list(tmp_path.glob("run-*/run.json")), "the folder stays free"
 
