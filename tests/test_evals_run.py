@@ -219,8 +219,12 @@ def test_killed_or_interrupted_no_reply_is_asked_for_twice(
     ends: list[tuple[float, float]] = []  # when a run was struck, and when it was gone
     with truth_mllm(items, seconds=0.15) as mllm:
 
+        def all_sent() -> None:
+            eventually(lambda: len(mllm.done) == sum(mllm.asked.values()))
+
         def struck(by: signal.Signals, replies: int) -> subprocess.CompletedProcess[str]:
             """A run that is sent a signal after so many more replies."""
+            all_sent()  # also what the run before was lost with
             wanted = len(mllm.done) + replies
             asked = arguments_of(SAMPLE, tmp_path / "struck", *arguments, mllm=mllm)
             process = imported.begin(asked, tmp_path, environment())
@@ -243,7 +247,7 @@ def test_killed_or_interrupted_no_reply_is_asked_for_twice(
         assert "Traceback" not in told.stderr
         mllm.seconds = 0.0
         evaluated(imported, tmp_path / "struck", *arguments, mllm=mllm)
-        eventually(lambda: len(mllm.done) == sum(mllm.asked.values()))
+        all_sent()
         assert mllm.asked.keys() == whole.asked.keys()
         # Replies under way at an end were lost; what came a moment before it may not have been read any more.
         lost = Counter(
