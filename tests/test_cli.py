@@ -8,12 +8,14 @@ import re
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import typer
 from drawn import ball, block, floor, png_bytes
 from floors import TrueCamera, depth_png
+from forked import Template, template
 from PIL import Image, ImageSequence
 from typer.testing import CliRunner
 
@@ -23,6 +25,7 @@ from cow_service.cli.options import COMMANDS, FIELDS, request_body
 from cow_service.records import Models, Simulation
 from cow_service.requests import SimulateRequest
 
+IMPORTED = ("cow_service.cli.console", "cow_service.api.app", "cow_service.server", "cow_service.pipeline")
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 
 
@@ -35,11 +38,31 @@ def picture(tmp_path: Path) -> Path:
     return path
 
 
-def cow(tmp_path: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+_templates: list[Template] = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _imported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with template(tmp_path_factory.mktemp("imported"), IMPORTED, os.environ) as one:
+        _templates.append(one)
+        yield
+        _templates.clear()
+
+
+def settings_in(tmp_path: Path, **environment: str) -> dict[str, str]:
     plain = {"COW_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    return os.environ | plain | environment
+
+
+def cow(tmp_path: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A process of its own, which has what it imports from another one."""
+    return _templates[0].begin(arguments, tmp_path, settings_in(tmp_path, **environment)).done()
+
+
+def cow_from_nothing(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "cow_service.cli.main", *arguments],
-        env=os.environ | plain | environment,
+        env=settings_in(tmp_path),
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -91,7 +114,7 @@ def test_no_result_of_another_picture_is_written_over_and_no_old_frame_stays(tmp
 
 
 def test_the_demo_needs_nothing(tmp_path: Path) -> None:
-    result = cow(tmp_path, "demo")
+    result = cow_from_nothing(tmp_path, "demo")
     assert result.returncode == 0, result.stderr
     simulation = Simulation.model_validate_json((tmp_path / "cow-demo" / "simulation.json").read_text())
     assert [encounter.object for encounter in simulation.trajectory.encounters] == ["blue mug"]
@@ -273,8 +296,8 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path,
 
 
 def test_version_and_help(tmp_path: Path) -> None:
-    assert cow(tmp_path, "--version").stdout.strip() == f"cow {__version__}"
-    shown = cow(tmp_path, "--help").stdout
+    assert cow_from_nothing(tmp_path, "--version").stdout.strip() == f"cow {__version__}"
+    shown = cow_from_nothing(tmp_path, "--help").stdout
     assert set(COMMANDS) <= set(re.findall(r"^(\w[\w ]+):$", shown, re.M))
     listed = re.findall(r"^  (\w+) ", shown.partition("Ask:")[2], re.M)
     assert sorted(listed) == sorted(name for name, each in commands().items() if not each.hidden)

@@ -28,7 +28,7 @@ import pytest
 import rapier3d
 from conftest import example
 from fastapi.testclient import TestClient
-from servers import Served
+from servers import Served, eventually
 
 from cow_service.api.app import create_app
 from cow_service.jobs.engine import JobEngine
@@ -43,7 +43,7 @@ TOLERANCE = {"artifact_bytes": 0.02, "row_bytes": 0.02, "modules_of_a_server": 0
 BY_THE_CLOCK = ("cow-notifications", "cow-maintenance", "cow-clean-up", "cow-processes", "cow-dispatcher")
 BALL = example("ball-and-mug")
 HALF = math.prod(BALL.meta["image_size"]) / 2
-IDLE_SECONDS = 10
+IDLE_SECONDS = 6
 QUIET_SOON = """
 from cow_service.jobs import active
 active.QUIET_SECONDS = 1.0
@@ -158,10 +158,16 @@ def switches(served: Served) -> int:
     return sum(int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt_switches"))
 
 
+def workers_in(served: Served) -> list[dict[str, Any]]:
+    return served.http.get("/workers").json()["processes"][0]["workers"]
+
+
 @pytest.mark.slow
 def test_an_idle_server_sleeps(tmp_path: Path) -> None:
     with Served(tmp_path, QUIET_SOON, COW_WORKERS="true", COW_CONCURRENCY="2") as served:
-        time.sleep(8)  # for the second worker to start
+        # The second worker starts when the first has loaded. Both have begun once they say what memory they take.
+        eventually(lambda: len([one for one in workers_in(served) if one["memory_mb"]]) == 2)
+        time.sleep(3)  # for it to load, and for the server to find that it is quiet
         before = switches(served)
         time.sleep(IDLE_SECONDS)
         hold(wakeups_per_second=(switches(served) - before) / IDLE_SECONDS)

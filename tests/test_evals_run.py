@@ -1,4 +1,8 @@
-"""`cow eval` as it is run: a real process, a real server in it, and an MLLM on loopback whose accuracy is known."""
+"""`cow eval` as it is run: a real process, a real server in it, and an MLLM on loopback whose accuracy is known.
+
+Most processes are forked from one that has made the imports, which take most of a small run's time; those without an
+MLLM and of Inspect's own command begin from nothing.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,8 @@ from typing import Any
 
 import pytest
 from conftest import EXAMPLES, ROOT, SCALE
+from forked import Template, template
+from servers import eventually
 from truth_mllm import TruthMllm, truth_mllm
 
 from cow_service.evals.items import Item, Pictures
@@ -36,6 +42,11 @@ PICTURES_SHOWN = {"never": 1, "always": 4, "placebo-still": 4, "encounters": 1, 
 REPEATS = 2
 MODEL = "openai-api/local/fake"
 READ_WITHIN = 1.5  # seconds after a reply was sent: the first one loads what reads it
+# What a run imports, Inspect's own parts among it.
+IMPORTED = (
+    *("cow_service.evals.run", "cow_service.evals.report.figures", "cow_service.server", "cow_service.workers.pool"),
+    *("inspect_ai.model._providers.openai_compatible", "inspect_ai.model._providers.anthropic", "acp", "json_repair"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -49,30 +60,37 @@ def mllm(items: list[Item]) -> Iterator[TruthMllm]:
         yield one
 
 
-def command(data: Path, out: Path, *arguments: str, mllm: TruthMllm | None = None) -> list[str]:
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Template]:
+    with template(tmp_path_factory.mktemp("imported"), IMPORTED, environment()) as one:
+        yield one
+
+
+def arguments_of(data: Path, out: Path, *arguments: str, mllm: TruthMllm | None = None) -> list[str]:
     own = ["--mllm", MODEL, "--base-url", mllm.address] if mllm else []
-    program = [sys.executable, "-m", "cow_service.cli.main", "eval"]
-    return [*program, str(data), "--out", str(out), *own, *arguments]
+    return ["eval", str(data), "--out", str(out), *own, *arguments]
 
 
 def environment() -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("COW_", "INSPECT_"))}
-    return {**kept, "LOCAL_API_KEY": "none"}
+    # One worker in the server: a second one takes longer to start than it would have to do.
+    return {**kept, "LOCAL_API_KEY": "none", "COW_CONCURRENCY": "1"}
 
 
 def evaluated(
-    data: Path, out: Path, *arguments: str, mllm: TruthMllm | None = None, code: int = 0
+    imported: Template, out: Path, *arguments: str, mllm: TruthMllm, code: int = 0, **settings: str
 ) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        command(data, out, *arguments, mllm=mllm),
-        cwd=out.parent, env=environment(), capture_output=True, text=True, check=False, timeout=300,
-    )  # fmt: skip
+    asked = arguments_of(SAMPLE, out, *arguments, mllm=mllm)
+    return checked(imported.begin(asked, out.parent, environment() | settings).done(), code)
+
+
+def checked(done: subprocess.CompletedProcess[str], code: int = 0) -> subprocess.CompletedProcess[str]:
     assert done.returncode == code, done.stdout[-2000:] + done.stderr[-4000:]
     assert "Traceback" not in done.stderr
     return done
 
 
-# What is asked with and what the refusal says. One process asks them all: each new one would import Inspect again.
+# What is asked with and what the refusal says.
 REFUSED = {
     ("--arm", "sometimes"): "There is no arm 'sometimes'",
     ("--arm", "oracle"): "needs pictures of what really happens",
@@ -84,26 +102,6 @@ REFUSED = {
     ("--prices", "nothing.yaml"): "The prices 'nothing.yaml' cannot be read",
     ("--mllm", "nobody/nothing"): "--mllm nobody/nothing cannot be used",
 }
-ASK_ALL = """
-import json, sys
-from typer.testing import CliRunner
-from cow_service.cli.main import app
-told = []
-for arguments in json.loads(sys.argv[1]):
-    done = CliRunner().invoke(app, arguments)
-    told.append([done.exit_code, done.stderr])
-print(json.dumps(told), file=sys.__stdout__)
-"""
-
-
-def refusals(out: Path, asked: list[list[str]]) -> list[tuple[int, str]]:
-    """Exit code and standard error of `cow eval` with each of the arguments, into a folder of its own."""
-    commands = [["eval", str(EXAMPLES), "--out", f"{out}-{n}", *arguments] for n, arguments in enumerate(asked)]
-    done = subprocess.run(
-        [sys.executable, "-c", ASK_ALL, json.dumps(commands)],
-        cwd=out.parent, env=environment(), capture_output=True, text=True, check=True, timeout=300,
-    )  # fmt: skip
-    return [(code, told) for code, told in json.loads(done.stdout.splitlines()[-1])]
 
 
 @dataclass(frozen=True)
@@ -118,10 +116,11 @@ class Done:
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory, items: list[Item]) -> Iterator[Done]:
+def done(tmp_path_factory: pytest.TempPathFactory, items: list[Item], imported: Template) -> Iterator[Done]:
     out = tmp_path_factory.mktemp("all") / "run"
     with truth_mllm(items, without=0.3, with_frames=1.0) as mllm:
-        told = evaluated(SAMPLE, out, "--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS), mllm=mllm)
+        asked = ("--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS))
+        told = evaluated(imported, out, *asked, mllm=mllm, COW_CONCURRENCY="2")
         run = read_run(out)
         yield Done(run, {each.arm: each for each in summarize([run])}, mllm, out, told.stdout)
 
@@ -197,95 +196,104 @@ def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None
     assert "GPT-5 (paper)" in (report / "report.md").read_text()
 
 
-def test_a_finished_run_asks_nothing_more_and_says_the_same(done: Done) -> None:
+def test_a_finished_run_asks_nothing_more_and_says_the_same(done: Done, imported: Template) -> None:
     before = sum(done.mllm.asked.values())
-    again = evaluated(SAMPLE, done.out, "--arm", "never", "--repeats", "1", mllm=done.mllm)
+    again = evaluated(imported, done.out, "--arm", "never", "--repeats", "1", mllm=done.mllm)
     assert sum(done.mllm.asked.values()) == before
     assert again.stdout == done.told
-    other = evaluated(SAMPLE, done.out, "--arm", "never", "--seed", "7", mllm=done.mllm, code=1)
+    other = evaluated(imported, done.out, "--arm", "never", "--seed", "7", mllm=done.mllm, code=1)
     assert "another seed (0, not 7)" in other.stderr
 
 
 @pytest.mark.soak
-def test_killed_no_reply_is_asked_for_twice(tmp_path: Path, items: list[Item]) -> None:
+def test_killed_or_interrupted_no_reply_is_asked_for_twice(
+    tmp_path: Path, items: list[Item], imported: Template
+) -> None:
+    """Killed, then interrupted, which ends in peace, then gone on with: as if nothing had happened."""
     draws = random.Random(18)
-    arguments = ("--arm", "never,always", "--repeats", "3", "--limit", "8" if SCALE > 1 else "4")
+    # Few at a time: much is left to ask when a run is struck.
+    limits = ("--limit", "8" if SCALE > 1 else "4", "--concurrency", "2")
+    arguments = ("--arm", "never,always", "--repeats", "3", *limits)
     with truth_mllm(items) as whole:
-        evaluated(SAMPLE, tmp_path / "whole", *arguments, mllm=whole)
-    kills: list[float] = []
+        evaluated(imported, tmp_path / "whole", *arguments, mllm=whole)
+    ends: list[tuple[float, float]] = []  # when a run was struck, and when it was gone
     with truth_mllm(items, seconds=0.15) as mllm:
-        for _ in range(KILLS):
-            wanted = len(mllm.done) + draws.randint(6, 10)
-            process = subprocess.Popen(
-                command(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm),
-                cwd=tmp_path, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            )  # fmt: skip
+
+        def all_sent() -> None:
+            eventually(lambda: len(mllm.done) == sum(mllm.asked.values()))
+
+        def struck(by: signal.Signals, replies: int) -> subprocess.CompletedProcess[str]:
+            """A run that is sent a signal after so many more replies."""
+            all_sent()  # also what the run before was lost with
+            wanted = len(mllm.done) + replies
+            asked = arguments_of(SAMPLE, tmp_path / "struck", *arguments, mllm=mllm)
+            process = imported.begin(asked, tmp_path, environment())
             deadline = time.monotonic() + 60
             while len(mllm.done) < wanted and time.monotonic() < deadline:
                 time.sleep(0.01)
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-            kills.append(time.monotonic())
-            assert process.returncode == -signal.SIGKILL
+            begun = time.monotonic()
+            process.send_signal(by)
+            done = process.done()
+            ends.append((begun, time.monotonic()))
             assert len(mllm.done) >= wanted
-        evaluated(SAMPLE, tmp_path / "killed", *arguments, mllm=mllm)
+            return done
+
+        for _ in range(KILLS):
+            assert struck(signal.SIGKILL, draws.randint(6, 10)).returncode == -signal.SIGKILL
+        mllm.seconds = 0.6  # the signal comes long before the last reply
+        told = struck(signal.SIGINT, 3)
+        assert told.returncode == 130
+        assert "Interrupted. The same command goes on with it." in told.stderr
+        assert "Traceback" not in told.stderr
+        mllm.seconds = 0.0
+        evaluated(imported, tmp_path / "struck", *arguments, mllm=mllm)
+        all_sent()
         assert mllm.asked.keys() == whole.asked.keys()
-        # Replies under way at a kill were lost; what came a moment before it may not have been read any more.
-        lost = Counter(key for key, begun, sent in mllm.done if any(begun < at < sent + READ_WITHIN for at in kills))
+        # Replies under way at an end were lost; what came a moment before it may not have been read any more.
+        lost = Counter(
+            key
+            for key, begun, sent in mllm.done
+            if any(begun < gone and struck_at < sent + READ_WITHIN for struck_at, gone in ends)
+        )
         twice = mllm.asked - lost - whole.asked
-        assert not twice, [(kills, [each for each in mllm.done if each[0] == key]) for key in twice]
+        assert not twice, [(ends, [each for each in mllm.done if each[0] == key]) for key in twice]
+    assert {each.failure for each in read_run(tmp_path / "struck").observations} == {None}
     for name in ("levels", "arms", "gains"):
-        tables = [(tmp_path / run / "report" / "tables" / f"{name}.md").read_text() for run in ("whole", "killed")]
+        tables = [(tmp_path / run / "report" / "tables" / f"{name}.md").read_text() for run in ("whole", "struck")]
         assert tables[0] == tables[1]
 
 
-def test_an_interrupted_run_ends_in_peace_and_is_gone_on_with(tmp_path: Path, mllm: TruthMllm) -> None:
-    mllm.seconds = 0.2
-    arguments = ("--arm", "never,always", "--limit", "6")
-    process = subprocess.Popen(
-        command(SAMPLE, tmp_path / "run", *arguments, mllm=mllm),
-        cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    deadline = time.monotonic() + 60
-    while len(mllm.done) < 3 and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "Interrupted. The same command goes on with it." in told
-    assert "Traceback" not in told
-    evaluated(SAMPLE, tmp_path / "run", *arguments, mllm=mllm)
-    run = read_run(tmp_path / "run")
-    assert [each.failure for each in run.observations] == [None] * 12
-
-
 def test_failures_are_kept_with_their_reason_and_retried_on_request(
-    tmp_path: Path, items: list[Item], mllm: TruthMllm
+    tmp_path: Path, items: list[Item], mllm: TruthMllm, imported: Template
 ) -> None:
     mllm.refuses = items[0].question[0][:40]
     asked, limited = items[:6], ("--arm", "never", "--limit", "6")
     refused = [item.id for item in asked if mllm.refuses in item.question[0]]
-    first = evaluated(SAMPLE, tmp_path / "run", *limited, mllm=mllm, code=3)
+    first = evaluated(imported, tmp_path / "run", *limited, mllm=mllm, code=3)
     assert f"{len(refused)} questions failed" in first.stderr or f"{len(refused)} question failed" in first.stderr
     failed = {each.item: each.failure for each in read_run(tmp_path / "run").observations if each.failure}
     assert set(failed) == set(refused)
     assert "The model is away." in str(failed[refused[0]])
     mllm.refuses = ""
-    evaluated(SAMPLE, tmp_path / "run", *limited, mllm=mllm, code=3)
+    evaluated(imported, tmp_path / "run", *limited, mllm=mllm, code=3)
     assert sum(mllm.asked.values()) == len(asked) - len(refused), "failures are not asked again by themselves"
-    evaluated(SAMPLE, tmp_path / "run", *limited, "--retry-failed", mllm=mllm)
+    evaluated(imported, tmp_path / "run", *limited, "--retry-failed", mllm=mllm)
     assert sum(mllm.asked.values()) == len(asked)
     assert [each.failure for each in read_run(tmp_path / "run").observations if each.failure] == []
 
 
-def test_what_cannot_be_asked_is_refused_before_the_first_call(tmp_path: Path, mllm: TruthMllm) -> None:
+def test_what_cannot_be_asked_is_refused_before_the_first_call(
+    tmp_path: Path, mllm: TruthMllm, imported: Template
+) -> None:
     own = ["--mllm", MODEL, "--base-url", mllm.address]
     asked = [[*([] if "--mllm" in arguments else own), *arguments] for arguments in REFUSED]
-    found = refusals(tmp_path / "run", [*asked, ["--ask", "prompt"]])
+    asked.append(["--ask", "prompt"])
     expected = [*REFUSED.values(), "--ask prompt asks a multimodal LLM: name it with --mllm"]
-    for (code, told), message in zip(found, expected, strict=True):
-        assert code == 1, told
-        assert message in told
+    for number, (arguments, message) in enumerate(zip(asked, expected, strict=True)):
+        out = tmp_path / f"run-{number}"
+        done = imported.begin(arguments_of(EXAMPLES, out, *arguments), tmp_path, environment()).done()
+        checked(done, 1)
+        assert message in done.stderr
     assert not mllm.asked
     assert not list(tmp_path.glob("run-*/run.json")), "the folder stays free"
 
@@ -294,7 +302,12 @@ def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path) -> None:
     scenes = Path(shutil.copytree(EXAMPLES, tmp_path / "scenes"))
     asked = scenes / "car-forward" / "meta.json"
     asked.write_text(asked.read_text().replace(" moves forward", " moves"))
-    done = evaluated(scenes, tmp_path / "run")
+    program = [sys.executable, "-m", "cow_service.cli.main", *arguments_of(scenes, tmp_path / "run")]
+    done = checked(
+        subprocess.run(
+            program, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False, timeout=300
+        )
+    )
     run = read_run(tmp_path / "run")
     known = {(each.arm, each.item): each for each in run.observations}
     assert all(known["never", item].abstained for item in run.items), "it sees nothing in the image alone"
@@ -325,14 +338,16 @@ def test_inspects_own_command_runs_the_task(tmp_path: Path, mllm: TruthMllm, ite
 
 @pytest.mark.soak_only
 @pytest.mark.timeout(1800)
-def test_the_true_gain_lies_in_the_interval_of_whole_runs(tmp_path: Path, items: list[Item]) -> None:
+def test_the_true_gain_lies_in_the_interval_of_whole_runs(
+    tmp_path: Path, items: list[Item], imported: Template
+) -> None:
     """Through the whole service, twenty seeded runs; the same with drawn rows is in test_evals_statistics.py."""
     runs, without, looking = 20, 0.4, 0.85
     covered = nothing = 0
     for seed in range(runs):
         with truth_mllm(items, without=without, with_frames=looking, counted=True, seed=seed) as mllm:
             out = tmp_path / f"run{seed}"
-            evaluated(SAMPLE, out, "--arm", "never,always,placebo-still", "--repeats", "5", mllm=mllm)
+            evaluated(imported, out, "--arm", "never,always,placebo-still", "--repeats", "5", mllm=mllm)
         run = read_run(out)
         arms = {each.arm: each for each in summarize([run])}
         always, placebo = arms["always"].gain, arms["placebo-still"].gain

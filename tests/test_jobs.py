@@ -8,7 +8,7 @@ import socket
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
 from datetime import datetime, timedelta
 from itertools import groupby
@@ -909,14 +909,15 @@ def test_a_stop_waits_for_what_is_nearly_done(tmp_path_factory: pytest.TempPathF
 
 @pytest.mark.slow
 def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: pytest.TempPathFactory) -> None:
-    own = {"COW_SHUTDOWN_GRACE": "1", "COW_CONCURRENCY": "1", "COW_MLLM_CONCURRENCY": "1"}
+    own = {"COW_SHUTDOWN_GRACE": "0.5", "COW_CONCURRENCY": "1", "COW_MLLM_CONCURRENCY": "1"}
     with Served(tmp_path_factory.mktemp("longer"), **own) as one, ThreadPoolExecutor(4) as pool:
         keys = [{"Idempotency-Key": str(seed)} for seed in (92, 93, 94)]
-        waiting = [
-            pool.submit(one.http.post, "/simulate", json=slow(4, seed=92 + place), headers=key)
-            for place, key in enumerate(keys)
-        ]
-        eventually(lambda: len(one.http.get("/jobs").json()["jobs"]) == 3 and one.clips())
+        # One clip is made at a time: those behind the first wait, however short they are.
+        bodies = [slow(3.5, seed=92), slow(0.2, seed=93), slow(0.2, seed=94)]
+        waiting: list[Future[httpx.Response]] = []
+        for body, key in zip(bodies, keys, strict=True):
+            waiting.append(pool.submit(one.http.post, "/simulate", json=body, headers=key))
+            eventually(lambda: len(one.http.get("/jobs").json()["jobs"]) == len(waiting) and one.clips())
         alone = one.submit(slow(0.2, seed=95))
         heard: list[str] = []
         follower = pool.submit(hear_until_cut, one, alone["id"], heard)
@@ -936,7 +937,7 @@ def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: py
             assert job["status"] == "succeeded", job
         assert one.ended(alone["id"])["status"] == "succeeded"
         for place, key in enumerate(keys):
-            again = one.http.post("/simulate", json=slow(4, seed=92 + place), headers=key)
+            again = one.http.post("/simulate", json=bodies[place], headers=key)
             assert again.status_code == 200
             assert again.json()["generator"]["seed"] == 92 + place
 
@@ -952,7 +953,7 @@ def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempP
     with Served(tmp_path_factory.mktemp("crash"), COW_WORKERS="true") as one:
         key = {"Idempotency-Key": "crash"}
         done = one.ended(one.submit({**BODY, "image": data_url(picture(7))})["id"])
-        job = one.submit(slow(5, seed=96), **key)
+        job = one.submit(slow(3, seed=96), **key)
         one.rendering(job["id"])
         heard = events_until(one, job["id"], "grounding")
         assert numbers(heard) == [1, 2, 3]
@@ -971,7 +972,7 @@ def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempP
         assert one.clips().count(96) == 2
         results = stage_results(one, job["id"])
         assert {stage: results[stage] for stage in before} == before  # not made again
-        assert one.http.post("/simulate", json=slow(5, seed=96), headers=key).json() == after["result"]
+        assert one.http.post("/simulate", json=slow(3, seed=96), headers=key).json() == after["result"]
 
 
 def events_until(served: Served, job_id: str, stage: str) -> list[dict[str, Any]]:

@@ -39,10 +39,10 @@ def test_a_server_runs_on_tables_that_it_may_not_create(tmp_path: Path, roles_fi
             server.run_script(ROLES, COW_SERVING_PASSWORD="it's secret")
         told = cow("migrate", COW_DATABASE_URL=url, COW_DATA_DIR=str(tmp_path))
         assert (told.returncode, told.stdout) == (0, "The job database is up to date.\n"), told.stderr
-        assert cow("migrate", COW_DATABASE_URL=url, COW_DATA_DIR=str(tmp_path)).returncode == 0, (
-            "again it changes nothing"
-        )
-        if not roles_first:
+        if roles_first:
+            again = cow("migrate", COW_DATABASE_URL=url, COW_DATA_DIR=str(tmp_path))
+            assert again.returncode == 0, "it changes nothing"
+        else:
             server.run_script(ROLES, COW_SERVING_PASSWORD="it's secret")
         with psycopg.connect(url) as connection:
             connection.execute("CREATE TABLE of_a_later_version (id int)")

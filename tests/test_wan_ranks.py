@@ -70,12 +70,16 @@ def _closed_afterwards() -> Iterator[None]:
     close_shared()
 
 
+def shared_in(folder: Path) -> WanGenerator:
+    if not _shared:
+        _shared.append(model(folder, "exact-2"))
+    return _shared[0]
+
+
 @pytest.fixture
 def shared(tmp_path_factory: pytest.TempPathFactory) -> WanGenerator:
-    """Made once, and again after a test that had a group of its own."""
-    if not _shared:
-        _shared.append(model(tmp_path_factory.mktemp("shared"), "exact-2"))
-    return _shared[0]
+    """Made once, and again after a test that had a group of its own, or broke this one."""
+    return shared_in(tmp_path_factory.mktemp("shared"))
 
 
 def given() -> Conditioning:
@@ -124,10 +128,9 @@ def test_a_rank_that_cannot_load_says_why(tmp_path: Path) -> None:
         group.denoise(NOISE, given(), profile.sampling, lambda done, total: None)
 
 
-def broken(folder: Path, on_step: Callable[[WanGenerator], None]) -> Exception:
+def broken(loaded: WanGenerator, on_step: Callable[[WanGenerator], None]) -> Exception:
     """What a clip raises in whose second step something happens. The clips after it say that a worker is replaced."""
-    close_shared()
-    loaded = model(folder, "exact-2")
+    _shared.remove(loaded)
     with pytest.raises(Exception) as caught:  # noqa: PT011
         latents(loaded, lambda done, total: on_step(loaded) if done == 2 else None)
     with pytest.raises(DeviceFailed, match="share clips do so no more"):
@@ -140,29 +143,27 @@ def process_of(loaded: WanGenerator) -> subprocess.Popen[bytes]:
     return group_of(loaded)._ranks[0]._spawned.process
 
 
-def test_a_rank_that_has_no_memory_says_so_once(alone: WanGenerator, tmp_path: Path) -> None:
+def test_a_rank_that_has_no_memory_says_so_once(alone: WanGenerator, shared: WanGenerator, tmp_path: Path) -> None:
     def run_out(loaded: WanGenerator) -> None:
         group_of(loaded)._ranks[0].error = GeneratorOutOfMemory("A share of a clip does not fit.")
         process_of(loaded).kill()
 
     begun = time.monotonic()
-    assert isinstance(broken(tmp_path, run_out), GeneratorOutOfMemory)
+    assert isinstance(broken(shared, run_out), GeneratorOutOfMemory)
     assert time.monotonic() - begun < 60, "far less than ranks wait for each other"
-    again = model(tmp_path, "exact-2")
-    assert torch.equal(latents(again), latents(alone))
+    assert torch.equal(latents(shared_in(tmp_path)), latents(alone)), "a new group"
     with pytest.raises(GeneratorUnavailable, match="another model of this process"):
         model(tmp_path, "exact-2")
-    group_of(again).close()
 
 
-def test_an_error_of_rank_0_stays_its_own(tmp_path: Path) -> None:
+def test_an_error_of_rank_0_stays_its_own(shared: WanGenerator) -> None:
     def fail(loaded: WanGenerator) -> None:
         def forward(*_: object) -> None:
             raise RuntimeError("a fault of the code")
 
         loaded.pipeline.transformer.register_forward_pre_hook(forward)
 
-    assert str(broken(tmp_path, fail)) == "a fault of the code"
+    assert str(broken(shared, fail)) == "a fault of the code"
 
 
 def test_a_rank_that_dies_before_it_is_met_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
