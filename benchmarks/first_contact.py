@@ -128,7 +128,7 @@ def environment(home: Path, profile: str, **others: str) -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "COW_PORT": "0", "NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "200",
     }  # fmt: skip
-    if profile == "small-float8":
+    if profile in ("small-float8", "fast-stored"):
         own["COW_CHECKPOINTS"] = json.dumps({"ati": str(home / "float8")})
     kept = {name: value for name, value in os.environ.items() if not name.startswith("COW_")}
     return kept | own | others

@@ -144,6 +144,16 @@ def test_without_a_coarse_clip_it_is_diffusers_own_sampling() -> None:
     assert told == [1, 2, 3]
 
 
+def test_what_is_decoded_in_bfloat16_is_off_by_less_than_a_grey_level() -> None:
+    pipeline = make_tiny(MODELS["tiny-ati"].architecture)
+    latents = torch.randn(latent_shape(64, 32, 9), generator=torch.Generator().manual_seed(0))
+    exact, found = pipeline.decode(latents).astype(int), pipeline.decode(latents, torch.bfloat16).astype(int)
+    assert found.shape == exact.shape == (9, 32, 64, 3)
+    assert 0 < np.abs(found - exact).mean() < 1
+    assert np.abs(found - exact).max() <= 20
+    assert pipeline.vae.dtype == torch.float32
+
+
 def test_a_checkpoint_is_loaded_and_another_kind_refused(tmp_path: Path) -> None:
     architecture = MODELS["tiny-refine"].architecture
     pipeline = make_tiny(architecture)

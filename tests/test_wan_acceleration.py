@@ -25,7 +25,7 @@ from torch import Tensor
 
 from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
 from cow_service.generators.wan import acceleration as subject
-from cow_service.generators.wan.acceleration import accelerate, reset_cache
+from cow_service.generators.wan.acceleration import accelerate, cached_pass, reset_cache
 from cow_service.generators.wan.capabilities import (
     EXACT_BACKENDS,
     MINIMUM_VERSIONS,
@@ -34,7 +34,8 @@ from cow_service.generators.wan.capabilities import (
     refusals,
 )
 from cow_service.generators.wan.checkpoints import add_lora
-from cow_service.generators.wan.profiles import Acceleration
+from cow_service.generators.wan.profiles import Acceleration, profile_of
+from cow_service.weights.manifests import load_manifests
 
 CPU = torch.device("cpu")
 WIDTH = 24  # of the toy's hidden states
@@ -205,6 +206,58 @@ def test_a_pipeline_is_accelerated_once():
     accelerate(pipeline, Acceleration(**FIRST_BLOCK), CPU)
     with pytest.raises(GeneratorUnavailable, match=r"`cache: first-block` does not work here: .*already been enabled"):
         accelerate(pipeline, Acceleration(**FIRST_BLOCK), CPU)
+
+
+# MagCache, whose ratios say beforehand which steps are skipped
+
+
+def test_magcache_skips_by_the_ratios_of_each_pass():
+    """The guided pass changes little in the second half of its steps, the other one all the time."""
+    ratios = [ratio for step in range(10) for ratio in (0.99 if step >= 5 else 0.5, 0.5)]
+    pipeline, plain = toy(), toy()
+    counts = counted(pipeline)
+    accelerate(pipeline, Acceleration(cache="magcache", cache_threshold=0.1, mag_ratios=tuple(ratios)), CPU)
+    transformer = pipeline.transformer
+
+    def clip_of(steps: int, first: int = 0) -> list[list[Tensor]]:
+        found: list[list[Tensor]] = []
+        for model in (transformer, plain.transformer):
+            reset_cache(model, steps, 2, first)
+            passes = [(step, branch) for step in range(first, steps) for branch in ("cond", "uncond")]
+            made: list[Tensor] = []
+            for step, branch in passes:
+                with cached_pass(model, branch):
+                    made.append(forward(model, 1, 1000.0 - 10 * step, branch))
+            reset_cache(model, steps, 2, first)
+            found.append(made)
+        return found
+
+    for steps, first, skipped in ((10, 0, 4), (20, 0, 8), (10, 4, 4)):
+        counts[:] = [0] * LAYERS
+        ours, exact = clip_of(steps, first)
+        assert counts == [2 * (steps - first) - skipped] * LAYERS, (steps, first)
+        assert same(ours[1::2], exact[1::2]), "the unconditional pass is computed each time"
+        assert not same(ours[::2], exact[::2])
+        assert all(error(mine, theirs) < 0.05 for mine, theirs in zip(ours, exact, strict=True))
+
+
+def test_the_shipped_ratios_skip_half_of_the_steps():
+    """Of 40 steps; a profile that skips nothing, or nearly all, has the ratios of another model."""
+    for name in ("ati", "wan-move", "refine"):
+        profile = profile_of(load_manifests()[name], "fast-magcache")
+        pipeline = toy()
+        counts = counted(pipeline)
+        accelerate(
+            pipeline,
+            profile.acceleration.model_copy(update={"fp8": "none", "compile": "none", "attention": "native"}),
+            CPU,
+        )
+        reset_cache(pipeline.transformer, 40, 2)
+        for step in range(40):
+            for branch in ("cond", "uncond"):
+                with cached_pass(pipeline.transformer, branch):
+                    forward(pipeline.transformer, 1, 1000.0 - step, branch)
+        assert 32 <= counts[0] <= 56, counts
 
 
 # DBCache, which counts passes: whole clips

@@ -120,14 +120,38 @@ def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
         # Without the encoder's: the text is the same in every step.
         taylor = cache_dit.TaylorSeerCalibratorConfig(taylorseer_order=order, enable_encoder_calibrator=False)
         cache_dit.enable_cache(transformer, cache_config=dbcache, calibrator_config=taylor if order else None)
+    elif wanted.cache == "magcache":
+        from diffusers.hooks.mag_cache import MagCacheConfig  # noqa: PLC0415
+
+        guided, plain = wanted.mag_ratios[::2], wanted.mag_ratios[1::2]
+        config: Any = MagCacheConfig(wanted.cache_threshold, MAX_SKIPPED, 1 / WARM_UP_SHARE, len(guided), list(guided))
+        config.of_passes = {"cond": guided, "uncond": plain}  # diffusers has one list for both
+        transformer.enable_cache(config)
 
 
-def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2) -> None:
+@contextmanager
+def cached_pass(transformer: Any, branch: str) -> Generator[None]:
+    """Around every pass, "cond" or "uncond", one after the other: each has its own state of the step cache."""
+    if hasattr(transformer._cache_config, "of_clip"):
+        transformer._cache_config.mag_ratios = transformer._cache_config.of_clip[branch]
+    with transformer.cache_context(branch):
+        yield
+
+
+def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2, first: int = 0) -> None:
     """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next.
 
-    `steps`: denoising steps of the coming clip, which dbcache counts. `branches`: passes of each step here.
-    Run every pass in `transformer.cache_context("cond")` or `("uncond")`, one after the other: each has its own state.
+    `steps`: denoising steps of the coming clip, of which those before `first` are left out. `branches`: passes of each
+    step here, which are run in `cached_pass`.
     """
+    config = transformer._cache_config
+    if steps is not None and hasattr(config, "of_passes"):  # the nearest ratio of each step
+        config.num_inference_steps = steps - first
+        config.of_clip = {
+            branch: [known[round(step * (len(known) - 1) / max(1, steps - 1))] for step in range(first, steps)]
+            for branch, known in config.of_passes.items()
+        }
+    steps = None if steps is None else steps - first
     if "cache_dit" in sys.modules and getattr(transformer, "_is_cached", False):  # by dbcache
         import cache_dit  # noqa: PLC0415
 

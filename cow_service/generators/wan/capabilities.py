@@ -120,8 +120,8 @@ def _find_refusals(wanted: Acceleration, available: Capabilities) -> Iterator[st
         yield "cache: GPUs that share a video would not skip the same steps with first-block; choose none."
     if wanted.fp8 != "none" and "torchao" not in has:
         yield f"fp8: {wanted.fp8} needs {_package('torchao')}; install it, or choose none."
-    if wanted.fp8 == "dynamic" and (own is None or own < ADA):
-        yield f"fp8: dynamic needs a GPU of compute capability {_dotted(ADA)} or more, and {here}; choose none."
+    if wanted.fp8.endswith("dynamic") and (own is None or own < ADA):
+        yield f"fp8: {wanted.fp8} needs a GPU of compute capability {_dotted(ADA)} or more, and {here}; choose none."
     if wanted.offload != "none" and not on_gpu:
         yield f"offload: {wanted.offload} needs a GPU to move weights to, and {here}; choose none."
     if on_gpu and available.gpus < wanted.ranks:

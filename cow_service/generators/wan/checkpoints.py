@@ -50,11 +50,17 @@ class Entry(NamedTuple):
 
 
 def load_transformer(
-    path: Path, architecture: Architecture, dtype: torch.dtype, device: torch.device, *, keep_float8: bool = False
+    path: Path,
+    architecture: Architecture,
+    dtype: torch.dtype,
+    device: torch.device,
+    *,
+    keep_float8: str | None = None,
 ) -> WanTransformer3DModel:
     """The transformer of a folder or file, in `dtype` (norms and time embedding stay float32), on `device`.
 
-    `keep_float8`: matrices of the blocks that the checkpoint has in float8 stay so, for torchao.
+    `keep_float8`, `Acceleration.fp8` where that is "stored" or "stored-dynamic": matrices of the blocks that the
+    checkpoint has in float8 stay so.
     `architecture` has the sizes of a file that comes without a `config.json`, named as in the original configuration.
     Raises `CheckpointInvalid` naming every file, name or shape that is wrong.
     """
@@ -82,7 +88,7 @@ def load_transformer(
                         with safe_open(entries[key].file, framework="pt", device=str(device)) as scales:
                             scale = scales.get_tensor(entries[key].key).float()
                     if keep_float8 and entry.dtype in FLOAT8 and len(entry.shape) == 2 and name.startswith("blocks."):
-                        state[name] = _keep_in_float8(tensor, scale, dtype)
+                        state[name] = _keep_in_float8(tensor, scale, dtype, computes=keep_float8 == "stored-dynamic")
                         continue
                     keep = any(part in precise for part in name.split("."))
                     exact = tensor if scale is None else tensor.float() * scale
@@ -225,12 +231,27 @@ def _match_names(entries: dict[str, Entry], wanted: Mapping[str, Tensor]) -> dic
     return sources
 
 
-def _keep_in_float8(weight: Tensor, scale: Tensor | None, dtype: torch.dtype) -> Tensor:
-    """A float8 matrix times one number, or as it is, as a weight that computes in `dtype`: no value is rounded anew."""
-    from torchao.quantization import Float8Tensor  # noqa: PLC0415
+def _keep_in_float8(weight: Tensor, scale: Tensor | None, dtype: torch.dtype, *, computes: bool) -> Tensor:
+    """A float8 matrix times one number, or as it is, as a weight of which no value is rounded anew.
+
+    It computes in `dtype`, or `computes` in float8, by rounding what it is multiplied with.
+    """
+    from torchao.quantization import Float8Tensor, PerTensor  # noqa: PLC0415
 
     factor = torch.ones((), device=weight.device) if scale is None else scale
-    return Float8Tensor(qdata=weight, scale=factor.float().reshape(1, 1), block_size=list(weight.shape), dtype=dtype)
+    computing: dict[str, Any] = {}
+    if computes:
+        from torchao.float8.inference import Float8MMConfig  # noqa: PLC0415
+        from torchao.quantization.quantize_.common import KernelPreference  # noqa: PLC0415
+        from torchao.quantization.quantize_.workflows import QuantizeTensorToFloat8Kwargs  # noqa: PLC0415
+
+        # One scale for a matrix: of torchao's kernels PyTorch's own takes that.
+        torch_kernel = KernelPreference.TORCH
+        rounding = QuantizeTensorToFloat8Kwargs(granularity=PerTensor(), kernel_preference=torch_kernel)
+        computing = {"act_quant_kwargs": rounding, "kernel_preference": torch_kernel}
+        computing |= {"mm_config": Float8MMConfig(use_fast_accum=True)}
+    scales = factor.float().reshape(1, 1)
+    return Float8Tensor(qdata=weight, scale=scales, block_size=list(weight.shape), dtype=dtype, **computing)
 
 
 def diffusers_names(originals: Iterable[str]) -> dict[str, str]:

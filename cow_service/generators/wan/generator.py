@@ -243,7 +243,8 @@ class WanGenerator(WanLimits):
             latents = self.denoise(
                 noise, conditioning, sampling, lambda done, total: progress(DENOISING_SHARE * done / total)
             )
-            return self.pipeline.decode(latents)
+            decoded_in = self.profile.decode_dtype
+            return self.pipeline.decode(latents, None if decoded_in is None else getattr(torch, decoded_in))
         finally:
             self.pipeline.vae.clear_cache()  # features of a clip that was not decoded to its end
             self.pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure

@@ -129,14 +129,14 @@ class Weights:
     def load_transformer(self, device: torch.device) -> WanTransformer3DModel:
         """With its LoRA."""
         # With offloading or quantisation the device need not hold all unquantised weights at once.
-        fp8, lora = self.profile.acceleration.fp8, self.profile.lora
-        direct = self.profile.acceleration.offload == "none" and fp8 in {"none", "stored"}
+        wanted, lora = self.profile.acceleration, self.profile.lora
+        direct = wanted.offload == "none" and (wanted.fp8 == "none" or wanted.keeps_float8)
         transformer = checkpoints.load_transformer(
             self.folder("transformer"),
             self.manifest.architecture,
             getattr(torch, self.profile.dtype),
             device if direct else torch.device("cpu"),
-            keep_float8=fp8 == "stored",
+            keep_float8=wanted.fp8 if wanted.keeps_float8 else None,
         )
         if lora is not None:
             checkpoints.add_lora(transformer, self.folder(lora) / self.manifest.sources[lora].files[0])

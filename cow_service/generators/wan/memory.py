@@ -52,7 +52,7 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
     }[wanted.offload]
     if wanted.offload == "none" and wanted.fp8 not in {"weights", "dynamic"}:  # read straight to the device
         return Need(on_device, 0)
-    on_host = sum((kept if wanted.fp8 == "stored" else loaded).values())
+    on_host = sum((kept if wanted.keeps_float8 else loaded).values())
     if wanted.offload == "group":
         on_host += int((PINNED - 1) * kept["transformer"])
     return Need(on_device, wanted.ranks * on_host)
@@ -70,8 +70,9 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
     def lacking(profile: Profile) -> str:
         if sentences := refusals(profile.acceleration, machine):
             return " ".join(sentences)
-        if profile.acceleration.fp8 == "stored" and not has_float8:
-            return "fp8: stored keeps the float8 of a checkpoint: give one that has some (COW_CHECKPOINTS)."
+        if profile.acceleration.keeps_float8 and not has_float8:
+            fp8 = profile.acceleration.fp8
+            return f"fp8: {fp8} keeps the float8 of a checkpoint: give one that has some (COW_CHECKPOINTS)."
         if not parameters:
             return ""
         need = need_of(profile, parameters, int(manifest.architecture["num_layers"]))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from cow_service.generators.wan.acceleration import reset_cache
+from cow_service.generators.wan.acceleration import cached_pass, reset_cache
 from cow_service.generators.wan.checkpoints import TEXT_LENGTH
 from cow_service.generators.wan.memory import wait_until_done
 from cow_service.generators.wan.profiles import Sampling
@@ -148,11 +148,12 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         return (latents - mean) / std
 
     @torch.no_grad()
-    def decode(self, latents: Tensor) -> NDArray[np.uint8]:
-        """Frames RGB [F, height, width, 3] of latents [1, C, T, h, w]."""
+    def decode(self, latents: Tensor, dtype: torch.dtype | None = None) -> NDArray[np.uint8]:
+        """Frames RGB [F, height, width, 3] of latents [1, C, T, h, w]; computed in `dtype`, else in the VAE's own."""
         latents = latents.to(self.compute_device, self.vae.dtype)
         mean, std = self._scale(latents)
-        video = self.vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
+        with torch.autocast(self.compute_device.type, dtype, enabled=dtype is not None):
+            video = self.vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
         pixels = (video.float() / 2 + 0.5).clamp(0, 1).mul(255).round().to(torch.uint8)
         return pixels.permute(1, 2, 3, 0).cpu().numpy()
 
@@ -259,7 +260,7 @@ def denoise(
 
         def compute() -> Tensor:
             states, times = taken(condition, time)
-            with transformer.cache_context(branch):
+            with cached_pass(transformer, branch):
                 return transformer(
                     hidden_states=states.to(dtype),
                     timestep=times,
@@ -272,7 +273,7 @@ def denoise(
 
     branches = 1 if negative is None else 2
     total = sampling.steps - first
-    reset_cache(transformer, total, branches)
+    reset_cache(transformer, sampling.steps, branches, first)
     try:
         for step, time in enumerate(schedule.timesteps[first:], first):
             velocity = velocity_of("cond", guided, time, prompt)
@@ -285,5 +286,5 @@ def denoise(
             wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
             on_step(step + 1 - first, total)
     finally:  # what was kept for the next step would lie in memory while the clip is decoded
-        reset_cache(transformer, total, branches)
+        reset_cache(transformer, sampling.steps, branches, first)
     return latents if has_channels else torch.cat([guided, latents[:, :, 1:]], dim=2)

@@ -75,19 +75,26 @@ class Acceleration(Record):
         description="regional compiles the transformer's block once for all of its layers; the same to rounding. The "
         "first clips of new shapes wait for the compiler.",
     )
-    cache: Literal["none", "first-block", "dbcache"] = Field(
+    cache: Literal["none", "first-block", "dbcache", "magcache"] = Field(
         default="none",
         description="Skips the transformer in steps that would change little, and so changes the frames. first-block "
         "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`. "
         "dbcache (the package cache-dit, for one GPU) decides as first-block by a fifth of the layers, never skips in "
         "the first fifth of the steps or more than 3 in a row, and can extrapolate what it skips "
         "(`cache_taylor_order`). Both keep one to three copies of the hidden states per guidance branch, dbcache as "
-        "many more as its order. Of no use with few, distilled steps.",
+        "many more as its order. magcache knows beforehand how much each step changes (`mag_ratios`), skips as seldom "
+        "as dbcache, and keeps one copy. Of no use with few, distilled steps.",
+    )
+    mag_ratios: tuple[float, ...] = Field(
+        default=(),
+        description="For magcache: by how much what the blocks add grows from one step to the next, of a clip of any "
+        "number of steps, guided and unconditional pass in turn. They belong to a model.",
     )
     cache_threshold: float = Field(
         default=0.05,
         ge=0,
-        description="Relative change of the first layers. 0 skips nothing; the larger, the faster and the worse.",
+        description="Relative change of the first layers, or of magcache the error that adds up. 0 skips nothing; the "
+        "larger, the faster and the worse.",
     )
     cache_taylor_order: int = Field(
         default=0,
@@ -96,12 +103,13 @@ class Acceleration(Record):
         description="For dbcache: 0 takes what was computed last for what is skipped, 1 and 2 extrapolate it from its "
         "last values (TaylorSeer).",
     )
-    fp8: Literal["none", "stored", "weights", "dynamic"] = Field(
+    fp8: Literal["none", "stored", "stored-dynamic", "weights", "dynamic"] = Field(
         default="none",
         description="Stores the linear layers of the transformer's blocks as float8, half of bfloat16's memory; norms, "
         "embeddings and the last layer stay as they are. stored keeps the float8 of a checkpoint that has it, value by "
         "value; weights and dynamic round, and so change the frames slightly. stored and weights compute in the "
-        "model's precision, slower than none; dynamic also computes in float8, and is faster where compiled.",
+        "model's precision, slower than none; dynamic and stored-dynamic also compute in float8, and are faster where "
+        "compiled.",
     )
     offload: Literal["none", "model", "group"] = Field(
         default="none",
@@ -128,6 +136,11 @@ class Acceleration(Record):
     )
 
     @property
+    def keeps_float8(self) -> bool:
+        """Whether the float8 of a checkpoint stays as it is."""
+        return self.fp8 in {"stored", "stored-dynamic"}
+
+    @property
     def ranks(self) -> int:
         """GPUs, and processes, that share a clip."""
         return self.context_parallel * (2 if self.guidance_parallel else 1)
@@ -141,6 +154,11 @@ class Profile(Record):
     dtype: Precision = Field(default="bfloat16", description="Of the transformer and the text encoder.")
     vae_dtype: Precision = Field(
         default="float32", description="Of the VAE; bfloat16 decodes in less time, with slightly banded gradients."
+    )
+    decode_dtype: Precision | None = Field(
+        default=None,
+        description="In which the VAE decodes where that is not its own: bfloat16 is faster, with slightly banded "
+        "gradients, and the first frame is still encoded in `vae_dtype`.",
     )
     acceleration: Acceleration = Acceleration()
     lora: str | None = Field(
