@@ -127,13 +127,14 @@ def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
         config: Any = MagCacheConfig(wanted.cache_threshold, MAX_SKIPPED, 1 / WARM_UP_SHARE, len(guided), list(guided))
         config.of_passes = {"cond": guided, "uncond": plain}  # diffusers has one list for both
         transformer.enable_cache(config)
+        transformer.mag_cache = config
 
 
 @contextmanager
 def cached_pass(transformer: Any, branch: str) -> Generator[None]:
     """Around every pass, "cond" or "uncond", one after the other: each has its own state of the step cache."""
-    if hasattr(transformer._cache_config, "of_clip"):
-        transformer._cache_config.mag_ratios = transformer._cache_config.of_clip[branch]
+    if (config := getattr(transformer, "mag_cache", None)) is not None:
+        config.mag_ratios = config.of_clip[branch]
     with transformer.cache_context(branch):
         yield
 
@@ -144,8 +145,8 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2, f
     `steps`: denoising steps of the coming clip, of which those before `first` are left out. `branches`: passes of each
     step here, which are run in `cached_pass`.
     """
-    config = transformer._cache_config
-    if steps is not None and hasattr(config, "of_passes"):  # the nearest ratio of each step
+    config = getattr(transformer, "mag_cache", None)
+    if steps is not None and config is not None:  # the nearest ratio of each step
         config.num_inference_steps = steps - first
         config.of_clip = {
             branch: [known[round(step * (len(known) - 1) / max(1, steps - 1))] for step in range(first, steps)]
