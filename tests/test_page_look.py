@@ -87,8 +87,8 @@ def test_the_pointer_lights_what_is_under_it(seen: Seen) -> None:
         seen.page.mouse.move(*seen.at((BARE[0] + step, BARE[1])))
     expect(lit).to_have_count(0)
     expect(seen.page.get_by_text("No clear outline here: draw a box.")).to_be_visible()
-    assert looks() < count + 30
-    assert seen.most_in_flight == 1
+    assert looks() > count + 1
+    assert seen.most_in_flight == 1  # where the pointer was while another point was asked about is left out
 
 
 def test_a_click_takes_it_and_another_one_what_is_within(seen: Seen) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cow_service.physics.ballistic import GRAVITY, Camera, FreePath, ballistic_path, given_path, has_passed, roll_out
 from cow_service.physics.camera import depth_motion
-from cow_service.physics.recording import points_inside, spread_anchors, swept
+from cow_service.physics.tracks import points_inside, spread_anchors, swept
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Path
 from cow_service.requests import TrajectoryRequest
 from cow_service.vision.masks import CroppedMask
@@ -93,10 +93,10 @@ def test_anchors_spread_over_an_empty_image() -> None:
 def test_tracks_lie_inside_the_mask() -> None:
     ys, xs = np.mgrid[:200, :300]
     ring = (np.hypot(xs - 150, ys - 100) < 60) & (np.hypot(xs - 150, ys - 100) > 25)
-    points = points_inside(CroppedMask.of(ring), (150, 100))
+    points = points_inside(CroppedMask.of(ring), (150, 100), 5)
     assert len(points) == 5
     assert all(ring[int(y), int(x)] for x, y in points)
-    assert points_inside(CroppedMask.of(np.zeros((10, 10), bool)), (4.0, 5.0)) == ((4.0, 5.0),)
+    assert points_inside(CroppedMask.of(np.zeros((10, 10), bool)), (4.0, 5.0), 5) == ((4.0, 5.0),)
 
 
 class TestBallisticLaw:

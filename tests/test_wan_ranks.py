@@ -26,7 +26,7 @@ from cow_service.errors import (
     WorkerEnded,
 )
 from cow_service.generators.wan import conditioning, loading
-from cow_service.generators.wan.generator import CONDITION_CHANNELS, WanGenerator
+from cow_service.generators.wan.generator import WanGenerator
 from cow_service.generators.wan.pipeline import Conditioning, denoise, latent_shape
 from cow_service.generators.wan.profiles import Acceleration, Profile, Sampling, profile_of
 from cow_service.generators.wan.ranks import MODULE, RankGroup, Sharing
@@ -87,7 +87,7 @@ def given() -> Conditioning:
     drawn = torch.Generator().manual_seed(2)
     sizes: Any = TINY.architecture
     texts = [torch.randn(1, 512, sizes["text_dim"], generator=drawn) for _ in range(2)]
-    conditions = [torch.randn(CONDITION_CHANNELS, *NOISE.shape[2:], generator=drawn) for _ in range(2)]
+    conditions = [torch.randn(20, *NOISE.shape[2:], generator=drawn) for _ in range(2)]
     return Conditioning(*texts, torch.randn(1, 17, sizes["image_dim"], generator=drawn), *conditions)
 
 
@@ -235,7 +235,7 @@ SIZES = {"even": NOISE, "odd": torch.randn(latent_shape(80, 48, 5), generator=to
 
 def clip_of(noise: Tensor, transformer: Any, **how: Any) -> Tensor:
     full = given()
-    condition = torch.zeros(CONDITION_CHANNELS, *noise.shape[2:])
+    condition = torch.zeros(20, *noise.shape[2:])
     inputs = Conditioning(full.prompt, full.negative_prompt, full.image, condition, condition)
     return denoise(transformer, CPU, noise, inputs, SAMPLING, lambda done, total: None, **how)
 
