@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,7 +21,7 @@ from cow_service.records import Path as BodyPath
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.masks import CroppedMask
+from cow_service.vision.masks import CroppedMask, hull
 
 WIDTH, HEIGHT, FRAMES = 640, 400, 41
 ESTIMATE = CameraEstimate.model_validate(
@@ -158,6 +159,23 @@ def test_what_passes_in_front_hides_points_of_what_stays() -> None:
     hidden = ~np.array(still.visible)
     assert hidden.any()
     assert not hidden[:, [0, -1]].any(), "before and after they are seen"
+
+
+def test_no_point_is_told_visible_beside_what_is_drawn() -> None:
+    """A neck is carried as if the body were as wide there as below."""
+    bottle = body("cylinder", -0.9, 3, (0.4, 0.6, 0.4))
+    told, (mask,) = world([bottle], [moving(0, bottle, (3, 3), (-0.9, 0.9))])
+    narrow, (x0, y0, x1, _) = mask.full(), (int(side) for side in mask.bbox)
+    middle, half = (x0 + x1) // 2, (x1 - x0) // 8
+    narrow[: y0 + 40, : middle - half] = narrow[: y0 + 40, middle + half :] = False
+    found = with_tracks(told, [CroppedMask.of(narrow)], told.path.points[0], Density(4, 50, 200))
+    tracks, seen = np.array(found.path.tracks), flags(found.path)
+    back = np.array(told.path.points[0]) + (tracks - np.array(told.path.points)) / np.array(told.path.scale)[:, None]
+    x, y = np.floor(back[..., 0]).astype(int), np.floor(back[..., 1]).astype(int)
+    near = cv2.dilate(hull(narrow).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    beside = ~near[np.clip(y, 0, HEIGHT - 1), np.clip(x, 0, WIDTH - 1)]
+    assert beside.any()
+    assert not (seen & beside).any()
 
 
 def test_a_side_that_turns_away_is_not_seen() -> None:

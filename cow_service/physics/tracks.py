@@ -136,7 +136,8 @@ class _Silhouettes:
 
     def told(self, body: int, carried: tuple[Floats, Bools]) -> dict[str, Any]:
         """Fields of a path: points of a body, and where they are seen; None where nothing ever hides one."""
-        points, seen = carried
+        # What is no simple shape, such as a bottle's neck, may be carried beside where it is drawn.
+        points, seen = carried[0], carried[1] & self._covered(body, carried[0])
         # What stays is chosen where it is seen: only what moves can come before it.
         for other in range(len(self.bodies)) if body in self._paths else self._paths:
             if other == body:
