@@ -163,11 +163,11 @@ def test_what_passes_in_front_hides_points_of_what_stays() -> None:
 
 def test_no_point_is_told_visible_beside_what_is_drawn() -> None:
     """A neck is carried as if the body were as wide there as below."""
-    bottle = body("cylinder", -0.9, 3, (0.4, 0.6, 0.4))
-    told, (mask,) = world([bottle], [moving(0, bottle, (3, 3), (-0.9, 0.9))])
-    narrow, (x0, y0, x1, _) = mask.full(), (int(side) for side in mask.bbox)
-    middle, half = (x0 + x1) // 2, (x1 - x0) // 8
-    narrow[: y0 + 40, : middle - half] = narrow[: y0 + 40, middle + half :] = False
+    bottle = body("cylinder", -0.7, 1.7, (0.5, 0.6, 0.5))
+    told, (mask,) = world([bottle], [moving(0, bottle, (1.7, 1.7), (-0.7, 0.7))])
+    narrow, (x0, y0, x1, y1) = mask.full(), (int(side) for side in mask.bbox)
+    middle, half, foot = (x0 + x1) // 2, (x1 - x0) // 8, y0 + 3 * (y1 - y0) // 4
+    narrow[:foot, : middle - half] = narrow[:foot, middle + half :] = False
     found = with_tracks(told, [CroppedMask.of(narrow)], told.path.points[0], Density(4, 50, 200))
     tracks, seen = np.array(found.path.tracks), flags(found.path)
     back = np.array(told.path.points[0]) + (tracks - np.array(told.path.points)) / np.array(told.path.scale)[:, None]
