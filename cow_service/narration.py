@@ -287,10 +287,15 @@ def facts_of(mover: str, trajectory: Trajectory) -> str:
 def shown(mover: str, trajectory: Trajectory) -> str:
     """What a clip shows, in one sentence: as `facts_of`, without what does not happen, or happens after its end."""
     last = (trajectory.num_frames - 1) / trajectory.fps
-    met = [each for each in trajectory.encounters if each.first_frame / trajectory.fps <= last]
-    within = [each for each in met if each.time is None or each.time <= last]
-    contacts = [each for each in trajectory.contacts if each.time <= last]
-    seen = {"encounters": tuple(within), "contacts": tuple(contacts), "outcome": None}
+    seen = {
+        "outcome": None,
+        "encounters": tuple(each for each in trajectory.encounters if each.time is None or each.time <= last),
+        "contacts": tuple(each for each in trajectory.contacts if each.time <= last),
+        "paths": tuple(
+            path.model_copy(update={"tipped_at": None}) if (path.tipped_at or 0.0) > last else path
+            for path in trajectory.paths
+        ),
+    }
     return f"{_Facts(mover, trajectory.model_copy(update=seen), only_what_happens=True).sentence()}."
 
 
@@ -465,15 +470,23 @@ class _Facts:
         ]
         if bounces and body == 0:
             times = {1: "once", 2: "twice"}.get(len(bounces), f"{len(bounces)} times")
-            return [f"bounces {times}", *([f"{on} on"] if first_touch - bounces[-1] > ROLLED_ON else [])]
+            landed = path.states[min(round(bounces[-1] * self._trajectory.fps), len(path.states) - 1)]
+            goes_on = first_touch - bounces[-1] > ROLLED_ON and math.dist(landed[:3], path.states[-1][:3]) >= MOVED
+            flight = self._flight(path) if self._only_what_happens else []
+            return [*flight, f"bounces {times}", *([f"{on} on"] if goes_on else [])]
         if record is None:
             return [f"moves {_direction(path)}"]
         if record.support == "air":
-            x, y, _ = _way_set_out(path)
-            return [f"flies {_direction(path)}" if abs(x) >= MOVED else "rises" if y < 0 else "falls"]
+            return self._flight(path)
         if not is_round and path.tipped_at is not None:
             on = "tips over and moves"
         return [f"{on} {_direction(path)}"]
+
+    @staticmethod
+    def _flight(path: Path) -> list[str]:
+        """How what nothing carries sets out."""
+        x, y, _ = _way_set_out(path)
+        return [f"flies {_direction(path)}" if abs(x) >= MOVED else "rises" if y < 0 else "falls"]
 
     def _time(self, encounter: Encounter) -> float:
         """Seconds until an encounter begins."""
@@ -488,7 +501,7 @@ class _Facts:
         """What a body does with another one, and when."""
         name, at = named(encounter.object, "the"), self._time(encounter)
         time, later = f"{at:.1f} s", self._after_clip(at)
-        share = "" if encounter.share is None else f"{round(100 * encounter.share)}%"
+        share = "" if encounter.share is None or self._only_what_happens else f"{round(100 * encounter.share)}%"
         if encounter.kind == "occludes":
             return f"passes in front of {name}{f' (hiding {share} of it)' if share else ''} from {time} on{later}"
         if encounter.kind == "occluded-by":

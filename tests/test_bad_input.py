@@ -389,7 +389,7 @@ def test_lengths_that_a_video_model_cannot_make(tmp_path: Path) -> None:
     with another_server(tmp_path) as server:
         body = {**BODY, "generator": "tiny-ati", "num_frames": 90}
         response = httpx.post(server.address + "/simulate", json=body, timeout=100)
-        told(response, 422, "invalid-request", "no clip of 90 frames at 16 per second; take 81")
+        told(response, 422, "invalid-request", "no clip of 90 frames at 16 per second; take 81 (5 s)")
 
 
 values = st.recursive(

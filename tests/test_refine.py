@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -17,7 +19,7 @@ from cow_service.errors import CheckpointInvalid
 from cow_service.generators.wan.checkpoints import load_transformer
 from cow_service.generators.wan.generator import WanGenerator, latent_mask
 from cow_service.generators.wan.loading import assemble
-from cow_service.generators.wan.pipeline import Conditioning, latent_shape
+from cow_service.generators.wan.pipeline import Conditioning, denoise, latent_shape, make_schedule
 from cow_service.generators.wan.profiles import Sampling
 from cow_service.generators.wan.ranks import Share
 from cow_service.generators.wan.tiny import make_tiny
@@ -41,18 +43,75 @@ def frames_of(service: Service, simulation: Simulation) -> list[Any]:
     return [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) for data in kept]
 
 
+PUT = "If I put the yellow ball to the right of the blue mug, will it fit without overlapping?"
+
+
+@pytest.mark.parametrize("question", [None, PUT])
 @pytest.mark.parametrize("name", TOYS)
-def test_at_full_strength_the_clip_is_the_compositors(toys: Service, name: str) -> None:
-    rate = int(MODELS[name].defaults["fps"])
-    refined = simulate(toys, generator=name, fps=rate, generator_options={"coarse_strength": 1.0}, video=False)
-    plain = simulate(toys, generator="cutout", fps=rate, video=False)
-    assert refined.generator.options["coarse_strength"] == 1
+def test_at_full_strength_the_clip_is_the_compositors(toys: Service, name: str, question: str | None) -> None:
+    rate, asked = int(MODELS[name].defaults["fps"]), {"video": False} | ({"question": question} if question else {})
+    refined = simulate(toys, generator=name, fps=rate, generator_options={"coarse_strength": 1.0}, **asked)
+    plain = simulate(toys, generator="cutout", fps=rate, **asked)
+    assert (refined.generator.steps, refined.generator.options["coarse_strength"]) == (0, 1)
     pairs = zip(frames_of(toys, refined), frames_of(toys, plain), strict=True)
     for index, (found, expected) in enumerate(pairs):
         height, width = found.shape[:2]
         small = cv2.resize(expected, (width, height), interpolation=cv2.INTER_AREA)
         label = height // 2  # a toy says so itself in the upper half
         assert np.abs(found[label:].astype(int) - small[label:]).max() <= 1, index
+
+
+def test_frames_are_those_nearest_in_time(toys: Service) -> None:
+    """Of a model's 24 a second, at the 16 a second of a request."""
+    options = {"coarse_strength": 1.0}
+    own = frames_of(toys, simulate(
+        toys, generator="tiny-refine", fps=24, num_frames=25, generator_options=options, video=False,
+        frames={"indices": list(range(25)), "max_side": None},
+    ))  # fmt: skip
+    asked = frames_of(toys, simulate(toys, generator="tiny-refine", fps=16, generator_options=options, video=False))
+    assert len(asked) == 17
+    for index, frame in enumerate(asked):
+        near = own[min(24, int(index * 1.5 + 0.5))].astype(int)
+        assert np.abs(frame - near).max() <= 12, index  # the world has its own frames at each rate
+        assert index < 4 or np.abs(frame - own[index].astype(int)).max() > 30, index
+
+
+@pytest.mark.parametrize("solver", ["unipc", "euler"])
+def test_what_is_put_back_stays(solver: str) -> None:
+    """A model that draws everything to 1, a clip of 0: where it is held, the next step begins with the clip's noise."""
+    noise, shape, steps = torch.randn(1, 16, 1, 4, 4), (20, 1, 4, 4), 40
+    seen: list[torch.Tensor] = []
+
+    class Draws:
+        dtype, config = torch.float32, SimpleNamespace(in_channels=36)
+
+        def cache_context(self, name: str) -> Any:
+            return nullcontext()
+
+        def _reset_stateful_cache(self) -> None:
+            pass
+
+        def __call__(self, hidden_states: torch.Tensor, timestep: torch.Tensor, **rest: Any) -> Any:
+            latents = hidden_states[:, :16]
+            seen.append(latents)
+            return ((latents - 1) / (timestep / 1000),)
+
+    moving = torch.ones(1, 1, 1, 4, 4, dtype=torch.bool)
+    given = Conditioning(
+        torch.zeros(1, 1, 1), None, None, torch.zeros(shape), torch.zeros(shape), torch.zeros_like(noise), moving
+    )
+    sampling = Sampling.model_validate(
+        {"solver": solver, "steps": steps, "shift": 3.0, "guidance_scale": 1.0, "coarse_strength": 0.05,
+         "object_strength": 0.5}
+    )  # fmt: skip
+    denoise(Draws(), CPU, noise, given, sampling, lambda done, total: None)
+    schedule = make_schedule(sampling, CPU)
+    assert len(seen) == steps - 2
+    held, after = 20 - 2, 20 + 1 - 2  # by the passes that are made
+    torch.testing.assert_close(seen[held], noise * float(schedule.sigmas[20]), atol=1e-4, rtol=1e-3)
+    sigma, following = float(schedule.sigmas[20]), float(schedule.sigmas[21])
+    one_step = noise * following + (1 - following / sigma)  # one step towards 1, from there
+    assert (seen[after] - one_step).abs().mean() < 0.03
 
 
 def distances(toys: Service, name: str, monkeypatch: pytest.MonkeyPatch, **strengths: float) -> tuple[float, float]:

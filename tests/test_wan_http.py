@@ -49,7 +49,7 @@ def test_frames_and_mp4(http: httpx.Client) -> None:
 def test_a_length_that_it_cannot_make(http: httpx.Client) -> None:
     answer = http.post("/simulate", json=body(num_frames=90))
     assert answer.status_code == 422
-    said = "this generator makes no clip of 90 frames at 16 per second; take 81"
+    said = "this generator makes no clip of 90 frames at 16 per second; take 81 (5 s)"
     assert answer.json()["errors"] == [{"pointer": "/num_frames", "detail": said}]
 
 

@@ -188,12 +188,12 @@ def tracks(
         raise InvalidRequest(f"{simulation.name} is not a simulation: {place}: {first['msg']}.") from error
     if not record.trajectory.path.states:
         raise InvalidRequest(f"{simulation.name} is a minimal result, without tracks: get it without `return=minimal`.")
-    told = record.trajectory
-    told = at_rate(told, CLIP_FPS, clip_length(told.num_frames, told.fps, CLIP_FPS))
-    found = tracks_of(told, record.image.width, record.image.height)
+    length = clip_length(record.trajectory.num_frames, record.trajectory.fps, CLIP_FPS)
+    trajectory = at_rate(record.trajectory, CLIP_FPS, length)
+    found = tracks_of(trajectory, record.image.width, record.image.height)
     with writable(out):
         written = write_tracks(found, out)
-    anchors, still = len(told.anchors), sum(len(each.points) for each in told.still_tracks)
+    anchors, still = len(trajectory.anchors), sum(len(each.points) for each in trajectory.still_tracks)
     moving = found.points.shape[1] - still - anchors
     names = " and ".join(str(path) for path in written)
     typer.echo(

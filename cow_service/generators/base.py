@@ -31,7 +31,6 @@ class GeneratorInput:
     before: GeneratorInput | None = None
     """Where things were put elsewhere: the same from the scene as the image shows it, from which they can be cut. Its
     trajectory has one frame more, the first, in which they are still there."""
-    tracks_given: bool = False  # the mover's tracks are the caller's
     inpainter: Inpainter | None = None  # paints what moving objects hide; None leaves it to the generator
 
 

@@ -83,6 +83,7 @@ def record_trajectory(
         contacts=contacts,
         light=(float(light[0, 0]), float(light[0, 1])) if world.fit.source == "shadow" else None,
         moving_until=until,
+        tracks_given=given is not None and given.tracks is not None,
         anchors=anchors,
         encounters=events.encounters(
             result.shown.events,
@@ -99,7 +100,7 @@ def record_trajectory(
         faint=world.faint,
         ensemble=0 if shown.ensemble is None else len(shown.ensemble.runs),
     )
-    if given is not None and given.tracks is not None:  # the caller's are all that there is
+    if trajectory.tracks_given:
         return trajectory
     return with_tracks(trajectory, [body.mask for body in shown.bodies], shown.seen[0].start)
 

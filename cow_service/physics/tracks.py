@@ -2,13 +2,13 @@
 
 Points are chosen inside a body's mask at the first frame, lifted onto its shape, and carried along with its pose. A
 point is hidden where it faces away from the camera, and where another body lies in front of it, by the same order in
-which the compositor draws. Points of a sphere do not roll with it: a plain ball looks the same however it has rolled.
+which the compositor draws, but for what is put into a container, of which that alone shows the front before its
+contents. Points of a sphere do not roll with it: a plain ball looks the same however it has rolled.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -28,11 +28,13 @@ DEEP = 0.25  # of the deepest point of a mask: so far from its rim points are ch
 STILL_POINTS = 3  # on a body that stays where it is
 TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
 WORKING_SIDE = 320  # px: paths are swept at this size
+MOST_CANDIDATES = 20_000  # among which points are chosen: more take seconds, and are no farther apart
 ANCHORS = 8
 GRID = 14  # candidates along the longer side
 CLEARANCE = 0.02  # of the shorter side, kept between an anchor and what may move
 
 Bools = NDArray[np.bool_]
+Extent: TypeAlias = tuple[Any, Any, Any]  # numbers, or arrays [F]
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def with_tracks(
     assert trajectory.camera is not None  # every world has one
     scene = _Silhouettes(trajectory, masks, start, FloorCamera.of(trajectory.camera, width, height))
     paths = [
-        path.model_copy(update=scene.told(path.body, scene.carried(path, density.count(masks[path.body]))))
+        path.model_copy(update=scene.fields(path.body, scene.carried(path, density.count(masks[path.body]))))
         for path in trajectory.paths
     ]
     moving = {path.body for path in paths}
@@ -71,13 +73,13 @@ def with_tracks(
         x0, y0, x1, y1 = trajectory.bodies[body].bbox
         chosen = np.array(points_inside(masks[body], ((x0 + x1) / 2, (y0 + y1) / 2), STILL_POINTS))
         stays = np.broadcast_to(chosen, (trajectory.num_frames, *chosen.shape))
-        seen = scene.told(body, (stays, np.ones(stays.shape[:2], bool)))["tracks_visible"]
+        seen = scene.fields(body, (stays, np.ones(stays.shape[:2], bool)))["tracks_visible"]
         still.append(StillTracks(body=body, points=pairs(chosen.round(POINT_DECIMALS)), visible=seen))
     return trajectory.model_copy(update={"paths": tuple(paths), "still_tracks": tuple(still)})
 
 
-def is_in_front(one: Any, other: Any, eye: float) -> Any:
-    """Whether one thing covers another one in the image, for numbers or arrays of (depth, bottom, top), m.
+def is_in_front(one: Extent, other: Extent, eye: float) -> Any:
+    """Whether one thing covers another one in the image, each given by its (depth, bottom, top), m.
 
     What is wholly above another's top is in front where the camera, at the height `eye`, looks down on that top. Else
     the nearer one is.
@@ -86,7 +88,7 @@ def is_in_front(one: Any, other: Any, eye: float) -> Any:
     slack = TOUCHING * np.minimum(top - bottom, other_top - other_bottom)
     above = (bottom >= other_top - slack) & (eye > other_top)
     below = (other_bottom >= top - slack) & (eye > top)
-    return above | ((below ^ True) & (depth <= other_depth))
+    return above | (np.logical_not(below) & (depth <= other_depth))
 
 
 class _Silhouettes:
@@ -96,6 +98,7 @@ class _Silhouettes:
         self._camera, self._frames, self._poses = camera, trajectory.num_frames, trajectory.law == "contact"
         self.bodies, self._masks, self._start = trajectory.bodies, masks, start
         self._paths = {path.body: path for path in trajectory.paths}
+        self._put = {each.body for each in trajectory.placed}
         places = [self._place(index) for index in range(len(self.bodies))]
         self._positions = places
         halves = [body.size[1] / 2 for body in self.bodies]
@@ -134,12 +137,12 @@ class _Silhouettes:
         cosine = np.einsum("fni,fni->fn", sight, normals) / np.maximum(np.linalg.norm(sight, axis=2), 1e-9)
         return seen + shift[:, None], (cosine >= FACING) | ~normals.any(axis=2)
 
-    def told(self, body: int, carried: tuple[Floats, Bools]) -> dict[str, Any]:
+    def fields(self, body: int, carried: tuple[Floats, Bools]) -> dict[str, Any]:
         """Fields of a path: points of a body, and where they are seen; None where nothing ever hides one."""
         # What is no simple shape, such as a bottle's neck, may be carried beside where it is drawn.
         points, seen = carried[0], carried[1] & self._covered(body, carried[0])
-        # What stays is chosen where it is seen: only what moves can come before it.
-        for other in range(len(self.bodies)) if body in self._paths else self._paths:
+        # What stays where the image shows it is chosen where it is seen: only what moves can come before it.
+        for other in range(len(self.bodies)) if body in self._paths or body in self._put else self._paths:
             if other == body:
                 continue
             front = is_in_front(self._extents[other], self._extents[body], self._camera.height)
@@ -224,10 +227,10 @@ def _level(shape: Shape, places: Floats, half: Floats) -> Floats:
 
 
 def at_rate(trajectory: Trajectory, fps: float, num_frames: int, lead: int = 0) -> Trajectory:
-    """The same motion at another frame rate, for so many frames: after its last frame all stays where it is.
+    """What a generator is told, at another frame rate: straight on between frames, and at rest after the last.
 
     What is true at the frames before and after a time is true at that time. `lead` frames before the motion begins
-    stay as they are, and are not counted.
+    stay as they are, and are not counted. Encounters and the ensemble's paths, which count frames, are left out.
     """
     last = trajectory.num_frames - 1
     if fps == trajectory.fps and num_frames + lead == last + 1:
@@ -237,10 +240,19 @@ def at_rate(trajectory: Trajectory, fps: float, num_frames: int, lead: int = 0) 
     before = np.floor(times + 1e-9).astype(int)
     after, share = np.minimum(np.ceil(times - 1e-9).astype(int), last), times - before
 
-    def between(values: Sequence[Any]) -> list[Any]:
+    def between(values: Sequence[Any]) -> Any:
         known = np.array(values, np.float64)
         part = share.reshape(-1, *[1] * (known.ndim - 1))
-        return (known[before] * (1 - part) + known[after] * part).tolist() if len(known) else []
+        return known[before] * (1 - part) + known[after] * part if len(known) else known
+
+    def rows(values: Sequence[Any]) -> tuple[Any, ...]:
+        return tuple(map(tuple, between(values).tolist()))
+
+    def poses(turns: Sequence[Any]) -> tuple[Any, ...]:
+        known = np.array(turns).reshape(-1, 4)  # a quaternion and its negative are the same turn: the nearer is taken
+        flips = np.cumprod(np.where((known[1:] * known[:-1]).sum(axis=1) < 0, -1.0, 1.0))
+        found = np.array(between((known * np.concatenate([[1.0], flips])[: len(known), None]).tolist())).reshape(-1, 4)
+        return tuple(map(tuple, (found / np.linalg.norm(found, axis=-1, keepdims=True)).tolist()))
 
     def both(flags: Sequence[bool]) -> tuple[bool, ...]:
         return tuple((np.array(flags)[before] & np.array(flags)[after]).tolist())
@@ -248,13 +260,15 @@ def at_rate(trajectory: Trajectory, fps: float, num_frames: int, lead: int = 0) 
     paths = [
         path.model_copy(
             update={
-                **{name: tuple(map(tuple, between(getattr(path, name)))) for name in ("states", "points", "band")},
-                "turns": _unit(between(path.turns)),
+                "states": rows(path.states),
+                "points": rows(path.points),
+                "turns": poses(path.turns),
                 "visible": both(path.visible),
-                "scale": tuple(between(path.scale)),
-                "rotation": tuple(between(path.rotation)),
-                "futures": tuple(tuple(map(tuple, between(each))) for each in path.futures),
-                "tracks": tuple(tuple(map(tuple, between(each))) for each in path.tracks),
+                "scale": tuple(between(path.scale).tolist()),
+                "rotation": tuple(between(path.rotation).tolist()),
+                "band": (),
+                "futures": (),
+                "tracks": tuple(map(rows, path.tracks)),
                 "tracks_visible": None if path.tracks_visible is None else tuple(map(both, path.tracks_visible)),
             }
         )
@@ -264,11 +278,8 @@ def at_rate(trajectory: Trajectory, fps: float, num_frames: int, lead: int = 0) 
         each if each.visible is None else each.model_copy(update={"visible": tuple(map(both, each.visible))})
         for each in trajectory.still_tracks
     ]
-    return trajectory.model_copy(update={"fps": fps, "paths": tuple(paths), "still_tracks": tuple(still)})
-
-
-def _unit(turns: Sequence[Any]) -> tuple[tuple[float, float, float, float], ...]:
-    return tuple((x / size, y / size, z / size, w / size) for x, y, z, w in turns if (size := math.hypot(x, y, z, w)))
+    update = {"fps": fps, "paths": tuple(paths), "still_tracks": tuple(still), "encounters": ()}
+    return trajectory.model_copy(update=update)
 
 
 def pairs(points: Floats) -> tuple[Point, ...]:
@@ -315,6 +326,7 @@ def points_inside(mask: CroppedMask, centre: tuple[float, float], count: int) ->
     deep = cv2.distanceTransform(np.pad(mask.patch, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     rows, columns = np.nonzero(deep >= DEEP * deep.max())
     candidates = np.stack([columns + mask.columns.start + 0.5, rows + mask.rows.start + 0.5], axis=1)
+    candidates = candidates[:: len(candidates) // MOST_CANDIDATES + 1]
     start = candidates[int(np.linalg.norm(candidates - np.array(centre), axis=1).argmin())]
     return tuple((float(x), float(y)) for x, y in [start, *_farthest(candidates, start, count - 1)])
 

@@ -401,7 +401,7 @@ class StillTracks(Record):
     body: int = Field(ge=0, description="Which of `Trajectory.bodies`.")
     points: tuple[Point, ...] = Field(description="[x, y], px, at every frame.")
     visible: tuple[tuple[bool, ...], ...] | None = Field(
-        default=None, description=f"Per point and frame: nothing hides it. Null: nothing ever does{_MINIMAL}."
+        default=None, description="Per point and frame: nothing hides it. Null: nothing ever does."
     )
 
 
@@ -540,8 +540,9 @@ class Trajectory(Record):
     moving_until: float | None = Field(
         default=None, ge=0, description="Seconds from which nothing moves any more, or the mover has left the image."
     )
+    tracks_given: bool = Field(default=False, description="The tracks are those of the request, and the only ones.")
     still_tracks: tuple[StillTracks, ...] = Field(
-        default=(), description="Of the bodies that stay where they are; empty in results of older versions."
+        default=(), description=f"Of the bodies that stay where they are; empty in results of older versions{_MINIMAL}."
     )
     anchors: tuple[Point, ...] = Field(description="Static points on the background that hold the camera still, px.")
     encounters: tuple[Encounter, ...] = ()

@@ -149,11 +149,8 @@ def _inputs(
     scene = run.scene_of(grounding, motion.cue)
     obstacles, taken = obstacles_of(scene, grounding)
     options, seed, inpainter = run.generator_options, run.request.clip_seed, run.backends.perception.inpainter
-    own = run.request.trajectory is not None and run.request.trajectory.tracks is not None
     if trajectory.factual is None:
-        given = GeneratorInput(
-            scene, grounding, motion, trajectory, obstacles, seed, options, tracks_given=own, inpainter=inpainter
-        )
+        given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, seed, options, inpainter=inpainter)
         return given, None
     everything = (*obstacles, *taken)
     as_it_is = GeneratorInput(

@@ -50,7 +50,8 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
             f"`generator_options` are not valid for this generator. It takes: {known}.", errors=fields
         ) from error
     if request.num_frames not in (legal := generator.nearest_lengths(request.num_frames, request.fps)):
-        asked, able = f"{request.num_frames} frames at {request.fps:g} per second", " or ".join(map(str, legal))
+        asked = f"{request.num_frames} frames at {request.fps:g} per second"
+        able = " or ".join(f"{length} ({(length - 1) / request.fps:g} s)" for length in legal)
         detail = f"this generator makes no clip of {asked}; take {able}"
         raise InvalidRequest(f"`num_frames`: {detail}.", errors=(FieldError("/num_frames", detail),))
     last = request.num_frames - 1

@@ -125,17 +125,19 @@ def with_attention(
     height: int,
     device: torch.device,
     kept: Path | None = None,
+    num_frames: int = FRAMES,
     cell: int = CELL,
 ) -> Profile:
     """The profile with the backend that `attention: auto` chooses on this device; any other profile as it is.
 
-    `width`, `height`: px of a clip, `cell`: of its latent cells. `kept`: file of earlier choices. Without it another
-    start of the same versions on the same GPU might choose another backend, and cached clips would not be found.
+    `width`, `height`, `num_frames`: of the longest clip, px; `cell`: px of its latent cells. `kept`: file of earlier
+    choices. Without it another start of the same versions on the same GPU might choose another backend, and cached
+    clips would not be found.
     """
     wanted = profile.acceleration
     if wanted.attention != AUTO:
         return profile
-    machine, shape = detect_capabilities(device), shape_of(architecture, width, height, cell=cell)
+    machine, shape = detect_capabilities(device), shape_of(architecture, width, height, num_frames, cell)
     names = tuple(name for name in backends_for_auto(wanted, machine) if _fetched(name) is None)
     situation = repr((machine.name, torch.__version__, diffusers.__version__, profile.dtype, tuple(shape), names))
     before: dict[str, str] = {}

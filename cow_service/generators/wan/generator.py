@@ -37,10 +37,10 @@ from cow_service.generators.wan.pipeline import (
 )
 from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, WanOptions
 from cow_service.generators.wan.ranks import RankGroup
-from cow_service.generators.wan.tracks import STRIDE, clip_length, tracks_of
+from cow_service.generators.wan.tracks import STRIDE, Tracks, clip_length, tracks_of
 from cow_service.narration import shown
 from cow_service.physics.tracks import Density, at_rate, with_tracks
-from cow_service.records import GeneratorInfo, Trajectory
+from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Image, Mask
@@ -53,8 +53,7 @@ USUAL_SIDES = 832, 480  # their ratio
 PATCH = 2  # latent cells, each way: the sides of a clip are multiples of it
 POSITIONS = 1024  # of tokens, that the model has each way
 DENOISING_SHARE = 0.9  # of the progress; the rest is decoding
-# Frames of the two clips to compile for: the longest, which is the default of most requests, then any other.
-COMPILED_FRAMES = (81, 17)
+COMPILED_FRAMES = 17  # of the clip that stands for any but the longest, which is the default of most requests
 
 ClipSize: TypeAlias = tuple[int, int, int]  # width and height (px), frames
 
@@ -69,6 +68,14 @@ def clip_size(max_area: int, width: int, height: int, cell: int = CELL) -> tuple
     # The small term keeps an exact 480 from becoming 464 when the root is a hair below it.
     clip_width, clip_height = (max(multiple, int(side / multiple + 1e-6) * multiple) for side in sides)
     return clip_width, clip_height
+
+
+@dataclass(frozen=True)
+class CoarseClip:
+    """The compositor's clip, at the size and frame rate of a video model."""
+
+    frames: Image  # [F, height, width, 3]
+    moving: Mask  # [F, height, width]: where what moves is seen
 
 
 @dataclass(eq=False)
@@ -94,8 +101,6 @@ class WanGenerator(WanLimits):
         defaults = self.manifest.defaults
         self._max_area, self._fps = int(defaults["max_area"]), float(defaults["fps"])  # px per frame; of the model's
         self._cell, self._channels = self.pipeline.vae_scale_factor_spatial, self.pipeline.vae.config.z_dim
-        sides = (float(defaults.get(f"track_{name}", 1)) for name in ("spacing", "least", "most"))
-        self._spacing, self._least, self._most = sides
         self._embeddings = EmbeddingCache(self.pipeline)
         self._negative_prompt = str(self.manifest.defaults.get("negative_prompt", ""))
         threads = self.manifest.defaults.get("threads")
@@ -103,7 +108,7 @@ class WanGenerator(WanLimits):
         parts = (
             *(self.manifest.name, self._repository, sorted(self.revisions.items()), self.weights_identity),
             *(self.device.type, self.settings.profile, self.profile.model_dump_json()),
-            *(self._max_area, self._negative_prompt),
+            sorted(defaults.items()),
         )
         self.fingerprint = sha256(repr(parts).encode()).hexdigest()
 
@@ -113,7 +118,7 @@ class WanGenerator(WanLimits):
         return (self.group or self.pipeline).denoise
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Of a clip, at the image's aspect ratio, in multiples of 16 px. Raises `InvalidRequest` if too narrow."""
+        """Of a clip, at the image's aspect ratio, in whole patches. Raises `InvalidRequest` if too narrow."""
         clip_width, clip_height = clip_size(self._max_area, width, height, self._cell)
         if max(clip_width, clip_height) > POSITIONS * PATCH * self._cell:
             detail = f"{width} x {height} px is too narrow for a video model: crop it"
@@ -126,7 +131,8 @@ class WanGenerator(WanLimits):
             return
         width, height = self.size(*USUAL_SIDES)
         with self._own_device(f"A clip of {width} x {height}", lambda: None):
-            sizes = [(width, height, frames) for frames in COMPILED_FRAMES]
+            longest = int(self.manifest.defaults["num_frames"])
+            sizes = [(width, height, frames) for frames in (longest, COMPILED_FRAMES)]
             compile_for(self.pipeline, self.denoise, self.profile.sampling, sizes)
 
     @contextmanager
@@ -147,13 +153,13 @@ class WanGenerator(WanLimits):
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
         options = cast(WanOptions, given.options)  # the generator's own `options_model`
         sampling, prompt, negative = self._chosen(options, given)
-        changed = self.profile.acceleration.model_dump(exclude_defaults=True, mode="json").items()
+        wanted = self.profile.acceleration.model_dump(exclude_defaults=True, mode="json", exclude={"mag_ratios"})
         return GeneratorInfo(
             name=self.manifest.name,
             model=self._repository,
             revision=self.revisions.get("transformer"),
             seed=given.seed,
-            steps=sampling.steps,
+            steps=sampling.steps - sampling.first_step,
             is_toy=not self.manifest.sources,
             options={
                 "profile": self.settings.profile,
@@ -162,6 +168,7 @@ class WanGenerator(WanLimits):
                 "guidance_scale": sampling.guidance_scale,
                 "dtype": self.profile.dtype,
                 "vae_dtype": self.profile.vae_dtype,
+                **({} if self.profile.decode_dtype is None else {"decode_dtype": self.profile.decode_dtype}),
                 "device": self.device.type,
                 "prompt": prompt,
                 "negative_prompt": negative or "",
@@ -171,7 +178,10 @@ class WanGenerator(WanLimits):
             }
             | {name: value for name in _STRENGTHS if (value := getattr(sampling, name))}
             | {f"{part}_revision": revision for part, revision in self.revisions.items() if part != "transformer"}
-            | {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in changed},
+            | {
+                name: value if isinstance(value, bool | int | float | str) else str(value)
+                for name, value in wanted.items()
+            },
         )
 
     def render(
@@ -182,18 +192,36 @@ class WanGenerator(WanLimits):
         `progress` is called after every denoising step; once it has raised, nothing more is computed.
         """
         width, height = self.size(given.scene.width, given.scene.height)
-        length, fps = self._length(given), given.trajectory.fps
-        what = f"A clip of {length} frames at {width} x {height}"
-        with self._own_device(what, lambda: progress(0.0)):
-            sampling, prompt, negative = self._chosen(cast(WanOptions, given.options), given)
-            slowed = replace(given, trajectory=at_rate(given.trajectory, self._fps, length))
-            if given.before is not None:
-                before = at_rate(given.before.trajectory, self._fps, length, lead=1)
-                slowed = replace(slowed, before=replace(given.before, trajectory=before))
-            video = self._make_clip(slowed, width, height, sampling, prompt, negative, progress)
+        length, rate = self._length(given), self._fps / given.trajectory.fps
+        sampling, prompt, negative = self._chosen(cast(WanOptions, given.options), given)
+        retimed = replace(given, trajectory=at_rate(given.trajectory, self._fps, length))
+        if given.before is not None:
+            before = at_rate(given.before.trajectory, self._fps, length, lead=1)
+            retimed = replace(retimed, before=replace(given.before, trajectory=before))
+        # What needs no device is done before it is waited for.
+        coarse = coarse_clip(retimed, width, height, progress) if sampling.held_steps else None
+        if coarse is not None and sampling.first_step == sampling.steps:
+            video = coarse.frames  # nothing is left to sample
+        else:
+            tracks = None if self.conditioning is None else self._tracks(retimed, width, height)
+            with self._own_device(f"A clip of {length} frames at {width} x {height}", lambda: progress(0.0)):
+                video = self._make_clip(retimed, width, height, tracks, coarse, sampling, (prompt, negative), progress)
         progress(1.0)
         for index in indices:
-            yield video[min(round(index * self._fps / fps), length - 1)]
+            yield video[min(math.floor(index * rate + 0.5), length - 1)]
+
+    def _tracks(self, given: GeneratorInput, width: int, height: int) -> Tracks:
+        """On the frames of a clip (px): of its bodies, as many as the model takes, and the anchors."""
+        spacing, least, most = (self.manifest.defaults[f"track_{name}"] for name in ("spacing", "least", "most"))
+        scene, trajectory = given.scene, given.trajectory
+        if not trajectory.tracks_given:
+            mover = CroppedMask.of(scene.silhouette(given.grounding.bbox))
+            masks = [mover, *(each.mask for each in given.obstacles)]
+            density = Density(float(spacing) * scene.width / width, int(least), int(most))
+            trajectory = with_tracks(trajectory, masks, given.grounding.point, density)
+        # The sides of a clip are rounded, so that its aspect ratio is not quite the image's.
+        found = tracks_of(trajectory, scene.width, scene.height)
+        return found.scaled(width / scene.width, height / scene.height)
 
     def _length(self, given: GeneratorInput) -> int:
         """Frames of the model's clip."""
@@ -204,9 +232,10 @@ class WanGenerator(WanLimits):
         given: GeneratorInput,
         width: int,
         height: int,
+        tracks: Tracks | None,
+        coarse: CoarseClip | None,
         sampling: Sampling,
-        prompt: str,
-        negative: str | None,
+        texts: tuple[str, str | None],
         progress: Callable[[float], None],
     ) -> Image:
         """All frames [F, height, width, 3] of a trajectory at the model's frame rate."""
@@ -215,26 +244,22 @@ class WanGenerator(WanLimits):
         noise = torch.randn(latent_shape(width, height, length, self._channels, self._cell), generator=random)
         progress(0.0)
         try:
-            scene, options = given.scene, cast(WanOptions, given.options)
-            coarse = coarse_clip(given, width, height, progress) if sampling.held_steps else None
-            if coarse is not None and sampling.first_step == sampling.steps:
-                return coarse.frames  # nothing is left to sample
-            first_frame = scene.clean if options.clean_cues else scene.image
+            # Before the texts: beside their encoder there may be no room for the VAE.
+            latents = None if coarse is None else self.pipeline.encode(coarse.frames)
+            progress(0.0)
+            clean, (prompt, negative) = cast(WanOptions, given.options).clean_cues, texts
+            first_frame = given.scene.clean if clean else given.scene.image
             image = self._embeddings.image(first_frame, width, height, length)
             condition = unconditional = image.condition
-            if self.conditioning is not None:
-                density = Density(self._spacing * scene.width / width, int(self._least), int(self._most))
-                tracks = tracks_of(with_surface_tracks(given, density), scene.width, scene.height)
-                # In pixels of the clip: its sides are rounded, so that its aspect ratio is not quite the image's.
-                tracks = tracks.scaled(width / scene.width, height / scene.height)
-                condition, unconditional = self.conditioning(image.condition, tracks, width, height)
+            if self.conditioning is not None and tracks is not None:
+                condition, unconditional = self.conditioning(condition, tracks, width, height)
             conditioning = Conditioning(
                 prompt=self._embeddings.text(prompt),
                 negative_prompt=None if negative is None else self._embeddings.text(negative),
                 image=image.embeds,
                 condition=condition,
                 unconditional=unconditional,
-                coarse=None if coarse is None else self.pipeline.encode(coarse.frames),
+                coarse=latents,
                 moving=None if coarse is None else latent_mask(coarse.moving, noise.shape),
             )
             if self.profile.acceleration.offload == "model":  # else the last encoder stays beside the transformer
@@ -255,17 +280,12 @@ class WanGenerator(WanLimits):
         sampling = self.profile.sampling.model_copy(update=update)
         prompt = options.prompt
         if prompt is None:
-            prompt = f"{shown(given.grounding.object, given.trajectory)} {CAMERA}"
+            trajectory, mover = given.trajectory, given.grounding.object
+            # Where something is put somewhere, the motion's sentence names the place.
+            is_put = trajectory.placement is not None
+            prompt = given.motion.sentence if is_put else f"{shown(mover, trajectory)} {CAMERA}"
         negative = self._negative_prompt if options.negative_prompt is None else options.negative_prompt
         return sampling, prompt, negative if sampling.is_guided else None
-
-
-@dataclass(frozen=True)
-class CoarseClip:
-    """The compositor's clip, at the size and frame rate of a video model."""
-
-    frames: Image  # [F, height, width, 3]
-    moving: Mask  # [F, height, width]: where what moves is seen
 
 
 def coarse_clip(given: GeneratorInput, width: int, height: int, progress: Callable[[float], None]) -> CoarseClip:
@@ -277,7 +297,9 @@ def coarse_clip(given: GeneratorInput, width: int, height: int, progress: Callab
     for index in range(earlier, earlier + given.trajectory.num_frames):
         progress(0.0)
         frame, mask = compose(layers, index), moving_mask(layers, index).astype(np.uint8)
-        frames.append(np.asarray(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), np.uint8))
+        shrinks = frame.shape[1] >= width
+        resampling = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+        frames.append(np.asarray(cv2.resize(frame, (width, height), interpolation=resampling), np.uint8))
         masks.append(np.asarray(cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST), bool))
     return CoarseClip(np.stack(frames), np.stack(masks))
 
@@ -287,15 +309,6 @@ def latent_mask(moving: Mask, shape: Sequence[int]) -> Tensor:
     frames = torch.from_numpy(moving)
     grouped = torch.cat([frames[:1], frames[1:].unflatten(0, (-1, STRIDE)).any(dim=1)]).float()
     return adaptive_max_pool2d(grouped, tuple(shape[3:]))[None, None] > 0
-
-
-def with_surface_tracks(given: GeneratorInput, density: Density) -> Trajectory:
-    """The trajectory with as many tracks as a model takes; the caller's own stay as they are, and alone."""
-    if given.tracks_given:
-        return given.trajectory
-    mover = CroppedMask.of(given.scene.silhouette(given.grounding.bbox))
-    masks = [mover, *(each.mask for each in given.obstacles)]
-    return with_tracks(given.trajectory, masks, given.grounding.point, density)
 
 
 def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling, sizes: Iterable[ClipSize]) -> None:

@@ -59,7 +59,8 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning | None, s
     size = clip_size(int(manifest.defaults["max_area"]), *USUAL_SIDES, cell)
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
         kept = settings.data_dir / "attention.json"
-        profile = with_attention(profile, manifest.architecture, *size, device, kept, cell)
+        longest = int(manifest.defaults["num_frames"])
+        profile = with_attention(profile, manifest.architecture, *size, device, kept, longest, cell)
         weights = replace(weights, profile=profile)
         pipeline, group = weights.load_pipeline(device)
     generator = WanGenerator(

@@ -5,7 +5,7 @@ between the guided and the unconditional pass, several processes can share the s
 after every step.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
@@ -189,8 +189,10 @@ class EmbeddingCache:
         self._images.clear()
 
 
-def make_schedule(sampling: Sampling, device: torch.device) -> Any:
+def make_schedule(sampling: Sampling, device: torch.device, uncorrected: Sequence[int] = ()) -> Any:
     """A fresh scheduler of diffusers with its steps set; it holds the state of one clip.
+
+    After the `uncorrected` steps the latents that it is handed count: UniPC would go on from those that it made itself.
 
     UniPC starts at the noise level of the public Wan2.1 implementation, 0.999 before the shift (diffusers: 1.0).
     """
@@ -204,6 +206,7 @@ def make_schedule(sampling: Sampling, device: torch.device) -> Any:
             prediction_type="flow_prediction",
             use_flow_sigmas=True,
             flow_shift=sampling.shift,
+            disable_corrector=list(uncorrected),
         )
         sigmas = np.linspace(1 - 1 / TRAIN_STEPS, 0, sampling.steps + 1)[:-1]
     schedule.set_timesteps(sigmas=cast(Any, sigmas), device=device)
@@ -228,8 +231,8 @@ def denoise(
     where something moves (Time-to-Move, arXiv 2511.08633).
     """
     dtype = cast(torch.dtype, transformer.dtype)  # found by a walk over all weights: once per clip
-    schedule = make_schedule(sampling, device)
     first, held = (sampling.first_step, sampling.held_steps) if given.coarse is not None else (0, 0)
+    schedule = make_schedule(sampling, device, range(first, held))
     schedule.set_begin_index(first)
     noise = noise.to(device, torch.float32)
     guided, unguided = (part.to(noise)[None] for part in (given.condition, given.unconditional))
@@ -256,7 +259,7 @@ def denoise(
     latents = noise if coarse is None else coarse_at(first)
 
     def velocity_of(branch: Branch, condition: Tensor, time: Tensor, text: Tensor) -> Tensor:
-        """[1, 16, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
+        """[1, C, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
 
         def compute() -> Tensor:
             states, times = taken(condition, time)

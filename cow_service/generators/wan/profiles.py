@@ -6,7 +6,7 @@ Without the model's libraries: a server that has none checks requests and passes
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cow_service.errors import GeneratorUnavailable
 from cow_service.records import Record
@@ -46,12 +46,16 @@ class Sampling(Record):
     @property
     def first_step(self) -> int:
         """The step that sampling begins with, where there is a coarse clip."""
-        return math.ceil(self.coarse_strength * self.steps - 1e-6)
+        return self._steps(self.coarse_strength)
 
     @property
     def held_steps(self) -> int:
         """How many steps what moves is kept as in the coarse clip."""
-        return max(self.first_step, math.ceil(self.object_strength * self.steps - 1e-6))
+        return max(self.first_step, self._steps(self.object_strength))
+
+    def _steps(self, strength: float) -> int:
+        """All of them only at 1: with few steps, too, the model has the last word."""
+        return self.steps if strength == 1 else min(math.ceil(strength * self.steps - 1e-6), self.steps - 1)
 
     @property
     def is_guided(self) -> bool:
@@ -135,6 +139,12 @@ class Acceleration(Record):
         "computes the unconditional pass; the same frames in about half the time, where steps are guided.",
     )
 
+    @model_validator(mode="after")
+    def _has_ratios(self) -> "Acceleration":
+        if (self.cache == "magcache") != bool(self.mag_ratios) or len(self.mag_ratios) % 2:
+            raise ValueError("`mag_ratios` go with `cache: magcache`, two for each step")
+        return self
+
     @property
     def keeps_float8(self) -> bool:
         """Whether the float8 of a checkpoint stays as it is."""
@@ -155,7 +165,7 @@ class Profile(Record):
     vae_dtype: Precision = Field(
         default="float32", description="Of the VAE; bfloat16 decodes in less time, with slightly banded gradients."
     )
-    decode_dtype: Precision | None = Field(
+    decode_dtype: Literal["bfloat16", "float16"] | None = Field(
         default=None,
         description="In which the VAE decodes where that is not its own: bfloat16 is faster, with slightly banded "
         "gradients, and the first frame is still encoded in `vae_dtype`.",

@@ -266,7 +266,7 @@ class Sharing:
             self._transformer.enable_parallelism(config=self._context)
 
     def prepare(self, noise: Tensor) -> None:
-        """Before each clip, of which `noise` [1, 16, T, h, w] has the size: any number of tokens can be split."""
+        """Before each clip, of which `noise` [1, C, T, h, w] has the size: any number of tokens can be split."""
         self._use_device()
         if self._context is not None:
             tokens = noise[0, 0].numel() // PATCH

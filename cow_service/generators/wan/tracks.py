@@ -74,8 +74,8 @@ def tracks_of(trajectory: Trajectory, width: int, height: int) -> Tracks:
             visible &= np.array(path.tracks_visible, bool).reshape(-1, frames).T
         parts.append(Tracks(points.astype(np.float32), visible))
     most = max(MAX_OTHER_TRACKS, 3 * parts[0].points.shape[1])  # memory and time of a clip grow with their number
-    least = max(1, most // max(1, len(parts) - 1))
-    parts[1:] = [Tracks(part.points[:, :least], part.visible[:, :least]) for part in parts[1 : most + 1]]
+    each = max(1, most // max(1, len(parts) - 1))
+    parts[1:] = [Tracks(part.points[:, :each], part.visible[:, :each]) for part in parts[1 : most + 1]]
     for still in trajectory.still_tracks:
         points = np.array(still.points, np.float64).reshape(1, -1, 2).repeat(frames, axis=0)
         seen = True if still.visible is None else np.array(still.visible, bool).reshape(-1, frames).T
@@ -136,7 +136,8 @@ def write_tracks(tracks: Tracks, path: Path) -> tuple[Path, ...]:
         return path, visibility
     if tracks.num_frames > MAX_FRAMES:
         raise InvalidRequest(
-            f"The trajectory has {tracks.num_frames} frames: ATI's files hold {MAX_FRAMES}. Simulate with that many."
+            f"The clip takes {tracks.num_frames} frames at {CLIP_FPS:g} per second, and ATI's files hold {MAX_FRAMES}, "
+            "5 s. Simulate a shorter one."
         )
     zipped = io.BytesIO()
     np.savez_compressed(zipped, array=to_ati_file(tracks))
