@@ -55,14 +55,16 @@ def settings_in(tmp_path: Path, **environment: str) -> dict[str, str]:
 
 
 def cow(tmp_path: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """A process of its own, which has what it imports from another one."""
+    """A process of its own, which in this file has what it imports from another one."""
+    if not _templates:
+        return cow_from_nothing(tmp_path, *arguments, **environment)
     return _templates[0].begin(arguments, tmp_path, settings_in(tmp_path, **environment)).done()
 
 
-def cow_from_nothing(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def cow_from_nothing(tmp_path: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "cow_service.cli.main", *arguments],
-        env=settings_in(tmp_path),
+        env=settings_in(tmp_path, **environment),
         cwd=tmp_path,
         capture_output=True,
         text=True,

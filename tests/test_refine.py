@@ -43,7 +43,7 @@ def frames_of(service: Service, simulation: Simulation) -> list[Any]:
     return [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) for data in kept]
 
 
-PUT = "If I put the yellow ball to the right of the blue mug, will it fit without overlapping?"
+PUT = "If the blue mug is put to the left of the white mug and the yellow ball moves to the right, will it hit the blue mug?"
 
 
 @pytest.mark.parametrize("question", [None, PUT])
