@@ -43,7 +43,10 @@ def frames_of(service: Service, simulation: Simulation) -> list[Any]:
     return [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) for data in kept]
 
 
-PUT = "If the blue mug is put to the left of the white mug and the yellow ball moves to the right, will it hit the blue mug?"
+PUT = (
+    "If the blue mug is put to the left of the white mug and the yellow ball moves to the right, "
+    "will it hit the blue mug?"
+)
 
 
 @pytest.mark.parametrize("question", [None, PUT])
