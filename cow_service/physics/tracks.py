@@ -28,7 +28,7 @@ DEEP = 0.25  # of the deepest point of a mask: so far from its rim points are ch
 STILL_POINTS = 3  # on a body that stays where it is
 TOUCHING = 0.25  # of the smaller height: how deep one body may seem to stand in the one beneath it
 WORKING_SIDE = 320  # px: paths are swept at this size
-MOST_CANDIDATES = 20_000  # among which points are chosen: more take seconds, and are no farther apart
+MOST_CANDIDATES = 4_000  # among which points are chosen: more take seconds, and are no farther apart
 ANCHORS = 8
 GRID = 14  # candidates along the longer side
 CLEARANCE = 0.02  # of the shorter side, kept between an anchor and what may move
@@ -107,7 +107,7 @@ class _Silhouettes:
             (place[:, 2], middle - half, middle + half)
             for place, middle, half in zip(places, middles, halves, strict=True)
         ]
-        self._grown = [_Grown(mask) for mask in masks]
+        self._grown: dict[int, _Grown] = {}
 
     def _place(self, body: int) -> Floats:
         """Its centre [F, 3] in the frame of the camera."""
@@ -161,6 +161,8 @@ class _Silhouettes:
             x, y = np.moveaxis(points - np.array(path.points)[:, None], 2, 0)
             turned_back = np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x], 2)
             back = start + turned_back / np.maximum(np.array(path.scale), 1e-6)[:, None, None]
+        if body not in self._grown:
+            self._grown[body] = _Grown(self._masks[body])
         return self._grown[body].contains(back)
 
 

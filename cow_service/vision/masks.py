@@ -118,9 +118,11 @@ def roundness_of(mask: Mask) -> float:
 def hull(mask: Mask) -> Mask:
     """The convex hull [H, W] of a mask."""
     filled = np.zeros(mask.shape, np.uint8)
-    ys, xs = np.nonzero(mask)
-    if len(xs):
-        cv2.fillConvexPoly(filled, cv2.convexHull(np.stack([xs, ys], axis=1).astype(np.int32)), 1)
+    rows = np.nonzero(mask.any(axis=1))[0]
+    if len(rows):  # the first and the last pixel of each row are enough
+        ends = mask[rows].argmax(axis=1), mask.shape[1] - 1 - mask[rows, ::-1].argmax(axis=1)
+        points = np.stack([np.concatenate(ends), np.tile(rows, 2)], axis=1)
+        cv2.fillConvexPoly(filled, cv2.convexHull(points.astype(np.int32)), 1)
     return filled > 0
 
 
