@@ -161,7 +161,7 @@ def test_a_server_that_forgets_the_picture_is_sent_it_again(served: Served, wind
     seen = Seen(str(served.http.base_url), windows, requests_fail=True)
     page, forgets = seen.page, {"type": "urn:cow:problem:artifact-not-found", "title": "Gone.", "detail": "Gone."}
     page.mouse.move(*seen.at(BARE))
-    page.wait_for_timeout(200)
+    expect(page.get_by_text("No clear outline here: draw a box.")).to_be_visible()  # the picture is there
     uploads = len([body for path, body in seen.requests if path == "look" and not body])
     page.route("**/look", lambda route: route.fulfill(status=404, body=json.dumps(forgets)), times=1)
     page.mouse.move(*seen.at(BALL))
