@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -86,7 +85,7 @@ def test_what_is_put_back_stays(solver: str) -> None:
     seen: list[torch.Tensor] = []
 
     class Draws:
-        dtype, config = torch.float32, SimpleNamespace(in_channels=36)
+        dtype = torch.float32
 
         def cache_context(self, name: str) -> Any:
             return nullcontext()

@@ -240,29 +240,13 @@ def denoise(
     negative = None if given.negative_prompt is None else given.negative_prompt.to(device, dtype)
     coarse = None if given.coarse is None else given.coarse.to(noise)
     moving = None if given.moving is None else given.moving.to(device)
-    has_channels = transformer.config.in_channels > noise.shape[1]
-
-    def coarse_at(step: int) -> Tensor:
-        """The coarse clip with the noise that latents have before a step."""
-        assert coarse is not None
-        sigma = float(schedule.sigmas[step])
-        return (1 - sigma) * coarse + sigma * noise
-
-    def taken(condition: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
-        """What the transformer takes: latents with the condition, and the times that tell how noisy they are."""
-        if has_channels:
-            return torch.cat([latents, condition], dim=1), time.expand(1)
-        times = time.expand(latents[0, 0, :, ::2, ::2].shape).clone()  # one for each token
-        times[0] = 0
-        return torch.cat([condition, latents[:, :, 1:]], dim=2), times.flatten()[None]
-
-    latents = noise if coarse is None else coarse_at(first)
+    latents = noise if coarse is None else torch.lerp(coarse, noise, float(schedule.sigmas[first]))
 
     def velocity_of(branch: Branch, condition: Tensor, time: Tensor, text: Tensor) -> Tensor:
         """[1, C, T, h, w] in float32, so that guidance and solver lose nothing to bfloat16."""
 
         def compute() -> Tensor:
-            states, times = taken(condition, time)
+            states, times = _with_condition(latents, condition, time)
             with cached_pass(transformer, branch):
                 return transformer(
                     hidden_states=states.to(dtype),
@@ -284,10 +268,24 @@ def denoise(
                 plain = velocity_of("uncond", unguided, time, negative)
                 velocity = plain + sampling.guidance_scale * (velocity - plain)
             latents = schedule.step(velocity, time, latents, return_dict=False)[0]
-            if step < held:
-                latents = torch.where(cast(Tensor, moving), coarse_at(step + 1), latents)
+            if coarse is not None and moving is not None and step < held:
+                latents = torch.where(moving, torch.lerp(coarse, noise, float(schedule.sigmas[step + 1])), latents)
             wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
             on_step(step + 1 - first, total)
     finally:  # what was kept for the next step would lie in memory while the clip is decoded
         reset_cache(transformer, sampling.steps, branches, first)
-    return latents if has_channels else torch.cat([guided, latents[:, :, 1:]], dim=2)
+    return torch.cat([guided, latents[:, :, 1:]], dim=2) if _is_first_frame(guided, latents) else latents
+
+
+def _is_first_frame(condition: Tensor, latents: Tensor) -> bool:
+    """Whether a condition is the first latent frame, and not further channels."""
+    return condition.shape[1] == latents.shape[1]
+
+
+def _with_condition(latents: Tensor, condition: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+    """What the transformer takes: latents with their condition, and the times that tell how noisy they are."""
+    if not _is_first_frame(condition, latents):
+        return torch.cat([latents, condition], dim=1), time.expand(1)
+    times = time.expand(latents[0, 0, :, ::2, ::2].shape).clone()  # one for each token
+    times[0] = 0
+    return torch.cat([condition, latents[:, :, 1:]], dim=2), times.flatten()[None]
