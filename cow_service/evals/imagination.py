@@ -14,19 +14,16 @@ from cow_service.client import AsyncClient, AsyncSimulation
 from cow_service.client.errors import Canceled
 from cow_service.errors import CannotGround, CannotReadDirection, CowError, InvalidRequest, MllmBadReply
 from cow_service.evals.items import Ask, Item, Pictures, question_text
-from cow_service.media.images import decode, encode_png, fit_within
-from cow_service.readers.base import Imagined
-from cow_service.readers.mllm.hypothesis import hypothesis
-from cow_service.records import DIRECTED_KINDS, Motion, Simulation, Usage
+from cow_service.media.images import decode
+from cow_service.readers.mllm.contents import facts_of, opposite_motion, still_frame
+from cow_service.records import Usage
 
 Shown = Literal["nothing", "simulation", "still", "wrong-direction", "facts", "oracle"]
 MAX_TRIES = 16
 MAX_INTERRUPTS = 20  # of one run, each of which may have canceled the same job
 NO_USAGE = Usage()
-STEEP = 0.05  # of a unit vector
 # What an image and a question may come to: nothing is imagined, and the question is asked without. All else is a fault.
 REFUSALS = (CannotGround, CannotReadDirection, MllmBadReply)
-_ENDS = ("distance", "duration", "until")
 Result = TypeVar("Result")
 _BEST_OF = re.compile(r"best-of-(\d+)")
 
@@ -166,26 +163,21 @@ class Imagination:
         if shown == "still":
             # The image itself, as large as a frame.
             pixels = decode(self._pictures.read(item.image)).pixels
-            still = self._pictures.add_made(encode_png(fit_within(pixels, self._options["frames"]["max_side"])))
+            still = self._pictures.add_made(still_frame(pixels, self._options["frames"]["max_side"]))
             return Evidence(frames=(still,) * self._options["frames"]["count"])
         begun = time.monotonic()
         try:
             simulation = await self._simulate(item, trial, {})
             usage, seconds = simulation.usage_total, sum(simulation.timings.values())
             if shown == "wrong-direction":
-                simulation = await self._simulate(item, trial, _opposite(simulation))
+                simulation = await self._simulate(item, trial, {"motion": opposite_motion(simulation)})
                 usage, seconds = usage + simulation.usage_total, seconds + sum(simulation.timings.values())
         except REFUSALS as refusal:
             usage = Usage.model_validate(refusal.usage or {})
             return Evidence(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
         found = replace(await evidence_of(simulation, self._client, self._pictures), usage=usage, seconds=seconds)
         if shown == "facts":
-            # In the words in which `/answer` tells it.
-            told: Any = hypothesis(Imagined(simulation, ()))
-            nothing = (
-                "The moving object meets nothing." if told["encounters_known"] else "It is not known what it meets."
-            )
-            return replace(found, frames=(), facts=(*told["facts"], *told["encounters"]) or (nothing,))
+            return replace(found, frames=(), facts=facts_of(simulation))
         return replace(found, probability=None) if shown == "wrong-direction" else found
 
     async def _simulate(self, item: Item, trial: int, changes: Mapping[str, Any]) -> AsyncSimulation:
@@ -207,23 +199,3 @@ async def evidence_of(simulation: AsyncSimulation, client: AsyncClient, pictures
         seconds=sum(simulation.timings.values()),
         simulated=True,
     )
-
-
-def _opposite(simulation: Simulation) -> dict[str, Any]:
-    """The fields of a request for the same scene with the motion the other way round.
-
-    A throw keeps its rise; a fall becomes a motion to the side. Raises `CannotReadDirection` for what goes nowhere.
-    """
-    motion: Motion = simulation.motion
-    if motion.kind == "fall":
-        wrong: dict[str, Any] = {"kind": "linear", "direction": (1.0, 0.0)}
-    elif motion.kind in DIRECTED_KINDS and motion.direction is not None:
-        right, down = motion.direction
-        if motion.kind == "projectile" and abs(right) < STEEP and abs(motion.depth) < STEEP:
-            raise CannotReadDirection("What is thrown straight up or down has no opposite direction.")
-        wrong = {"kind": motion.kind, "direction": (-right, down if motion.kind == "projectile" else -down)}
-        wrong |= {"depth": -motion.depth, "speed": motion.speed}
-        wrong |= {name: value for name in _ENDS if (value := getattr(motion, name)) is not None}
-    else:
-        raise CannotReadDirection(f"A {motion.kind} motion has no direction, so there is no wrong one.")
-    return {"motion": wrong}

@@ -1,0 +1,56 @@
+"""What a multimodal LLM can be shown beside a question: what was imagined, or a placebo in its place.
+
+A placebo has as many pictures of the same size, and tells nothing of what would happen. What the imagined frames gain
+over it is what imagining brings; what a placebo gains over the image alone is what more pictures bring.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cow_service.errors import CannotReadDirection
+from cow_service.media.images import encode_png, fit_within
+from cow_service.readers.base import Imagined
+from cow_service.readers.mllm.hypothesis import hypothesis
+from cow_service.records import DIRECTED_KINDS, Simulation
+
+# `true`: frames drawn along the path that is known to be true. `text`: what the simulation found, in words.
+Content = Literal["none", "simulated", "still", "wrong-direction", "other-item", "text", "true"]
+PLACEBOS: tuple[Content, ...] = ("still", "wrong-direction", "other-item")
+STEEP = 0.05  # of a unit vector
+_ENDS = ("distance", "duration", "until")
+
+
+def still_frame(image: NDArray[np.uint8], max_side: int) -> bytes:
+    """PNG of the image itself (height, width, 3), as large as a frame of at most so many px."""
+    return encode_png(fit_within(image, max_side))
+
+
+def facts_of(simulation: Simulation) -> tuple[str, ...]:
+    """What a simulation found, in the words in which `/answer` tells it to a multimodal LLM."""
+    told: Any = hypothesis(Imagined(simulation, ()))
+    nothing = "The moving object meets nothing." if told["encounters_known"] else "It is not known what it meets."
+    return (*told["facts"], *told["encounters"]) or (nothing,)
+
+
+def opposite_motion(simulation: Simulation) -> dict[str, Any]:
+    """The field `motion` of a request for the same scene, with the motion the other way round.
+
+    A throw keeps its rise; a fall becomes a motion to the side. Raises `CannotReadDirection` for what goes nowhere.
+    """
+    motion = simulation.motion
+    if motion.kind == "fall":
+        return {"kind": "linear", "direction": (1.0, 0.0)}
+    if motion.kind not in DIRECTED_KINDS or motion.direction is None:
+        raise CannotReadDirection(f"A {motion.kind} motion has no direction, so there is no wrong one.")
+    right, down = motion.direction
+    if motion.kind == "projectile" and abs(right) < STEEP and abs(motion.depth) < STEEP:
+        raise CannotReadDirection("What is thrown straight up or down has no opposite direction.")
+    return {
+        "kind": motion.kind,
+        "direction": (-right, down if motion.kind == "projectile" else -down),
+        "depth": -motion.depth,
+        "speed": motion.speed,
+        **{name: value for name in _ENDS if (value := getattr(motion, name)) is not None},
+    }
