@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 from cow_service.cli.batch import EXIT_INTERRUPTED, EXIT_SOME_FAILED
 from cow_service.cli.options import Texts, argument, option, printable
 from cow_service.client.options import CONCURRENCY
-from cow_service.errors import CowError, install_line
+from cow_service.errors import CowError, InvalidRequest, install_line
 
 _OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair", "pydantic_ai", "tenacity")
 
@@ -35,37 +35,68 @@ app = typer.Typer(
     cls=_RunByDefault,
     rich_markup_mode=None,
     no_args_is_help=True,
-    help="Measure whether imagination helps: cow eval DATA asks, cow eval report RUNS compares.",
+    help="Measure whether imagination helps: cow eval DATA asks, cow eval report RUNS compares, cow eval plan DATA "
+    "fixes the analysis before.",
 )
 
 Out = Annotated[Path, option("Folder of the run; one in it is gone on with.", "--out", "-o")]
 Prices = Annotated[
     Path | None, option("YAML or JSON: {MODEL: {input: 1.25, output: 10}}, per million tokens.", shown="none")
 ]
+DATA = (
+    "A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the name of a data "
+    "set of the Hugging Face hub, such as Mwxinnn/CausalSpatial."
+)
+# What a run and a plan share.
+Mllm = Annotated[
+    str | None, option("The multimodal LLM, as Inspect names it: openai/gpt-5.", shown="the embedded reader")
+]
+Revision = Annotated[str | None, option("Commit or snapshot of its weights, for the record.", shown="none")]
+Arms = Annotated[
+    Texts,
+    option(
+        "never, always, auto, placebo-still, placebo-direction, placebo-item, encounters, frames-only, gate, oracle, "
+        "each with suffixes such as :initial or :vote-3; or factors: content=simulated,frames=events,votes=1. May be "
+        "repeated, or several names with commas.",
+        shown="the preset's",
+    ),
+]
+PresetName = Annotated[
+    Literal["default", "paper", "controls", "dose"] | None,
+    option(
+        "default: with placebos; paper: its protocol; controls: votes, gate, frames, words; dose: frames degraded. "
+        "Arms of --arm come on top.",
+        shown="default, or the arms of --arm alone",
+    ),
+]
+Repeats = Annotated[int | None, option("How often each question is asked in each arm.", min=1, shown="the preset's: 1")]
+Order = Annotated[Literal["shuffled", "data"] | None, option("Of the options.", shown="the preset's: shuffled")]
+Subsets = Annotated[Texts, option("Of CausalSpatial's layout only these; may be repeated.")]
+Limit = Annotated[int | None, option("Only the first so many questions.", min=1, shown="all")]
+Seed = Annotated[int, option("Of the order in which options are shown.")]
+Reader = Annotated[str | None, option("Who grounds and reads motion for the imagination.", shown="the server's")]
+GeneratorName = Annotated[str | None, option("Who makes its frames.", shown="the server's")]
+BaseUrl = Annotated[str | None, option("Where the multimodal LLM is served.", shown="the provider's")]
+Temperature = Annotated[float | None, option("Of its replies.", shown="the provider's")]
+MaxTokens = Annotated[int | None, option("Of a reply.", min=1, shown="8192")]
+SkipFaulty = Annotated[
+    bool, option("Leave out rows that cannot be asked, and columns that mean nothing.", "--skip-faulty")
+]
 
 
 @app.command()
 def run(
-    data: Annotated[
-        str,
-        argument(
-            "A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the "
-            "name of a data set of the Hugging Face hub, such as Mwxinnn/CausalSpatial."
-        ),
-    ],
     out: Out,
-    mllm: Annotated[
-        str | None, option("The multimodal LLM, as Inspect names it: openai/gpt-5.", shown="the embedded reader")
+    data: Annotated[str | None, argument(DATA)] = None,
+    plan: Annotated[
+        Path | None,
+        option("What `cow eval plan` wrote: asks that, and reports whether it was followed.", shown="none"),
     ] = None,
-    arm: Annotated[
-        Texts,
-        option(
-            "never, always, auto, best-of-K, placebo-still, placebo-direction, encounters, frames-only, oracle; "
-            "may be repeated, or several with commas.",
-            shown="never,always",
-        ),
-    ] = None,
-    repeats: Annotated[int, option("How often each question is asked in each arm.", min=1)] = 1,
+    mllm: Mllm = None,
+    mllm_revision: Revision = None,
+    arm: Arms = None,
+    preset: PresetName = None,
+    repeats: Repeats = None,
     ask: Annotated[
         Literal["prompt", "answer"] | None,
         option(
@@ -73,23 +104,20 @@ def run(
             shown="prompt with --mllm, else answer",
         ),
     ] = None,
-    subset: Annotated[Texts, option("Of CausalSpatial's layout only these; may be repeated.")] = None,
-    limit: Annotated[int | None, option("Only the first so many questions.", min=1, shown="all")] = None,
-    seed: Annotated[int, option("Of the order in which options are shown.")] = 0,
-    reader: Annotated[
-        str | None, option("Who grounds and reads motion for the imagination.", shown="the server's")
-    ] = None,
-    generator: Annotated[str | None, option("Who makes its frames.", shown="the server's")] = None,
+    order: Order = None,
+    subset: Subsets = None,
+    limit: Limit = None,
+    seed: Seed = 0,
+    reader: Reader = None,
+    generator: GeneratorName = None,
     url: Annotated[str | None, option("The COW server.", shown="one is started in this process")] = None,
-    base_url: Annotated[str | None, option("Where the multimodal LLM is served.", shown="the provider's")] = None,
-    temperature: Annotated[float | None, option("Of its replies.", shown="the provider's")] = None,
-    max_tokens: Annotated[int | None, option("Of a reply.", min=1, shown="8192")] = None,
+    base_url: BaseUrl = None,
+    temperature: Temperature = None,
+    max_tokens: MaxTokens = None,
     concurrency: Annotated[int, option("Most questions at the same time, in each arm.", min=1)] = CONCURRENCY,
-    skip_faulty: Annotated[
-        bool, option("Leave out rows that cannot be asked, and columns that mean nothing.", "--skip-faulty")
-    ] = False,
+    skip_faulty: SkipFaulty = False,
     retry_failed: Annotated[bool, option("Ask those again that failed.", "--retry-failed")] = False,
-    log_images: Annotated[bool, option("Keep pictures in Inspect's logs, for inspect view.")] = True,
+    log_images: Annotated[bool, option("Keep pictures in Inspect's logs, for inspect view.")] = False,
     prices: Prices = None,
 ) -> None:
     """Ask every question in every arm, and report. `cow eval report RUNS` compares runs.
@@ -100,17 +128,13 @@ def run(
     """
     given = locals()
     _check_installed()
-    from cow_service.evals.plan import Plan  # noqa: PLC0415
     from cow_service.evals.run import evaluate  # noqa: PLC0415
     from cow_service.evals.runs import REPORT  # noqa: PLC0415
 
-    arms = [name.strip() for text in arm or ["never,always"] for name in text.split(",") if name.strip()]
-    fields: dict[str, Any] = {name: given[name] for name in Plan.__dataclass_fields__.keys() & given.keys()}
-    fields |= {"ask": ask or ("answer" if mllm is None else "prompt"), "arms": arms, "subsets": tuple(subset or ())}
-    plan = Plan(**fields)
     priced = _priced(prices)
+    wanted = _request(given)
     try:
-        done = evaluate(plan, lambda told: typer.echo(printable(told), err=True))
+        done = evaluate(wanted, lambda told: typer.echo(printable(told), err=True))
     except KeyboardInterrupt:
         typer.echo("Interrupted. The same command goes on with it.", err=True)
         sys.stderr.flush()
@@ -124,6 +148,82 @@ def run(
         typer.echo(f"{unasked} questions were not asked. The same command goes on with it.", err=True)
     if failed or unasked:
         raise typer.Exit(EXIT_SOME_FAILED)
+
+
+@app.command()
+def plan(
+    data: Annotated[str, argument(DATA)],
+    out: Annotated[Path, option("The file to write.", "--out", "-o")],
+    mllm: Annotated[str, option("The multimodal LLM, as Inspect names it: openai/gpt-5.")],
+    effect: Annotated[float, option("The gain that you hope for, in percentage points.", min=0.01, max=100)] = 2.4,
+    pilot: Annotated[
+        Path | None,
+        option("Folder of a smaller run: says how much scenes differ, and what a reply costs.", shown="none"),
+    ] = None,
+    mllm_revision: Revision = None,
+    arm: Arms = None,
+    preset: PresetName = None,
+    repeats: Repeats = None,
+    order: Order = None,
+    subset: Subsets = None,
+    limit: Limit = None,
+    seed: Seed = 0,
+    reader: Reader = None,
+    generator: GeneratorName = None,
+    base_url: BaseUrl = None,
+    temperature: Temperature = None,
+    max_tokens: MaxTokens = None,
+    skip_faulty: SkipFaulty = False,
+    prices: Prices = None,
+) -> None:
+    """Fix an analysis before the run: the primary question, its test, how many scenes it needs, and what it costs.
+
+    Nothing is asked. `cow eval run --plan FILE --out DIR` asks what the file says; its report says whether the plan was
+    followed.
+    """
+    given = {**locals(), "ask": "prompt", "plan": None}
+    _check_installed()
+    from cow_service.evals.run import write_plan  # noqa: PLC0415
+
+    typer.echo(printable(write_plan(_request(given), out, effect / 100, pilot, _priced(prices))))
+    typer.echo(f"\nThe plan: {out}. Ask it with: cow eval run --plan {out} --out DIR")
+
+
+def _request(given: dict[str, Any]) -> Any:
+    """What the options ask for; what is not given is the plan's or the preset's. Raises `InvalidRequest`."""
+    from cow_service.evals.design import PRESETS  # noqa: PLC0415
+    from cow_service.evals.plan import read_plan  # noqa: PLC0415
+    from cow_service.evals.request import EvalRequest  # noqa: PLC0415
+
+    fields: dict[str, Any] = {name: given[name] for name in EvalRequest.__dataclass_fields__.keys() & given.keys()}
+    if given["plan"] is not None:
+        plan = read_plan(given["plan"])
+        names = [name for name in (*plan.options, "arm", "preset", "repeats") if name in given]
+        changed = [name for name in names if given[name] not in (None, [], False, 0)]
+        if changed:
+            raise InvalidRequest(f"--plan says what is asked: leave --{changed[0].replace('_', '-')} out.")
+        fields |= {name: plan.options[name] for name in fields.keys() & plan.options.keys()}
+        subsets = tuple(plan.options["subset"])
+        fields |= {"plan": plan, "arms": tuple(plan.arms), "repeats": plan.repeats, "subsets": subsets}
+        return EvalRequest(**fields)
+    if given["data"] is None:
+        raise InvalidRequest("Name the data to ask about, or a plan with --plan.")
+    preset, ask = (
+        PRESETS[given["preset"] or "default"],
+        given["ask"] or ("answer" if given["mllm"] is None else "prompt"),
+    )
+    # An arm of factors holds commas itself.
+    named = [name for text in given["arm"] or () for name in ([text] if "=" in text else text.split(","))]
+    own = preset.arms if ask == "prompt" else ("never", "always")  # the service's own /answer shows no placebos
+    own = own if given["preset"] or not named else ()
+    fields |= {
+        "ask": ask,
+        "arms": [*own, *(name.strip() for name in named if name.strip())],
+        "repeats": given["repeats"] or preset.repeats,
+        "order": given["order"] or preset.order,
+        "subsets": tuple(given["subset"] or ()),
+    }
+    return EvalRequest(**fields)
 
 
 @app.command()

@@ -21,7 +21,8 @@ from cow_service.adaptive import AdaptivePlaces
 from cow_service.client import AsyncClient
 from cow_service.client.errors import error_from
 from cow_service.errors import MllmUnavailable
-from cow_service.evals.imagination import NO_USAGE, REFUSALS, Arm, Evidence, Imagination, asked_once, evidence_of
+from cow_service.evals.design import GATE_VOTES, Arm, Order
+from cow_service.evals.imagination import NO_USAGE, REFUSALS, Evidence, Imagination, asked_once, evidence_of
 from cow_service.evals.items import Item, Observation, Pictures, question_text
 from cow_service.media.artifacts import media_type_of
 from cow_service.readers.mllm.answer import read_answer
@@ -32,7 +33,6 @@ from cow_service.records import AnswerOption, Usage, Verdict
 from cow_service.stages.answering import gate_of
 from cow_service.stages.keys import FirstAnswers
 
-GATE_VOTES = 3
 GATE_THRESHOLD = 1.0
 PROMPT = "eval-question"
 OVERLAY = "Not sent to the model: the overlay of the simulation that the frames are of."
@@ -52,12 +52,15 @@ MOST_LISTED = 5  # options, of which all orders are listed
 _PAPER_FORMS = tuple(map(re.compile, (r"\(([a-j])\)", r"^([a-j])$", r"([a-j])\.", r"^([a-j])\)")))
 
 
-def order_of(item: Item, seed: int, repeat: int) -> tuple[int, ...]:
-    """The order in which the options are shown: the same in every arm, and another one in every repeat.
+def order_of(item: Item, order: Order, seed: int, repeat: int) -> tuple[int, ...]:
+    """The order in which the options are shown: as the data has them, or shuffled.
 
-    Up to five options go through all their orders before one comes again.
+    Shuffled it is the same in every arm, and another one in every repeat. Up to five options go through all their
+    orders before one comes again.
     """
     places = range(len(item.options))
+    if order == "data":
+        return tuple(places)
     if len(places) > MOST_LISTED:
         return tuple(_draws(seed, item.id, str(repeat)).sample(places, len(places)))
     orders = list(permutations(places))
@@ -139,6 +142,7 @@ class Reply:
     text: str
     usage: Usage = NO_USAGE
     seconds: float = 0.0
+    model: str | None = None  # as its provider names what replied
 
 
 @dataclass(frozen=True)
@@ -172,7 +176,10 @@ def observation_of(case: Case, asked: CaseReplies) -> Observation:
         frames=tuple(digest for each in asked.evidence for digest in each.frames),
         overlay=first_shown.overlay,
         probability=first_shown.probability,
+        event_shown=first_shown.event_shown,
+        path_error=first_shown.path_error,
         happens=happens(case.item),
+        model=next((reply.model for reply in asked.replies if reply.model is not None), None),
     )
 
 
@@ -217,7 +224,7 @@ class PromptAsker:
     async def __call__(self, case: Case) -> CaseReplies:
         """Imagines where the arm says so, and asks. Raises `MllmUnavailable`, and what a simulation failed with."""
         first: tuple[Reply, ...] = ()
-        if case.arm.gated:
+        if case.arm.gate:
             alone = self._messages(case, Evidence())
             first = tuple([await self._ask(case, alone, f"first {vote}") for vote in range(GATE_VOTES)])
             letters = [letter for reply in first if (letter := case.read(reply.text)) is not None]
@@ -228,8 +235,9 @@ class PromptAsker:
             # Whether to imagine is decided by the rule of `/answer`.
             if not gate_of(FirstAnswers(verdict=verdict, asked=len(first)), GATE_THRESHOLD).imagined:
                 return CaseReplies(first)
-        trials = range(case.arm.tries)
-        evidence = tuple([await self.imagination.evidence(case.item, case.arm.shown, trial) for trial in trials])
+        evidence = tuple(
+            [await self.imagination.evidence(case.item, case.arm, trial) for trial in range(case.arm.votes)]
+        )
         replies: list[Reply] = []
         messages: list[inspect_model.ChatMessage] = []
         for trial, found in enumerate(evidence):
@@ -253,11 +261,11 @@ class PromptAsker:
         if (used := output.usage) is not None:
             cached = (used.input_tokens_cache_read or 0) + (used.input_tokens_cache_write or 0)
             usage = Usage(calls=1, input_tokens=used.input_tokens + cached, output_tokens=used.output_tokens)
-        return Reply(output.completion, usage, output.time or 0.0)
+        return Reply(output.completion, usage, output.time or 0.0, output.model or None)
 
     def _messages(self, case: Case, evidence: Evidence) -> list[inspect_model.ChatMessage]:
         """One message: pictures, then the question."""
-        with_image = case.arm.with_image or not evidence.frames
+        with_image = case.arm.image or not evidence.frames
         shown = "image-and-facts" if evidence.facts else "nothing"
         if evidence.frames:
             shown = "image-and-frames" if with_image else "frames"
@@ -277,13 +285,13 @@ class AnswerAsker:
     key: str  # of the run
 
     async def __call__(self, case: Case) -> CaseReplies:
-        """Asks, once per try of the arm."""
-        imagine = "never" if case.arm.shown == "nothing" else "auto" if case.arm.gated else "always"
-        asked = [await self._ask(case, imagine, trial) for trial in range(case.arm.tries)]
+        """Asks, once per vote of the arm."""
+        imagine = "never" if case.arm.content == "none" else "auto" if case.arm.gate else "always"
+        asked = [await self._ask(case, imagine, trial) for trial in range(case.arm.votes)]
         return CaseReplies(tuple(reply for reply, _ in asked), tuple(found for _, found in asked))
 
     async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Evidence]:
-        options: Any = {**self.options, **({"seed": trial} if trial else {})}
+        options: Any = {**self.options, "frames": case.arm.frames_request, **({"seed": trial} if trial else {})}
         image = self.pictures.path(case.item.image)
         ask = partial(self.client.answer, image, case.question, imagine=imagine, **options)
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))

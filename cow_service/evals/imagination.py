@@ -2,95 +2,32 @@
 
 import asyncio
 import hashlib
-import re
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.adaptive import AdaptivePlaces
 from cow_service.client import AsyncClient, AsyncSimulation
 from cow_service.client.errors import Canceled
-from cow_service.errors import CannotGround, CannotReadDirection, CowError, InvalidRequest, MllmBadReply
-from cow_service.evals.items import Ask, Item, Pictures, question_text
+from cow_service.errors import CannotGround, CannotReadDirection, CowError, MllmBadReply
+from cow_service.evals.design import Arm
+from cow_service.evals.items import Item, Pictures, Truth, question_text
 from cow_service.media.images import decode
 from cow_service.readers.mllm.contents import facts_of, opposite_motion, still_frame
 from cow_service.records import Usage
 
-Shown = Literal["nothing", "simulation", "still", "wrong-direction", "facts", "oracle"]
-MAX_TRIES = 16
 MAX_INTERRUPTS = 20  # of one run, each of which may have canceled the same job
+PATH_SAMPLES = 2000  # between which the nearest point of a path is looked for
+MAX_DONORS = 8  # scenes that are tried for frames of another scene
 NO_USAGE = Usage()
 # What an image and a question may come to: nothing is imagined, and the question is asked without. All else is a fault.
 REFUSALS = (CannotGround, CannotReadDirection, MllmBadReply)
 Result = TypeVar("Result")
-_BEST_OF = re.compile(r"best-of-(\d+)")
-
-
-@dataclass(frozen=True)
-class Arm:
-    """What is shown beside the image, and how often it is asked."""
-
-    name: str
-    shown: Shown = "nothing"
-    with_image: bool = True  # whether the question's image is shown
-    gated: bool = False  # whether the answers from the image alone decide if anything is imagined
-    tries: int = 1  # simulations, a reply each; the most frequent answer is taken
-
-    @property
-    def asks(self) -> tuple[Ask, ...]:
-        """The ways to ask in which there is such an arm."""
-        plain = self.shown in ("nothing", "simulation") and self.with_image
-        return ("prompt", "answer") if plain else ("prompt",)
-
-
-ARMS: dict[str, Arm] = {
-    arm.name: arm
-    for arm in (
-        Arm("never"),
-        Arm("always", "simulation"),
-        Arm("auto", "simulation", gated=True),  # where three answers from the image alone disagree
-        Arm("best-of-3", "simulation", tries=3),  # each with its own seed
-        Arm("placebo-still", "still"),  # the first image again in place of each frame
-        Arm("placebo-direction", "wrong-direction"),
-        Arm("encounters", "facts"),  # in words; no frames
-        Arm("frames-only", "simulation", with_image=False),
-        Arm("oracle", "oracle"),  # pictures of what really happens
-    )
-}
-
-
-def arm_of(name: str) -> Arm:
-    """The arm of a name; `best-of-K` for any number of simulations. Raises `InvalidRequest` for another name."""
-    best = _BEST_OF.fullmatch(name)
-    if best and 2 <= int(best[1]) <= MAX_TRIES:
-        return Arm(name, "simulation", tries=int(best[1]))
-    if name not in ARMS:
-        raise InvalidRequest(
-            f"There is no arm '{name}': there are {', '.join(ARMS)}, and best-of-K for K from 2 to {MAX_TRIES}."
-        )
-    return ARMS[name]
-
-
-def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[Arm, ...]:
-    """The arms of these names. Raises `InvalidRequest` for one that cannot be asked so, or of these items."""
-    arms = tuple(arm_of(name) for name in dict.fromkeys(names))
-    if not arms:
-        raise InvalidRequest(f"Name at least one arm: {', '.join(ARMS)}.")
-    for arm in arms:
-        if ask not in arm.asks:
-            there = ", ".join(each.name for each in ARMS.values() if ask in each.asks)
-            raise InvalidRequest(
-                f"The service's own /answer has no arm '{arm.name}', only {there}: use --ask prompt with --mllm."
-            )
-    without = [item for item in items if not item.oracle]
-    if without and any(arm.shown == "oracle" for arm in arms):
-        raise InvalidRequest(
-            f"The arm 'oracle' needs pictures of what really happens, and {len(without)} of {len(items)} items have "
-            f"none, such as {without[0].row}."
-        )
-    return arms
 
 
 async def asked_once(places: AdaptivePlaces, ask: Callable[..., Awaitable[Result]], *parts: str) -> Result:
@@ -118,6 +55,8 @@ class Evidence:
     overlay: str | None = None
     facts: tuple[str, ...] = ()  # what the simulation found, in words
     probability: float | None = None  # that what the question asks happens
+    event_shown: bool | None = None  # whether a frame shows the moment of what is asked, or later; None: no such moment
+    path_error: float | None = None  # of the path that is shown, as a share of the image's width
     refusal: CowError | None = None  # why there is nothing
     usage: Usage = NO_USAGE
     seconds: float = 0.0  # of its stages, without waiting for a place
@@ -128,60 +67,142 @@ class Imagination:
     """Simulations of items, from one server. For one event loop."""
 
     def __init__(
-        self, client: AsyncClient, places: AdaptivePlaces, pictures: Pictures, options: Mapping[str, Any], key: str
+        self,
+        client: AsyncClient,
+        places: AdaptivePlaces,
+        pictures: Pictures,
+        options: Mapping[str, Any],
+        key: str,
+        items: Sequence[Item],
     ) -> None:
         """`places` are for requests of the client, `options` are fields of these.
 
-        `key` names the run: the same run never asks the same twice.
+        `key` names the run: the same run never asks the same twice. `items` are those of the run, of which some may
+        lend their frames to others.
         """
         self._client = client
         self.places = places
         self._pictures = pictures
         self._options = dict(options)
         self._key = key
-        self._found: dict[tuple[str, Shown, int], asyncio.Task[Evidence]] = {}
+        self._items = items
+        self._found: dict[tuple[str, Arm, int], asyncio.Task[Evidence]] = {}
 
-    async def evidence(self, item: Item, shown: Shown, trial: int = 0) -> Evidence:
+    async def evidence(self, item: Item, arm: Arm, trial: int = 0) -> Evidence:
         """What to show of an item. `trial` counts simulations of the same, which differ by their seed.
 
         Raises the `CowError` for which a simulation failed, but for refusals: those are part of the evidence.
         """
-        place = item.id, shown, trial
+        # What is shown does not depend on how often it is asked about.
+        place = item.id, arm.model_copy(update={"votes": 1, "gate": False, "image": True}), trial
         if place not in self._found:
-            self._found[place] = asyncio.ensure_future(self._make(item, shown, trial))
+            self._found[place] = asyncio.ensure_future(self._make(*place[1:], item))
         try:
             return await asyncio.shield(self._found[place])
         except CowError:
             self._found.pop(place, None)
             raise
 
-    async def _make(self, item: Item, shown: Shown, trial: int) -> Evidence:
-        if shown == "nothing":
+    async def _make(self, arm: Arm, trial: int, item: Item) -> Evidence:
+        if arm.content == "none":
             return Evidence()
-        if shown == "oracle":
-            return Evidence(frames=item.oracle)
-        if shown == "still":
-            # The image itself, as large as a frame.
-            pixels = decode(self._pictures.read(item.image)).pixels
-            still = self._pictures.add_made(still_frame(pixels, self._options["frames"]["max_side"]))
-            return Evidence(frames=(still,) * self._options["frames"]["count"])
         begun = time.monotonic()
         try:
-            simulation = await self._simulate(item, trial, {})
-            usage, seconds = simulation.usage_total, sum(simulation.timings.values())
-            if shown == "wrong-direction":
-                simulation = await self._simulate(item, trial, {"motion": opposite_motion(simulation)})
-                usage, seconds = usage + simulation.usage_total, seconds + sum(simulation.timings.values())
+            return await self._shown(arm, trial, item)
         except REFUSALS as refusal:
             usage = Usage.model_validate(refusal.usage or {})
             return Evidence(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
-        found = replace(await evidence_of(simulation, self._client, self._pictures), usage=usage, seconds=seconds)
-        if shown == "facts":
-            return replace(found, frames=(), facts=facts_of(simulation))
-        return replace(found, probability=None) if shown == "wrong-direction" else found
 
-    async def _simulate(self, item: Item, trial: int, changes: Mapping[str, Any]) -> AsyncSimulation:
-        options: Any = {**self._options, **({"seed": trial} if trial else {}), **changes}
+    async def _shown(self, arm: Arm, trial: int, item: Item) -> Evidence:
+        """Every content begins with the simulation: a placebo has as many pictures as there would be of it, or none."""
+        if arm.content == "true" and arm.error is None:
+            return await self._truth(arm, trial, item)
+        simulation = await self._simulate(item, arm, trial)
+        found = await evidence_of(simulation, self._client, self._pictures)
+        if arm.content == "simulated":
+            truth = item.truth
+            if truth is None or len(truth.track) < 2:
+                return found
+            return replace(found, path_error=self._share(_offsets(np.array(truth.track), simulation), item))
+        if arm.content == "text":
+            return replace(found, frames=(), facts=facts_of(simulation), event_shown=None)
+        found = replace(found, probability=None, event_shown=None)
+        if arm.content == "still":
+            pixels = decode(self._pictures.read(item.image)).pixels
+            return replace(found, frames=(self._pictures.add_made(still_frame(pixels, arm.size)),) * len(found.frames))
+        if arm.content == "other-item":
+            other = await self._of_another(arm, trial, item)
+        elif arm.content == "true":
+            other = await self._along(simulation, arm, item)
+        else:
+            changed = await self._simulate(item, arm, trial, motion=opposite_motion(simulation))
+            other = await evidence_of(changed, self._client, self._pictures)
+        usage, seconds = found.usage + other.usage, found.seconds + other.seconds
+        return replace(other, probability=None, event_shown=None, usage=usage, seconds=seconds)
+
+    async def _of_another(self, arm: Arm, trial: int, item: Item) -> Evidence:
+        """Frames of another scene: of those in an order of the item's own, the first that can be simulated.
+
+        Raises `CannotGround` where none of several can.
+        """
+
+        def rank(other: Item) -> bytes:
+            return hashlib.sha256(f"{item.id}\n{trial}\n{other.id}".encode()).digest()
+
+        for other in sorted((each for each in self._items if each.scene != item.scene), key=rank)[:MAX_DONORS]:
+            found = await self.evidence(other, arm.with_content("simulated"))
+            if found.refusal is None:
+                return replace(found, path_error=None)
+        raise CannotGround(f"None of {MAX_DONORS} other scenes could be simulated.")
+
+    async def _truth(self, arm: Arm, trial: int, item: Item) -> Evidence:
+        """What really happens, at the moments that the simulation's frames show; without one, at moments of its own."""
+        truth, simulation = _truth_of(item), None
+        try:
+            simulation = await self._simulate(item, arm, trial)
+        except REFUSALS:
+            if len(truth.track) < 2:
+                raise
+        if len(truth.track) > 1:
+            return await self._along(simulation, arm, item)
+        assert simulation is not None
+        nearest = [min(truth.pictures, key=lambda known: abs(known[0] - frame.time)) for frame in simulation.frames]
+        made = await evidence_of(simulation, self._client, self._pictures)
+        return replace(made, frames=tuple(digest for _, digest in nearest), probability=None, path_error=0.0)
+
+    async def _along(self, simulation: AsyncSimulation | None, arm: Arm, item: Item) -> Evidence:
+        """Frames that the generator draws along the true path, or off it by so much of the simulation's own error.
+
+        They show the moments of the simulation's frames; after the end of what is known, that end.
+        """
+        truth, indices = _truth_of(item), None
+        fps, points, off, frames = truth.fps, np.array(truth.track), np.zeros((1, 2)), arm.frames_request
+        if simulation is not None:
+            fps = simulation.trajectory.fps
+            points = _true_path(truth, fps)
+            off = (arm.error or 0.0) * _offsets(points, simulation)
+            points = points + off
+            indices = [min(frame.index, len(points) - 1) for frame in simulation.frames]
+            frames = {"max_side": arm.size, "indices": sorted(set(indices))}
+        # How it moves is known, so it need not be read.
+        given = {"motion": {"kind": "static"}, "trajectory": {"points": points.round(2).tolist(), "fps": fps}}
+        if truth.bbox is not None:
+            given["grounding"] = {"bbox": truth.bbox, **({"object": truth.object} if truth.object else {})}
+        drawn = await self._simulate(item, arm, 0, frames=frames, **given)
+        found = await evidence_of(drawn, self._client, self._pictures)
+        if indices is not None:
+            shown = {frame.index: frame.sha256 for frame in drawn.frames}
+            found = replace(found, frames=tuple(shown[index] for index in indices))
+        return replace(found, probability=None, event_shown=None, path_error=self._share(off, item))
+
+    def _share(self, offsets: NDArray[np.float64], item: Item) -> float:
+        """The mean length of offsets (points, 2), px, as a share of the image's width."""
+        width = decode(self._pictures.read(item.image)).pixels.shape[1]
+        return float(np.linalg.norm(offsets, axis=1).mean() / width)
+
+    async def _simulate(self, item: Item, arm: Arm, trial: int, **changes: Any) -> AsyncSimulation:
+        seed = {"seed": trial} if trial else {}
+        options: Any = {**self._options, "frames": arm.frames_request, **seed, **changes}
         image, question = self._pictures.path(item.image), question_text(item)
         ask = partial(self._client.simulate, image, question, video=False, **options)
         return await asked_once(self.places, ask, self._key, item.id, item.image, str(sorted(options.items())))
@@ -191,11 +212,40 @@ async def evidence_of(simulation: AsyncSimulation, client: AsyncClient, pictures
     """What a simulation gives to show; its pictures are kept."""
     for digest in simulation.pictures.values():
         pictures.add_made(await client.artifact(digest))
-    outcome = simulation.trajectory.outcome
+    outcome, step = simulation.trajectory.outcome, 1 / simulation.trajectory.fps
+    moment = None if outcome is None or (outcome.probability or 0.0) < 0.5 else outcome.time
     return Evidence(
         frames=tuple(frame.sha256 for frame in simulation.frames),
         overlay=simulation.overlay.sha256,
         probability=None if outcome is None else outcome.probability,
+        event_shown=None if moment is None else any(frame.time >= moment - step for frame in simulation.frames),
+        usage=simulation.usage_total,
         seconds=sum(simulation.timings.values()),
         simulated=True,
     )
+
+
+def _truth_of(item: Item) -> Truth:
+    """What is known of an item of which `check_arms` found that something is."""
+    assert item.truth is not None
+    return item.truth
+
+
+def _true_path(truth: Truth, fps: float) -> NDArray[np.float64]:
+    """The true track as (moments, 2), px, so many per second until it ends."""
+    track = np.array(truth.track)
+    times = np.arange(0, (len(track) - 1) / truth.fps + 1e-9, 1 / fps)
+    known = np.arange(len(track)) / truth.fps
+    return np.stack([np.interp(times, known, track[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _offsets(points: NDArray[np.float64], simulation: AsyncSimulation) -> NDArray[np.float64]:
+    """From each of these points (points, 2) to where the simulation's path passes it, px.
+
+    Whenever it does so: no picture tells how fast things are.
+    """
+    path = np.array(simulation.trajectory.path.points)
+    stamps = np.linspace(0, len(path) - 1, PATH_SAMPLES)
+    fine = np.stack([np.interp(stamps, np.arange(len(path)), path[:, axis]) for axis in (0, 1)], axis=1)
+    nearest = np.linalg.norm(points[:, None] - fine[None], axis=2).argmin(axis=1)
+    return fine[nearest] - points

@@ -1,9 +1,10 @@
 """What is asked and what comes of it: an item is one question on one image, with its options and its truth."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -12,12 +13,26 @@ from cow_service.media.artifacts import DiskArtifacts, media_type_of
 from cow_service.media.images import decode
 from cow_service.readers.options import split_options
 from cow_service.records import AnswerOption, Record
-from cow_service.records.world import Sha256
+from cow_service.records.world import BBox, Point, Sha256
 
 Task = Literal["collision", "trajectory", "compatibility", "occlusion", "other"]
 TASKS: tuple[Task, ...] = ("collision", "trajectory", "compatibility", "occlusion", "other")
 REAL = "real"  # the level of photographs
 UNKNOWN_LEVEL = "?"
+
+
+class Truth(Record):
+    """What is known of what really happens."""
+
+    pictures: tuple[tuple[float, Sha256], ...] = Field(default=(), description="Of moments, s, in their order.")
+    fps: float = Field(default=30.0, gt=0, description="Points of `track` per second, pictures by their number, too.")
+    track: tuple[Point, ...] = Field(default=(), description="Centre of the moving object, px; empty: not known.")
+    bbox: BBox | None = Field(default=None, description="Of the moving object at the first moment, px.")
+    object: str | None = Field(default=None, description="What it is called.")
+
+    def shows(self, *, drawn: bool) -> bool:
+        """Whether there are true frames; `drawn`: along the true path."""
+        return len(self.track) > 1 or (not drawn and bool(self.pictures))
 
 
 class Item(Record):
@@ -36,7 +51,7 @@ class Item(Record):
     task: Task
     level: str = Field(description="L1, L2, ..., `real` for photographs, `?` where the data does not say.")
     scene: str = Field(description="Items of one scene are not independent: statistics draw whole scenes.")
-    oracle: tuple[Sha256, ...] = Field(default=(), description="Pictures of what really happens, in order.")
+    truth: Truth | None = Field(default=None, description="Of scenes that were made, or filmed.")
 
 
 def question_text(item: Item, order: tuple[int, ...] | None = None) -> str:
@@ -125,6 +140,13 @@ class Observation(Record):
     overlay: Sha256 | None = None
     probability: float | None = Field(default=None, description="That it happens, by the simulation, if it tells.")
     happens: bool | None = Field(default=None, description="Whether it does, by the truth; null: not a yes or no.")
+    event_shown: bool | None = Field(
+        default=None, description="Whether a frame shows the moment at which the simulation says that it happens."
+    )
+    path_error: float | None = Field(
+        default=None, description="Mean distance at which the path shown passes the true one, by the image's width."
+    )
+    model: str | None = Field(default=None, description="What replied, as its provider names it.")
     failure: str | None = Field(default=None, description="Why there is no reply; such a question counts nowhere.")
 
     @property
@@ -142,29 +164,21 @@ class Observation(Record):
         """Whether there is a reply, and no option could be read in it."""
         return self.failure is None and self.read is None
 
-
-class RunInfo(Record):
-    """What a folder of results was asked: as much as it takes to ask the same again."""
-
-    format: int = 1
-    data: str = Field(description="As it was given.")
-    data_digest: Sha256 = Field(description="Of the items, their pictures included.")
-    counts: dict[str, int] = Field(description="Items by task and level: `collision L1`.")
-    faults: tuple[str, ...] = Field(default=(), description="Rows that were left out, and why.")
-    notes: tuple[str, ...] = Field(default=(), description="What was found in the data and worked around, with counts.")
-    mllm: str = Field(description="Who answered, as Inspect names it, or `cow/embedded`.")
-    ask: Ask
-    arms: tuple[str, ...]
-    repeats: int = Field(ge=1)
-    seed: int
-    settings: dict[str, Any] = Field(description="Frames, reader, generator, generation settings.")
-    versions: dict[str, str] = Field(description="Of the packages and prompts.")
-    rounds: int = Field(default=0, description="How often what had failed was asked again.")
-    token: str = Field(default="", description="Random: names the requests and replies of the run.")
-    created_at: str = Field(description="RFC 3339, UTC.")
-
     @property
-    def baseline_key(self) -> tuple[Any, ...]:
-        """What two runs have in common whose replies may be compared."""
-        generation: Any = self.settings.get("generation")
-        return self.data_digest, self.mllm, self.ask, self.seed, generation
+    def simulation_right(self) -> bool | None:
+        """Whether what the simulation finds likelier is what happens; None where one of the two is not known."""
+        if self.probability is None or self.happens is None:
+            return None
+        return (self.probability >= 0.5) == self.happens
+
+    def agrees_with(self, alone: Sequence[str | None]) -> str | None:
+        """Whether the simulation says what most of these replies from the image alone say.
+
+        Words for a table; None where the simulation says nothing, or is not asked for yes or no.
+        """
+        right, read = self.simulation_right, Counter(each for each in alone if each is not None).most_common(1)
+        if right is None or not read:
+            return None
+        if read[0][0] == self.abstain:
+            return "the image alone: not sure"
+        return "agree" if right == (read[0][0] == self.truth) else "contradict each other"

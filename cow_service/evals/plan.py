@@ -1,161 +1,214 @@
-"""What is to be asked, checked before anything is, and as the record of the run."""
+"""What a run is, on record; and the analysis that is fixed before it: the primary question, its test, its size."""
 
 import hashlib
-import os
-import platform
-import secrets
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+import math
+from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from cow_service import __version__
-from cow_service.client.options import CONCURRENCY
+from pydantic import Field, ValidationError
+
 from cow_service.errors import InvalidRequest
-from cow_service.evals.imagination import Arm
-from cow_service.evals.items import Ask, Item, RunInfo
-from cow_service.evals.loaders import Collected, digest_of
-from cow_service.readers.prompts import load_prompt
-from cow_service.settings import load_settings
+from cow_service.evals.design import GATE_VOTES, Arm, Order, primary
+from cow_service.evals.items import Ask
+from cow_service.evals.statistics import ALPHA, POWER, Cost, power_of, scenes_needed
+from cow_service.records import Record
+from cow_service.records.world import Sha256
 
-PACKAGES = ("inspect-ai", "numpy", "opencv-python-headless", "rapier3d", "scipy", "torch", "diffusers", "openai")
-PROMPTS = ("eval-question", "identify", "locate", "scale", "answer-from-image", "answer-with-frames")
-# Providers that Inspect and the server in this process both know, and where both look for the key.
-KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY", "google": "GOOGLE_API_KEY"}
-MAX_TOKENS = 8192  # of a reply, as in the paper
-FRAMES = {"policy": "initial", "count": 3, "max_side": 512}  # frames 1, 3, 5, as in the paper
-_SAME = ("data_digest", "mllm", "ask", "seed", "settings")  # what a run that goes on has in common with its begin
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What the caller wants."""
-
-    data: str
-    out: Path
-    mllm: str | None = None  # as Inspect names models; None: the service's own reader answers
-    ask: Ask = "prompt"
-    arms: Sequence[str] = ("never", "always")
-    repeats: int = 1
-    subsets: Sequence[str] = ()
-    limit: int | None = None
-    seed: int = 0
-    reader: str | None = None
-    generator: str | None = None
-    url: str | None = None
-    base_url: str | None = None  # of the multimodal LLM
-    temperature: float | None = None
-    max_tokens: int | None = None
-    concurrency: int = CONCURRENCY
-    skip_faulty: bool = False
-    retry_failed: bool = False
-    log_images: bool = True
+FORMAT = 2
+DISCORDANT = 0.2  # share of pairs of replies of which one alone is right, where no pilot tells
+METHOD = (
+    "The difference in the share of right replies between the primary arm and each placebo with the same frames and "
+    "votes, paired by question and repeat. Two-sided permutation test of the signs of whole scenes; p is the largest "
+    "of the placebos'. 95% interval with scenes as clusters. All other contrasts are adjusted together (Holm). An "
+    "unreadable reply is not right; a question without a reply in one of the two arms counts in neither."
+)
 
 
-def check_plan(plan: Plan) -> None:
-    """Raises `InvalidRequest` for options that contradict each other."""
-    if plan.ask == "prompt" and plan.mllm is None:
-        raise InvalidRequest("--ask prompt asks a multimodal LLM: name it with --mllm, such as openai/gpt-5.")
-    if plan.ask == "answer" and plan.mllm is not None and plan.url is not None:
-        raise InvalidRequest("The server at --url answers with its own multimodal LLM: leave --mllm out.")
-    if plan.ask == "answer" and (plan.temperature is not None or plan.max_tokens is not None):
-        raise InvalidRequest("--temperature and --max-tokens are for --ask prompt: /answer has its own.")
+class RunRecord(Record):
+    """What decides the replies of a run."""
+
+    data: str = Field(description="As it was given.")
+    data_digest: Sha256 = Field(description="Of the items, their pictures and truths included.")
+    scenes: int = Field(default=0, description="Clusters of items.")
+    counts: dict[str, int] = Field(description="Items by task and level: `collision L1`.")
+    mllm: str = Field(description="Who answered, as Inspect names it, or `cow/embedded`.")
+    ask: Ask
+    arms: dict[str, dict[str, Any]] = Field(description="The factors of each arm, by its name.")
+    repeats: int = Field(ge=1)
+    order: Order = Field(default="shuffled", description="Of the options.")
+    seed: int
+    options: dict[str, Any] = Field(description="As they were given: the names of the command line's options.")
+    versions: dict[str, str] = Field(description="Of this service, its commit, the packages and prompts.")
+    created_at: str = Field(description="RFC 3339, UTC.")
+
+    @property
+    def design_digest(self) -> str:
+        """Of all that decides the replies but the versions of the packages."""
+        prompts = {name: value for name, value in self.versions.items() if name.startswith("prompts/")}
+        fixed = self.model_dump(mode="json", include=set(_OF_DESIGN)) | prompts
+        return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def points(self) -> tuple[Arm, ...]:
+        """The arms."""
+        return tuple(map(Arm.model_validate, self.arms.values()))
 
 
-def request_options(reader: str | None, generator: str | None) -> dict[str, Any]:
-    """The fields of requests for simulations."""
-    named = {"reader": reader, "generator": generator}
-    return {"frames": dict(FRAMES), **{name: value for name, value in named.items() if value is not None}}
+_OF_DESIGN = ("data_digest", "mllm", "ask", "arms", "repeats", "order", "seed", "options")
 
 
-def server_settings(plan: Plan) -> dict[str, Any]:
-    """Settings of the server in this process: where it answers, its reader asks the multimodal LLM.
+class AnalysisPlan(RunRecord):
+    """What is to be asked and how it is to be analysed, written before the first question is."""
 
-    Raises `InvalidRequest` for one that it cannot ask.
-    """
-    if plan.url is not None or plan.ask == "prompt" or plan.mllm is None:
-        return {}
-    provider, _, name = plan.mllm.partition("/")
-    if provider not in KEYS:
+    format: int = FORMAT
+    primary: str = Field(description="The arm whose gain is the primary question.")
+    placebos: tuple[str, ...] = Field(description="The arms of which it is to beat each.")
+    method: str = METHOD
+    alpha: float = ALPHA
+    effect: float = Field(description="The gain that is hoped for, as a share of questions.")
+    variance: float = Field(description="Of the scenes' mean differences, as assumed or as a pilot run had it.")
+    scenes_needed: int = Field(description=f"For that gain, with a power of {POWER:.0%}.")
+    power: float = Field(description="Of the scenes that there are.")
+
+    @property
+    def digest(self) -> str:
+        """Of the whole plan."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+
+class RunInfo(RunRecord):
+    """What a folder of results was asked: as much as it takes to ask the same again."""
+
+    format: int = FORMAT
+    faults: tuple[str, ...] = Field(default=(), description="Rows that were left out, and why.")
+    notes: tuple[str, ...] = Field(default=(), description="What was found in the data and worked around, with counts.")
+    rounds: int = Field(default=0, description="How often what had failed was asked again.")
+    token: str = Field(default="", description="Random: names the requests and replies of the run.")
+    plan: AnalysisPlan | None = Field(default=None, description="The analysis that was fixed before the run.")
+    replied_as: tuple[str, ...] = Field(
+        default=(),
+        description="The models that replied, as their provider names them: dated versions, where it has any.",
+    )
+
+    @property
+    def baseline_key(self) -> tuple[Any, ...]:
+        """What two runs have in common whose replies may be compared."""
+        deciding = ("mllm_revision", "base_url", "temperature", "max_tokens")
+        generation = tuple(self.options.get(name) for name in deciding)
+        return self.data_digest, self.mllm, self.ask, self.seed, self.order, generation
+
+
+def differences(before: RunRecord, now: RunRecord) -> list[str]:
+    """What decides replies and is not the same, each by the name of its option."""
+    names = dict.fromkeys((*before.options, *now.options))
+    found = [
+        f"--{name.replace('_', '-')} {before.options.get(name)}, not {now.options.get(name)}"
+        for name in names
+        if before.options.get(name) != now.options.get(name)
+    ]
+    if before.data_digest != now.data_digest and not found:
+        counts = f"{sum(before.counts.values())} questions, now {sum(now.counts.values())}"
+        found.append(f"the questions, pictures or truths of '{now.data}' have changed since ({counts})")
+    if before.mllm != now.mllm and not found:
+        found.append(f"the multimodal LLM {before.mllm}, not {now.mllm}")
+    prompts = sorted(name for name in now.versions if name.startswith("prompts/"))
+    return found + [
+        f"the text of {name} (version {before.versions.get(name)}, not {now.versions[name]})"
+        for name in prompts
+        if before.versions.get(name) != now.versions[name]
+    ]
+
+
+def departures(run: RunInfo, failed: int) -> list[str]:
+    """Where a run does not follow its plan, in words; `failed` questions have no reply."""
+    plan = run.plan
+    if plan is None:
+        return []
+    found = differences(plan, run)
+    missing = [name for name in plan.arms if name not in run.arms]
+    added = [name for name in run.arms if name not in plan.arms]
+    found += [f"arms that were planned and not asked: {', '.join(missing)}"] if missing else []
+    found += [f"arms that were not planned: {', '.join(added)}"] if added else []
+    found += [f"--repeats {plan.repeats}, not {run.repeats}"] if plan.repeats != run.repeats else []
+    found += [f"{failed} questions without a reply"] if failed else []
+    old, new = (record.versions.get("cow-service") for record in (plan, run))
+    return found + ([f"cow-service {old}, not {new}"] if old != new else [])
+
+
+def planned(info: RunInfo, effect: float, variance: float) -> AnalysisPlan:
+    """The plan of a run with these options. Raises `InvalidRequest` for one without a primary question."""
+    question = primary(info.points)
+    if question is None:
         raise InvalidRequest(
-            f"The server in this process cannot ask '{plan.mllm}': start `cow serve` with COW_MLLM, and give its --url."
+            "A plan needs a primary question: an arm of simulated frames, such as always, and a placebo with the same "
+            "frames and votes, such as placebo-still."
         )
-    key = os.environ.get("COW_MLLM_API_KEY") or os.environ.get(KEYS[provider])
-    named = {"mllm": f"{provider}:{name}", "mllm_base_url": plan.base_url, "mllm_api_key": key}
-    return {**named, "reader": plan.reader or "mllm"}
-
-
-def info_of(plan: Plan, items: Sequence[Item], found: Collected, arms: Sequence[Arm]) -> RunInfo:
-    """The record of a run that begins."""
-    counts = Counter(f"{item.task} {item.level}" for item in items)
-    settings: dict[str, Any] = {"requests": request_options(plan.reader, plan.generator)}
-    if plan.ask == "prompt":
-        generation = {"temperature": plan.temperature, "max_tokens": plan.max_tokens or MAX_TOKENS}
-        settings["generation"] = {**generation, "base_url": plan.base_url}
-    mllm = plan.mllm
-    if mllm is None and plan.url is not None:  # the service answers by itself
-        mllm = f"cow at {plan.url}" + ("" if plan.reader is None else f", reader {plan.reader}")
-    elif mllm is None:
-        own = load_settings()
-        reader = plan.reader or own.reader
-        mllm = f"cow/{own.mllm}" if reader == "mllm" and own.mllm else f"cow/{reader}"
-    return RunInfo(
-        data=plan.data,
-        data_digest=digest_of(items),
-        counts=dict(sorted(counts.items())),
-        faults=tuple(found.faults),
-        notes=tuple(found.notes),
-        mllm=mllm,
-        ask=plan.ask,
-        arms=tuple(arm.name for arm in arms),
-        repeats=plan.repeats,
-        seed=plan.seed,
-        settings=settings,
-        versions=versions(),
-        token=secrets.token_hex(16),
+    arm, placebos = question
+    return AnalysisPlan(
+        **info.model_dump(include=set(RunRecord.model_fields) - {"created_at"}),
         created_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        primary=arm.name,
+        placebos=tuple(each.name for each in placebos),
+        effect=effect,
+        variance=variance,
+        scenes_needed=scenes_needed(effect, variance),
+        power=power_of(effect, variance, info.scenes),
     )
 
 
-def merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:
-    """A run that goes on, with more arms or repeats perhaps. Raises `InvalidRequest` where the rest is not the same."""
-    if before is None:
-        return wanted
-    same = [(name.replace("_", " "), getattr(before, name), getattr(wanted, name)) for name in _SAME]
-    prompts = [name for name in wanted.versions if name.startswith("prompts/")]
-    same += [(name, before.versions.get(name), wanted.versions[name]) for name in prompts]
-    for name, was, is_now in same:
-        if was != is_now:
-            raise InvalidRequest(
-                f"The folder holds a run with another {name} ({was}, not {is_now}): give --out another folder, or the "
-                "same arguments as before."
-            )
-    arms = (*before.arms, *(arm for arm in wanted.arms if arm not in before.arms))
-    newer = [f"{name} {version}" for name, version in wanted.versions.items() if before.versions.get(name) != version]
-    notes = (f"Gone on with {', '.join(newer)}.",) if newer else ()
-    changes = {
-        "arms": arms,
-        "repeats": max(before.repeats, wanted.repeats),
-        "notes": tuple(dict.fromkeys((*before.notes, *notes))),
-        # Under the key of an earlier round a failed job would only be found again.
-        "rounds": before.rounds + again,
-    }
-    return before.model_copy(update=changes)
+def read_plan(path: Path) -> AnalysisPlan:
+    """A plan that `cow eval plan` wrote. Raises `InvalidRequest` for a file that is none."""
+    try:
+        return AnalysisPlan.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise InvalidRequest(f"The plan '{path}' cannot be read: {error.strerror or error}.") from error
+    except ValidationError as error:
+        raise InvalidRequest(
+            f"'{path}' is no plan that `cow eval plan` of this version wrote: {str(error).splitlines()[-2].strip()}"
+        ) from error
 
 
-def versions() -> dict[str, str]:
-    """Of this service, of Python, of the packages that are installed, and of the prompts."""
-    found = {"cow-service": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    for name in PROMPTS:
-        prompt = load_prompt(name)
-        digest = hashlib.sha256(prompt.body.encode()).hexdigest()
-        found[f"prompts/{name}"] = f"{prompt.version} (sha256 {digest})"
-    return found
+def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
+    """The plan in words: the primary question, how many scenes it needs, and what it takes.
+
+    `costs` are those of a pilot's arms by name, where there was one.
+    """
+    items, points = sum(plan.counts.values()), f"{100 * plan.effect:g} points"
+    shown = 100 * math.sqrt(scenes_needed(1.0, plan.variance * 1e6) / 1e6 / max(plan.scenes, 1))
+    lines = [
+        f"Primary question: does {plan.primary} gain over each of {', '.join(plan.placebos)}?",
+        f"{plan.scenes_needed:,} scenes show a gain of {points} with a power of {POWER:.0%} (variance of scenes "
+        f"{plan.variance:.3f}). There are {plan.scenes:,}: a power of {plan.power:.0%}, or {POWER:.0%} for a gain of "
+        f"{shown:.1f} points.",
+    ]
+    simulations: set[Any] = set()
+    calls = pictures = 0
+    for arm in plan.points:
+        asked = arm.votes + (GATE_VOTES if arm.gate else 0)
+        calls += asked * items * plan.repeats
+        pictures += (asked * arm.image + arm.votes * arm.count * arm.shows_frames) * items * plan.repeats
+        for trial in range(arm.votes if arm.content != "none" else 0):
+            frames = tuple(arm.frames_request.values()) if arm.shows_frames else ()
+            simulations |= {(frames, trial)}
+            if arm.content in ("wrong-direction", "true"):
+                simulations |= {(frames, trial, arm.content, arm.error)}
+    lines.append(
+        f"{items:,} questions, {len(plan.arms)} arms, {plan.repeats} repeats: at most {calls:,} calls with "
+        f"{pictures:,} pictures, and {len(simulations) * items:,} simulations."
+    )
+    replies = items * plan.repeats
+    known = {name: (costs[name], replies / costs[name].replies) for name in plan.arms if name in costs}
+    if known:
+        tokens = sum((cost.input_tokens + cost.output_tokens) * more for cost, more in known.values())
+        hours = sum(cost.seconds * more for cost, more in known.values()) / 3600
+        money = sum((cost.money or 0.0) * more for cost, more in known.values())
+        paid = f", {money:,.2f} in the currency of the prices" if money else ""
+        unknown = [name for name in plan.arms if name not in costs]
+        lines.append(
+            f"By the pilot {tokens:,.0f} tokens and {hours:,.1f} hours, one call after another{paid}"
+            + (f"; without {', '.join(unknown)}, which the pilot did not ask." if unknown else ".")
+        )
+    return "\n".join(lines)

@@ -7,8 +7,9 @@ import atexit
 import os
 import secrets
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,12 @@ from cow_service.adaptive import FIRST
 from cow_service.client import Client
 from cow_service.client.progress import progress_shown
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
-from cow_service.evals import asking, plan, runs
-from cow_service.evals.imagination import check_arms
-from cow_service.evals.items import Ask, Item, Observation, Pictures, RunInfo, question_text
+from cow_service.evals import asking, request, runs
+from cow_service.evals.design import Order, arm_of, check_arms
+from cow_service.evals.items import Ask, Item, Observation, Pictures, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
+from cow_service.evals.plan import DISCORDANT, RunInfo, describe, planned
+from cow_service.evals.report.summary import Price, summarize
 from cow_service.evals.session import EvalProgress, active_session, session
 from cow_service.readers.prompts import load_prompt
 
@@ -42,6 +45,7 @@ def causalspatial(
     ask: Ask = "prompt",
     repeats: int = 1,
     seed: int = 0,
+    order: Order = "shuffled",
     limit: int | None = None,
     reader: str | None = None,
     generator: str | None = None,
@@ -55,7 +59,7 @@ def causalspatial(
     if shared is None:  # the session of the first task of the process is that of all
         stack = ExitStack()
         atexit.register(stack.close)
-        options, key = plan.request_options(reader, generator), secrets.token_hex(8)
+        options, key = request.request_options(reader, generator), secrets.token_hex(8)
         folder = Path(tempfile.mkdtemp(prefix="cow-eval-"))  # of pictures and a server; left to the system to clean
         shared = stack.enter_context(session(folder, url, options, key, key))
     items = shared.items  # loaded and checked before, whatever `data` says
@@ -63,6 +67,7 @@ def causalspatial(
         named = subsets.split(",") if isinstance(subsets, str) else subsets
         items = load(data, shared.pictures, subsets=[part.strip() for part in named if part.strip()]).items[:limit]
     check_arms([arm], ask, items)
+    shared.lenders = items
     samples = [
         Sample(
             id=item.id,
@@ -75,23 +80,22 @@ def causalspatial(
     ]
     return Task(
         dataset=MemoryDataset(samples, name=arm),
-        solver=look_and_ask(arm, ask, seed),
+        solver=look_and_ask(arm, ask, seed, order),
         scorer=chosen_option(),
         epochs=Epochs(repeats, "mean"),
-        config=GenerateConfig(max_tokens=plan.MAX_TOKENS),
+        config=GenerateConfig(max_tokens=request.MAX_TOKENS),
         name=arm,
         version=load_prompt("eval-question").version,
     )
 
 
 @solver
-def look_and_ask(arm: str, ask: Ask, seed: int) -> Solver:
+def look_and_ask(arm: str, ask: Ask, seed: int, order: Order = "shuffled") -> Solver:
     """Asks one question in one arm, with its options in the order of the repeat."""
 
     async def solve(state: TaskState, generate: Generate) -> TaskState:
         item = Item.model_validate(state.metadata[runs.ITEM])
-        (one,) = check_arms([arm], ask, [item])
-        case = asking.Case(item, one, state.epoch, asking.order_of(item, seed, state.epoch))
+        case = asking.Case(item, arm_of(arm), state.epoch, asking.order_of(item, order, seed, state.epoch))
         shared = active_session()
         if shared is None:
             raise RuntimeError("The solver runs in tasks of `causalspatial` alone.")
@@ -133,42 +137,80 @@ def chosen_option() -> Scorer:
     return score
 
 
-def evaluate(wanted: plan.Plan, tell: Callable[[str], None]) -> runs.EvalRun:
+def prepare(wanted: request.EvalRequest, folder: Path, tell: Callable[[str], None]) -> tuple[RunInfo, list[Item]]:
+    """What is to be asked, checked, as the record of a run; its pictures are kept in the folder.
+
+    `tell` is told what was found in the data. Raises as `evaluate` does.
+    """
+    request.check_request(wanted)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageUnavailable(f"'{folder}' cannot be written: {error.strerror or error}.") from error
+    found = load(wanted.data, Pictures(folder / runs.PICTURES), subsets=wanted.subsets, skip_faulty=wanted.skip_faulty)
+    items = found.items[: wanted.limit]
+    arms = check_arms(wanted.arms, wanted.ask, items)
+    for told in (*found.notes, *found.faults):
+        tell(told)
+    return request.info_of(wanted, found, items, arms), items
+
+
+def write_plan(
+    wanted: request.EvalRequest, file: Path, effect: float, pilot: Path | None, prices: Mapping[str, Price]
+) -> str:
+    """Writes the plan of a run that hopes for a gain of `effect` (a share of questions); returns what it says.
+
+    A pilot run tells how much scenes differ, and what a reply costs. Raises as `evaluate` does.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        info, _ = prepare(wanted, Path(folder), lambda told: None)
+    variance, costs = DISCORDANT, {}
+    if pilot is not None:
+        findings = summarize([runs.read_run(pilot)], prices)
+        if not findings.primaries:
+            raise InvalidRequest(f"The pilot '{pilot}' answers no primary question: it needs always and a placebo.")
+        variance = findings.primaries[0].found.gain.sd ** 2
+        costs = {each.arm: each.cost for each in findings.arms}
+    fixed = planned(info, effect, variance)
+    try:
+        file.write_text(fixed.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StorageUnavailable(f"'{file}' cannot be written: {error.strerror or error}.") from error
+    return describe(fixed, costs)
+
+
+def evaluate(wanted: request.EvalRequest, tell: Callable[[str], None]) -> runs.EvalRun:
     """Asks everything that the folder has no reply to yet; returns all of it.
 
     All is checked before the first question is asked; `tell` is told what was found in the data. Raises
     `InvalidRequest` for data, arms and settings that cannot be asked, `StorageUnavailable` for a folder that cannot be
     written, and the `CowError` for which no server can be used.
     """
-    plan.check_plan(wanted)
-    try:
-        wanted.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageUnavailable(f"'{wanted.out}' cannot be written: {error.strerror or error}.") from error
-    found = load(
-        wanted.data, Pictures(wanted.out / runs.PICTURES), subsets=wanted.subsets, skip_faulty=wanted.skip_faulty
-    )
-    items = found.items[: wanted.limit]
-    arms = check_arms(wanted.arms, wanted.ask, items)
-    for told in (*found.notes, *found.faults):
-        tell(told)
-    settings = plan.server_settings(wanted)
+    begun, items = prepare(wanted, wanted.out, tell)
+    settings = request.server_settings(wanted)
     try:
         model = get_model("none/none") if wanted.ask == "answer" else get_model(wanted.mllm, base_url=wanted.base_url)
     except Exception as error:
         # Inspect's providers raise what they like: a missing package, key or name.
         raise InvalidRequest(f"--mllm {wanted.mllm} cannot be used: {error}") from error
-    begun = plan.info_of(wanted, items, found, arms)
     # Inspect keeps replies in the folder: a reply that has come is never asked for again.
     os.environ["INSPECT_CACHE_DIR"] = str((wanted.out / runs.CACHE).resolve())
     logs = wanted.out / runs.LOGS
     again = wanted.retry_failed and logs.is_dir() and runs.forget_failures(logs) > 0
-    info = plan.merged(runs.read_info(wanted.out), begun, again=again)
+    info = request.merged(runs.read_info(wanted.out), begun, again=again)
     _ask(wanted, info, items, model, settings)
-    return runs.read_run(wanted.out)
+    done = runs.read_run(wanted.out)
+    # Only the replies tell which version of a model has replied.
+    replied = info.model_copy(
+        update={"replied_as": tuple(sorted({each.model for each in done.observations if each.model is not None}))}
+    )
+    runs.write_run(wanted.out, replied, items)
+    return replace(done, info=replied)
 
 
-def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, settings: dict[str, Any]) -> None:
+def _ask(
+    wanted: request.EvalRequest, info: RunInfo, items: Sequence[Item], model: Model, settings: dict[str, Any]
+) -> None:
     """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin: the folder stays free."""
     logs = wanted.out / runs.LOGS
     logs.mkdir(exist_ok=True)
@@ -181,7 +223,8 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
         return
     keys = f"{info.token} {info.rounds}", info.token
     console = rich.get_console()
-    with session(wanted.out, wanted.url, info.settings["requests"], *keys, **settings) as shared, ExitStack() as stack:
+    options = request.request_options(wanted.reader, wanted.generator)
+    with session(wanted.out, wanted.url, options, *keys, **settings) as shared, ExitStack() as stack:
         _check_server(shared.url, wanted)
         runs.write_run(wanted.out, info, items)
         stack.callback(setattr, console, "quiet", console.quiet)
@@ -194,10 +237,9 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
 
             shared.items, shared.on_reply, shared.concurrency = items, on_reply, wanted.concurrency
             shared.progress = progress
+            asked: dict[str, Any] = {"data": info.data_digest, "ask": info.ask, "seed": info.seed, "order": info.order}
             _, ended = eval_set(
-                tasks=[
-                    causalspatial(data=info.data_digest, arm=arm, ask=wanted.ask, seed=wanted.seed) for arm in info.arms
-                ],
+                tasks=[causalspatial(arm=arm, **asked) for arm in info.arms],
                 epochs=Epochs(info.repeats, "mean"),
                 log_dir=str(logs),
                 model=model,
@@ -222,7 +264,7 @@ def _ask(wanted: plan.Plan, info: RunInfo, items: Sequence[Item], model: Model, 
         raise KeyboardInterrupt
 
 
-def _check_server(url: str, wanted: plan.Plan) -> None:
+def _check_server(url: str, wanted: request.EvalRequest) -> None:
     """Raises the `CowError` for which the server cannot be asked, or not so."""
     try:
         with Client(url, retries=0) as client:

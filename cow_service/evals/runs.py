@@ -1,5 +1,6 @@
 """A folder of results: what was asked, and what came of it, which stands in Inspect's logs alone."""
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,9 @@ from pydantic import ValidationError
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals.asking import Case, order_of, place_of
-from cow_service.evals.imagination import arm_of
-from cow_service.evals.items import Item, Observation, RunInfo
+from cow_service.evals.design import arm_of
+from cow_service.evals.items import Item, Observation
+from cow_service.evals.plan import FORMAT, RunInfo
 
 RUN, ITEMS = "run.json", "items.jsonl"  # what was asked
 PICTURES = "pictures"  # by digest: images and frames
@@ -53,8 +55,14 @@ def read_info(folder: Path) -> RunInfo | None:
     """What a folder was asked; None where no run was begun in it. Raises `InvalidRequest` for one that is damaged."""
     path = folder / RUN
     try:
-        return RunInfo.model_validate_json(path.read_bytes()) if path.is_file() else None
-    except (ValidationError, OSError) as error:
+        found: Any = json.loads(path.read_bytes()) if path.is_file() else None
+        if isinstance(found, dict) and found.get("format") != FORMAT:
+            raise InvalidRequest(
+                f"'{folder}' holds a run that another version of COW wrote (format {found.get('format')}, not "
+                f"{FORMAT}), whose arms showed other frames: ask into another folder."
+            )
+        return None if found is None else RunInfo.model_validate(found)
+    except (ValueError, OSError) as error:
         raise _unreadable(folder, RUN, error) from error
 
 
@@ -100,7 +108,7 @@ def _observation(log: inspect_log.EvalLog, sample: inspect_log.EvalSample) -> Ob
         return None
     arguments: dict[str, Any] = log.plan.steps[0].params
     item = Item.model_validate(sample.metadata[ITEM])
-    order = order_of(item, arguments["seed"], sample.epoch)
+    order = order_of(item, arguments["order"], arguments["seed"], sample.epoch)
     case = Case(item, arm_of(arguments["arm"]), sample.epoch, order)
     return Observation(**place_of(case), failure=sample.error.message[:MAX_FAILURE])
 

@@ -39,6 +39,7 @@ class Session:
     options: Mapping[str, Any]  # fields of the requests for simulations and answers
     concurrency: int = CONCURRENCY  # most requests at the same time
     items: Sequence[Item] | None = None  # of its tasks; None: each task loads its own
+    lenders: Sequence[Item] = ()  # items whose frames others may be shown
     # Called with the arm of every question that has been asked, and with what came of it; None: it failed.
     on_reply: Callable[[str, Observation | None], None] = lambda arm, seen: None
     progress: "EvalProgress | None" = None
@@ -51,7 +52,8 @@ class Session:
         if loop not in self._clients:
             places = AdaptivePlaces(self.concurrency)
             client = AsyncClient(self.url, timeout=TIMEOUT, http_client=_observed(places.limit))
-            self._clients[loop] = client, Imagination(client, places, self.pictures, self.options, self.key)
+            imagination = Imagination(client, places, self.pictures, self.options, self.key, self.lenders)
+            self._clients[loop] = client, imagination
         return self._clients[loop]
 
     async def show_load(self) -> None:

@@ -1,22 +1,23 @@
-"""Rates, and what is gained by an arm over another: paired by question and repeat, drawn by scene."""
+"""Rates, and the gain of an arm over another: paired by question and repeat, clustered by scene."""
 
 import math
 import statistics
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import binomtest
+from scipy.stats import norm, permutation_test
 from scipy.stats import t as student_t
 
 from cow_service.evals.items import Observation
 from cow_service.records import Record
 
 RESAMPLES = 10_000
-CONFIDENCE = 0.95
+BATCH = 500  # resamples that are held in memory together
+ALPHA, POWER = 0.05, 0.8
 
 
 class Spread(Record):
@@ -46,13 +47,21 @@ class Gain(Record):
     questions: int
     scenes: int
     gain: float
-    low: float = Field(description="Lower end of the 95% interval: bootstrap over scenes.")
+    low: float = Field(description="Lower end of the 95% interval, clustered by scene.")
     high: float
     helped: int = Field(description="Pairs of replies, wrong in the baseline and right in the arm.")
     hurt: int = Field(description="The other way round.")
-    discordant: tuple[int, int] = Field(description="Questions right in most repeats of only the arm, the baseline.")
-    p: float = Field(description="Exact McNemar test on these questions, two-sided.")
-    p_holm: float | None = Field(default=None, description="The same, adjusted over the tasks that are compared.")
+    sd: float = Field(description="Standard deviation of the scenes' mean differences.")
+    p: float = Field(description="Two-sided; the signs of whole scenes' differences are permuted.")
+    p_holm: float | None = Field(default=None, description="The same, adjusted over all contrasts that are shown.")
+
+
+class PrimaryGain(Record):
+    """The primary question: what simulated frames gain over the strongest placebo."""
+
+    placebo: str = Field(description="The strongest: the one with most right replies.")
+    gain: Gain = Field(description="Over it. Its interval holds whichever placebo is strongest in truth.")
+    p: float = Field(description="The largest of all placebos where all gains have one sign, else 1.")
 
 
 class Bin(Record):
@@ -113,89 +122,131 @@ def _spread(observations: Sequence[Observation], is_one: Callable[[Observation],
     )
 
 
-def gain(arm: Sequence[Observation], baseline: Sequence[Observation], resamples: int = RESAMPLES) -> Gain | None:
-    """Of an arm over a baseline; None where no question was replied to in both.
+Pairs = NDArray[np.float64]  # (scenes, 3): pairs of replies in which the arm alone is right, the baseline alone; all
 
-    The interval is a bootstrap over scenes, studentized, and never narrower than few scenes allow.
-    """
+
+def pairs_of(arm: Sequence[Observation], baseline: Sequence[Observation]) -> tuple[Pairs, int]:
+    """What both replied to, by scene, and how many questions that are; failed questions count in neither."""
     there = {(each.item, each.repeat): each for each in baseline if each.failure is None}
     replied = [each for each in arm if each.failure is None]
-    pairs = [(each, there[place]) for each in replied if (place := (each.item, each.repeat)) in there]
-    if not pairs:
-        return None
-    sums: dict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
-    by_item: dict[str, list[tuple[bool, bool]]] = defaultdict(list)
-    for one, other in pairs:
-        sums[one.scene][0] += one.right - other.right
-        sums[one.scene][1] += 1
-        by_item[one.item].append((one.right, other.right))
-    table = np.array([sums[scene] for scene in sorted(sums)])
-    low, high = bootstrap_interval(table, resamples)
-    # Whether most replies to a question are right, in the arm and in the baseline.
-    majority = [[statistics.fmean(side) > 0.5 for side in zip(*values, strict=True)] for values in by_item.values()]
-    won = sum(a and not b for a, b in majority)
-    lost = sum(b and not a for a, b in majority)
+    both = [(each, there[place]) for each in replied if (place := (each.item, each.repeat)) in there]
+    sums: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    for one, other in both:
+        sums[one.scene][0] += one.right and not other.right
+        sums[one.scene][1] += other.right and not one.right
+        sums[one.scene][2] += 1
+    table = np.array([sums[scene] for scene in sorted(sums)], dtype=np.float64).reshape(-1, 3)
+    return table, len({one.item for one, _ in both})
+
+
+def gain(arm: Sequence[Observation], baseline: Sequence[Observation]) -> Gain | None:
+    """Of an arm over a baseline; None where no question was replied to in both."""
+    pairs, questions = pairs_of(arm, baseline)
+    return gain_of(pairs, questions) if len(pairs) else None
+
+
+def gain_of(pairs: Pairs, questions: int) -> Gain:
+    """The gain, its 95% interval and its p, all with the scenes as clusters."""
+    helped, hurt, count = pairs.T
+    difference = helped - hurt
+    low, high = cluster_interval(pairs)
     return Gain(
-        questions=len(by_item),
-        scenes=len(table),
-        gain=float(table[:, 0].sum() / table[:, 1].sum()),
+        questions=questions,
+        scenes=len(pairs),
+        gain=float(difference.sum() / count.sum()),
         low=low,
         high=high,
-        helped=sum(one.right and not other.right for one, other in pairs),
-        hurt=sum(other.right and not one.right for one, other in pairs),
-        discordant=(won, lost),
-        p=float(binomtest(won, won + lost).pvalue) if won + lost else 1.0,
+        helped=int(helped.sum()),
+        hurt=int(hurt.sum()),
+        sd=float(np.std(difference / count, ddof=1)) if len(pairs) > 1 else 0.0,
+        p=sign_flip_p(difference),
     )
 
 
-def bootstrap_interval(table: NDArray[np.float64], resamples: int = RESAMPLES) -> tuple[float, float]:
-    """The 95% interval of a ratio of sums, from a table (clusters, 2) of numerators and denominators.
+def sign_flip_p(differences: NDArray[np.float64]) -> float:
+    """Two-sided p of the scenes' differences (scenes,), of which all signs are equally likely where nothing is gained.
 
-    A bootstrap-t over clusters with the linearized standard error (Efron and Tibshirani 1993, section 12.5), and at
-    least as wide as `_plus_two_interval`: of few clusters, or of nearly equal ones, a bootstrap sees too little. The
-    random numbers are fixed by the table.
+    A permutation test of whole scenes, exact for few: questions on one scene may depend on each other as they like. Of
+    scenes with one question and one reply it is McNemar's exact test. The random numbers are fixed by the differences.
     """
-    count = len(table)
-    low, high = _plus_two_interval(table)
-    total = table.sum(axis=0)
-    ratio = total[0] / total[1]
-    error = _standard_error(table, np.ones((1, count)), np.array([ratio]))[0]
-    if error > 0:
-        draws = np.random.default_rng(zlib.crc32(np.ascontiguousarray(table).tobytes()))
-        weights = draws.multinomial(count, np.full(count, 1 / count), size=resamples).astype(np.float64)
-        drawn = weights @ table
-        ratios = drawn[:, 0] / drawn[:, 1]
-        errors = _standard_error(table, weights, ratios)
-        usable = errors > 0
-        edge = (1 - CONFIDENCE) / 2
-        below, above = np.quantile((ratios[usable] - ratio) / errors[usable], [1 - edge, edge])
-        low, high = min(low, float(ratio - below * error)), max(high, float(ratio - above * error))
-    return max(-1.0, low), min(1.0, high)
+    told = differences[differences != 0]
+    if len(told) < 2:
+        return 1.0
+    found = permutation_test(
+        (told,),
+        np.sum,
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=BATCH,
+        rng=np.random.default_rng(zlib.crc32(told.tobytes())),
+    )
+    return min(1.0, float(found.pvalue))
 
 
-def _plus_two_interval(table: NDArray[np.float64]) -> tuple[float, float]:
-    """A t interval after one cluster of mean size at -1 and one at 1 were added.
+def primary_gain(placebos: Mapping[str, Pairs], questions: int) -> PrimaryGain | None:
+    """Of an arm over the strongest of its placebos, by their names; None where there is none.
 
-    The same idea as for single shares (Agresti and Coull 1998). One cluster alone says nothing: [-1, 1].
+    Which placebo is the strongest is found out from the same replies, so one must not only test against that: the gain
+    is one where each placebo is beaten (an intersection-union test, Berger 1982). The lower end of the interval is the
+    lowest of all, the upper one the lowest of those with their error shared among the placebos.
     """
-    count, size = len(table), table[:, 1].mean()
-    if count < 2:
+    found = {name: gain_of(pairs, questions) for name, pairs in placebos.items() if len(pairs)}
+    if not found:
+        return None
+    strongest = min(found, key=lambda name: found[name].gain)
+    low = min(each.low for each in found.values())
+    high = min(cluster_interval(placebos[name], ALPHA / len(found))[1] for name in found)
+    one_sign = len({math.copysign(1, each.gain) for each in found.values() if each.gain}) == 1
+    return PrimaryGain(
+        placebo=strongest,
+        gain=found[strongest].model_copy(update={"low": low, "high": max(low, high)}),
+        p=max(each.p for each in found.values()) if one_sign else 1.0,
+    )
+
+
+def scenes_needed(effect: float, variance: float) -> int:
+    """How many scenes show such a gain (a share) with a power of 80% at 5%, two-sided.
+
+    `variance` is that of the scenes' mean differences: of one question and reply each, at most the share of
+    discordant pairs.
+    """
+    return math.ceil(variance * ((norm.ppf(1 - ALPHA / 2) + norm.ppf(POWER)) / effect) ** 2)
+
+
+def power_of(effect: float, variance: float, scenes: int) -> float:
+    """How probable it is that so many scenes show such a gain; see `scenes_needed`."""
+    return float(norm.cdf(effect * math.sqrt(scenes / variance) - norm.ppf(1 - ALPHA / 2)))
+
+
+def cluster_interval(pairs: Pairs, alpha: float = ALPHA) -> tuple[float, float]:
+    """The interval of a gain that leaves out `alpha` / 2 at each side. One scene alone says nothing: [-1, 1].
+
+    A t interval with the standard error of clusters. So that it holds where scenes are few, or where nearly all agree,
+    a scene at -1 and one at +1 are added first, as is done for single shares (Agresti and Coull 1998). They are as
+    large as the pairs of replies that tell as much as one that stands alone: the design effect, the factor by which the
+    replies of a scene go together.
+    """
+    scenes = len(pairs)
+    if scenes < 2:
         return -1.0, 1.0
-    more = np.vstack([table, [[size, size], [-size, size]]])
-    ratio = more[:, 0].sum() / more[:, 1].sum()
-    error = _standard_error(more, np.ones((1, count + 2)), np.array([ratio]))[0]
-    reach = float(student_t.ppf((1 + CONFIDENCE) / 2, count - 1)) * error
-    return float(ratio - reach), float(ratio + reach)
+    helped, hurt, count = pairs.T
+    values = np.stack([helped - hurt, count], axis=1)
+    total, size = count.sum(), count.mean()
+    ratio = values[:, 0].sum() / total
+    alone = ((helped + hurt).sum() / total - ratio**2) / total  # its variance, if replies did not go together
+    effect = min(max(_standard_error(values, ratio) ** 2 / alone, 1.0), size) if alone > 0 else size
+    more = np.vstack([values, [[effect, effect], [-effect, effect]]])
+    middle = more[:, 0].sum() / more[:, 1].sum()
+    reach = float(student_t.ppf(1 - alpha / 2, scenes - 1)) * _standard_error(more, middle)
+    return max(-1.0, float(middle - reach)), min(1.0, float(middle + reach))
 
 
-def _standard_error(
-    table: NDArray[np.float64], weights: NDArray[np.float64], ratios: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Of ratios of weighted sums (draws,), linearized: the spread of what each cluster adds to its ratio."""
+def _standard_error(table: NDArray[np.float64], ratio: float) -> float:
+    """Of the ratio of the sums of two columns, linearized: the spread of what each cluster adds to it."""
     count = len(table)
-    added = table[None, :, 0] - ratios[:, None] * table[None, :, 1]
-    squares = (weights * added**2).sum(axis=1)
-    return np.sqrt(squares * count / max(count - 1, 1)) / (weights @ table[:, 1])
+    squares = ((table[:, 0] - ratio * table[:, 1]) ** 2).sum()
+    return float(np.sqrt(squares * count / (count - 1)) / table[:, 1].sum())
 
 
 def holm(values: Sequence[float]) -> list[float]:

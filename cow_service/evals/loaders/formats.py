@@ -13,9 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import ValidationError
+
 from cow_service.errors import InvalidRequest
-from cow_service.evals.items import LETTERS, REAL, Pictures
-from cow_service.evals.loaders.rows import Collected, Row, RowFault, Unread, collect
+from cow_service.evals.items import LETTERS, REAL, Pictures, Truth
+from cow_service.evals.loaders.rows import Collected, Known, Row, RowFault, Unread, collect
 
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
 # Where a row stands, and what reads its fields, which raises `RowFault`.
@@ -39,6 +41,7 @@ def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
 
 META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
 SCENE_TEXTS = ("question", "answer", "task", "level")
+SAMPLES_PER_SECOND = 30.0  # of scenes that do not say
 
 
 def scene_folders(folder: Path) -> list[Path]:
@@ -62,15 +65,29 @@ def _scene_row(scene: Path) -> Row:
         source_id=named,
         image=image.read_bytes() if image.is_file() else None,
         scene=scene.name,
-        oracle=oracle_frames(scene),
+        truth=truth_of(scene, meta),
         **texts,
     )
 
 
-def oracle_frames(scene: Path) -> list[bytes]:
-    """Pictures of what really happens, in the order of their numbers; empty where there are none."""
+def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
+    """What a scene's folder knows of what really happens; None where that is nothing.
+
+    `future_12.jpg` shows sample 12; `fps` samples pass in a second. Raises `RowFault` for a track that is none.
+    """
+    fps, moved = meta.get("fps", SAMPLES_PER_SECOND), meta.get("object")
+    boxes: Any = (meta.get("boxes") or {}).get(moved) or ()
+    bbox: Any = meta.get("bbox") or (boxes[0] if boxes and isinstance(boxes[0], list) else boxes) or None
     numbered = [(int("".join(filter(str.isdigit, path.stem)) or 0), path) for path in scene.glob(FUTURE)]
-    return [path.read_bytes() for _, path in sorted(numbered)]
+    pictures = [(number / fps, path.read_bytes()) for number, path in sorted(numbered)]
+    if not pictures and not meta.get("track"):
+        return None
+    fields = {"fps": fps, "track": meta.get("track") or (), "bbox": bbox, "object": moved}
+    try:
+        return Known(Truth.model_validate(fields), pictures)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise RowFault(f"`{first['loc'][0]}` cannot be used: {first['msg']}") from error
 
 
 # What a column means, by its names; those of VLMEvalKit are among them.
@@ -265,6 +282,7 @@ def _published_row(
     if level is None and not real:
         raise RowFault(f"the id {source[:60]!r} names no level: it should be like Collision_Level_1_0")
     image: Any = fields["image"]
+    made = folder / TRUTH / subset / source
     return Row(
         id=unique,
         source_id=source,
@@ -274,5 +292,5 @@ def _published_row(
         options=fields.get("options") or None,
         task=str(fields.get("type") or subset) if real else subset,
         level=REAL if real or level is None else f"L{level[1]}",
-        oracle=oracle_frames(folder / TRUTH / subset / source) if (folder / TRUTH).is_dir() else (),
+        truth=truth_of(made, _json_object((made / META).read_bytes())) if (made / META).is_file() else None,
     )

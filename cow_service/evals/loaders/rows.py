@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from cow_service.errors import CowError, StorageUnavailable
 from cow_service.evals import items
-from cow_service.evals.items import Item, Pictures, Task
+from cow_service.evals.items import Item, Pictures, Task, Truth
 from cow_service.readers.options import not_sure_option, option_named
 from cow_service.records import AnswerOption
 
@@ -19,6 +19,14 @@ _TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **
 
 class RowFault(ValueError):
     """Why a row cannot be asked; its text says what is wrong with which value."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a data set knows of what really happens, and pictures of it with their moments, s."""
+
+    truth: Truth
+    pictures: Sequence[tuple[float, bytes]]
 
 
 @dataclass(frozen=True)
@@ -34,7 +42,7 @@ class Row:
     task: str | None = None
     level: str | None = None
     scene: str | None = None
-    oracle: Sequence[bytes] = ()
+    truth: Known | None = None
 
 
 Unread = tuple[str, Callable[[], Row]]  # where a row stands (for people), and what reads it, which raises `RowFault`
@@ -57,7 +65,9 @@ def item_of(place: str, row: Row, pictures: Pictures) -> Item:
         wording = items.appended_wording(row.question.rstrip(), texts)
     parts, options = wording
     image = _picture(row.image, "image", pictures)
-    abstain = not_sure_option(options)
+    abstain, known = not_sure_option(options), row.truth
+    shown = () if known is None else known.pictures
+    kept = tuple((time, _picture(data, "picture of what really happens", pictures)) for time, data in shown)
     try:
         return Item(
             id=row.id,
@@ -71,7 +81,7 @@ def item_of(place: str, row: Row, pictures: Pictures) -> Item:
             task=task_of(row.task),
             level=row.level or items.UNKNOWN_LEVEL,
             scene=row.scene or image,
-            oracle=tuple(_picture(each, "oracle frame", pictures) for each in row.oracle),
+            truth=None if known is None else known.truth.model_copy(update={"pictures": kept}),
         )
     except ValidationError as error:
         first = error.errors()[0]

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
+from cow_service.evals.design import BASELINE
 from cow_service.evals.items import TASKS
-from cow_service.evals.report.summary import BASELINE, ArmSummary
+from cow_service.evals.report.summary import ArmSummary, Dose, Findings
 from cow_service.evals.report.tables import points
 from cow_service.evals.statistics import Calibration, Cost, Gain, Rates, Spread
 
@@ -103,9 +104,9 @@ def _percent_axis(axes: Axes, low: float, high: float) -> None:
 # Gains: a forest plot, on all questions and on each task
 
 
-def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
+def draw_gains(findings: Findings) -> Figure | None:
     """What every arm gains over the image alone; None where no arm has a gain."""
-    styles = arm_styles(summaries)
+    summaries, styles = findings.arms, arm_styles(findings.arms)
     groups = {"All questions": [(each.name, each.gain) for each in summaries if each.gain is not None]}
     for task in TASKS:
         groups[task.capitalize()] = [(each.name, each.gains[task]) for each in summaries if task in each.gains]
@@ -155,6 +156,40 @@ def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
     return figure
 
 
+# Dose and response: what frames are worth that are off by so much
+
+
+def draw_doses(findings: Findings) -> Figure | None:
+    """The gain over the error of the path that is shown; None where frames of no two errors were shown."""
+    by_run: dict[str, list[Dose]] = {}
+    for each in findings.doses:
+        by_run.setdefault(each.name.rpartition(", ")[0], []).append(each)
+    by_run = {name: sorted(doses, key=lambda dose: dose.error) for name, doses in by_run.items() if len(doses) > 1}
+    if not by_run:
+        return None
+    figure = Figure(figsize=(SQUARE + 1.4, SQUARE - 1.4), layout="constrained")
+    axes = figure.add_subplot()
+    for place, (name, doses) in enumerate(by_run.items()):
+        colour, marker = COLOURS[place % len(COLOURS)], ROUND_FIRST[place % len(ROUND_FIRST)]
+        errors, gains = [each.error for each in doses], [100 * each.gain.gain for each in doses]
+        reach = [[100 * (each.gain.gain - each.gain.low), 100 * (each.gain.high - each.gain.gain)] for each in doses]
+        ends: Any = list(zip(*reach, strict=True))
+        options: dict[str, Any] = {"color": colour, "marker": marker, "capsize": 3, "markeredgecolor": INK}
+        axes.errorbar(errors, gains, yerr=ends, label=short(name) if name else None, **options)
+        for each, gain in zip(doses, gains, strict=True):
+            if each.path_error is not None:
+                text = f"{100 * each.path_error:.1f}%"
+                axes.annotate(text, (each.error, gain), (6, 6), textcoords="offset points", fontsize=7.5, color=DIM)
+    axes.axhline(0, color=INK, linewidth=1, zorder=1)
+    axes.grid()
+    axes.set_xlabel("Error of the path shown, in units of the simulation's own (small print: % of the width)")
+    axes.set_ylabel(f"Gain over “{BASELINE}” (percentage points)")
+    axes.set_title("What frames are worth whose path is off by so much (95% intervals)")
+    if any(by_run):
+        axes.legend()
+    return figure
+
+
 # Rates: how many questions each arm answers rightly, by task, and by the levels of each task
 
 
@@ -162,8 +197,9 @@ def draw_gains(summaries: Sequence[ArmSummary]) -> Figure | None:
 Groups = dict[str, dict[str, Rates]]
 
 
-def draw_rates(summaries: Sequence[ArmSummary]) -> Figure | None:
+def draw_rates(findings: Findings) -> Figure | None:
     """Right answers of every arm; None where nothing was replied to."""
+    summaries = findings.arms
     if not summaries:
         return None
     panels, styles = _rate_panels(summaries), arm_styles(summaries)
@@ -228,10 +264,10 @@ def _draw_rate_panel(axes: Axes, groups: Groups, styles: dict[str, ArmStyle], sp
 # Calibration: whether what the simulation tells with 70% happens in 70% of the cases
 
 
-def draw_calibration(summaries: Sequence[ArmSummary]) -> Figure | None:
+def draw_calibration(findings: Findings) -> Figure | None:
     """Told probabilities against what happened; None where none was told."""
     curves: list[tuple[list[str], Calibration]] = []
-    for each in summaries:  # arms that share their simulations tell the same: one curve, with all of their names
+    for each in findings.arms:  # arms that share their simulations tell the same: one curve, with all of their names
         same = next((names for names, found in curves if found == each.calibration), None)
         if same is not None:
             same.append(each.name)
@@ -279,11 +315,11 @@ MEASURES: dict[str, tuple[str, Callable[[Cost], float | None]]] = {  # by title:
 }
 
 
-def draw_cost(summaries: Sequence[ArmSummary]) -> Figure | None:
+def draw_cost(findings: Findings) -> Figure | None:
     """Right answers against their cost; None where nothing is known to have cost anything."""
     shown: dict[str, list[tuple[ArmSummary, float]]] = {}
     for title, (_, sum_of) in MEASURES.items():
-        known = [(each, sum_of(each.cost)) for each in summaries]
+        known = [(each, sum_of(each.cost)) for each in findings.arms]
         means = [(each, value / max(each.cost.replies, 1)) for each, value in known if value is not None]
         if any(mean > 0 for _, mean in means):
             shown[title] = means
@@ -291,7 +327,7 @@ def draw_cost(summaries: Sequence[ArmSummary]) -> Figure | None:
         return None
     figure = Figure(figsize=(COST_WIDTH, COST_PANEL * len(shown) + 0.6), layout="constrained")
     grid = figure.subplots(len(shown), squeeze=False)
-    styles = arm_styles(summaries)
+    styles = arm_styles(findings.arms)
     _add_arm_legend(figure, styles, COST_WIDTH)
     for axes, (title, means) in zip(grid[:, 0], shown.items(), strict=True):
         for each, mean in means:
@@ -316,4 +352,10 @@ def draw_cost(summaries: Sequence[ArmSummary]) -> Figure | None:
     return figure
 
 
-DRAWINGS = {"gains": draw_gains, "rates": draw_rates, "calibration": draw_calibration, "cost": draw_cost}
+DRAWINGS: dict[str, Callable[[Findings], Figure | None]] = {
+    "gains": draw_gains,
+    "doses": draw_doses,
+    "rates": draw_rates,
+    "calibration": draw_calibration,
+    "cost": draw_cost,
+}

@@ -17,8 +17,9 @@ from urllib.parse import quote
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
+from cow_service.evals.design import BASELINE
 from cow_service.evals.items import Item, Observation
-from cow_service.evals.report.summary import BASELINE, ArmSummary
+from cow_service.evals.report.summary import ArmSummary, Findings
 from cow_service.evals.report.tables import p_text, points
 from cow_service.evals.runs import PICTURES, EvalRun
 
@@ -27,6 +28,7 @@ SCRIPTS = ("data.js", "filters.js", "cards.js", "main.js")
 STYLES = ("page.css", "cards.css")
 TITLES = {
     "gains": "Gains over the image alone",
+    "doses": "Dose and response",
     "rates": "Right answers by task and level",
     "calibration": "Calibration of the told probabilities",
     "cost": "Right answers against their cost",
@@ -39,7 +41,7 @@ ITEMS_PER_BLOCK = 100  # items whose replies are read together, once one of them
 def write_page(
     folder: Path,
     runs: Sequence[EvalRun],
-    summaries: Sequence[ArmSummary],
+    findings: Findings,
     plots: Sequence[Path] = (),
     sections: Sequence[tuple[str, str]] = (),
 ) -> Path:
@@ -49,7 +51,7 @@ def write_page(
     texts, shown after the summary. The page refers to plots and pictures where they are.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    core, replies = page_data(runs, summaries)
+    core, replies = page_data(runs, findings.arms)
     core["pictures"] = _addresses(folder, runs, core["pictures"])
     style, script = "".join(map(_source, STYLES)), "'use strict';\n" + "".join(map(_source, SCRIPTS))
     # Nothing but this script, this style, and pictures beside the page: whatever a reply says, it does nothing.
@@ -74,7 +76,8 @@ def write_page(
         replies=[Markup(script_json(block)) for block in replies],
         runs=runs,
         items=len(core["items"]),
-        summaries=summaries,
+        findings=findings,
+        summaries=findings.arms,
         against={name: core["arms"][place][0] for name, place in core["arms"] if place is not None},
         sections=sections,
         plots=[(TITLES.get(path.stem, path.stem), _address(folder, path)) for path in drawn],
@@ -147,10 +150,10 @@ def page_data(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> tuple
         packed_item = {
             "data": names[key[0]],
             "image": _place(pictures, item.image),
-            "oracle": [_place(pictures, picture) for picture in item.oracle],
+            "oracle": [_place(pictures, picture) for _, picture in (item.truth.pictures if item.truth else ())],
             "seen": [[packed(each) for each in of_arm] for of_arm in replied],
         }
-        items.append(item.model_dump(mode="json", exclude={"source_id"}) | packed_item)
+        items.append(item.model_dump(mode="json", exclude={"source_id", "truth"}) | packed_item)
     core = {
         "perBlock": ITEMS_PER_BLOCK,
         "data": list(names.values()),

@@ -1,8 +1,9 @@
-"""What a report says: rates, gains, calibration and cost of every arm of every run, computed once for all its forms."""
+"""What a report says of runs, computed once for all its forms: rates, contrasts, and why looking helps or hurts."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import yaml
@@ -10,12 +11,12 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals import statistics
+from cow_service.evals.design import BASELINE, primary, references
 from cow_service.evals.items import TASKS, Observation, Task
+from cow_service.evals.plan import departures
 from cow_service.evals.runs import EvalRun
-from cow_service.evals.statistics import Calibration, Cost, Gain, Rates
+from cow_service.evals.statistics import Calibration, Cost, Gain, PrimaryGain, Rates
 from cow_service.records import Record
-
-BASELINE = "never"
 
 
 class ArmSummary(Record):
@@ -28,9 +29,56 @@ class ArmSummary(Record):
     cells: dict[tuple[str, str | None], Rates] = Field(description="By task and level; level null: all levels.")
     baseline: int | None = Field(description="The run whose arm `never` it is compared with; null for that arm.")
     gain: Gain | None = Field(default=None, description="Over the arm `never`; null for itself, or without one.")
-    gains: dict[str, Gain] = Field(description="The same per task, p values adjusted over them.")
+    gains: dict[str, Gain] = Field(description="The same per task.")
     calibration: Calibration | None = None
     cost: Cost
+
+
+class Contrast(Record):
+    """What one arm gains over another one of the same run."""
+
+    name: str = Field(description="Of the arm, as in the report.")
+    reference: str = Field(description="The arm that it is compared with.")
+    task: str | None = Field(description="Null: all questions.")
+    gain: Gain
+
+
+class Primary(Record):
+    """The primary question of a run."""
+
+    run: int
+    arm: str
+    placebos: tuple[str, ...]
+    found: PrimaryGain
+    departures: tuple[str, ...] | None = Field(description="From the plan; null where there was none.")
+
+
+class Split(Record):
+    """The gain of simulated frames over the image alone, on the questions of which something is so."""
+
+    name: str
+    by: str = Field(description="What the questions are told apart by.")
+    value: str
+    gain: Gain
+
+
+class Dose(Record):
+    """The gain of frames whose path is off by so much, over the image alone."""
+
+    name: str
+    error: float = Field(description="In units of the simulation's own error.")
+    path_error: float | None = Field(description="Mean of the questions, as a share of the image's width.")
+    gain: Gain
+
+
+class Findings(Record):
+    """All that a report says."""
+
+    arms: tuple[ArmSummary, ...]
+    contrasts: tuple[Contrast, ...]
+    primaries: tuple[Primary, ...]
+    splits: tuple[Split, ...]
+    doses: tuple[Dose, ...]
 
 
 class Price(Record):
@@ -40,35 +88,121 @@ class Price(Record):
     output: float = Field(ge=0)
 
 
-def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None) -> tuple[ArmSummary, ...]:
-    """Of every arm that has replies, in the order of the runs and of their arms."""
-    found: list[ArmSummary] = []
+def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None) -> Findings:
+    """All that is found in these runs, in their order and that of their arms."""
+    arms: list[ArmSummary] = []
+    contrasts: list[Contrast] = []
+    splits: list[Split] = []
+    doses: list[Dose] = []
     for place, run in enumerate(runs):
-        for arm in run.info.arms:
-            observations = run.of_arm(arm)
+        for arm in run.info.points:
+            observations = run.of_arm(arm.name)
             of_all = statistics.rates(observations)
             if of_all is None:
                 continue
-            name = f"{run.info.mllm}, {arm}" if len(runs) > 1 else arm
-            compared = None if arm == BASELINE else baseline_run(runs, run)
+            name = f"{run.info.mllm}, {arm.name}" if len(runs) > 1 else arm.name
+            name = f"{name} ({place + 1})" if any(each.name == name for each in arms) else name
+            compared = None if arm.name == BASELINE else baseline_run(runs, run)
             baseline = [] if compared is None else compared.of_arm(BASELINE)
+            known = {BASELINE: baseline} | {
+                each.name: run.of_arm(each.name) for each in references(arm, run.info.points)
+            }
+            for reference, seen in known.items():
+                contrasts += _contrasts(name, reference, observations, seen)
+            if arm.content == "simulated" and not arm.gate:
+                splits += _splits(name, observations, baseline)
+            of_arm = {each.task: each.gain for each in contrasts if (each.name, each.reference) == (name, BASELINE)}
+            if arm.error is not None and None in of_arm:
+                errors = [each.path_error for each in observations if each.path_error is not None]
+                mean = fmean(errors) if errors else None
+                doses.append(Dose(name=name, error=arm.error, path_error=mean, gain=of_arm[None]))
             price = (prices or {}).get(run.info.mllm)
-            paid = () if price is None else (price.input, price.output)
-            found.append(
+            arms.append(
                 ArmSummary(
                     run=place,
-                    arm=arm,
-                    name=f"{name} ({place + 1})" if any(each.name == name for each in found) else name,
+                    arm=arm.name,
+                    name=name,
                     rates=of_all,
                     cells=_cells(observations),
                     baseline=None if compared is None else runs.index(compared),
-                    gain=statistics.gain(observations, baseline),
-                    gains=_gains(observations, baseline),
+                    gain=of_arm.get(None),
+                    gains={task: gain for task, gain in of_arm.items() if task is not None},
                     calibration=statistics.calibration(observations),
-                    cost=statistics.cost(observations, *paid),
+                    cost=statistics.cost(observations, *(() if price is None else (price.input, price.output))),
                 )
             )
-    return tuple(found)
+    adjusted = statistics.holm([each.gain.p for each in contrasts])
+    shown = tuple(
+        each.model_copy(update={"gain": each.gain.model_copy(update={"p_holm": p})})
+        for each, p in zip(contrasts, adjusted, strict=True)
+    )
+    primaries = tuple(found for place, run in enumerate(runs) if (found := _primary(place, run)) is not None)
+    return Findings(arms=tuple(arms), contrasts=shown, primaries=primaries, splits=tuple(splits), doses=tuple(doses))
+
+
+def _contrasts(name: str, reference: str, seen: Sequence[Observation], other: Sequence[Observation]) -> list[Contrast]:
+    """On all questions; over the image alone also on those of each task, where there are several."""
+    there, of_task = _by_task(other), _by_task(seen)
+    found = [(None, statistics.gain(seen, other))]
+    if len(of_task) > 1 and reference == BASELINE:
+        found += [(task, statistics.gain(each, there.get(task, []))) for task, each in of_task.items()]
+    return [Contrast(name=name, reference=reference, task=task, gain=gain) for task, gain in found if gain is not None]
+
+
+def _primary(place: int, run: EvalRun) -> Primary | None:
+    """Of a run: the question that its plan states, else that of its arms; None where it has no placebo."""
+    plan, question = run.info.plan, primary(run.info.points)
+    arm, placebos = ("", ()) if question is None else (question[0].name, tuple(each.name for each in question[1]))
+    if plan is not None:
+        arm, placebos = plan.primary, plan.placebos
+    pairs = {name: statistics.pairs_of(run.of_arm(arm), run.of_arm(name)) for name in placebos}
+    found = statistics.primary_gain(
+        {name: table for name, (table, _) in pairs.items()}, max((n for _, n in pairs.values()), default=0)
+    )
+    if found is None:
+        return None
+    failed = sum(each.failure is not None for each in run.observations)
+    departed = None if plan is None else tuple(departures(run.info, failed))
+    return Primary(run=place, arm=arm, placebos=placebos, found=found, departures=departed)
+
+
+def _splits(name: str, seen: Sequence[Observation], baseline: Sequence[Observation]) -> list[Split]:
+    """The gain by what is known of each question's simulation, where something is.
+
+    Whether the simulation was right, how far its path was off, whether it contradicts what the image alone made most
+    replies say, and whether its frames go on to the moment that is asked about.
+    """
+    errors = sorted(each.path_error for each in seen if each.path_error is not None)
+    middle = errors[len(errors) // 2] if errors else 0.0
+    alone: dict[str, list[str | None]] = defaultdict(list)
+    for each in baseline:
+        alone[each.item].append(each.read)
+    by: dict[str, Callable[[Observation], str | None]] = {
+        "simulation": lambda each: (
+            None if each.simulation_right is None else "right" if each.simulation_right else "wrong"
+        ),
+        f"path error ({100 * middle:.1f}% of the width in the middle)": lambda each: (
+            None if each.path_error is None else "smaller" if each.path_error < middle else "larger"
+        ),
+        "simulation and the image alone": lambda each: each.agrees_with(alone[each.item]),
+        "frames": lambda each: (
+            None
+            if each.event_shown is None
+            else "reach the moment asked about"
+            if each.event_shown
+            else "end before it"
+        ),
+    }
+    found: list[Split] = []
+    for what, value_of in by.items():
+        groups: dict[str, list[Observation]] = defaultdict(list)
+        for each in seen:
+            if (value := value_of(each)) is not None:
+                groups[value].append(each)
+        for value, group in sorted(groups.items()):
+            if (gain := statistics.gain(group, baseline)) is not None:
+                found.append(Split(name=name, by=what, value=value, gain=gain))
+    return found
 
 
 def baseline_run(runs: Sequence[EvalRun], run: EvalRun) -> EvalRun | None:
@@ -86,14 +220,6 @@ def _cells(observations: Sequence[Observation]) -> dict[tuple[str, str | None], 
             if of_level is not None:
                 cells[task, level] = of_level
     return cells
-
-
-def _gains(observations: Sequence[Observation], baseline: Sequence[Observation]) -> dict[str, Gain]:
-    there = _by_task(baseline)
-    found = {task: statistics.gain(seen, there.get(task, [])) for task, seen in _by_task(observations).items()}
-    known = {task: gain for task, gain in found.items() if gain is not None}
-    adjusted = statistics.holm([gain.p for gain in known.values()])
-    return {task: known[task].model_copy(update={"p_holm": p}) for task, p in zip(known, adjusted, strict=True)}
 
 
 def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation]]:

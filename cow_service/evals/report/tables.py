@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from cow_service.evals.asking import DIFFERENCES as READING
+from cow_service.evals.design import BASELINE
 from cow_service.evals.items import TASKS, Task
-from cow_service.evals.report.summary import ArmSummary
+from cow_service.evals.report.summary import ArmSummary, Findings
 from cow_service.evals.runs import EvalRun
 from cow_service.evals.statistics import Cost, Gain, Rates, Spread
 
@@ -24,12 +25,15 @@ PRINTED_TPR = {"GPT-5": 54.17, "Gemini 2.5 Pro": 50.55, "Qwen3-VL-30B-T": 50.50,
 PRINTED_GAINS: dict[Task, float] = {"collision": 2.40, "trajectory": 2.20}
 PRINTED_MODEL = "Qwen3-VL-30B-A3B-I with COW"
 PROTOCOL = (
-    "Options are shown in a random order, another one in every repeat and the same in every arm; the public scripts "
-    "show them as the data has them.",
+    "Options are shown in a random order, another one in every repeat and the same in every arm, unless --order data "
+    "or --preset paper asks for the data's own order, in which the public scripts show them.",
+    "Simulated frames are those around the moment that matters, unless an arm has :initial: the paper shows frames "
+    "1, 3 and 5.",
+    "The paper asked five times without COW and three times with it; here all arms are asked equally often.",
     "The note about frames is worded anew; the question and the JSON template are the paper's.",
     "An answer counts for the option whose text was shown with its letter.",
     "Questions whose call failed count nowhere and are listed; the public scripts score the text of the error.",
-    "Intervals and tests are paired by question and drawn by scene; the paper prints means over repeats.",
+    "Intervals and tests are paired by question and clustered by scene; the paper prints means over repeats.",
 )
 DATA = (
     "The paper's cells do not all follow from the published data (n = 1030; some of its cells have fewer questions, "
@@ -52,10 +56,28 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
 
-def tables(summaries: Sequence[ArmSummary]) -> tuple[Table, ...]:
+def tables(findings: Findings) -> tuple[Table, ...]:
     """All tables that have rows."""
-    found = (by_level(summaries), overview(summaries), gains(summaries), calibration(summaries), costs(summaries))
+    arms = findings.arms
+    found = (
+        *(primary(findings), by_level(arms), overview(arms), contrasts(findings), splits(findings), doses(findings)),
+        *(calibration(arms), costs(arms)),
+    )
     return tuple(table for table in found if table.rows)
+
+
+def primary(findings: Findings) -> Table:
+    """The primary question of each run, and whether it was fixed before."""
+    rows: list[tuple[str, ...]] = []
+    for each in findings.primaries:
+        gain = each.found.gain
+        departed = "none" if not each.departures else "; ".join(each.departures)
+        planned = "no plan" if each.departures is None else f"departures: {departed}"
+        told = f"{100 * gain.gain:+.2f}", f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}", p_text(each.found.p)
+        rows.append((each.arm, each.found.placebo, str(gain.questions), str(gain.scenes), *told, planned))
+    header = ("arm", "strongest placebo", "questions", "scenes", "gain, points", "95% interval", "p", "plan")
+    title = "Primary question: simulated frames against the strongest placebo, which must each be beaten"
+    return Table("primary", title, header, tuple(rows))
 
 
 def by_level(summaries: Sequence[ArmSummary]) -> Table:
@@ -93,30 +115,54 @@ def overview(summaries: Sequence[ArmSummary]) -> Table:
     return Table("arms", "Replies by arm", ("arm", *columns), rows)
 
 
-def gains(summaries: Sequence[ArmSummary]) -> Table:
-    """What each arm gains over `never`, and where the paper printed a gain, that."""
-    columns: dict[str, Callable[[Gain], str]] = {
-        "questions": lambda gain: str(gain.questions),
-        "scenes": lambda gain: str(gain.scenes),
-        "gain, points": lambda gain: f"{100 * gain.gain:+.2f}",
-        "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}",
-        "helped": lambda gain: str(gain.helped),
-        "hurt": lambda gain: str(gain.hurt),
-        "McNemar p": lambda gain: p_text(gain.p),
-        "Holm p": lambda gain: p_text(gain.p_holm),
-    }
-    known = [
-        (each.name, task, gain)
-        for each in summaries
-        if each.gain is not None
-        for task, gain in ((ALL, each.gain), *each.gains.items())
+_GAIN: dict[str, Callable[[Gain], str]] = {
+    "questions": lambda gain: str(gain.questions),
+    "scenes": lambda gain: str(gain.scenes),
+    "gain, points": lambda gain: f"{100 * gain.gain:+.2f}",
+    "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}",
+    "helped": lambda gain: str(gain.helped),
+    "hurt": lambda gain: str(gain.hurt),
+}
+
+
+def _gain(gain: Gain) -> tuple[str, ...]:
+    return tuple(cell(gain) for cell in _GAIN.values())
+
+
+def contrasts(findings: Findings, *, by_task: bool = True) -> Table:
+    """What each arm gains over those that it is compared with; by task also what the paper printed."""
+    rows = [
+        (each.name, each.reference, each.task or ALL, *_gain(each.gain), p_text(each.gain.p), p_text(each.gain.p_holm))
+        for each in findings.contrasts
+        if by_task or each.task is None
     ]
-    rows = [(name, task, *(cell(gain) for cell in columns.values())) for name, task, gain in known]
-    if rows:
+    if rows and by_task:
         printed = ((f"{PRINTED_MODEL} (paper)", task, f"{value:+.2f}") for task, value in PRINTED_GAINS.items())
-        rows += [(name, task, NONE, NONE, value, *(NONE,) * 5) for name, task, value in printed]
-    title = "Gain over the arm `never`, paired by question and repeat, drawn by scene"
-    return Table("gains", title, ("arm", "task", *columns), tuple(rows))
+        rows += [(name, "without", task, NONE, NONE, value, *(NONE,) * 5) for name, task, value in printed]
+    title = "Gains, paired by question and repeat, clustered by scene; Holm p is adjusted over all of these rows"
+    return Table("gains", title, ("arm", "over", "task", *_GAIN, "p", "Holm p"), tuple(rows))
+
+
+def splits(findings: Findings) -> Table:
+    """Why simulated frames help or hurt: the gain by what is known of each question's simulation."""
+    rows = tuple((each.name, each.by, each.value, *_gain(each.gain)) for each in findings.splits)
+    title = f"Gains over `{BASELINE}` by what is known of the simulation; looked at after the fact, so without p"
+    return Table("why", title, ("arm", "questions told apart by", "value", *_GAIN), rows)
+
+
+def doses(findings: Findings) -> Table:
+    """What frames gain that are off by so much."""
+    rows = tuple(
+        (
+            each.name,
+            f"{each.error:g}",
+            NONE if each.path_error is None else f"{100 * each.path_error:.2f}",
+            *_gain(each.gain),
+        )
+        for each in findings.doses
+    )
+    title = f"Gain over `{BASELINE}` of frames off the true path by so many times the simulation's own error"
+    return Table("doses", title, ("arm", "times", "path error, % of width", *_GAIN), rows)
 
 
 def calibration(summaries: Sequence[ArmSummary]) -> Table:

@@ -9,7 +9,7 @@ from pathlib import Path
 from cow_service.errors import InvalidRequest, StorageUnavailable
 from cow_service.evals.report import tables
 from cow_service.evals.report.page import write_page
-from cow_service.evals.report.summary import ArmSummary, Price, summarize
+from cow_service.evals.report.summary import Findings, Price, summarize
 from cow_service.evals.runs import EvalRun
 
 SUFFIXES = (".svg", ".png")
@@ -22,29 +22,29 @@ def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]
 
     Raises `InvalidRequest` where nothing has been replied to, and `StorageUnavailable`.
     """
-    summaries = summarize(runs, prices)
-    if not summaries:
+    findings = summarize(runs, prices)
+    if not findings.arms:
         reasons = {each.failure for run in runs for each in run.observations if each.failure is not None}
         why = f" Every question failed: {sorted(reasons)[0]}" if reasons else ""
         raise InvalidRequest(f"There is nothing to report: no question has a reply.{why}")
     try:
-        _write(runs, summaries, out)
+        _write(runs, findings, out)
     except OSError as error:
         raise StorageUnavailable(f"'{out}' cannot be written: {error.strerror or error}.") from error
-    main = tables.overview(summaries), tables.gains(summaries)
+    main = tables.overview(findings.arms), tables.contrasts(findings, by_task=False), tables.primary(findings)
     return "\n\n".join(tables.markdown(table) for table in main if table.rows)
 
 
-def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) -> None:
+def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
     (out / "tables").mkdir(parents=True, exist_ok=True)
-    known = tables.tables(summaries)
+    known = tables.tables(findings)
     for table in known:
         for extension, text in FORMATS.items():
             (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
     (out / "tables" / "replies.csv").write_text(tables.csv_text(tables.replies(runs)), encoding="utf-8")
-    plots = write_plots(out / "plots", summaries)
+    plots = write_plots(out / "plots", findings)
     differs = {f"Differences from the paper: {about.lower()}": told for about, told in tables.DIFFERENCES.items()}
-    write_page(out, runs, summaries, plots, [(heading, "\n".join(told)) for heading, told in differs.items()])
+    write_page(out, runs, findings, plots, [(heading, "\n".join(told)) for heading, told in differs.items()])
 
     # What was asked, and what was found in the data.
     asked: list[str] = []
@@ -52,7 +52,8 @@ def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) 
         info = run.info
         asked.append(
             f"{info.mllm}, asked by {info.ask}: {len(run.items)} questions of {info.data}, arms "
-            f"{', '.join(info.arms)}, {info.repeats} repeats, seed {info.seed}."
+            f"{', '.join(info.arms)}, {info.repeats} repeats, seed {info.seed}, design {info.design_digest[:12]}, "
+            f"{info.versions.get('cow-service')} at commit {info.versions.get('commit')}."
         )
         failures = sorted({each.failure for each in run.observations if each.failure is not None})
         asked += [f"- {told}" for told in info.notes]
@@ -69,11 +70,11 @@ def _write(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary], out: Path) 
     (out / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def write_plots(folder: Path, summaries: Sequence[ArmSummary]) -> tuple[Path, ...]:
+def write_plots(folder: Path, findings: Findings) -> tuple[Path, ...]:
     """Writes the plots for which there is something to draw, and removes those of an earlier report.
 
-    The files are `gains`, `rates`, `calibration` and `cost`, each as `.svg` and `.png`. The same summaries make the
-    same bytes of SVG.
+    The files are `gains`, `doses`, `rates`, `calibration` and `cost`, each as `.svg` and `.png`. The same findings make
+    the same bytes of SVG.
     """
     # A second of imports, which nobody but the writer of a report should wait for.
     from matplotlib import style  # noqa: PLC0415
@@ -86,7 +87,7 @@ def write_plots(folder: Path, summaries: Sequence[ArmSummary]) -> tuple[Path, ..
         with style.context(figures.STYLE), warnings.catch_warnings():
             # Names of models may have letters that the font has not: the SVG keeps them as text.
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            figure = draw(summaries)
+            figure = draw(findings)
             for suffix in SUFFIXES:
                 path = folder / f"{name}{suffix}"
                 path.unlink(missing_ok=True)

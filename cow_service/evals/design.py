@@ -1,0 +1,215 @@
+"""The design of an evaluation: what is shown in each arm, and which arms are compared.
+
+An arm is a point of a few factors: the content shown beside the question's image, which frames of it, how many votes,
+and whether the answers from the image alone decide if anything is shown. Arms that differ in their content alone tell
+what that content is worth.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
+
+from pydantic import Field, ValidationError, model_validator
+
+from cow_service.errors import InvalidRequest
+from cow_service.evals.items import Ask, Item
+from cow_service.readers.mllm.contents import PLACEBOS, Content
+from cow_service.records import Record
+from cow_service.records.results import FramePolicy
+
+GATE_VOTES = 3  # replies from the image alone
+MOMENTS: tuple[FramePolicy, ...] = get_args(FramePolicy)
+OF_FRAMES = ("frames", "count", "size")
+Order = Literal["shuffled", "data"]
+
+
+class Arm(Record):
+    """What is shown beside the image, and how often the question is asked."""
+
+    content: Content = "none"
+    frames: FramePolicy = Field(default="events", description="Which frames.")
+    count: int = Field(default=3, ge=1, le=64, description="How many.")
+    size: int = Field(default=512, ge=16, le=8192, description="Their longest side, px.")
+    votes: int = Field(default=1, ge=1, le=16, description="Replies, each with a simulation of its own seed.")
+    gate: bool = Field(default=False, description="Shown only where answers from the image alone do not agree.")
+    image: bool = Field(default=True, description="The image is shown beside the frames.")
+    error: float | None = Field(
+        default=None,
+        ge=0,
+        le=100,
+        description="Of `true`: how far the path is off, in units of the simulation's error.",
+    )
+
+    @model_validator(mode="after")
+    def _shows_what_it_chooses(self) -> Self:
+        chosen = [name for name in OF_FRAMES if getattr(self, name) != type(self).model_fields[name].default]
+        if chosen and not self.shows_frames:
+            raise ValueError(f"{self.content} shows no frames: leave {' and '.join(chosen)} out")
+        if self.error is not None and self.content != "true":
+            raise ValueError("only frames of content=true are drawn with an error")
+        return self
+
+    @property
+    def name(self) -> str:
+        """The shortest name that `arm_of` reads as this arm."""
+        same = {name: arm for name, arm in NAMED.items() if (arm.content, arm.image) == (self.content, self.image)}
+        base = next((name for name, arm in same.items() if arm.gate == self.gate), next(iter(same)))
+        own, parts = same[base], [base]
+        parts += [self.frames] if self.frames != own.frames else []
+        parts += [f"count-{self.count}"] if self.count != own.count else []
+        parts += [f"size-{self.size}"] if self.size != own.size else []
+        parts += [f"vote-{self.votes}"] if self.votes != own.votes else []
+        parts += ["gate"] if self.gate != own.gate else []
+        parts += [f"error-{self.error:g}"] if self.error is not None else []
+        return ":".join(parts)
+
+    @property
+    def shows_frames(self) -> bool:
+        """Whether there are frames to choose."""
+        return self.content not in ("none", "text")
+
+    @property
+    def asks(self) -> tuple[Ask, ...]:
+        """The ways to ask in which there is such an arm."""
+        by_service = self.content in ("none", "simulated") and self.image and not (self.gate and self.content == "none")
+        return ("prompt", "answer") if by_service else ("prompt",)
+
+    @property
+    def frames_request(self) -> dict[str, Any]:
+        """The field `frames` of a request."""
+        return {"policy": self.frames, "count": self.count, "max_side": self.size}
+
+    def with_content(self, content: Content) -> "Arm":
+        """The arm that differs from this one in the content alone."""
+        kept = {} if content == "none" else {name: getattr(self, name) for name in OF_FRAMES}
+        return Arm(content=content, votes=self.votes, gate=self.gate, image=content == "none" or self.image, **kept)
+
+
+# An arm takes the first name that says its content.
+NAMED: dict[str, Arm] = {
+    "never": Arm(),
+    "gate": Arm(gate=True),
+    "always": Arm(content="simulated"),
+    "auto": Arm(content="simulated", gate=True),
+    "placebo-still": Arm(content="still"),
+    "placebo-direction": Arm(content="wrong-direction"),
+    "placebo-item": Arm(content="other-item"),
+    "encounters": Arm(content="text"),
+    "frames-only": Arm(content="simulated", image=False),
+    "oracle": Arm(content="true"),
+}
+BASELINE = "never"
+_SUFFIXES = {"count": "count", "size": "size", "vote": "votes", "error": "error"}  # of a name, and their factors
+_BEST_OF = re.compile(r"best-of-(\d+)")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Arms that belong together, and how they are asked."""
+
+    arms: tuple[str, ...]
+    repeats: int = 1
+    order: Order = "shuffled"  # of the options
+
+
+_MATCHED = ("never", "always", "placebo-still", "placebo-direction", "placebo-item")
+PRESETS: dict[str, Preset] = {
+    "default": Preset(_MATCHED),
+    # Frames 1, 3 and 5 of 512 px, options as the data has them, five repeats; of COW the paper made three.
+    "paper": Preset(("never", "always:initial"), repeats=5, order="data"),
+    "controls": Preset(
+        (
+            *(*_MATCHED, "always:initial", "placebo-still:initial", "encounters"),
+            *("never:vote-3", "always:vote-3", "gate", "auto"),
+        )
+    ),
+    # What frames are worth whose path is off by so much: for data with truth.
+    "dose": Preset(
+        ("never", "always", "placebo-still", *(f"oracle:error-{error:g}" for error in (0, 0.5, 1, 2, 4))),
+    ),
+}
+
+
+def arm_of(text: str) -> Arm:
+    """The arm of a name (`always:initial:vote-3`) or of factors (`content=simulated,frames=initial,votes=3`).
+
+    `best-of-K` is `always:vote-K`. Raises `InvalidRequest` for what is neither.
+    """
+    base, *suffixes = text.strip().split(":")
+    if best := _BEST_OF.fullmatch(base):
+        base, suffixes = "always", [f"vote-{best[1]}", *suffixes]
+    given: dict[str, Any] = {}
+    if "=" in base:
+        for part in text.split(","):
+            name, _, value = part.strip().partition("=")
+            given[name] = value
+    elif base in NAMED:
+        given = NAMED[base].model_dump(exclude_defaults=True)
+    else:
+        raise InvalidRequest(
+            f"There is no arm '{text}': there are {', '.join(NAMED)}, each with suffixes such as :initial or :vote-3, "
+            "or factors, such as content=simulated,frames=events,votes=1."
+        )
+    for suffix in suffixes if "=" not in base else ():
+        name, _, value = suffix.partition("-")
+        if suffix in MOMENTS:
+            given["frames"] = suffix
+        elif suffix == "gate":
+            given["gate"] = True
+        elif name in _SUFFIXES:
+            given[_SUFFIXES[name]] = value
+        else:
+            known = ", ".join(f":{each}" for each in (*MOMENTS, "gate", *(f"{name}-N" for name in _SUFFIXES)))
+            raise InvalidRequest(f"The arm '{text}' has an unknown suffix ':{suffix}': there are {known}.")
+    try:
+        return Arm.model_validate(given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = f"{first['loc'][0]}: " if first["loc"] else ""
+        raise InvalidRequest(f"The arm '{text}' cannot be asked: {where}{first['msg']}.") from error
+
+
+def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[Arm, ...]:
+    """The arms of these names. Raises `InvalidRequest` for one that cannot be asked so, or of these items."""
+    arms = tuple(dict.fromkeys(map(arm_of, names)))
+    if not arms:
+        raise InvalidRequest(f"Name at least one arm: {', '.join(NAMED)}.")
+    for arm in arms:
+        if ask not in arm.asks:
+            raise InvalidRequest(
+                f"The service's own /answer has no arm '{arm.name}', only never, always and auto, with votes: use "
+                "--ask prompt with --mllm."
+            )
+        without = [item for item in items if item.truth is None or not item.truth.shows(drawn=arm.error is not None)]
+        if arm.content == "true" and without:
+            needed = "the true path" if arm.error is not None else "the true path, or pictures of what really happens"
+            raise InvalidRequest(
+                f"The arm '{arm.name}' needs {needed}, and {len(without)} of {len(items)} items have none, such as "
+                f"{without[0].row}."
+            )
+        if arm.content == "other-item" and len({item.scene for item in items}) < 2:
+            raise InvalidRequest(f"The arm '{arm.name}' shows frames of another scene, and there is only one.")
+    return arms
+
+
+def references(arm: Arm, asked: Sequence[Arm]) -> tuple[Arm, ...]:
+    """What an arm is compared with, of the arms that were asked: all contrasts that a report shows.
+
+    The image alone; the image alone with as many calls; and of frames that are meant to tell something, each placebo
+    with the same frames and votes.
+    """
+    wanted = [NAMED[BASELINE], arm.with_content("none")]
+    if arm.content in ("simulated", "true"):
+        wanted += [arm.with_content(placebo) for placebo in PLACEBOS]
+    return tuple(each for each in dict.fromkeys(wanted) if each in asked and each != arm)
+
+
+def primary(asked: Sequence[Arm]) -> tuple[Arm, tuple[Arm, ...]] | None:
+    """The primary question: the first arm of simulated frames that has placebos, and these; None without one."""
+    for arm in asked:
+        if arm.content == "simulated" and not arm.gate:
+            placebos = tuple(each for each in references(arm, asked) if each.content in PLACEBOS)
+            if placebos:
+                return arm, placebos
+    return None
