@@ -22,7 +22,7 @@ from cow_service.client import AsyncClient
 from cow_service.client.errors import error_from
 from cow_service.errors import MllmUnavailable
 from cow_service.evals.design import GATE_VOTES, Arm, Order
-from cow_service.evals.imagination import NO_USAGE, REFUSALS, Evidence, Imagination, asked_once, evidence_of
+from cow_service.evals.imagination import NO_USAGE, REFUSALS, Evidence, Imagination, asked_once, evidence_of, kept
 from cow_service.evals.items import Item, Observation, Pictures, question_text
 from cow_service.media.artifacts import media_type_of
 from cow_service.readers.mllm.answer import read_answer
@@ -303,7 +303,7 @@ class AnswerAsker:
                 raise problem
             found = Evidence(refusal=problem)
         elif answer.simulation is not None:
-            found = await evidence_of(answer.simulation, self.client, self.pictures)
+            found = await kept(evidence_of(answer.simulation), self.client, self.pictures)
         # Usage and stages are of everything together: what is not of the simulation stands with the reply.
         seconds = max(0.0, sum(answer.timings.values()) - found.seconds)
         # In the form that the paper's prompt asks for.

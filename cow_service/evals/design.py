@@ -167,7 +167,9 @@ def arm_of(text: str) -> Arm:
     except ValidationError as error:
         first = error.errors()[0]
         where = f"{first['loc'][0]}: " if first["loc"] else ""
-        raise InvalidRequest(f"The arm '{text}' cannot be asked: {where}{first['msg']}.") from error
+        raise InvalidRequest(
+            f"The arm '{text}' cannot be asked: {where}{first['msg'].removeprefix('Value error, ')}."
+        ) from error
 
 
 def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[Arm, ...]:

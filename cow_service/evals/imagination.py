@@ -108,7 +108,7 @@ class Imagination:
             return Evidence()
         begun = time.monotonic()
         try:
-            return await self._shown(arm, trial, item)
+            return await kept(await self._shown(arm, trial, item), self._client, self._pictures)
         except REFUSALS as refusal:
             usage = Usage.model_validate(refusal.usage or {})
             return Evidence(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
@@ -118,7 +118,7 @@ class Imagination:
         if arm.content == "true" and arm.error is None:
             return await self._truth(arm, trial, item)
         simulation = await self._simulate(item, arm, trial)
-        found = await evidence_of(simulation, self._client, self._pictures)
+        found = evidence_of(simulation)
         if arm.content == "simulated":
             truth = item.truth
             if truth is None or len(truth.track) < 2:
@@ -126,7 +126,7 @@ class Imagination:
             return replace(found, path_error=self._share(_offsets(np.array(truth.track), simulation), item))
         if arm.content == "text":
             return replace(found, frames=(), facts=facts_of(simulation), event_shown=None)
-        found = replace(found, probability=None, event_shown=None)
+        found = replace(found, probability=None, event_shown=None, overlay=None)
         if arm.content == "still":
             pixels = decode(self._pictures.read(item.image)).pixels
             return replace(found, frames=(self._pictures.add_made(still_frame(pixels, arm.size)),) * len(found.frames))
@@ -136,9 +136,9 @@ class Imagination:
             other = await self._along(simulation, arm, item)
         else:
             changed = await self._simulate(item, arm, trial, motion=opposite_motion(simulation))
-            other = await evidence_of(changed, self._client, self._pictures)
+            other = evidence_of(changed)
         usage, seconds = found.usage + other.usage, found.seconds + other.seconds
-        return replace(other, probability=None, event_shown=None, usage=usage, seconds=seconds)
+        return replace(other, probability=None, event_shown=None, overlay=None, usage=usage, seconds=seconds)
 
     async def _of_another(self, arm: Arm, trial: int, item: Item) -> Evidence:
         """Frames of another scene: of those in an order of the item's own, the first that can be simulated.
@@ -167,7 +167,7 @@ class Imagination:
             return await self._along(simulation, arm, item)
         assert simulation is not None
         nearest = [min(truth.pictures, key=lambda known: abs(known[0] - frame.time)) for frame in simulation.frames]
-        made = await evidence_of(simulation, self._client, self._pictures)
+        made = evidence_of(simulation)
         return replace(made, frames=tuple(digest for _, digest in nearest), probability=None, path_error=0.0)
 
     async def _along(self, simulation: AsyncSimulation | None, arm: Arm, item: Item) -> Evidence:
@@ -179,17 +179,20 @@ class Imagination:
         fps, points, off, frames = truth.fps, np.array(truth.track), np.zeros((1, 2)), arm.frames_request
         if simulation is not None:
             fps = simulation.trajectory.fps
-            points = _true_path(truth, fps)
+            points = _at_rate(points, truth.fps, fps)
             off = (arm.error or 0.0) * _offsets(points, simulation)
             points = points + off
             indices = [min(frame.index, len(points) - 1) for frame in simulation.frames]
             frames = {"max_side": arm.size, "indices": sorted(set(indices))}
         # How it moves is known, so it need not be read.
-        given = {"motion": {"kind": "static"}, "trajectory": {"points": points.round(2).tolist(), "fps": fps}}
+        path: dict[str, Any] = {"points": points.round(2).tolist(), "fps": fps}
+        if truth.scale:
+            path["scale"] = _at_rate(np.array(truth.scale)[:, None], truth.fps, fps)[:, 0].round(4).tolist()
+        given: dict[str, Any] = {"motion": {"kind": "static"}, "trajectory": path}
         if truth.bbox is not None:
             given["grounding"] = {"bbox": truth.bbox, **({"object": truth.object} if truth.object else {})}
         drawn = await self._simulate(item, arm, 0, frames=frames, **given)
-        found = await evidence_of(drawn, self._client, self._pictures)
+        found = evidence_of(drawn)
         if indices is not None:
             shown = {frame.index: frame.sha256 for frame in drawn.frames}
             found = replace(found, frames=tuple(shown[index] for index in indices))
@@ -208,10 +211,16 @@ class Imagination:
         return await asked_once(self.places, ask, self._key, item.id, item.image, str(sorted(options.items())))
 
 
-async def evidence_of(simulation: AsyncSimulation, client: AsyncClient, pictures: Pictures) -> Evidence:
-    """What a simulation gives to show; its pictures are kept."""
-    for digest in simulation.pictures.values():
-        pictures.add_made(await client.artifact(digest))
+async def kept(found: Evidence, client: AsyncClient, pictures: Pictures) -> Evidence:
+    """The same, its pictures kept."""
+    for digest in dict.fromkeys((*found.frames, *(() if found.overlay is None else (found.overlay,)))):
+        if not pictures.has(digest):
+            pictures.add_made(await client.artifact(digest))
+    return found
+
+
+def evidence_of(simulation: AsyncSimulation) -> Evidence:
+    """What a simulation gives to show."""
     outcome, step = simulation.trajectory.outcome, 1 / simulation.trajectory.fps
     moment = None if outcome is None or (outcome.probability or 0.0) < 0.5 else outcome.time
     return Evidence(
@@ -231,12 +240,11 @@ def _truth_of(item: Item) -> Truth:
     return item.truth
 
 
-def _true_path(truth: Truth, fps: float) -> NDArray[np.float64]:
-    """The true track as (moments, 2), px, so many per second until it ends."""
-    track = np.array(truth.track)
-    times = np.arange(0, (len(track) - 1) / truth.fps + 1e-9, 1 / fps)
-    known = np.arange(len(track)) / truth.fps
-    return np.stack([np.interp(times, known, track[:, axis]) for axis in (0, 1)], axis=1)
+def _at_rate(values: NDArray[np.float64], fps: float, wanted: float) -> NDArray[np.float64]:
+    """Values (moments, columns), so many per second, at another rate and until they end."""
+    times = np.arange(0, (len(values) - 1) / fps + 1e-9, 1 / wanted)
+    known = np.arange(len(values)) / fps
+    return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
 
 
 def _offsets(points: NDArray[np.float64], simulation: AsyncSimulation) -> NDArray[np.float64]:

@@ -27,6 +27,7 @@ class Truth(Record):
     pictures: tuple[tuple[float, Sha256], ...] = Field(default=(), description="Of moments, s, in their order.")
     fps: float = Field(default=30.0, gt=0, description="Points of `track` per second, pictures by their number, too.")
     track: tuple[Point, ...] = Field(default=(), description="Centre of the moving object, px; empty: not known.")
+    scale: tuple[float, ...] = Field(default=(), description="Its apparent size at each, 1 at the first; or empty.")
     bbox: BBox | None = Field(default=None, description="Of the moving object at the first moment, px.")
     object: str | None = Field(default=None, description="What it is called.")
 
@@ -96,11 +97,17 @@ class Pictures(DiskArtifacts):
 
     def add(self, data: bytes) -> str:
         """Keeps a picture; returns its digest. Raises what `decode` raises for what is none."""
-        try:
-            self.get(hashlib.sha256(data).hexdigest())
-        except ArtifactNotFound:
+        if not self.has(hashlib.sha256(data).hexdigest()):
             decode(data)
         return self.add_made(data)
+
+    def has(self, digest: str) -> bool:
+        """Whether a picture is kept."""
+        try:
+            self.get(digest)
+        except ArtifactNotFound:
+            return False
+        return True
 
     def add_made(self, data: bytes) -> str:
         """The same for a picture that the service made."""

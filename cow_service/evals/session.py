@@ -24,7 +24,7 @@ from cow_service.observability import logging
 from cow_service.service import Service
 from cow_service.settings import load_settings
 
-LOG = "server.log"
+LOG, ARTIFACTS = "server.log", "artifacts"  # in the folder of the server in the process
 TIMEOUT = 600.0  # seconds that a server may say nothing: an MLLM of its own may think for long
 
 
@@ -117,6 +117,7 @@ def _server(folder: Path, settings: Mapping[str, Any]) -> Generator[str]:
     known = load_settings(data_dir=folder / SERVER, host="127.0.0.1", port=0, **settings)
     (folder / SERVER).mkdir(parents=True, exist_ok=True)
     with (folder / SERVER / LOG).open("a", encoding="utf-8") as log, ExitStack() as stack:
+        stack.callback(_share_files, folder / PICTURES, folder / SERVER / ARTIFACTS)
         logging.set_up(known, out=log, err=log)
         stack.callback(logging.set_up, known)
         service = Service(known)
@@ -125,6 +126,17 @@ def _server(folder: Path, settings: Mapping[str, Any]) -> Generator[str]:
             stack.callback(pool.close)
             pool.start()  # it computes in processes of its own: replies are read, and kept, as they come
         yield stack.enter_context(serving(service, pool))
+
+
+def _share_files(pictures: Path, artifacts: Path) -> None:
+    """Has files of the server be those of the run where they are the same: a picture takes its space once."""
+    for path in pictures.rglob("*.*"):
+        same = artifacts / path.relative_to(pictures)
+        # Some file systems have no hard links: then there are two files.
+        with suppress(OSError):
+            if same.is_file() and not same.samefile(path):
+                (linked := same.with_suffix(".linked")).hardlink_to(path)
+                linked.replace(same)
 
 
 @dataclass

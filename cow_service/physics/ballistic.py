@@ -169,9 +169,14 @@ def _unit(direction: Vector | None, depth: float) -> Floats:
 
 
 def given_path(camera: Camera, given: TrajectoryRequest, times: Floats) -> FreePath:
-    """Given points at the object's first depth, linear between them, at rest after the last, at times [F] (s)."""
+    """Given points at the object's first depth, linear between them, at rest after the last, at times [F] (s).
+
+    Where apparent sizes are given, the depths are those at which the object has them.
+    """
     stamps = np.arange(len(given.points)) / given.fps
     path = np.array([camera.lift(point) for point in given.points])
+    if given.scale is not None:
+        path /= np.array(given.scale)[:, None]
     position = sampled(path, given.fps, times)
     step = np.minimum(np.searchsorted(stamps, times, side="right"), len(stamps) - 1)
     velocity = (path[step] - path[step - 1]) * given.fps

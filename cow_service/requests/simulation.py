@@ -270,6 +270,9 @@ class TrajectoryRequest(Record):
     visible: Flags | None = Field(
         default=None, max_length=4096, description="Per point inside the image: the object can be seen there."
     )
+    scale: tuple[Annotated[Finite, Field(ge=0.001, le=1000)], ...] | None = Field(
+        default=None, max_length=4096, description="Per point: apparent size, 1 as it is in the image. By default 1."
+    )
     tracks: Annotated[tuple[Points, ...], Field(fail_fast=True)] | None = Field(
         default=None,
         min_length=1,
@@ -290,8 +293,10 @@ class TrajectoryRequest(Record):
     @model_validator(mode="after")
     def _same_length(self) -> TrajectoryRequest:
         wanted = len(self.points)
-        if self.visible is not None and len(self.visible) != wanted:
-            raise ValueError(f"`visible` has {len(self.visible)} entries for {wanted} `points`")
+        for name in ("visible", "scale"):
+            entries = getattr(self, name)
+            if entries is not None and len(entries) != wanted:
+                raise ValueError(f"`{name}` has {len(entries)} entries for {wanted} `points`")
         wrong = next((len(track) for track in self.tracks or () if len(track) != wanted), None)
         if wrong is not None:
             raise ValueError(f"a track has {wrong} points where `points` has {wanted}")

@@ -5,6 +5,7 @@ import binascii
 import csv
 import difflib
 import json
+import math
 import re
 import sys
 from collections import Counter
@@ -76,13 +77,17 @@ def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
     `future_12.jpg` shows sample 12; `fps` samples pass in a second. Raises `RowFault` for a track that is none.
     """
     fps, moved = meta.get("fps", SAMPLES_PER_SECOND), meta.get("object")
-    boxes: Any = (meta.get("boxes") or {}).get(moved) or ()
-    bbox: Any = meta.get("bbox") or (boxes[0] if boxes and isinstance(boxes[0], list) else boxes) or None
+    boxes: Any = (meta.get("boxes") or {}).get(moved) or ()  # one, or one per sample
+    sides: list[float] = []
+    if boxes and isinstance(boxes[0], list):
+        sides = [math.sqrt(max((x1 - x0) * (y1 - y0), 1.0)) for x0, y0, x1, y1 in boxes]
+        boxes = boxes[0]
     numbered = [(int("".join(filter(str.isdigit, path.stem)) or 0), path) for path in scene.glob(FUTURE)]
     pictures = [(number / fps, path.read_bytes()) for number, path in sorted(numbered)]
     if not pictures and not meta.get("track"):
         return None
-    fields = {"fps": fps, "track": meta.get("track") or (), "bbox": bbox, "object": moved}
+    fields = {"fps": fps, "track": meta.get("track") or (), "bbox": meta.get("bbox") or boxes or None, "object": moved}
+    fields |= {"scale": [side / sides[0] for side in sides]}
     try:
         return Known(Truth.model_validate(fields), pictures)
     except ValidationError as error:
