@@ -9,14 +9,23 @@ from pathlib import Path
 
 from drawn import ball, floor, png_bytes
 
-from cow_service.evals.items import Item, Observation, RunInfo, Task
+from cow_service.evals.design import arm_of
+from cow_service.evals.items import Item, Observation, Task
+from cow_service.evals.plan import RunInfo
 from cow_service.evals.runs import EvalRun
 from cow_service.records import AnswerOption
 
 LETTERS = "ABCD"
 LEVELS = {"collision": ("L1", "L2"), "trajectory": ("L1", "L2", "real"), "compatibility": ("?",), "occlusion": ("L1",)}
 HOSTILE = 'A</script><img src=x onerror="document.title=1"><b>bold</b> & \u2028 \u202eesrever\u202c 🎱'
-RIGHT = {"never": 0.45, "always": 0.7, "auto": 0.66, "best-of-3": 0.52, "placebo-still": 0.44, "placebo-direction": 0.3}
+RIGHT = {
+    "never": 0.45,
+    "always": 0.7,
+    "auto": 0.66,
+    "always:vote-3": 0.52,
+    "placebo-still": 0.44,
+    "placebo-direction": 0.3,
+}
 
 
 def picture(folder: Path, number: int, name: str = "", size: tuple[int, int] = (96, 64)) -> str:
@@ -98,10 +107,10 @@ def info(arms: Sequence[str], repeats: int, items: Sequence[Item], mllm: str = "
         notes=("2 rows share the id 7: told apart by their place.",),
         mllm=mllm,
         ask="prompt",
-        arms=tuple(arms),
+        arms={arm_of(arm).name: arm_of(arm).model_dump() for arm in arms},
         repeats=repeats,
         seed=7,
-        settings={"frames": 4, "generator": "cutout"},
+        options={"data": "questions.jsonl", "generator": "cutout"},
         versions={"cow-service": "0.1"},
         created_at="2025-01-02T03:04:05Z",
     )

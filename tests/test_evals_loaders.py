@@ -138,10 +138,14 @@ def file_in(folder: Path) -> Path:
     return folder / "train.parquet"
 
 
-def test_made_scenes_have_oracle_frames_and_both_levels(pictures: Pictures) -> None:
+def test_made_scenes_have_their_truth_and_both_levels(pictures: Pictures) -> None:
     items = load(str(SAMPLE), pictures).items
     assert len(items) == 12
-    assert all(item.oracle for item in items)
+    for item in items:
+        assert item.truth is not None
+        assert [moment for moment, _ in item.truth.pictures] == [0.4, 1.2]
+        assert (len(item.truth.track), len(item.truth.scale), item.truth.scale[0]) == (61, 61, 1.0)
+        assert item.truth.object in item.truth.boxes
     assert {item.level for item in items} == {"L1", "L2"}
     assert {item.task for item in items} == {"collision", "trajectory", "compatibility", "occlusion"}
 
@@ -304,8 +308,9 @@ def test_options_are_shown_in_any_order_and_read_back(texts: list[str], draws: A
 
 def test_the_order_of_options_is_fixed_by_seed_item_and_repeat(pictures: Pictures) -> None:
     items = load(str(EXAMPLES), pictures).items
-    orders = [order_of(item, 0, repeat) for item in items for repeat in range(1, 13)]
+    orders = [order_of(item, "shuffled", 0, repeat) for item in items for repeat in range(1, 13)]
     assert len(set(orders)) == 6
     assert all(len(set(orders[12 * place : 12 * place + 6])) == 6 for place in range(len(items))), "all, then again"
-    assert orders == [order_of(item, 0, repeat) for item in items for repeat in range(1, 13)]
-    assert orders != [order_of(item, 1, repeat) for item in items for repeat in range(1, 13)]
+    assert orders == [order_of(item, "shuffled", 0, repeat) for item in items for repeat in range(1, 13)]
+    assert orders != [order_of(item, "shuffled", 1, repeat) for item in items for repeat in range(1, 13)]
+    assert {order_of(item, "data", 0, repeat) for item in items for repeat in (1, 2)} == {(0, 1, 2)}

@@ -16,19 +16,20 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("scipy")
 
 from cow_service.evals.report.page import TITLES as PLOTS
-from cow_service.evals.report.summary import ArmSummary, Price, summarize
+from cow_service.evals.report.summary import Findings, Price, summarize
 from cow_service.evals.report.write import write_plots
 
-NINE = (
+ARMS = (
     "never",
     "always",
     "auto",
-    "best-of-3",
+    "always:vote-3",
     "placebo-still",
     "placebo-direction",
     "encounters",
     "frames-only",
-    "oracle",
+    "oracle:error-0",
+    "oracle:error-2",
 )
 TASKS = ("collision", "trajectory", "compatibility", "occlusion")
 LONG = "hf/a-multimodal-model-with-a-very-long-name-and-a-suffix-72B-instruct"
@@ -36,8 +37,8 @@ ODD = ("_hidden", "a/$x$ <b> & 模型\n\x07", LONG)
 
 
 @pytest.fixture(scope="module")
-def nine(tmp_path_factory: pytest.TempPathFactory) -> tuple[ArmSummary, ...]:
-    found = run(tmp_path_factory.mktemp("nine"), 48, NINE, 3, TASKS)
+def nine(tmp_path_factory: pytest.TempPathFactory) -> Findings:
+    found = run(tmp_path_factory.mktemp("nine"), 48, ARMS, 3, TASKS)
     return summarize([found], {"openai/small": Price(input=0.2, output=0.8)})
 
 
@@ -49,7 +50,7 @@ def words(path: Path) -> str:
     return " ".join("".join(each.itertext()) for each in ElementTree.parse(path).iter() if each.tag.endswith("text"))
 
 
-def test_every_plot_is_a_vector_and_a_picture(nine: tuple[ArmSummary, ...], tmp_path: Path) -> None:
+def test_every_plot_is_a_vector_and_a_picture(nine: Findings, tmp_path: Path) -> None:
     paths = write_plots(tmp_path / "plots", nine)
     assert [path.name for path in paths] == [f"{name}{suffix}" for name in PLOTS for suffix in (".svg", ".png")]
     for path in paths:
@@ -61,24 +62,25 @@ def test_every_plot_is_a_vector_and_a_picture(nine: tuple[ArmSummary, ...], tmp_
             assert ElementTree.parse(path).getroot().tag == "{http://www.w3.org/2000/svg}svg"
 
 
-def test_the_same_summaries_make_the_same_bytes(nine: tuple[ArmSummary, ...], tmp_path: Path) -> None:
+def test_the_same_summaries_make_the_same_bytes(nine: Findings, tmp_path: Path) -> None:
     one, other = write_plots(tmp_path / "a", nine), write_plots(tmp_path / "b", nine)
     vectors = [(a, b) for a, b in zip(one, other, strict=True) if a.suffix == ".svg"]
     assert [a.name for a, b in vectors if a.read_bytes() != b.read_bytes()] == []
 
 
-def test_the_figures_stand_in_the_text(nine: tuple[ArmSummary, ...], tmp_path: Path) -> None:
+def test_the_figures_stand_in_the_text(nine: Findings, tmp_path: Path) -> None:
     write_plots(tmp_path, nine)
     said = {name: words(tmp_path / f"{name}.svg") for name in PLOTS}
-    for each in nine:
+    for each in nine.arms:
         assert f"{100 * each.rates.tpr.mean:.0f}" in said["rates"]
         assert all(each.name in said[name] for name in ("rates", "cost"))
         if each.gain is not None:
             assert f"{100 * each.gain.gain:+.1f}".replace("-", "−") in said["gains"]
-    told = next(each.calibration for each in nine if each.calibration)
+    told = next(each.calibration for each in nine.arms if each.calibration)
     assert f"Brier score {told.brier:.3f}" in said["calibration"]
     assert f"n = {told.count}" in said["calibration"]
     assert "Money per question" in said["cost"]
+    assert "Error of the path shown" in said["doses"]
 
 
 def test_one_arm_has_no_gains_and_no_calibration(tmp_path: Path) -> None:
@@ -95,12 +97,12 @@ def test_one_scene_has_no_interval(tmp_path: Path) -> None:
 
 
 def test_nothing_asked_draws_nothing(tmp_path: Path) -> None:
-    assert write_plots(tmp_path, ()) == ()
+    assert write_plots(tmp_path, summarize([])) == ()
 
 
 def test_odd_names_of_models_are_drawn(tmp_path: Path) -> None:
     runs = [run(tmp_path / str(place), 12, ("never", "always"), 2, mllm=name) for place, name in enumerate(ODD)]
-    assert names(write_plots(tmp_path, summarize(runs))) == set(PLOTS)
+    assert names(write_plots(tmp_path, summarize(runs))) == set(PLOTS) - {"doses"}
     said = words(tmp_path / "rates.svg")
     assert "_hidden, always" in said
     assert "a/$x$ <b> & 模型 , always" in said

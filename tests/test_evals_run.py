@@ -28,17 +28,18 @@ from truth_mllm import TruthMllm, truth_mllm
 
 from cow_service.evals.items import Item, Pictures
 from cow_service.evals.loaders import load
-from cow_service.evals.report.summary import ArmSummary, summarize
+from cow_service.evals.report.summary import ArmSummary, Findings, summarize
 from cow_service.evals.runs import EvalRun, read_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(420)]
 SAMPLE = ROOT / "cow-scenes" / "sample"
 KILLS = 1 if SCALE == 1 else 3
 ALL_ARMS = (
-    *("never", "always", "auto", "best-of-2", "placebo-still"),
-    *("placebo-direction", "encounters", "frames-only", "oracle"),
+    *("never", "always", "auto", "gate", "always:vote-2", "never:vote-2", "placebo-still"),
+    *("placebo-direction", "placebo-item", "encounters", "frames-only", "oracle", "oracle:error-2"),
 )
-PICTURES_SHOWN = {"never": 1, "always": 4, "placebo-still": 4, "encounters": 1, "frames-only": 3, "oracle": 3}
+PICTURES_SHOWN = {"never": 1, "always": 4, "encounters": 1, "frames-only": 3, "oracle": 4}
+PICTURES_SHOWN |= {"placebo-still": 4, "placebo-item": 4, "oracle:error-2": 4}
 REPEATS = 2
 MODEL = "openai-api/local/fake"
 READ_WITHIN = 1.5  # seconds after a reply was sent: the first one loads what reads it
@@ -93,9 +94,12 @@ def checked(done: subprocess.CompletedProcess[str], code: int = 0) -> subprocess
 # What is asked with and what the refusal says.
 REFUSED = {
     ("--arm", "sometimes"): "There is no arm 'sometimes'",
-    ("--arm", "oracle"): "needs pictures of what really happens",
+    ("--arm", "placebo-item", "--limit", "1"): "shows frames of another scene, and there is only one",
+    ("--arm", "content=none,frames=initial"): "none shows no frames: leave frames out",
+    ("--arm", "always:vote-99"): "votes: Input should be less than or equal to 16",
+    ("--plan", "nothing.json"): "The plan 'nothing.json' cannot be read",
     ("--subset", "physic"): "There is no subset 'physic'",
-    ("--ask", "answer", "--arm", "placebo-still"): "has no arm 'placebo-still'",
+    ("--ask", "answer", "--arm", "placebo-still"): "/answer has no arm 'placebo-still'",
     ("--url", "http://127.0.0.1:9"): "The server at http://127.0.0.1:9 cannot be asked",
     ("--reader", "embeded"): "--reader embeded: the server has only",
     ("--ask", "answer", "--temperature", "1"): "are for --ask prompt",
@@ -110,6 +114,7 @@ class Done:
 
     run: EvalRun
     arms: dict[str, ArmSummary]
+    findings: Findings
     mllm: TruthMllm
     out: Path
     told: str
@@ -122,7 +127,8 @@ def done(tmp_path_factory: pytest.TempPathFactory, items: list[Item], imported: 
         asked = ("--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS))
         told = evaluated(imported, out, *asked, mllm=mllm, COW_CONCURRENCY="2")
         run = read_run(out)
-        yield Done(run, {each.arm: each for each in summarize([run])}, mllm, out, told.stdout)
+        found = summarize([run])
+        yield Done(run, {each.arm: each for each in found.arms}, found, mllm, out, told.stdout)
 
 
 def test_every_question_is_asked_in_every_arm_and_repeat(done: Done, items: list[Item]) -> None:
@@ -143,14 +149,18 @@ def test_all_arms_see_the_options_in_the_same_order(done: Done) -> None:
 
 
 @pytest.mark.parametrize("arm", PICTURES_SHOWN)
-def test_an_arm_shows_what_it_is_named_for(done: Done, arm: str, items: list[Item]) -> None:
-    by_item = {item.id: item for item in items}
+def test_an_arm_shows_what_it_is_named_for(done: Done, arm: str) -> None:
     for each in done.run.of_arm(arm):
         if each.refusal is None:
             shown = len(each.frames) + (arm != "frames-only")
-            assert shown == (1 + len(by_item[each.item].oracle) if arm == "oracle" else PICTURES_SHOWN[arm])
-    still = {len(set(each.frames)) for each in done.run.of_arm("placebo-still")}
+            assert shown == PICTURES_SHOWN[arm]
+    still = {len(set(each.frames)) for each in done.run.of_arm("placebo-still") if each.refusal is None}
     assert still == {1}
+    own = {each.item: set(each.frames) for each in done.run.of_arm("always")}
+    others = {each.item: set(each.frames) for each in done.run.of_arm("placebo-item")}
+    lent = [any(frames == own[lender] for lender in own if lender != item) for item, frames in others.items() if frames]
+    assert lent
+    assert all(lent), "frames of another item"
     right, wrong = (
         {each.item: each.frames for each in done.run.of_arm(f"{name}")} for name in ("always", "placebo-direction")
     )
@@ -174,8 +184,74 @@ def test_the_gate_asks_thrice_before_and_imagines_where_answers_differ(done: Don
     for each in done.run.of_arm("auto"):
         assert each.calls in (3, 4)
         assert (each.calls == 4) == (bool(each.frames) or each.refusal is not None)
-    assert {each.calls for each in done.run.of_arm("best-of-2")} == {2}
-    assert {each.imaginations for each in done.run.of_arm("best-of-2") if each.refusal is None} == {2}
+    assert {each.calls for each in done.run.of_arm("always:vote-2")} == {2}
+    assert {each.imaginations for each in done.run.of_arm("always:vote-2") if each.refusal is None} == {2}
+    assert {each.calls for each in done.run.of_arm("never:vote-2")} == {2}
+    assert {each.calls for each in done.run.of_arm("gate")} == {3, 4}, "as many calls as auto, and nothing shown"
+    assert not any(each.frames for each in done.run.of_arm("gate"))
+
+
+def test_true_frames_are_drawn_along_the_true_path_or_off_it(done: Done) -> None:
+    errors: dict[str, dict[str, float | None]] = {
+        arm: {each.item: each.path_error for each in done.run.of_arm(arm)}
+        for arm in ("always", "oracle:error-2", "oracle")
+    }
+    assert set(errors["oracle"].values()) == {0.0}
+    for item, own in errors["always"].items():
+        off = errors["oracle:error-2"][item]
+        assert own is not None or off is None, "where nothing was simulated, no error is known"
+        # The simulation's own is measured at the moments of the truth, the other at those of the clip.
+        assert own is None or off is None or off == pytest.approx(2 * own, rel=0.2, abs=0.002)
+    simulations = [each for each in done.run.of_arm("always") if each.probability is not None]
+    assert any(each.event_shown for each in simulations)
+    assert not any(each.event_shown is False for each in simulations), "the default frames go on to the moment"
+    assert done.findings.doses
+    assert {each.by for each in done.findings.splits} > {"simulation", "frames"}
+
+
+def test_the_record_says_what_was_asked_of_whom_and_keeps_a_picture_once(done: Done) -> None:
+    told = json.loads((done.out / "run.json").read_text())
+    assert told["versions"]["commit"]
+    assert told["replied_as"] == ["fake"]
+    assert told["arms"]["always:vote-2"]["votes"] == 2
+    assert (told["options"]["seed"], told["options"]["mllm"]) == (0, MODEL)
+    pictures, artifacts = done.out / "pictures", done.out / "server" / "artifacts"
+    both = [(path, artifacts / path.relative_to(pictures)) for path in pictures.rglob("*.png")]
+    both = [(path, same) for path, same in both if same.is_file()]
+    assert len(both) > 20
+    assert all(path.samefile(same) for path, same in both)
+    logs = sum(path.stat().st_size for path in (done.out / "logs").glob("*.eval"))
+    assert logs < 2_000_000, "no pictures in the logs"
+
+
+def test_a_plan_is_asked_and_followed(tmp_path: Path, items: list[Item], mllm: TruthMllm, imported: Template) -> None:
+    plan = tmp_path / "plan.json"
+    own = ["--mllm", MODEL, "--base-url", mllm.address]
+    fixed = [
+        "eval",
+        "plan",
+        str(SAMPLE),
+        *own,
+        "--arm",
+        "never,always,placebo-still",
+        "--limit",
+        "3",
+        "--out",
+        str(plan),
+    ]
+    told = checked(imported.begin(fixed, tmp_path, environment()).done()).stdout
+    assert "does always gain over each of placebo-still?" in told
+    assert "2,726 scenes show a gain of 2.4 points" in told
+    assert not mllm.asked
+    planned = ["eval", "--plan", str(plan), "--out", str(tmp_path / "run")]
+    done = checked(imported.begin(planned, tmp_path, environment()).done())
+    assert "departures: none" in done.stdout
+    assert len(read_run(tmp_path / "run").observations) == 9
+    refused = checked(imported.begin([*planned, "--seed", "4"], tmp_path, environment()).done(), 1)
+    assert "--plan says what is asked: leave --seed out." in refused.stderr
+    more = ["eval", str(SAMPLE), *own, "--arm", "encounters", "--limit", "3", "--out", str(tmp_path / "run")]
+    departed = checked(imported.begin(more, tmp_path, environment()).done()).stdout
+    assert "arms that were not planned: encounters" in departed
 
 
 def test_each_reply_was_one_request_and_counts_its_tokens(done: Done) -> None:
@@ -187,7 +263,8 @@ def test_each_reply_was_one_request_and_counts_its_tokens(done: Done) -> None:
 def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None:
     report = done.out / "report"
     names = {path.relative_to(report).as_posix() for path in report.rglob("*") if path.is_file()}
-    tables = {f"tables/{name}.{form}" for name in ("levels", "arms", "gains", "cost") for form in ("md", "csv", "tex")}
+    kinds = ("primary", "levels", "arms", "gains", "why", "doses", "cost")
+    tables = {f"tables/{name}.{form}" for name in kinds for form in ("md", "csv", "tex")}
     assert {"index.html", "report.md", "manifest.json", "tables/replies.csv", *tables} <= names
     manifest = json.loads((report / "manifest.json").read_text())
     assert manifest["runs"][0]["versions"]["prompts/eval-question"].startswith("1 (sha256 ")
@@ -202,7 +279,7 @@ def test_a_finished_run_asks_nothing_more_and_says_the_same(done: Done, imported
     assert sum(done.mllm.asked.values()) == before
     assert again.stdout == done.told
     other = evaluated(imported, done.out, "--arm", "never", "--seed", "7", mllm=done.mllm, code=1)
-    assert "another seed (0, not 7)" in other.stderr
+    assert "other options: --seed 0, not 7." in other.stderr
 
 
 @pytest.mark.soak
@@ -349,7 +426,7 @@ def test_the_true_gain_lies_in_the_interval_of_whole_runs(
             out = tmp_path / f"run{seed}"
             evaluated(imported, out, "--arm", "never,always,placebo-still", "--repeats", "5", mllm=mllm)
         run = read_run(out)
-        arms = {each.arm: each for each in summarize([run])}
+        arms = {each.arm: each for each in summarize([run]).arms}
         always, placebo = arms["always"].gain, arms["placebo-still"].gain
         assert always is not None
         assert placebo is not None

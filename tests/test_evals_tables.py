@@ -11,7 +11,7 @@ import pytest
 from asked_runs import HOSTILE, run
 from conftest import ROOT
 
-from cow_service.evals.report.summary import ArmSummary, read_prices, summarize
+from cow_service.evals.report.summary import Findings, read_prices, summarize
 from cow_service.evals.report.tables import Table, csv_text, latex, markdown, replies, tables
 from cow_service.evals.report.write import write_report
 from cow_service.evals.runs import EvalRun
@@ -27,20 +27,20 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> EvalRun:
 
 
 @pytest.fixture(scope="module")
-def summaries(asked: EvalRun, tmp_path_factory: pytest.TempPathFactory) -> tuple[ArmSummary, ...]:
+def summaries(asked: EvalRun, tmp_path_factory: pytest.TempPathFactory) -> Findings:
     prices = tmp_path_factory.mktemp("prices") / "prices.yaml"
     prices.write_text("openai/small: {input: 2, output: 10}\n")
     return summarize([asked], read_prices(prices))
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_tables_are_as_they_were(form: str, summaries: tuple[ArmSummary, ...]) -> None:
+def test_tables_are_as_they_were(form: str, summaries: Findings) -> None:
     """A change that is wanted: write what is told here into tests/data/evals."""
     told = "\n".join(f"{table.title}\n{FORMS[form](table)}" for table in tables(summaries))
     assert told == (GOLDEN / f"tables.{form}").read_text(encoding="utf-8")
 
 
-def test_the_figures_of_a_table_are_those_of_the_replies(asked: EvalRun, summaries: tuple[ArmSummary, ...]) -> None:
+def test_the_figures_of_a_table_are_those_of_the_replies(asked: EvalRun, summaries: Findings) -> None:
     by_name = {table.name: table for table in tables(summaries)}
     rows = {(row[0], row[1]): dict(zip(by_name["levels"].header, row, strict=True)) for row in by_name["levels"].rows}
     for arm in asked.info.arms:
@@ -72,7 +72,7 @@ def test_runs_of_two_models_are_compared_each_with_its_own_baseline(tmp_path: Pa
     large = run(tmp_path / "large", mllm="openai/large", arms=("never",), repeats=2)
     more = run(tmp_path / "more", mllm="openai/large", arms=("always",), repeats=2)
     small = run(tmp_path / "small", arms=("never", "always"), repeats=2)
-    found = {each.name: each for each in summarize([large, more, small])}
+    found = {each.name: each for each in summarize([large, more, small]).arms}
     assert set(found) == {"openai/large, never", "openai/large, always", "openai/small, never", "openai/small, always"}
     assert found["openai/large, always"].gain is not None, "its baseline is in another folder"
     write_report([large, more, small], tmp_path / "report", {})

@@ -166,10 +166,8 @@ def arm_of(text: str) -> Arm:
         return Arm.model_validate(given)
     except ValidationError as error:
         first = error.errors()[0]
-        where = f"{first['loc'][0]}: " if first["loc"] else ""
-        raise InvalidRequest(
-            f"The arm '{text}' cannot be asked: {where}{first['msg'].removeprefix('Value error, ')}."
-        ) from error
+        why = ": ".join((*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")))
+        raise InvalidRequest(f"The arm '{text}' cannot be asked: {why}.") from error
 
 
 def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[Arm, ...]:

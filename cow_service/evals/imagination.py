@@ -4,6 +4,7 @@ import asyncio
 import hashlib
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -129,7 +130,8 @@ class Imagination:
         found = replace(found, probability=None, event_shown=None, overlay=None)
         if arm.content == "still":
             pixels = decode(self._pictures.read(item.image)).pixels
-            return replace(found, frames=(self._pictures.add_made(still_frame(pixels, arm.size)),) * len(found.frames))
+            still = self._pictures.add_made(still_frame(pixels, arm.size))
+            return replace(found, frames=(still,) * len(found.frames), simulated=False)
         if arm.content == "other-item":
             other = await self._of_another(arm, trial, item)
         elif arm.content == "true":
@@ -156,26 +158,32 @@ class Imagination:
         raise CannotGround(f"None of {MAX_DONORS} other scenes could be simulated.")
 
     async def _truth(self, arm: Arm, trial: int, item: Item) -> Evidence:
-        """What really happens, at the moments that the simulation's frames show; without one, at moments of its own."""
+        """What really happens, at the moments that the simulation's frames show; without one, at moments of its own.
+
+        Drawn along the true path, or of the true pictures those that are nearest to these moments.
+        """
         truth, simulation = _truth_of(item), None
-        try:
+        with suppress(*REFUSALS):
             simulation = await self._simulate(item, arm, trial)
-        except REFUSALS:
-            if len(truth.track) < 2:
-                raise
-        if len(truth.track) > 1:
+        try:
             return await self._along(simulation, arm, item)
-        assert simulation is not None
+        except REFUSALS:
+            if simulation is None or not truth.pictures:
+                raise
         nearest = [min(truth.pictures, key=lambda known: abs(known[0] - frame.time)) for frame in simulation.frames]
-        made = evidence_of(simulation)
-        return replace(made, frames=tuple(digest for _, digest in nearest), probability=None, path_error=0.0)
+        return replace(
+            evidence_of(simulation), frames=tuple(digest for _, digest in nearest), overlay=None, path_error=0.0
+        )
 
     async def _along(self, simulation: AsyncSimulation | None, arm: Arm, item: Item) -> Evidence:
         """Frames that the generator draws along the true path, or off it by so much of the simulation's own error.
 
-        They show the moments of the simulation's frames; after the end of what is known, that end.
+        They show the moments of the simulation's frames; after the end of what is known, that end. Raises
+        `CannotGround` where no true path is known.
         """
         truth, indices = _truth_of(item), None
+        if len(truth.track) < 2:
+            raise CannotGround("No true path is known.")
         fps, points, off, frames = truth.fps, np.array(truth.track), np.zeros((1, 2)), arm.frames_request
         if simulation is not None:
             fps = simulation.trajectory.fps
@@ -189,8 +197,9 @@ class Imagination:
         if truth.scale:
             path["scale"] = _at_rate(np.array(truth.scale)[:, None], truth.fps, fps)[:, 0].round(4).tolist()
         given: dict[str, Any] = {"motion": {"kind": "static"}, "trajectory": path}
-        if truth.bbox is not None:
-            given["grounding"] = {"bbox": truth.bbox, **({"object": truth.object} if truth.object else {})}
+        if truth.object is not None and truth.object in truth.boxes:
+            objects = [{"object": name, "bbox": box} for name, box in truth.boxes.items() if name != truth.object]
+            given |= {"grounding": {"object": truth.object, "bbox": truth.boxes[truth.object]}, "objects": objects}
         drawn = await self._simulate(item, arm, 0, frames=frames, **given)
         found = evidence_of(drawn)
         if indices is not None:

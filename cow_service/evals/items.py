@@ -28,8 +28,8 @@ class Truth(Record):
     fps: float = Field(default=30.0, gt=0, description="Points of `track` per second, pictures by their number, too.")
     track: tuple[Point, ...] = Field(default=(), description="Centre of the moving object, px; empty: not known.")
     scale: tuple[float, ...] = Field(default=(), description="Its apparent size at each, 1 at the first; or empty.")
-    bbox: BBox | None = Field(default=None, description="Of the moving object at the first moment, px.")
     object: str | None = Field(default=None, description="What it is called.")
+    boxes: dict[str, BBox] = Field(default_factory=dict, description="Of all known objects at the first moment, px.")
 
     def shows(self, *, drawn: bool) -> bool:
         """Whether there are true frames; `drawn`: along the true path."""

@@ -77,17 +77,16 @@ def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
     `future_12.jpg` shows sample 12; `fps` samples pass in a second. Raises `RowFault` for a track that is none.
     """
     fps, moved = meta.get("fps", SAMPLES_PER_SECOND), meta.get("object")
-    boxes: Any = (meta.get("boxes") or {}).get(moved) or ()  # one, or one per sample
-    sides: list[float] = []
-    if boxes and isinstance(boxes[0], list):
-        sides = [math.sqrt(max((x1 - x0) * (y1 - y0), 1.0)) for x0, y0, x1, y1 in boxes]
-        boxes = boxes[0]
     numbered = [(int("".join(filter(str.isdigit, path.stem)) or 0), path) for path in scene.glob(FUTURE)]
     pictures = [(number / fps, path.read_bytes()) for number, path in sorted(numbered)]
     if not pictures and not meta.get("track"):
         return None
-    fields = {"fps": fps, "track": meta.get("track") or (), "bbox": meta.get("bbox") or boxes or None, "object": moved}
-    fields |= {"scale": [side / sides[0] for side in sides]}
+    # Of each object a box, or one per sample.
+    boxes: dict[str, Any] = {name: given for name, given in (meta.get("boxes") or {}).items() if given}
+    sampled = {name: given for name, given in boxes.items() if isinstance(given[0], list)}
+    sides = [math.sqrt(max((x1 - x0) * (y1 - y0), 1.0)) for x0, y0, x1, y1 in sampled.get(str(moved), ())]
+    fields = {"fps": fps, "track": meta.get("track") or (), "scale": [side / sides[0] for side in sides]}
+    fields |= {"object": moved, "boxes": boxes | {name: given[0] for name, given in sampled.items()}}
     try:
         return Known(Truth.model_validate(fields), pictures)
     except ValidationError as error:

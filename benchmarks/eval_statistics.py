@@ -1,6 +1,6 @@
 """Checks the statistics of `cow eval` by simulation: how often intervals hold the true gain, how often p is below 5%.
 
-    python benchmarks/coverage.py --out benchmarks/results/coverage.json
+    python benchmarks/eval_statistics.py --out benchmarks/results/eval_statistics.json
 
 Each design draws replies whose true gain is known: how many scenes, questions on each, repeats, and how scenes differ
 in difficulty and in what looking gains there. Where nothing is gained, p should be below 5% in 5% of the data sets (the
