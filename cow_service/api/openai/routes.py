@@ -113,7 +113,9 @@ async def responses(request: Request, completer: ChatCompleter) -> Response:
 
 @router.get("/models", operation_id="chatModels", summary="Models to chat with")
 def models(completer: ChatCompleter) -> records.ChatModels:
-    """Every reader, with imagination and without (`:no-imagination`); the server's default comes first."""
+    """Every reader, the server's default first: with imagination and without (`:no-imagination`).
+
+    Models with an MLLM also have controls, such as `:still`; suffixes of different kinds can be combined."""
     names = records.usable_models(completer.service)
     return records.ChatModels(data=tuple(records.ChatModel(id=name, created=completer.started) for name in names))
 
