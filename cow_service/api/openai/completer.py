@@ -34,6 +34,8 @@ from cow_service.records import AnswerOption, Job
 from cow_service.requests import SimulateRequest
 from cow_service.requests.values import SHOWN_CHARACTERS
 
+DEFAULT_WAIT_SECONDS = 60.0  # from a chat's arrival; after it, no refused call of the imagination is repeated
+
 
 class Completer:
     """Completes chats."""
@@ -74,6 +76,8 @@ class Completer:
             return await self._answer(request, chat, answerer, stored=stored)
         prefer, submitter = preferences_without_key(request), self._submitter
         owner = submitting.owner_of(request)
+        seconds = submitting.preferences_of(request.headers).wait
+        until = time.time() + (DEFAULT_WAIT_SECONDS if seconds is None else seconds)
         what_if = await submitter.in_thread(owner, partial(find_what_if, chat, answerer))
         if isinstance(what_if, records.ChatImagination):
             return await self._forward(request, EnrichedChat(chat, answerer, chat.messages, what_if), reader)
@@ -81,7 +85,7 @@ class Completer:
         try:
             wanted: SimulateRequest | None = what_if.request
             while wanted is not None:
-                submission = submitting.Submission("simulate", owner, prefer, new_job_id(owner, None))
+                submission = submitting.Submission("simulate", owner, prefer, new_job_id(owner, None), until=until)
                 if chat.stream:
                     created_at = await submitter.submit(submission, wanted)
                     return self._stream(submission, created_at, what_if, reader)
