@@ -222,7 +222,7 @@ class MllmBadReply(CowError, code="mllm-bad-reply", status=502):
 
 
 class MllmRefused(CowError, code="mllm-refused", status=422):
-    """The multimodal LLM does not take what it was asked about the image."""
+    """The multimodal LLM rejected the call as invalid."""
 
 
 class MllmUnavailable(CowError, code="mllm-unavailable", status=503):

@@ -219,7 +219,7 @@ class MllmClient:
             said = [each for each in model.failures if not isinstance(each, errors.ModelTimeoutError)]
             refusal = self._refusal(said[-1]) if said else None
             if refusal is not None and refusal["status"] != HTTPStatus.TOO_MANY_REQUESTS:
-                failed: CowError = MllmRefused(f"{self._name} does not take this ({call.prompt}): {model.reasons}.")
+                failed: CowError = MllmRefused(f"{self._name} rejected the call ({call.prompt}): {model.reasons}.")
             elif isinstance(error, TimeoutError):
                 reasons = f": {model.reasons}" if model.failures else ""
                 budget = f"{model.seconds:.3g} s (COW_MLLM_BUDGET, or a chat's `Prefer: wait`)"
