@@ -51,7 +51,7 @@ def post(served: Served, path: str = "/v1/chat/completions", body: Any = CHAT, *
 @pytest.mark.parametrize("status", [400, 413, 422])
 def test_what_the_mllm_does_not_take_stays_what_it_said(served: Served, mllm: MllmServer, status: int) -> None:
     mllm.say(refusing(status, f"the image is too small for the patches of {KEY}"))
-    response = post(served)
+    response = post(served, Prefer="wait=0")  # it is asked once all the same
     said = response.json()["error"]
     assert (response.status_code, response.json()["status"], said["code"]) == (status, status, "mllm-refused")
     assert (said["message"], said["type"]) == ("the image is too small for the patches of ***", "invalid_request_error")

@@ -156,9 +156,8 @@ class MllmClient:
         except errors.ModelAPIError as error:
             raise MllmUnavailable(f"{self._name} could not be asked: {reason_of(error)}.") from error
         except TimeoutError as error:
-            raise MllmUnavailable(
-                f"{self._name} took no more chats for {self._budget:g} s (COW_MLLM_BUDGET)."
-            ) from error
+            detail = f"{self._name} took no more chats for {self._budget:g} s (COW_MLLM_BUDGET)."
+            raise MllmUnavailable(detail) from error
         except errors.ContentFilterError as error:
             raise MllmBadReply(f"{self._name} refused to answer: its content filter held the reply back.") from error
         return ChatTurn(completion_of(response, self.model.name), warnings=chat.warnings)
@@ -239,18 +238,12 @@ class MllmClient:
 
     def _refusal(self, error: errors.ModelAPIError) -> dict[str, Any] | None:
         """What a caller of `/v1` is told as the model's server said it; None for what is not the caller's to mend."""
-        if not isinstance(error, errors.ModelHTTPError) or error.status_code not in _CALLERS_STATUS:
-            return None
-        if isinstance(error, errors.ModelQuotaExceededError):
+        is_own = isinstance(error, errors.ModelQuotaExceededError)
+        if is_own or not isinstance(error, errors.ModelHTTPError) or error.status_code not in _CALLERS_STATUS:
             return None
         message = reason_of(error)
         match error.body:
-            case (
-                {"error": {"message": str(said)}}
-                | {"message": str(said)}
-                | {"error": str(said)}
-                | {"detail": str(said)}
-            ):
+            case {"error": {"message": str(said)}} | {"message": str(said)} | {"detail": str(said)}:
                 message = shortened(said, MAX_REFUSAL)
             case _:
                 pass
@@ -319,7 +312,7 @@ class RetryingModel(WrapperModel):
     ) -> None:
         super().__init__(wrapped)
         self._places, self._timeout, self._schema, self._retries = places, timeout, schema, retries
-        self.seconds, self._ends = seconds, time.monotonic() + seconds
+        self.seconds, self._ends = max(0.0, seconds), time.monotonic() + seconds
         self.calls = 0
         self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens
@@ -395,6 +388,8 @@ class RetryingModel(WrapperModel):
                     # With a longer pause every other call would fail without having been made.
                     most = max(self._ends - time.monotonic(), self._timeout)
                     call.refuse(failure.retry_after if (failure.retry_after or 0.0) < most else None)
+                if failure is error:
+                    raise
                 raise failure from error
         self.truncated = response.finish_reason == "length"
         return response
