@@ -58,6 +58,11 @@ class AdaptiveLimit:
         """Calls that may be in flight now."""
         return int(self._limit)
 
+    @property
+    def seconds_paused(self) -> float:
+        """How much longer the other side has asked not to be called."""
+        return max(0.0, self._resumes_at - self._clock())
+
     def seconds_to_wait(self) -> float:
         """Seconds before a call may begin: 0 at once, infinity where another one must end first."""
         with self._lock:

@@ -24,6 +24,7 @@
     ├── ReaderUnavailable          reader-unavailable       503
     ├── PerceptionUnavailable      perception-unavailable   503
     ├── MllmBadReply               mllm-bad-reply           502
+    ├── MllmRefused                mllm-refused             422
     ├── MllmUnavailable            mllm-unavailable         503
     ├── GeneratorUnavailable       generator-unavailable    503
     │   ├── WeightsUnavailable     weights-unavailable      503
@@ -108,6 +109,7 @@ class CowError(Exception):
         self.errors = errors[:MAX_FIELDS]
         self.headers = headers or {}  # of the HTTP response
         self.usage: dict[str, Any] | None = None  # what was asked of a multimodal LLM before, where that was anything
+        self.refusal: dict[str, Any] | None = None  # by the multimodal LLM's server: a `records.MllmRefusal`
 
     @property
     def title(self) -> str:
@@ -123,7 +125,7 @@ class CowError(Exception):
             "detail": self.detail,
             "errors": [asdict(field) for field in self.errors],
         }
-        others = {"remedy": self.remedy or None, "usage": self.usage}
+        others = {"remedy": self.remedy or None, "usage": self.usage, "refusal": self.refusal}
         return problem | {name: value for name, value in others.items() if value is not None}
 
 
@@ -217,6 +219,10 @@ class PerceptionUnavailable(CowError, code="perception-unavailable", status=503)
 
 class MllmBadReply(CowError, code="mllm-bad-reply", status=502):
     """The multimodal LLM gave no reply that can be used."""
+
+
+class MllmRefused(CowError, code="mllm-refused", status=422):
+    """The multimodal LLM rejected the call as invalid."""
 
 
 class MllmUnavailable(CowError, code="mllm-unavailable", status=503):

@@ -48,7 +48,8 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     """Imagines, unless the request says never or the gate sees no need, then answers.
 
     A simulation that fails does not lose the answer: it is then given from the image alone, with a warning.
-    Raises `InvalidRequest`, `Canceled`, `ReaderUnavailable`, `MllmBadReply`, `MllmUnavailable`.
+    Raises `InvalidRequest`, `Canceled`, `ReaderUnavailable`, `MllmBadReply`, `MllmRefused`,
+    `MllmUnavailable`.
     """
     request = run.request
     first = run.stage("gating", ask_first) if request.imagine == "auto" else None
@@ -92,6 +93,7 @@ def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, errors.CowErro
     except (
         errors.InvalidRequest,
         errors.Canceled,
+        errors.MllmRefused,
         errors.MllmUnavailable,
         errors.ReaderUnavailable,
         errors.PerceptionUnavailable,

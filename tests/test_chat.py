@@ -22,7 +22,7 @@ from openai import AsyncOpenAI, OpenAI
 from servers import BODY, QUESTION, TIME_LIMIT, Served, data_url, eventually, picture, problem, slow
 
 from cow_service.api.middleware.access import hash_of, new_key
-from cow_service.api.openai.records import answerers
+from cow_service.api.openai.records import Answerer, answerers
 from cow_service.records import Answer
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -124,7 +124,7 @@ def refused(call: Any, kind: type[openai.APIStatusError], code: str) -> openai.A
 
 def test_every_reader_is_a_model_with_and_without_imagination(client: OpenAI) -> None:
     models = [model.id for model in client.models.list()]
-    assert models == [MLLM, MLLM + WITHOUT, "cow/embedded", "cow/embedded" + WITHOUT]
+    assert [models[0], models[1], *models[-2:]] == [MLLM, MLLM + WITHOUT, "cow/embedded", "cow/embedded" + WITHOUT]
     for name in models:
         found = client.models.retrieve(name)
         assert (found.id, found.object, found.owned_by) == (name, "model", "cow")
@@ -142,7 +142,7 @@ def test_an_unknown_model_is_told_what_there_is(chat: Any) -> None:
 def test_names_of_mllms_may_hold_colons(tmp_path: Path) -> None:
     def names(**settings: Any) -> list[tuple[str, str]]:
         with Service(Settings(data_dir=tmp_path, **settings)) as service:
-            return [(name, one.reader) for name, one in answerers(service).items() if not name.endswith(WITHOUT)]
+            return [(name, one.reader) for name, one in answerers(service).items() if one == Answerer(one.reader)]
 
     assert names() == [("cow/embedded", "embedded")]
     assert names(mllm="openai:gpt-5") == [("cow/openai:gpt-5", "mllm"), ("cow/embedded", "embedded")]
@@ -277,7 +277,7 @@ def test_it_may_be_asked_from_an_event_loop(served: Served) -> None:
     [
         ({"seed": -1}, "seed", "greater than or equal to 0"),
         ({"extra_body": {"cow": {"votes": 99}}}, "cow.votes", "/cow/votes"),
-        ({"extra_body": {"cow": {"vote": 1}}}, "cow.vote", "not permitted"),
+        ({"extra_body": {"cow": {"vote": 1}}}, "cow.vote", "no such field"),
         ({"extra_body": {"cow": {"reader": "mllm"}}}, "cow.reader", "`model`"),
         ({"extra_body": {"cow": {"imagine": "never"}}}, "cow.imagine", "`model`"),
         ({"extra_body": {"cow": {"seed": 1}}, "seed": 1}, "cow.seed", "once"),

@@ -423,7 +423,7 @@ def test_a_caller_who_leaves_ends_the_call(served: Served, mllm: RandomMllm) -> 
         ({"cow": {"imagine": "never"}}, "cow.imagine", "`model`"),
         ({"cow": {"question": "?"}}, "cow.question", "`messages`"),
         ({"cow": {"num_frames": 0}}, "cow.num_frames", "greater"),
-        ({"cow": {"vote": 1}}, "cow.vote", "not permitted"),
+        ({"cow": {"vote": 1}}, "cow.vote", "no such field"),
         ({"cow": {**COW, "grounding": {"point": [999, 1]}}}, "cow.grounding.point", "outside"),
         ({"cow": {**COW, "generator": "nobody"}}, "cow.generator", "cutout"),
         ({"cow": 1}, "cow", "no object"),

@@ -18,6 +18,7 @@ from servers import QUESTION, Served, picture
 pytestmark = [pytest.mark.soak_only, pytest.mark.slow, pytest.mark.timeout(300)]
 SAMPLES, EPOCHS, SEED = 4, 2 * SCALE, 3
 IMAGINING = ("openai-api/local/cow/qwen3-vl-8b", "openai/cow/qwen3-vl-8b")
+CONTROL = "openai-api/local/cow/qwen3-vl-8b:still:initial"
 WITHOUT = "openai-api/local/cow/qwen3-vl-8b:no-imagination"
 EMBEDDED = "openai-api/local/cow/embedded"
 ASKED = SAMPLES * EPOCHS
@@ -73,7 +74,10 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory, mllm: RandomMllm) -> dic
         path.write_bytes(picture(number))
         images.append(str(path))
     stored_nowhere = {"responses_api": True, "responses_store": False}
-    models = [(name, stored_nowhere if name.startswith("openai/") else {}) for name in (*IMAGINING, WITHOUT, EMBEDDED)]
+    models = [
+        (name, stored_nowhere if name.startswith("openai/") else {})
+        for name in (*IMAGINING, CONTROL, WITHOUT, EMBEDDED)
+    ]
     mllm.draws.seed(SEED)
     own = {"COW_MLLM": "qwen3-vl-8b", "COW_MLLM_BASE_URL": mllm.address, "COW_READER": "embedded"}
     with Served(folder, **own) as served:
@@ -100,7 +104,7 @@ def letters(told: dict[str, Any]) -> list[str]:
     return [reply.rpartition("ANSWER: ")[2] for reply, _ in told["replies"]]
 
 
-@pytest.mark.parametrize("name", [*IMAGINING, WITHOUT])
+@pytest.mark.parametrize("name", [*IMAGINING, CONTROL, WITHOUT])
 def test_the_score_is_that_of_the_letters_drawn(evaluated: dict[str, Any], name: str) -> None:
     told = evaluated[name]
     assert (told["status"], len(told["replies"])) == ("success", ASKED)
@@ -112,11 +116,13 @@ def test_the_score_is_that_of_the_letters_drawn(evaluated: dict[str, Any], name:
 
 def test_each_of_its_requests_is_one_call_with_frames_or_without(evaluated: dict[str, Any], mllm: RandomMllm) -> None:
     received = [json.dumps(each.fields["messages"]).count('"image_url":') for each in mllm.received]
-    assert Counter(count for count in received if count) == {1: ASKED, 4: 2 * ASKED}
+    assert Counter(count for count in received if count) == {1: ASKED, 4: ASKED, 5: 2 * ASKED}
     assert received.count(0) <= 1, "the provider of OpenAI's own models says hello first"
     mllm.draws.seed(SEED)
     drawn = [letter for count in received if (letter := mllm.letter()) and count]
-    assert Counter(drawn) == Counter(letter for name in (*IMAGINING, WITHOUT) for letter in letters(evaluated[name]))
+    assert Counter(drawn) == Counter(
+        letter for name in (*IMAGINING, CONTROL, WITHOUT) for letter in letters(evaluated[name])
+    )
 
 
 def test_the_reader_without_weights_replies_in_its_form(evaluated: dict[str, Any]) -> None:

@@ -319,7 +319,7 @@ def test_an_outage_is_not_replayed_under_its_key(mllm: MllmServer, make) -> None
         ) as client:
             return [await client.post("/answer", json=body) for _ in range(3)]
 
-    mllm.say(say.status(400), '{"answer": "B"}')
+    mllm.say(say.status(401), '{"answer": "B"}')
     down, up, again = asyncio.run(calls())
     assert (down.status_code, up.status_code, again.status_code) == (503, 200, 200)
     assert again.json() == up.json()
@@ -334,7 +334,7 @@ def test_an_outage_is_not_replayed_under_its_key(mllm: MllmServer, make) -> None
 def test_what_cannot_pass_is_not_repeated(status: int, told: str, mllm: MllmServer, make) -> None:
     mllm.say(say.status(status))
     problem = post(make(), "/answer", image=blank(64, 64), question=OPTIONS, imagine="never")
-    assert problem["problem"] == "mllm-unavailable"
+    assert problem["problem"] == ("mllm-refused" if status == 400 else "mllm-unavailable")
     assert told in problem["detail"]
     assert len(mllm.asked) == 1
 

@@ -14,7 +14,7 @@ from drawn import ball, block, floor, trail
 from mllm_server import MllmServer
 from runs import run_of
 
-from cow_service.errors import Canceled, CannotReadDirection, MllmUnavailable, ObjectNotFound
+from cow_service.errors import Canceled, CannotReadDirection, MllmRefused, ObjectNotFound
 from cow_service.readers.base import CallLog, MotionHints, Quantity, ReaderInput
 from cow_service.readers.mllm.client import MllmClient
 from cow_service.readers.mllm.identify import read_identified
@@ -252,7 +252,7 @@ def test_answers_are_the_same_each_time_of_a_deterministic_model_at_temperature_
 def test_calls_that_fail_count_too(mllm: MllmServer, reader: MllmReader, scene: Scene) -> None:
     mllm.say(say.status(400))
     calls = CallLog()
-    with pytest.raises(MllmUnavailable):
+    with pytest.raises(MllmRefused):
         reader.ground(ReaderInput(scene, QUESTION, calls=calls))
     assert calls.usage.calls == len(mllm.asked) == 1
     assert calls.prompts.keys() == {"identify", "looking"}

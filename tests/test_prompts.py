@@ -102,7 +102,7 @@ SCHEMAS = {
     [
         name
         for name in PROMPTS.names()
-        if name not in {"looking", "motion-sentence", "imagined-frames", "eval-question"}
+        if name not in {"looking", "motion-sentence", "imagined-frames", "imagined-facts", "eval-question"}
         and not name.startswith("tool")
     ],
 )

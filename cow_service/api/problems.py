@@ -1,6 +1,7 @@
 """Errors on the wire: RFC 9457 `application/problem+json`, one shape for all."""
 
 import logging
+import math
 import re
 from collections.abc import Callable
 from http import HTTPStatus
@@ -58,30 +59,38 @@ class ChatProblem(Problem):
 
 
 def openai_error(error: errors.CowError) -> dict[str, Any]:
-    """An error as OpenAI's clients read it: a `ChatError`."""
-    other = "server_error" if error.status >= HTTPStatus.INTERNAL_SERVER_ERROR else "invalid_request_error"
+    """An error as OpenAI's clients read it: a `ChatError`. Where the MLLM refused a call, in the MLLM's words."""
+    status = openai_status(error)
+    other = "server_error" if status >= HTTPStatus.INTERNAL_SERVER_ERROR else "invalid_request_error"
     param = None
     if error.errors:  # a JSON Pointer as OpenAI writes places: messages[0].content
         steps = [step.replace("~1", "/").replace("~0", "~") for step in error.errors[0].pointer.split("/")[1:]]
         param = "".join(f"[{step}]" if re.fullmatch("[0-9]+", step) else f".{step}" for step in steps).lstrip(".")
     return {
-        "message": str(error),
-        "type": OPENAI_TYPES.get(HTTPStatus(error.status), other),
+        "message": str(error) if error.refusal is None else error.refusal["message"],
+        "type": OPENAI_TYPES.get(HTTPStatus(status), other),
         "param": param or None,
         "code": error.code,
     }
 
 
+def openai_status(error: errors.CowError) -> int:
+    """The status of an error for OpenAI's clients: the MLLM's own, where it refused a call."""
+    return error.status if error.refusal is None else error.refusal["status"]
+
+
 def chat_problem(error: errors.CowError) -> dict[str, Any]:
     """An error as `ChatProblem`."""
-    return error.as_problem() | {"error": openai_error(error)}
+    return error.as_problem() | {"status": openai_status(error), "error": openai_error(error)}
 
 
 def respond(error: errors.CowError, scope: Scope) -> JSONResponse:
     """The HTTP response for an error, which OpenAI's clients, too, can read where the request is one of theirs."""
     problem = chat_problem(error) if scope["path"].startswith(OPENAI_ROOT) else error.as_problem()
     headers = {"Retry-After": "5"} if error.status == HTTPStatus.SERVICE_UNAVAILABLE else {}
-    return JSONResponse(problem, error.status, headers=headers | error.headers, media_type=MEDIA_TYPE)
+    if error.refusal is not None and (seconds := error.refusal.get("retry_after")) is not None:
+        headers = {"Retry-After": f"{math.ceil(seconds)}"}
+    return JSONResponse(problem, problem["status"], headers=headers | error.headers, media_type=MEDIA_TYPE)
 
 
 def install_problem_handlers(app: FastAPI) -> None:

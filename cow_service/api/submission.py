@@ -99,6 +99,7 @@ class Submission:
     prefer: Preferences
     job_id: str
     image: bytes | None = None
+    until: float | None = None  # see `JobSpec.until`
     replayed: bool = False  # the job was there before, under the same Idempotency-Key
 
     @property
@@ -340,6 +341,7 @@ class Submitter:
             fresh=submission.prefer.fresh,
             webhook=body.webhook,
             priority=body.priority,
+            until=submission.until,
             request_id=context.request_id.get(),
             traceparent=context.traceparent(),
         )

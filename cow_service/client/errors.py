@@ -113,6 +113,8 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
     error.code = code or error.code
     if isinstance(usage := problem.get("usage"), dict):
         error.usage = usage
+    if isinstance(refusal := problem.get("refusal"), dict):
+        error.refusal = refusal
     if isinstance(status := problem.get("status"), int):
         error.status = status
     return error

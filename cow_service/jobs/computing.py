@@ -278,6 +278,7 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     given = work.progress, step, outages.wait_through, job.id, spec.created_at, spec.turn
     seen = None if spec.fresh else service.seen
     with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
+        run.until = spec.until
         try:
             result = answer(cast("Run[AnswerRequest]", run)) if isinstance(request, AnswerRequest) else simulate(run)
         except CowError:  # the stages before the one that failed are found by the next try

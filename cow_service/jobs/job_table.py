@@ -60,6 +60,11 @@ class JobSpec(Record):
     webhook: str | None = Field(default=None, description="URL to call when the job has ended.")
     priority: Priority = Field(default="normal", description="Among the waiting jobs of its key.")
     turn: int = Field(default=0, ge=0, description="Its place among the jobs of all keys: the lower comes first.")
+    until: float | None = Field(
+        default=None,
+        exclude_if=lambda until: until is None,  # earlier versions do not know it
+        description="Unix time, s, after which a multimodal LLM that refuses is not asked again.",
+    )
     request_id: str | None = None
     traceparent: str | None = None
 
@@ -460,10 +465,10 @@ _SHOWN = [
 
 
 def error_as_json(error: CowError) -> dict[str, Any]:
-    """Its code, detail, remedy, fields and usage, as JSON values."""
+    """Its code, detail, remedy, fields, usage and refusal, as JSON values."""
     fields = [asdict(field) for field in error.errors]
     told = {"code": error.code, "detail": error.detail, "remedy": error.remedy}
-    return told | {"errors": fields, "usage": error.usage}
+    return told | {"errors": fields, "usage": error.usage, "refusal": error.refusal}
 
 
 def error_from_json(kept: Mapping[str, Any]) -> CowError:
@@ -472,7 +477,7 @@ def error_from_json(kept: Mapping[str, Any]) -> CowError:
     error = kind(
         kept["detail"], remedy=kept.get("remedy", ""), errors=tuple(FieldError(**field) for field in kept["errors"])
     )
-    error.usage = kept.get("usage")
+    error.usage, error.refusal = kept.get("usage"), kept.get("refusal")
     return error
 
 

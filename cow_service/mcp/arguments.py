@@ -227,6 +227,7 @@ REMEDIES = {
     "shutting-down": _RETRY_LATER,
     "not-ready": _RETRY_LATER,
     "mllm-unavailable": "Call again in a while, or with another `reader` ('embedded' needs no model).",
+    "mllm-refused": "The same call would be rejected again: change image or question, or name another `reader`.",
     "canceled": "Somebody canceled the job. Call again if it is still wanted.",
 }
 

@@ -73,6 +73,7 @@ class ReaderInput:
     motion_wanted: bool = True  # stage 2 is left to the reader, too
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: nobody need look for them
     sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, beside the question's
+    until: float | None = None  # Unix time, s, after which an MLLM that refuses is not asked again; None: its own limit
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = lambda: None  # to be called while waiting; raises `Canceled`
     cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant

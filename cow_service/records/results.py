@@ -141,6 +141,14 @@ class ProblemField(BaseModel):
     detail: str
 
 
+class MllmRefusal(BaseModel):
+    """What the server of a multimodal LLM refused a call with."""
+
+    status: int = Field(description="Of its HTTP response.")
+    message: str = Field(description="In its own words.")
+    retry_after: float | None = Field(default=None, ge=0, description="When it may be asked again, s.")
+
+
 class Problem(BaseModel):
     """Why a request failed (RFC 9457)."""
 
@@ -158,6 +166,11 @@ class Problem(BaseModel):
         default=None,
         exclude_if=lambda usage: usage is None,
         description="What was asked of a multimodal LLM before it failed; left out where that was nothing.",
+    )
+    refusal: MllmRefusal | None = Field(
+        default=None,
+        exclude_if=lambda refusal: refusal is None,
+        description="What the multimodal LLM refused a call with; left out where it did not.",
     )
 
     @property

@@ -140,6 +140,7 @@ class Run(Generic[Request_co]):
     id: str = field(default_factory=lambda: str(uuid.uuid4()))
     created_at: str = field(default_factory=now)
     turn: int = 0  # of the job, among those of all callers: the lower comes first
+    until: float | None = None  # see `ReaderInput.until`
     seen: SeenImages | None = None  # images that other runs have measured; None: everything is measured anew
     _image_key: ImageKey = (None, "")
     _is_estimated: bool = False  # the depth map, by a model
@@ -345,6 +346,7 @@ class Run(Generic[Request_co]):
             question=self.request.question,
             seed=self.request.seed,
             motion_wanted="motion" in self.request.left_to_reader,
+            until=self.until,
             calls=self._calls[stage],
             check_canceled=self.check_canceled,
             cpu=self.cpu,

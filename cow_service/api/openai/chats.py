@@ -128,7 +128,7 @@ def locate_in_chat(error: CowError, own: Mapping[str, str]) -> CowError:
     """An error of the request made of a chat, pointing into the chat."""
     fields = tuple(FieldError(point_into_chat(field.pointer, own), field.detail) for field in error.errors)
     located = type(error)(error.detail, remedy=error.remedy, errors=fields, headers=error.headers)
-    located.usage = error.usage
+    located.usage, located.refusal = error.usage, error.refusal
     return located
 
 

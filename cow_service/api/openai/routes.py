@@ -39,6 +39,12 @@ REPLIES = (
 )
 
 
+_WAIT = (
+    "`wait=N` (RFC 7240): calls of the imagination that the MLLM refuses (429) are repeated until N seconds after "
+    "the chat arrived, 60 without it."
+)
+WAIT = {**PREFERENCES[0], "description": _WAIT}
+CHAT_WAIT = {**WAIT, "description": f"With an MLLM, {_WAIT} Without one: {PREFERENCES[0]['description']}"}
 ChatCompleter = Annotated[Completer, from_app("completer")]
 
 
@@ -73,7 +79,7 @@ router = APIRouter(prefix=OPENAI_ROOT.rstrip("/"), tags=["OpenAI-compatible"])
         **documented(*FAILURES, errors.ModelNotFound),
         **UPSTREAM_ERRORS,
     },
-    openapi_extra={"requestBody": _body_of(ChatRequest), "parameters": PREFERENCES},
+    openapi_extra={"requestBody": _body_of(ChatRequest), "parameters": [CHAT_WAIT, *PREFERENCES[1:]]},
 )
 async def chat(request: Request, completer: ChatCompleter) -> Response:
     """The chat goes on to the MLLM as it is, and the MLLM's reply comes back as it is, with `cow` beside it.
@@ -94,7 +100,10 @@ async def chat(request: Request, completer: ChatCompleter) -> Response:
         **documented(*FAILURES, errors.ModelNotFound),
         **UPSTREAM_ERRORS,
     },
-    openapi_extra={"requestBody": _body_of(ResponsesRequest), "parameters": PREFERENCES[2:]},
+    openapi_extra={
+        "requestBody": _body_of(ResponsesRequest),
+        "parameters": [WAIT, *PREFERENCES[2:]],
+    },
 )
 async def responses(request: Request, completer: ChatCompleter) -> Response:
     """Text and images in, without state: what needs it (`previous_response_id`, `store`...) is refused by name.
@@ -113,7 +122,9 @@ async def responses(request: Request, completer: ChatCompleter) -> Response:
 
 @router.get("/models", operation_id="chatModels", summary="Models to chat with")
 def models(completer: ChatCompleter) -> records.ChatModels:
-    """Every reader, with imagination and without (`:no-imagination`); the server's default comes first."""
+    """Every reader, the server's default first: with imagination and without (`:no-imagination`).
+
+    Models with an MLLM also have controls, such as `:still`; suffixes of different kinds can be combined."""
     names = records.usable_models(completer.service)
     return records.ChatModels(data=tuple(records.ChatModel(id=name, created=completer.started) for name in names))
 

@@ -5,7 +5,9 @@ import concurrent.futures
 import hashlib
 import logging
 import random
+import time
 from collections.abc import Callable, Coroutine, Sequence
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from threading import Thread
@@ -21,10 +23,10 @@ from pydantic_ai.models.wrapper import WrapperModel
 from pydantic_ai.output import OutputObjectDefinition
 from pydantic_ai.settings import ModelSettings
 from pydantic_ai.usage import RunUsage
-from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, stop_before_delay, wait_random_exponential
+from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, wait_random_exponential
 
 from cow_service.adaptive import BUSY, AdaptivePlaces
-from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmUnavailable
+from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable, shortened
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
@@ -91,6 +93,8 @@ class MllmClient:
         self.model = model
         self._name = f"The multimodal LLM '{model.name}'"
         self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
+        own = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
+        self._keys = {key for key in (own, model.upstream and model.upstream.key) if key}
         self.places = AdaptivePlaces(settings.mllm_concurrency)
         self._instructions = load_prompt(SYSTEM_PROMPT)
         self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
@@ -137,7 +141,7 @@ class MllmClient:
     async def _chat(self, body: dict[str, Any]) -> ChatTurn:
         chat = prepare_chat(body, self.model.model)
         settings = self._supported(chat.settings | ModelSettings(timeout=self._timeout, max_retries=0))
-        once = RetryingModel(self.model.model, self.places, self._timeout, budget=0, schema=None)
+        once = RetryingModel(self.model.model, self.places, self._timeout, self._budget, None, retries=False)
         try:
             response = await model_request(
                 once, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
@@ -151,6 +155,9 @@ class MllmClient:
             return ChatTurn({"error": told}, error.status_code, chat.warnings, retry)
         except errors.ModelAPIError as error:
             raise MllmUnavailable(f"{self._name} could not be asked: {reason_of(error)}.") from error
+        except TimeoutError as error:
+            detail = f"{self._name} took no more chats for {self._budget:g} s (COW_MLLM_BUDGET)."
+            raise MllmUnavailable(detail) from error
         except errors.ContentFilterError as error:
             raise MllmBadReply(f"{self._name} refused to answer: its content filter held the reply back.") from error
         return ChatTurn(completion_of(response, self.model.name), warnings=chat.warnings)
@@ -159,7 +166,8 @@ class MllmClient:
         """The parsed reply, or the error that the call came to: one failed vote must not lose the others."""
         prompt, parser, used = load_prompt(call.prompt), _ReplyParser(call.parse), RunUsage()
         schema = call.schema if self.model.supports_schema else None
-        model = RetryingModel(self.model.model, self.places, self._timeout, self._budget, schema)
+        seconds = self._budget if given.until is None else min(self._budget, given.until - time.time())
+        model = RetryingModel(self.model.model, self.places, self._timeout, seconds, schema)
         images = [BinaryContent(image, media_type=MEDIA_TYPE) for image in call.images]
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
@@ -206,13 +214,19 @@ class MllmClient:
             return MllmUnavailable(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}")
         if isinstance(error, errors.ContentFilterError):
             return MllmBadReply(f"{self._name} refused to look at this: its content filter held the reply back.")
-        if isinstance(error, TimeoutError):
-            reasons = f": {model.reasons}" if model.failures else ""
-            return MllmUnavailable(
-                f"{self._name} gave no usable reply within {self._budget:g} s (COW_MLLM_BUDGET) and {tries}{reasons}."
-            )
-        if isinstance(error, errors.ModelAPIError):
-            return MllmUnavailable(f"{self._name} could not be asked ({tries}): {model.reasons}.")
+        if isinstance(error, (TimeoutError, errors.ModelAPIError)):
+            said = [each for each in model.failures if not isinstance(each, errors.ModelTimeoutError)]
+            refusal = self._refusal(said[-1]) if said else None
+            if refusal is not None and refusal["status"] != HTTPStatus.TOO_MANY_REQUESTS:
+                failed: CowError = MllmRefused(f"{self._name} rejected the call ({call.prompt}): {model.reasons}.")
+            elif isinstance(error, TimeoutError):
+                reasons = f": {model.reasons}" if model.failures else ""
+                budget = f"{model.seconds:.3g} s (COW_MLLM_BUDGET, or a chat's `Prefer: wait`)"
+                failed = MllmUnavailable(f"{self._name} gave no usable reply within {budget} and {tries}{reasons}.")
+            else:
+                failed = MllmUnavailable(f"{self._name} could not be asked ({tries}): {model.reasons}.")
+            failed.refusal = refusal
+            return failed
         fault = parser.fault
         if model.truncated:
             fault += ", and it was cut off: it has no more room than `max_tokens` of the model's manifest"
@@ -221,6 +235,21 @@ class MllmClient:
             f"{self._name} was asked {model.calls} times ({call.prompt}) and gave no reply that can be used. "
             f"Of the last one, '{excerpt}': {fault}."
         )
+
+    def _refusal(self, error: errors.ModelAPIError) -> dict[str, Any] | None:
+        """What a caller of `/v1` is told as the model's server said it; None for what is not the caller's to mend."""
+        is_own = isinstance(error, errors.ModelQuotaExceededError)
+        if is_own or not isinstance(error, errors.ModelHTTPError) or error.status_code not in _CALLERS_STATUS:
+            return None
+        message = reason_of(error)
+        match error.body:
+            case {"error": {"message": str(said)}} | {"message": str(said)} | {"detail": str(said)}:
+                message = shortened(said, MAX_REFUSAL)
+            case _:
+                pass
+        for key in self._keys:
+            message = message.replace(key, "***")
+        return {"status": error.status_code, "message": message, "retry_after": error.retry_after}
 
     def _closed(self) -> MllmUnavailable:
         return MllmUnavailable(f"{self._name} is asked no more: this server is stopping.")
@@ -242,6 +271,12 @@ _NEVER_RETRIED = (errors.ModelRequestRejectedError, errors.ModelQuotaExceededErr
 _RETRIED_STATUS = (
     HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.CONFLICT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS,
 )  # fmt: skip
+# Of what was asked, or how often: not of this server's key, address or account.
+_CALLERS_STATUS = (
+    HTTPStatus.BAD_REQUEST, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.UNPROCESSABLE_ENTITY,
+    HTTPStatus.TOO_MANY_REQUESTS,
+)  # fmt: skip
+MAX_REFUSAL = 2000  # characters of a server's own words
 _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     (errors.ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
     (
@@ -259,17 +294,25 @@ _MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
 
 
 class RetryingModel(WrapperModel):
-    """A model that repeats a failed request while that may help and `budget` seconds are not over; with 0, never.
+    """A model that repeats a failed request while that may help: no attempt begins when `seconds` are over.
 
     Each attempt waits for one of `places`, then takes `timeout` seconds at most. `calls` counts the attempts, and
     `failures` keeps the errors of those that failed.
     """
 
     def __init__(
-        self, wrapped: Model, places: AdaptivePlaces, timeout: float, budget: float, schema: Schema | None
+        self,
+        wrapped: Model,
+        places: AdaptivePlaces,
+        timeout: float,
+        seconds: float,
+        schema: Schema | None,
+        *,
+        retries: bool = True,
     ) -> None:
         super().__init__(wrapped)
-        self._places, self._timeout, self._budget, self._schema = places, timeout, budget, schema
+        self._places, self._timeout, self._schema, self._retries = places, timeout, schema, retries
+        self.seconds, self._ends = max(0.0, seconds), time.monotonic() + seconds
         self.calls = 0
         self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens
@@ -298,11 +341,12 @@ class RetryingModel(WrapperModel):
             return isinstance(error, errors.ModelAPIError) and not isinstance(error, _NEVER_RETRIED)
 
         def is_over(state: RetryCallState) -> bool:
-            """Whether the budget ends before the next attempt, or the address has long accepted no connection."""
+            """Whether the time ends before the next attempt, or the address has long accepted no connection."""
             error = state.outcome.exception() if state.outcome else None
             refused = isinstance(error, errors.ModelConnectionError) and error.phase == "connect"
             unreachable = refused and (state.seconds_since_start or 0.0) > CONNECT_SECONDS
-            return unreachable or stop_before_delay(self._budget)(state)
+            too_late = time.monotonic() + state.upcoming_sleep >= self._ends
+            return unreachable or too_late or not self._retries
 
         def seconds_to_wait(state: RetryCallState) -> float:
             """Those that the server asked for, else exponential backoff, with jitter."""
@@ -319,39 +363,50 @@ class RetryingModel(WrapperModel):
     async def _attempt(
         self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
     ) -> ModelResponse:
-        self.calls += 1
-        try:
-            async with self._places.held() as call:
-                try:
-                    with anyio.fail_after(self._timeout):
-                        response = await super().request(messages, settings, parameters)
-                    call.succeeded = True
-                except (errors.ModelAPIError, TimeoutError) as error:
-                    if is_busy(error):
-                        seconds = error.retry_after if isinstance(error, errors.ModelAPIError) else None
-                        # Past the budget every other call would fail without having been made.
-                        call.refuse(seconds if (seconds or 0.0) < max(self._budget, self._timeout) else None)
+        async with AsyncExitStack() as stack:
+            try:
+                with anyio.fail_after(max(0.0, self._ends - time.monotonic())):
+                    call = await stack.enter_async_context(self._places.held())
+            except TimeoutError as error:  # without a place; what failed before tells more
+                if not self.failures and (pause := self._places.limit.seconds_paused):
+                    told = errors.ModelHTTPError.for_category(  # as another call was told
+                        errors.ModelRateLimitError, status_code=429, model_name=self.model_name, retry_after=pause
+                    )
+                    self.failures.append(told)
+                raise (self.failures[-1] if self.failures else error) from None
+            self.calls += 1
+            try:
+                with anyio.fail_after(self._timeout):
+                    response = await super().request(messages, settings, parameters)
+                call.succeeded = True
+            except errors.ContentFilterError:
+                raise
+            except (errors.AgentRunError, TimeoutError, *_MALFORMED) as error:
+                failure = self._failure(error)
+                self.failures.append(failure)
+                if is_busy(failure):
+                    # With a longer pause every other call would fail without having been made.
+                    most = max(self._ends - time.monotonic(), self._timeout)
+                    call.refuse(failure.retry_after if (failure.retry_after or 0.0) < most else None)
+                if failure is error:
                     raise
-        except errors.ContentFilterError:
-            raise
-        except errors.ModelAPIError as error:
-            self.failures.append(error)
-            raise
-        except TimeoutError as error:
-            self.failures.append(errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s"))
-            raise self.failures[-1] from error
-        except (errors.AgentRunError, *_MALFORMED) as error:
-            self.failures.append(errors.ModelAPIError(self.model_name, "the reply was no chat completion"))
-            raise self.failures[-1] from error
+                raise failure from error
         self.truncated = response.finish_reason == "length"
         return response
 
+    def _failure(self, error: Exception) -> errors.ModelAPIError:
+        if isinstance(error, errors.ModelAPIError):
+            return error
+        if isinstance(error, TimeoutError):
+            return errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
+        return errors.ModelAPIError(self.model_name, "the reply was no chat completion")
 
-def is_busy(error: errors.ModelAPIError | TimeoutError) -> bool:
+
+def is_busy(error: errors.ModelAPIError) -> bool:
     """Whether fewer calls at the same time may help."""
     if isinstance(error, errors.ModelHTTPError):
         return error.status_code in BUSY
-    return isinstance(error, (errors.ModelTimeoutError, errors.ModelConnectionError, TimeoutError))
+    return isinstance(error, (errors.ModelTimeoutError, errors.ModelConnectionError))
 
 
 def reason_of(error: errors.ModelAPIError) -> str:

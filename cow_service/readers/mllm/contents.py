@@ -8,17 +8,25 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageOps
 
 from cow_service.errors import CannotReadDirection
-from cow_service.media.images import encode_png, fit_within
+from cow_service.media.images import decode, encode_png, fit_within
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.hypothesis import hypothesis
 from cow_service.records import DIRECTED_KINDS, Simulation
+from cow_service.weights.manifests import EXAMPLES
 
 # `true`: frames drawn along the path that is known to be true. `text`: what the simulation found, in words.
 Content = Literal["none", "simulated", "still", "wrong-direction", "other-item", "text", "true"]
 PLACEBOS: tuple[Content, ...] = ("still", "wrong-direction", "other-item")
 STEEP = 0.05  # of a unit vector
+QUESTIONS = {  # about the example pictures
+    "ball-and-mug": "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?",
+    "falling-ball": "If the black ball falls freely from its current position, will it land on the orange cylinder?",
+    "bottle-passes-cylinder": "If the red bottle moves along the arrow, will the white cylinder be occluded?",
+    "thrown-ball": "If the pink ball is thrown in the direction of the arrow, will it hit the white cube?",
+}
 _ENDS = ("distance", "duration", "until")
 
 
@@ -54,3 +62,25 @@ def opposite_motion(simulation: Simulation) -> dict[str, Any]:
         "speed": motion.speed,
         **{name: value for name in _ENDS if (value := getattr(motion, name)) is not None},
     }
+
+
+def other_item(image: NDArray[np.uint8]) -> tuple[bytes, str]:
+    """Another picture (JPEG) and a question about it: the example that looks least like the image (height, width, 3).
+
+    An example that is the image itself is never taken, whatever it was encoded as.
+    """
+
+    def thumbnail(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+        return as_large_as(pixels, 16, 16).astype(np.float64)
+
+    files = {name: EXAMPLES[name].file("image").read_bytes() for name in QUESTIONS}
+    unlike = {name: np.abs(thumbnail(decode(file).pixels) - thumbnail(image)).mean() for name, file in files.items()}
+    name = max(unlike, key=lambda each: float(unlike[each]))
+    return files[name], QUESTIONS[name]
+
+
+def as_large_as(pixels: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """The middle of a picture (height, width, 3), scaled to exactly that size (px)."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    return np.asarray(ImageOps.fit(Image.fromarray(pixels), (width, height)))

@@ -7,7 +7,7 @@ import { remedyOf } from "../app/words.js";
 
 const TOOLS = { "cannot-ground": ["mover", "Draw its box"], "object-not-found": ["mover", "Draw its box"], "cannot-read-direction": ["direction", "Draw the direction"] };
 const AGAIN = new Set(["queue-full", "rate-limited", "storage-unavailable", "not-ready", "worker-ended", "job-timeout", "mllm-unavailable",
-  "reader-unavailable", "perception-unavailable", "generator-unavailable", "generator-out-of-memory", "device-failed", "weights-unavailable", "internal-error", "mllm-bad-reply", "unauthorized"]);
+  "reader-unavailable", "perception-unavailable", "generator-unavailable", "generator-out-of-memory", "device-failed", "weights-unavailable", "internal-error", "mllm-bad-reply", "mllm-refused", "unauthorized"]);
 
 export function ProblemNotice({ problem }) {
   const tool = get().picture ? TOOLS[problem.code] : undefined;
