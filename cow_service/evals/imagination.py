@@ -18,8 +18,8 @@ from cow_service.client.errors import Canceled
 from cow_service.errors import CannotGround, CannotReadDirection, CowError, MllmBadReply
 from cow_service.evals.design import Arm
 from cow_service.evals.items import Item, Pictures, Truth, question_text
-from cow_service.media.images import decode
-from cow_service.readers.mllm.contents import facts_of, opposite_motion, still_frame
+from cow_service.media.images import decode, decode_own, encode_png
+from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion, still_frame
 from cow_service.records import Usage
 
 MAX_INTERRUPTS = 20  # of one run, each of which may have canceled the same job
@@ -133,7 +133,8 @@ class Imagination:
             still = self._pictures.add_made(still_frame(pixels, arm.size))
             return replace(found, frames=(still,) * len(found.frames), simulated=False)
         if arm.content == "other-item":
-            other = await self._of_another(arm, trial, item)
+            first = simulation.frames[0]
+            other = await self._of_another(arm, trial, item, first.width, first.height)
         elif arm.content == "true":
             other = await self._along(simulation, arm, item)
         else:
@@ -142,8 +143,8 @@ class Imagination:
         usage, seconds = found.usage + other.usage, found.seconds + other.seconds
         return replace(other, probability=None, event_shown=None, overlay=None, usage=usage, seconds=seconds)
 
-    async def _of_another(self, arm: Arm, trial: int, item: Item) -> Evidence:
-        """Frames of another scene: of those in an order of the item's own, the first that can be simulated.
+    async def _of_another(self, arm: Arm, trial: int, item: Item, width: int, height: int) -> Evidence:
+        """Frames of this size (px) of another scene: in an order of the item's own, the first that can be simulated.
 
         Raises `CannotGround` where none of several can.
         """
@@ -151,10 +152,15 @@ class Imagination:
         def rank(other: Item) -> bytes:
             return hashlib.sha256(f"{item.id}\n{trial}\n{other.id}".encode()).digest()
 
+        def fitted(frame: str) -> str:
+            pixels = decode_own(self._pictures.read(frame))
+            is_so = pixels.shape[:2] == (height, width)
+            return frame if is_so else self._pictures.add_made(encode_png(as_large_as(pixels, width, height)))
+
         for other in sorted((each for each in self._items if each.scene != item.scene), key=rank)[:MAX_DONORS]:
             found = await self.evidence(other, arm.with_content("simulated"))
             if found.refusal is None:
-                return replace(found, path_error=None)
+                return replace(found, frames=tuple(map(fitted, found.frames)), path_error=None)
         raise CannotGround(f"None of {MAX_DONORS} other scenes could be simulated.")
 
     async def _truth(self, arm: Arm, trial: int, item: Item) -> Evidence:
