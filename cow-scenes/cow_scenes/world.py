@@ -4,7 +4,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .catalogue import HEIGHT, RADIUS
+from .catalogue import BOWL_OPENING, HEIGHT, RADIUS
+from .meshes import surface_of
 
 FPS = 30
 SAMPLES = 61
@@ -40,6 +41,21 @@ class Thing:
         """Metres."""
         return HEIGHT[self.shape] * self.scale
 
+    @property
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """The drawn mesh at scale 1: vertices (n, 3) about the centre, triangles (m, 3)."""
+        return surface_of(self.shape)
+
+    @property
+    def width(self) -> float:
+        """Metres: the narrowest round opening that it passes."""
+        return self.height
+
+    @property
+    def opening(self) -> float:
+        """Metres: the width of a container's opening."""
+        return 2 * BOWL_OPENING * self.scale
+
 
 @dataclass(frozen=True)
 class Table:
@@ -66,6 +82,11 @@ class World:
     table: Table | None = None
     removed: str | None = None
     carry_to: tuple[float, float, float] | None = None
+
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """Names of what is seen, has an id and never moves."""
+        return ("table",) if self.table else ()
 
     def thing(self, name: str) -> Thing:
         """The object of that name."""
