@@ -60,9 +60,7 @@ def depths(
     camera: Camera, things: tuple[Thing, ...], poses: dict[str, tuple[np.ndarray, np.ndarray]], table: Table | None
 ) -> dict[str, np.ndarray]:
     """Depth of each object on its own, by name; the table's is under `table`."""
-    found = {
-        t.name: depth_of(camera, placed(t, *poses[t.name]), t.surface[1]) for t in things if t.name in poses
-    }
+    found = {t.name: depth_of(camera, placed(t, *poses[t.name]), t.surface[1]) for t in things if t.name in poses}
     return found | ({"table": depth_of(camera, *table_mesh(table))} if table else {})
 
 
