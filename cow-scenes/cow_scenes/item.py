@@ -21,8 +21,9 @@ def question_picture(item: Accepted, clean: Image.Image, trail: Image.Image | No
     """The picture that is asked about, and the item's record."""
     if not item.draft.arrow:
         return trail or clean, meta_of(item, None)
-    arrow = draw_style(item.key.random("arrow"), item.draft.along)
     mover = item.draft.world.thing(item.draft.world.mover)
+    avoid = mover.colour if item.key.family == "other" else ""
+    arrow = draw_style(item.key.random("arrow"), item.draft.along, avoid)
     left, top, right, bottom = box_of(item.camera, mover, *still(mover))
     point = item.camera.project(np.array(mover.centre))
     ends = ends_of(arrow, point, direction_of(item), float(min(right - left, bottom - top)) / 2, clean.width)

@@ -30,8 +30,7 @@ class ContactLog:
         """Note what touches after `step` steps."""
         forces: dict[tuple[str, str], list] = {}
         for one, other, force, at in touches:
-            a, b = sorted((one, other))
-            forces.setdefault((a, b), []).append((force, at))
+            forces.setdefault((one, other) if one < other else (other, one), []).append((force, at))
         for pair, points in forces.items():
             impulse = sum(force for force, _ in points) / self.rate
             if step - self.last.get(pair, -1000) > self.substeps:

@@ -75,7 +75,7 @@ class Stage:
         """Level L2: 2 to 4 more objects that stand about."""
         taken = [(np.array(t.centre[:2]), t.radius) for t in self.things] + self.blocked
         for _ in range(int(self.random.integers(2, 5)) if level == "L2" else 0):
-            noun, at = self.choose(self.nouns), self.spot(1.3)
+            noun, at = self.choose(self.nouns), self.spot(1.1)
             size = shapes()[noun].radius * self.sizes(noun)[1]
             if all(np.hypot(*(at - other)) > size + radius + 0.06 * self.reach for other, radius in taken):
                 taken.append((at, self.add(noun, at).radius))
@@ -275,7 +275,7 @@ def draw_place(random: Random, level: str, want: int) -> Draft:
     """Something turned anyhow beside a vessel, somewhat narrower or wider than its opening."""
     stage = open_stage(random)
     at = stage.spot(0.4)
-    noun = stage.choose(("ball", "apple", "orange", "cube", "box", "can", "cylinder", "mug"))
+    noun = stage.choose(("ball", "apple", "orange", "cube", "box", "can", "cylinder"))
     vessel_noun = stage.choose(VESSELS)
     vessel_scale = stage.number(*stage.sizes(vessel_noun))
     scale = stage.number(*RATIOS[want]) * shapes()[vessel_noun].opening * vessel_scale / (2 * shapes()[noun].radius)

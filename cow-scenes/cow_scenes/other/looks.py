@@ -8,9 +8,13 @@ from PIL import Image, ImageDraw, ImageFilter
 
 TEXELS = 512
 WOODS = ((150, 104, 64), (112, 74, 46), (190, 150, 104), (92, 70, 56))
+CLUTTER = ((128, 112, 96), (98, 84, 72), (96, 106, 100), (118, 104, 110), (110, 104, 92))
+"""Colours that no question names."""
 PLAIN = ((196, 190, 180), (168, 172, 176), (142, 132, 120), (206, 200, 186), (120, 126, 128))
 MUTED = (*PLAIN, (98, 84, 72), (84, 92, 88), (150, 138, 142), (112, 104, 92), (70, 74, 80))
 SURROUNDINGS = ("room", "table top", "outdoors")
+MOST_PITCH = 38.0
+"""Degrees down up to which a table top has its backdrop: below it, a camera sees a floor there."""
 PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "rocket")
 """Pictures inside scikit-image's wheel, by their names there: CC0 (chelsea, coffee) or in the public domain."""
 SCANS = {"grass": (92, 128, 60), "gravel": (150, 144, 136), "brick": (166, 104, 84)}
@@ -101,8 +105,8 @@ def drawn_backdrop(random: np.random.Generator, width: int, height: int) -> Imag
 
 
 def photographed_backdrop(random: np.random.Generator, width: int, height: int, avoid: frozenset[str]) -> Image.Image:
-    """A cutting of a photograph, slightly out of focus; `coffee` shows a cup and is left out beside a mug."""
-    names = tuple(n for n in PHOTOGRAPHS if not (n == "coffee" and "mug" in avoid))
+    """A cutting of a photograph, slightly out of focus; `coffee` shows a cup and is left out beside others."""
+    names = tuple(n for n in PHOTOGRAPHS if not (n == "coffee" and avoid & {"mug", "bowl", "pot"}))
     photograph = Image.fromarray(scan(str(pick(random, names))))
     scale = max(width / photograph.width, height / photograph.height) * random.uniform(1.0, 1.4)
     large = photograph.resize((int(photograph.width * scale) + 1, int(photograph.height * scale) + 1))
@@ -150,13 +154,12 @@ def rgba(colour: tuple) -> str:
     return " ".join(f"{c / 255:.3f}" for c in colour) + " 1"
 
 
-def lights(random: np.random.Generator, reach: float) -> tuple[str, str]:
-    """Lamps with shadows around a scene, and the even light: XML of the world and of `visual`."""
-    count, made = int(random.integers(1, 4)), ""
-    turn = random.uniform(0, 2 * np.pi)
+def lights(random: np.random.Generator, reach: float, yaw: float) -> tuple[str, str]:
+    """Lamps with shadows on the camera's side of a scene, and the even light: XML of the world and of `visual`."""
+    made, count = "", int(random.integers(1, 4))
     for k in range(count):
-        lean = random.uniform(0.25, 0.9)
-        way = np.array([np.cos(turn + 2.1 * k) * lean, np.sin(turn + 2.1 * k) * lean, 1.0])
+        lean, turn = random.uniform(0.25, 0.9), yaw + np.pi + random.uniform(-1.5, 1.5)
+        way = np.array([np.cos(turn) * lean, np.sin(turn) * lean, 1.0])
         at, bright = way * reach * 3.5, (0.75 if k == 0 else 0.35) / (1 + 0.25 * (count - 1))
         warm = bright * (1 + random.uniform(-1, 1) * np.array([0.10, 0.0, -0.12]))
         made += (
@@ -179,7 +182,7 @@ def clutter(random: np.random.Generator, reach: float, far: float, yaw: float) -
         made += (
             f'<geom type="{kind}" size="{size[0]:.3f} {size[1]:.3f} {size[2]:.3f}" material="plain" '
             f'pos="{away / np.cos(turn - yaw) * np.cos(turn):.3f} {away / np.cos(turn - yaw) * np.sin(turn):.3f} '
-            f'{height:.3f}" euler="0 0 {random.uniform(0, 90):.1f}" rgba="{rgba(pick(random, MUTED))}"/>'
+            f'{height:.3f}" euler="0 0 {random.uniform(0, 90):.1f}" rgba="{rgba(pick(random, CLUTTER))}"/>'
         )
     return made
 
@@ -190,22 +193,27 @@ def look_of(
     extent: np.ndarray,
     yaw: float,
     size: tuple[int, int],
+    pitch: float,
     avoid: frozenset[str],
 ) -> Look:
-    """The surroundings of a scene about the origin, `reach` metres wide to each side, seen towards `yaw`.
+    """The surroundings of a scene about the origin, `reach` metres wide to each side.
 
-    `extent` are points (n, 2) on the floor that things pass: walls and clutter are beyond them. `avoid` are nouns that
+    The camera looks towards `yaw` and `pitch` degrees down. `extent` are points (n, 2) on the floor that things pass: walls and clutter are beyond them. `avoid` are nouns that
     a photographed backdrop may not show.
     """  # fmt: skip
-    kind = str(pick(random, SURROUNDINGS))
+    kind = str(pick(random, SURROUNDINGS if pitch < MOST_PITCH else ("room", "outdoors")))
     floors = {"room": ("wood", "tiles", "carpet", "stone"), "table top": ("wood", "cloth", "stone"),
               "outdoors": ("grass", "gravel", "brick", "stone", "tiles")}[kind]  # fmt: skip
     ahead = np.array([np.cos(yaw), np.sin(yaw)])
     far = max(float((extent @ ahead).max()), reach) + 0.25 * reach
-    bodies, visual = lights(random, reach)
-    files = {"floor.png": png(floor_texture(random, str(pick(random, floors)))), "wall.png": png(wall_texture(random))}
+    bodies, visual = lights(random, reach, yaw)
+    floor = str(pick(random, floors))
+    files = {"floor.png": png(floor_texture(random, floor)), "wall.png": png(wall_texture(random))}
+    y, x = np.mgrid[:128, :128]
+    weave = 0.75 + 0.25 * np.abs(np.sin(y * np.pi / 8)) * np.where((x // 8 + y // 8) % 2, 1.0, 0.7)
+    files["weave.png"] = png(shaded((255, 255, 255), weave))
     files["grain.png"] = png(shaded((255, 255, 255), 0.9 + 0.07 * noise(random, 0.9, size=128)))
-    repeat, shine = random.uniform(0.6, 1.6) / reach, random.uniform(0, 0.18) * (kind != "outdoors")
+    repeat, shine = random.uniform(0.6, 1.6) / reach, random.uniform(0, 0.18) * (floor in {"wood", "tiles"})
     half = np.abs(extent).max() + 0.3 * reach if kind == "table top" else 40 * reach
     bodies += (
         f'<geom type="plane" size="{half:.3f} {half:.3f} 1" material="floor" euler="0 0 {random.uniform(0, 90):.1f}"/>'
@@ -213,15 +221,16 @@ def look_of(
     if kind != "table top":
         bodies += clutter(random, reach, far, yaw)
     if kind == "room":
+        # What is not quite opaque casts no shadow, which would cover the wall itself with a moire pattern.
         for turn, away in ((yaw, far + random.uniform(0.9, 2.0) * reach), (yaw + np.pi / 2, far + 2.5 * reach)):
-            x, y = np.cos(turn) * away, np.sin(turn) * away
+            x, y = np.cos(turn), np.sin(turn)
             bodies += (
-                f'<geom type="box" size="0.02 {8 * reach:.3f} {4 * reach:.3f}" pos="{x:.3f} {y:.3f} {4 * reach:.3f}" '
-                f'euler="0 0 {np.degrees(turn):.2f}" material="wall"/>'
+                f'<geom type="plane" size="{8 * reach:.3f} {4 * reach:.3f} 1" material="wall" rgba="1 1 1 0.999" '
+                f'pos="{x * away:.3f} {y * away:.3f} {4 * reach:.3f}" xyaxes="{y:.6f} {-x:.6f} 0 0 0 1"/>'
             )
     assets = (
         '<texture name="floor" type="2d" file="floor.png"/><texture name="wall" type="2d" file="wall.png"/>'
-        '<texture name="grain" type="cube" file="grain.png"/>'
+        '<texture name="grain" type="cube" file="grain.png"/><texture name="weave" type="cube" file="weave.png"/>'
         f'<material name="floor" texture="floor" texuniform="true" texrepeat="{repeat:.3f} {repeat:.3f}" '
         f'reflectance="{shine:.3f}" specular="{shine:.3f}" shininess="0.5"/>'
         f'<material name="wall" texture="wall" texuniform="true" texrepeat="{repeat:.3f} {repeat:.3f}" specular="0"/>'

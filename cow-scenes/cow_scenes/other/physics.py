@@ -160,22 +160,25 @@ def set_matter(model: mujoco.MjModel, world: OtherWorld) -> None:
 
 def touches_now(model: mujoco.MjModel, data: mujoco.MjData, names: list[str]) -> Iterator[Touch]:
     """What touches after a step."""
-    force = np.zeros(6)
-    for i in range(data.ncon):
-        contact = data.contact[i]
-        a, b = (names[model.geom_bodyid[g]] for g in contact.geom)
-        if contact.dist <= 0.001:
-            mujoco.mj_contactForce(model, data, i, force)
-            yield a, b, float(force[0]), contact.pos.copy()
+    contact = data.contact
+    near = np.flatnonzero((contact.dist <= 0.001) & (contact.efc_address >= 0))
+    bodies, forces = model.geom_bodyid[contact.geom[near]].tolist(), data.efc_force[contact.efc_address[near]].tolist()
+    # With elliptic cones a contact's first constraint is its normal force.
+    for (a, b), force, at in zip(bodies, forces, contact.pos[near], strict=True):
+        yield names[a], names[b], force, at
 
 
 def gap_now(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, least: float) -> float:
     """The distance of two bodies in metres, if it is below `least`."""
-    for g in np.flatnonzero(model.geom_bodyid == a):
-        for h in np.flatnonzero(model.geom_bodyid == b):
-            apart = np.linalg.norm(data.geom_xpos[g] - data.geom_xpos[h]) - model.geom_rbound[g] - model.geom_rbound[h]
-            if apart < least:
-                least = min(least, max(0.0, mujoco.mj_geomDistance(model, data, g, h, GAP_REACH, None)))
+    ours, theirs = (np.flatnonzero(model.geom_bodyid == body) for body in (a, b))
+    apart = np.linalg.norm(data.geom_xpos[ours][:, None] - data.geom_xpos[theirs], axis=-1)
+    apart -= model.geom_rbound[ours][:, None] + model.geom_rbound[theirs]
+    for k in np.argsort(apart, axis=None):
+        g, h = np.unravel_index(k, apart.shape)
+        if apart[g, h] >= least:
+            break
+        found = mujoco.mj_geomDistance(model, data, int(ours[g]), int(theirs[h]), GAP_REACH, None)
+        least = min(least, max(0.0, found))
     return least
 
 

@@ -89,7 +89,8 @@ def vessel(low: float, high: float, height: float, wall: float, handles: tuple, 
     outline = [(low, 0), (high, height), (high - wall, height), (low - wall, wall)]
     angle, wedges = np.linspace(0, 2 * np.pi, SIDES + 1), []
     for two in itertools.pairwise(angle):
-        wedges.append(np.array([(r * np.cos(t), r * np.sin(t), z) for t in two for r, z in outline]))
+        # Only the floor of the vessel rests on what it stands on: two dozen wedges would make a hundred contacts.
+        wedges.append(np.array([(r * np.cos(t), r * np.sin(t), max(z, wall / 2)) for t in two for r, z in outline]))
     tubes = [tube(path, [thick] * len(path)) for path, thick in handles]
     return Shape(
         (lathe([(0, 0), *outline, (0, wall)]), *(part for part, _ in tubes)),
@@ -148,8 +149,10 @@ def shapes() -> dict[str, Shape]:
     stick = np.linspace((0.115, 0, 0.035), (0.30, 0, 0.038), 4)
     return {
         "ball": Shape((moved(sphere(0.08), 0, 0, 0.08),), ("sphere", (0.08,)), 250, (0.44, 1.0), (1.0, 1.5)),
-        "cube": Shape((box((-0.05, -0.05, 0), (0.05, 0.05, 0.1)),), ("box", (0.05, 0.05, 0.05)), 400, (0.6, 1.3), (1.5, 3.0)),
-        "box": Shape((box((-0.11, -0.07, 0), (0.11, 0.07, 0.12)),), ("box", (0.11, 0.07, 0.06)), 200, (0.6, 1.0), (1.2, 2.2)),
+        "cube": Shape((box((-0.05, -0.05, 0), (0.05, 0.05, 0.1)),), ("box", (0.05,) * 3), 400, (0.6, 1.3), (1.5, 3.0)),
+        "box": Shape(
+            (box((-0.11, -0.07, 0), (0.11, 0.07, 0.12)),), ("box", (0.11, 0.07, 0.06)), 200, (0.6, 1.0), (1.2, 2.2)
+        ),
         "book": blocks([*covers, *pages], 600, table=(0.8, 1.3), floor=(1.2, 1.5)),
         "can": solid([(0, 0), (0.033, 0), (0.033, 0.115), (0, 0.115)], ((0, 1),), density=700, table=(0.9, 1.3)),
         "cylinder": solid(
