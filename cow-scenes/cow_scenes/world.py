@@ -1,6 +1,7 @@
 """A world before and after it is run. These records hold no picture and no engine."""
 
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -92,7 +93,7 @@ class World:
         """The object of that name."""
         return next(t for t in self.things if t.name == name)
 
-    def turned(self, degrees: float, factor: float) -> "World":
+    def turned(self, degrees: float, factor: float) -> Self:
         """The same world with the mover's velocity turned about z and scaled: a slightly other push."""
         a = np.radians(degrees)
         x, y, z = self.velocity

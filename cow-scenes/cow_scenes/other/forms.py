@@ -1,20 +1,16 @@
 """The second family's questions: worlds on a table top or on a floor, in real sizes and speeds."""
 
-from dataclasses import dataclass, field
-from typing import Any
-
 import numpy as np
 
-from ..forms.base import Draft, Form, Palette, arrow_words, choose_along, hits_target, off_target, pick, push, unit
+from ..forms.base import Draft, Form, arrow_words, choose_along, hits_target, off_target, push, unit
 from ..forms.billiards import judge as judge_billiards
 from ..forms.occlude import judge as judge_occlude
 from ..forms.put import judge_fall
 from ..world import Run
-from .physics import Fixture, Matter, OtherWorld
+from .physics import Fixture, Matter
 from .shapes import Solid, shapes
+from .stage import Random, Stage, Vector, open_stage
 
-Random = np.random.Generator
-Vector = tuple[float, float, float]
 ROUND = ("ball", "ball", "ball", "orange", "apple")
 FLAT = ("cube", "box", "book", "chair", "cylinder")
 """What can be landed on."""
@@ -22,80 +18,6 @@ VESSELS = ("mug", "pot", "basket", "bowl")
 RATIOS = ((0.80, 0.96), (1.04, 1.20))
 """Width of what is put over the vessel's opening, for Yes and for No."""
 GRAVITY = 9.81
-
-
-@dataclass
-class Stage:
-    """A scene while it is drawn: `reach` is its size in metres, `blocked` what stands about besides `things`."""
-
-    random: Random
-    reach: float
-    palette: Palette
-    matter: Matter
-    things: list[Solid] = field(default_factory=list)
-    fixtures: list[Fixture] = field(default_factory=list)
-    blocked: list[tuple[np.ndarray, float]] = field(default_factory=list)
-
-    @property
-    def nouns(self) -> tuple[str, ...]:
-        """What occurs in a scene of this size."""
-        return tuple(n for n in shapes() if self.sizes(n)[1] > 0)
-
-    def sizes(self, noun: str) -> tuple[float, float]:
-        """Least and largest scale of a kind of object."""
-        return shapes()[noun].table if self.reach < 1 else shapes()[noun].floor
-
-    def number(self, low: float, high: float) -> float:
-        """A number between two."""
-        return float(self.random.uniform(low, high))
-
-    def add(self, noun: str, at: np.ndarray, lift: float = 0.0, scale: float = 0.0) -> Solid:
-        """Stand an object at (x, y), or `lift` metres above the floor; with a scale of its own if none is given."""
-        scale = scale or self.number(*self.sizes(noun))
-        known = [c for c in shapes()[noun].colours if c in self.palette.left]
-        if shapes()[noun].colours and not known:
-            noun, scale = "cube", self.number(*self.sizes("cube"))
-        colour = pick(self.random, tuple(known)) if known else self.palette.next()
-        if known:
-            self.palette.left.remove(colour)
-        height = shapes()[noun].height * scale / 2 + lift
-        made = Solid(noun, colour, (float(at[0]), float(at[1]), height), self.number(0, 2 * np.pi), scale)
-        self.things.append(made)
-        return made
-
-    def choose(self, nouns: tuple[str, ...]) -> str:
-        """One of the nouns that occurs here."""
-        return pick(self.random, tuple(n for n in nouns if n in self.nouns) or ("ball",))
-
-    def spot(self, share: float) -> np.ndarray:
-        """A place (2,) about the middle."""
-        return unit(self.number(0, 2 * np.pi)) * share * self.reach * np.sqrt(self.number(0, 1))
-
-    def add_others(self, level: str) -> None:
-        """Level L2: 2 to 4 more objects that stand about."""
-        taken = [(np.array(t.centre[:2]), t.radius) for t in self.things] + self.blocked
-        for _ in range(int(self.random.integers(2, 5)) if level == "L2" else 0):
-            noun, at = self.choose(self.nouns), self.spot(1.1)
-            size = shapes()[noun].radius * self.sizes(noun)[1]
-            if all(np.hypot(*(at - other)) > size + radius + 0.06 * self.reach for other, radius in taken):
-                taken.append((at, self.add(noun, at).radius))
-
-    def draft(
-        self, form: str, motion: str, question: str, target: Solid, velocity: Vector = (0.0, 0.0, 0.0), **more: Any
-    ) -> Draft:
-        """The question about this scene; the first object is the mover. `spin` and the like are the world's."""
-        ours = {name: more.pop(name) for name in ("spin", "removed", "carry_to") if name in more}
-        world = OtherWorld(
-            tuple(self.things), self.things[0].name, velocity, fixtures=tuple(self.fixtures), matter=self.matter, **ours
-        )
-        return Draft(form, motion, world, target.name, question, clear_gap=0.08 * self.reach, **more)
-
-
-def open_stage(random: Random) -> Stage:
-    """A table top or a floor, its friction and its restitution."""
-    reach = random.uniform(0.4, 0.6) if random.uniform() < 0.6 else random.uniform(1.1, 1.6)
-    matter = Matter(float(random.uniform(0.25, 1.0)), float(random.uniform(0.1, 0.75)))
-    return Stage(random, float(reach), Palette(random), matter)
 
 
 def rolling(thing: Solid, velocity: Vector) -> Vector:

@@ -198,9 +198,9 @@ def look_of(
 ) -> Look:
     """The surroundings of a scene about the origin, `reach` metres wide to each side.
 
-    The camera looks towards `yaw` and `pitch` degrees down. `extent` are points (n, 2) on the floor that things pass: walls and clutter are beyond them. `avoid` are nouns that
-    a photographed backdrop may not show.
-    """  # fmt: skip
+    The camera looks towards `yaw` and `pitch` degrees down. `extent` are points (n, 2) on the floor that things pass:
+    walls and clutter are beyond them. `avoid` are nouns that a photographed backdrop may not show.
+    """
     kind = str(pick(random, SURROUNDINGS if pitch < MOST_PITCH else ("room", "outdoors")))
     floors = {"room": ("wood", "tiles", "carpet", "stone"), "table top": ("wood", "cloth", "stone"),
               "outdoors": ("grass", "gravel", "brick", "stone", "tiles")}[kind]  # fmt: skip

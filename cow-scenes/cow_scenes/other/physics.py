@@ -108,8 +108,8 @@ def numbers(values: object) -> str:
 def solid_xml(thing: Solid, k: int) -> tuple[str, str]:
     """Meshes and body of an object: the pieces that touch others."""
     shape, scale = shapes()[thing.shape], thing.scale
-    if isinstance(shape.pieces[0], str):
-        kind, size = shape.pieces
+    if shape.primitive:
+        kind, size = shape.primitive
         meshes, geoms = "", f'<geom type="{kind}" size="{numbers(np.array(size) * scale)}" density="{shape.density}"/>'
     else:
         lowered = [(piece - (0, 0, shape.height / 2)) * scale for piece in shape.pieces]

@@ -21,18 +21,19 @@ Primitive = tuple[str, tuple[float, ...]]
 class Shape:
     """One kind of object at scale 1, in metres, standing on z = 0.
 
-    `pieces` are a primitive, or the corners (n, 3) of each convex piece. `density` (kg/m3) fills the pieces. `table`
+    `pieces` are the corners (n, 3) of each convex piece; a `primitive` has none. `density` (kg/m3) fills them. `table`
     and `floor` are the least and largest scale in scenes on a table top and on a floor; (0, 0) where it does not occur.
     Without `colours` it may have any. `opening` is the inner width of a container.
     """
 
     parts: tuple[Part, ...]
-    pieces: Primitive | tuple[np.ndarray, ...]
+    pieces: tuple[np.ndarray, ...]
     density: float
     table: Sizes = (0.0, 0.0)
     floor: Sizes = (0.0, 0.0)
     colours: tuple[str, ...] = ()
     opening: float = 0.0
+    primitive: Primitive | None = None
 
     @property
     def height(self) -> float:
@@ -119,6 +120,16 @@ PEAR: Profile = [
 BOTTLE: Profile = [(0, 0), (0.036, 0), (0.036, 0.15), (0.014, 0.20), (0.014, 0.235), (0, 0.235)]
 
 
+def globe(radius: float, density: float, **more: Any) -> Shape:
+    """A ball."""
+    return Shape((moved(sphere(radius), 0, 0, radius),), (), density, primitive=("sphere", (radius,)), **more)
+
+
+def block(x: float, y: float, z: float, density: float, **more: Any) -> Shape:
+    """A box by its half sides."""
+    return Shape((box((-x, -y, 0), (x, y, 2 * z)),), (), density, primitive=("box", (x, y, z)), **more)
+
+
 def blocks(corners: Sequence[tuple], density: float, **more: Any) -> Shape:
     """An object of boxes: (low corner, high corner, material) each, which are drawn and are its pieces."""
     parts = tuple(box(*corner) for corner in corners)
@@ -148,11 +159,9 @@ def shapes() -> dict[str, Shape]:
     grips = tuple((arch((0.155, 0.16), (0.045, 0.025), -90, 90) * (s, 1, 1), 0.009) for s in (1, -1))
     stick = np.linspace((0.115, 0, 0.035), (0.30, 0, 0.038), 4)
     return {
-        "ball": Shape((moved(sphere(0.08), 0, 0, 0.08),), ("sphere", (0.08,)), 250, (0.44, 1.0), (1.0, 1.5)),
-        "cube": Shape((box((-0.05, -0.05, 0), (0.05, 0.05, 0.1)),), ("box", (0.05,) * 3), 400, (0.6, 1.3), (1.5, 3.0)),
-        "box": Shape(
-            (box((-0.11, -0.07, 0), (0.11, 0.07, 0.12)),), ("box", (0.11, 0.07, 0.06)), 200, (0.6, 1.0), (1.2, 2.2)
-        ),
+        "ball": globe(0.08, 250, table=(0.44, 1.0), floor=(1.0, 1.5)),
+        "cube": block(0.05, 0.05, 0.05, 400, table=(0.6, 1.3), floor=(1.5, 3.0)),
+        "box": block(0.11, 0.07, 0.06, 200, table=(0.6, 1.0), floor=(1.2, 2.2)),
         "book": blocks([*covers, *pages], 600, table=(0.8, 1.3), floor=(1.2, 1.5)),
         "can": solid([(0, 0), (0.033, 0), (0.033, 0.115), (0, 0.115)], ((0, 1),), density=700, table=(0.9, 1.3)),
         "cylinder": solid(
@@ -161,9 +170,7 @@ def shapes() -> dict[str, Shape]:
         "bottle": solid(BOTTLE, ((0, 0.15), (0.15, 0.2), (0.2, 0.24)), density=600, table=(0.8, 1.2), floor=(1.2, 1.4)),
         "apple": solid(APPLE, ((0, 0.042), (0.042, 1)), 1, density=800, table=(0.9, 1.2), colours=("red", "green")),
         "pear": solid(PEAR, ((0, 0.054), (0.054, 1)), 1, density=800, table=(0.9, 1.2), colours=("green", "yellow")),
-        "orange": Shape(
-            (moved(sphere(0.038), 0, 0, 0.038),), ("sphere", (0.038,)), 800, (0.9, 1.3), colours=("orange",)
-        ),
+        "orange": globe(0.038, 800, table=(0.9, 1.3), colours=("orange",)),
         "banana": banana(),
         "mug": vessel(0.040, 0.042, 0.095, 0.004, ((arch((0.040, 0.05), (0.032, 0.030), -90, 90), 0.006),),
                       density=1800, table=(0.9, 1.3)),
