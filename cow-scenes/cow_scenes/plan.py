@@ -58,8 +58,11 @@ class ItemKey:
 
     @property
     def forms(self) -> tuple[str, ...]:
-        """The forms of this task and level."""
-        return FORMS[self.task, self.level] if self.family == "first" else OTHER_FORMS[self.task]
+        """The forms of this task and level; the second family's L2 begins with other ones than its L1."""
+        if self.family == "first":
+            return FORMS[self.task, self.level]
+        forms = OTHER_FORMS[self.task]
+        return forms if self.level == "L1" else (*forms[len(forms) // 2 :], *forms[: len(forms) // 2])
 
     @property
     def form(self) -> str:
@@ -72,7 +75,7 @@ class ItemKey:
         turn, place = divmod(self.number, len(self.forms))
         if self.form == "first":
             return (turn * self.forms.count("first") + self.forms[:place].count("first")) % 3
-        return (turn + place) % 2
+        return (turn + place + (self.family == "other" and self.level == "L2")) % 2
 
     def random(self, stream: str) -> np.random.Generator:
         """A generator of this item's own; another `stream` gives independent numbers."""

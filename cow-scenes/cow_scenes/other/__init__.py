@@ -2,8 +2,12 @@
 
 import ctypes.util
 import importlib.util
+import os
 
 from ..errors import UsageError
+
+# MuJoCo reads this when it is imported. OSMesa draws without a graphics card, the same everywhere.
+os.environ["MUJOCO_GL"] = "osmesa"
 
 
 def require_libraries() -> None:

@@ -1,10 +1,5 @@
 """Draws an item of the second family with MuJoCo: its pictures, its ids and its depth."""
 
-import os
-
-# MuJoCo reads this when it is imported. OSMesa draws without a graphics card, the same everywhere.
-os.environ["MUJOCO_GL"] = "osmesa"
-
 import mujoco
 import numpy as np
 from PIL import Image
