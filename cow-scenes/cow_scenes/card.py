@@ -25,7 +25,7 @@ Licence of pictures and records: Apache-2.0. `manifest.json` has versions, argum
 
 MAKERS = {
     "first": "Bullet computed the motion, Blender's Cycles drew it",
-    "other": "MuJoCo computed the motion and drew it",
+    "other": "MuJoCo computed the motion and drew it, before photographs that are CC0 or in the public domain",
 }
 
 

@@ -43,7 +43,7 @@ class Fixture:
 
 @dataclass(frozen=True)
 class Matter:
-    """Friction and restitution of every touch; `sliding` is the mover's friction, None where it has no other."""
+    """Friction and nominal restitution of every touch; `sliding` is the mover's friction if it has one of its own."""
 
     friction: float
     restitution: float
@@ -142,7 +142,7 @@ def set_matter(model: mujoco.MjModel, world: OtherWorld) -> None:
     """Friction and restitution of a world; what is removed touches nothing.
 
     A contact is a spring with a damper, whose ratio follows from the restitution (MuJoCo's documentation, chapter
-    Modeling, Restitution).
+    Modeling, Restitution). That formula is for a contact that also pulls; MuJoCo's do not, and bounces are higher.
     """
     logarithm = np.log(world.matter.restitution)
     damping = -logarithm / np.hypot(np.pi, logarithm)
