@@ -7,32 +7,16 @@ from ..forms.billiards import judge as judge_billiards
 from ..forms.occlude import judge as judge_occlude
 from ..forms.put import judge_fall
 from ..world import Run
-from .physics import Fixture, Matter
+from .physics import Fixture
 from .shapes import Solid, shapes
-from .stage import Random, Stage, Vector, open_stage
+from .stage import ROUND, Random, Stage, open_stage, rolling
 
-ROUND = ("ball", "ball", "ball", "orange", "apple")
 FLAT = ("cube", "box", "book", "chair", "cylinder")
 """What can be landed on."""
 VESSELS = ("mug", "pot", "basket", "bowl")
 RATIOS = ((0.80, 0.96), (1.04, 1.20))
 """Width of what is put over the vessel's opening, for Yes and for No."""
 GRAVITY = 9.81
-
-
-def rolling(thing: Solid, velocity: Vector) -> Vector:
-    """The spin of a ball that rolls; other objects slide."""
-    if thing.shape not in ROUND:
-        return (0.0, 0.0, 0.0)
-    return (-velocity[1] / (thing.height / 2), velocity[0] / (thing.height / 2), 0.0)
-
-
-def launch(stage: Stage, mover: Solid, heading: float, way: float) -> dict:
-    """Velocity and spin that take the mover over `way` metres in 0.5 to 1.2 s; what slides has little friction."""
-    if mover.shape not in ROUND:
-        stage.matter = Matter(stage.matter.friction, stage.matter.restitution, stage.number(0.0, 0.03))
-    velocity = push(heading, max(0.3, way / stage.number(0.5, 1.2)))
-    return {"velocity": velocity, "spin": rolling(mover, velocity)}
 
 
 def pair(stage: Stage, want: int) -> tuple[Solid, Solid, float, float]:
@@ -52,7 +36,7 @@ def draw_slide(random: Random, level: str, want: int) -> Draft:
     stage.add_others(level)
     question = f"If the {mover.name} moves {arrow_words(along)}, will it hit the {target.name}?"
     return stage.draft(
-        "slide", "linear", question, target, **launch(stage, mover, heading, away), arrow=True, along=along
+        "slide", "linear", question, target, **stage.launch(mover, heading, away), arrow=True, along=along
     )
 
 
@@ -69,7 +53,7 @@ def draw_towards(random: Random, level: str, want: int) -> Draft:
     target = third if between == (want == 0) else goal
     stage.add_others(level)
     question = f"If the {mover.name} moves towards the {goal.name}, will it hit the {target.name}?"
-    return stage.draft("towards", "linear", question, target, **launch(stage, mover, heading, away))
+    return stage.draft("towards", "linear", question, target, **stage.launch(mover, heading, away))
 
 
 def judge_towards(draft: Draft, run: Run) -> int | None:
@@ -90,7 +74,7 @@ def draw_remove(random: Random, level: str, want: int) -> Draft:
     stage.add_others(level)
     words = f"If the {barrier.name} is removed and the {mover.name} moves {arrow_words(along)}"
     return stage.draft(
-        "remove", "linear", f"{words}, will it hit the {target.name}?", target, **launch(stage, mover, heading, away),
+        "remove", "linear", f"{words}, will it hit the {target.name}?", target, **stage.launch(mover, heading, away),
         arrow=True, along=along, removed=barrier.name,
     )  # fmt: skip
 
@@ -127,7 +111,7 @@ def draw_billiards(random: Random, level: str, want: int) -> Draft:
     )
     stage.add_others(level)
     question = f"If the {mover.name} moves {arrow_words(along)}, will the {via.name} hit the {target.name}?"
-    more = launch(stage, mover, heading, stage.reach * 0.9)
+    more = stage.launch(mover, heading, stage.reach * 0.9)
     return stage.draft("billiards", "linear", question, target, **more, arrow=True, along=along, via=via.name)
 
 
@@ -173,7 +157,7 @@ def draw_step(random: Random, level: str, want: int) -> Draft:
     verb = "rolls" if noun in ROUND else "slides"
     question = f"If the {mover.name} {verb} {arrow_words(along)}, will it hit the {target.name}?"
     return stage.draft(
-        "step", "linear", question, target, **launch(stage, mover, heading, stage.reach), arrow=True, along=along
+        "step", "linear", question, target, **stage.launch(mover, heading, stage.reach), arrow=True, along=along
     )
 
 
@@ -239,7 +223,7 @@ def draw_occlude(random: Random, level: str, want: int) -> Draft:
     mover, target = stage.add(stage.choose(stage.nouns), start), stage.add(stage.choose(stage.nouns), at)
     stage.add_others(level)
     question = f"If the {mover.name} moves {arrow_words(along)}, will the {target.name} be occluded at some moment?"
-    more = launch(stage, mover, float(heading), stage.reach)
+    more = stage.launch(mover, float(heading), stage.reach)
     return stage.draft("slide-occlude", "linear", question, target, **more, arrow=True, along=along, view_yaw=view)
 
 

@@ -5,12 +5,21 @@ from typing import Any
 
 import numpy as np
 
-from ..forms.base import Draft, Palette, pick, unit
+from ..forms.base import Draft, Palette, pick, push, unit
 from .physics import Fixture, Matter, OtherWorld
 from .shapes import Solid, shapes
 
 Random = np.random.Generator
 Vector = tuple[float, float, float]
+ROUND = ("ball", "ball", "ball", "orange", "apple")
+"""What rolls; more often a ball."""
+
+
+def rolling(thing: Solid, velocity: Vector) -> Vector:
+    """The spin of what rolls; other objects slide."""
+    if thing.shape not in ROUND:
+        return (0.0, 0.0, 0.0)
+    return (-velocity[1] / (thing.height / 2), velocity[0] / (thing.height / 2), 0.0)
 
 
 @dataclass
@@ -68,6 +77,13 @@ class Stage:
             size = shapes()[noun].radius * self.sizes(noun)[1]
             if all(np.hypot(*(at - other)) > size + radius + 0.06 * self.reach for other, radius in taken):
                 taken.append((at, self.add(noun, at).radius))
+
+    def launch(self, mover: Solid, heading: float, way: float) -> dict:
+        """Velocity and spin that take the mover over `way` metres in 0.5 to 1.2 s; what slides has little friction."""
+        if mover.shape not in ROUND:
+            self.matter = Matter(self.matter.friction, self.matter.restitution, self.number(0.0, 0.03))
+        velocity = push(heading, max(0.3, way / self.number(0.5, 1.2)))
+        return {"velocity": velocity, "spin": rolling(mover, velocity)}
 
     def draft(
         self, form: str, motion: str, question: str, target: Solid, velocity: Vector = (0.0, 0.0, 0.0), **more: Any
