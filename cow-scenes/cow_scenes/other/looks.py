@@ -187,15 +187,32 @@ def clutter(random: np.random.Generator, reach: float, far: float, yaw: float) -
     return made
 
 
+def wall(reach: float, turn: float, away: float) -> str:
+    """A wall that faces the middle from `away` metres."""
+    x, y = np.cos(turn), np.sin(turn)
+    # What is not quite opaque casts no shadow, which would cover the wall itself with a moire pattern.
+    return (
+        f'<geom type="plane" size="{8 * reach:.3f} {4 * reach:.3f} 1" material="wall" rgba="1 1 1 0.999" '
+        f'pos="{x * away:.3f} {y * away:.3f} {4 * reach:.3f}" xyaxes="{y:.6f} {-x:.6f} 0 0 0 1"/>'
+    )
+
+
+def materials(repeat: float, shine: float) -> str:
+    """Textures and materials: those of floor and wall repeat per metre, the floor mirrors as it shines."""
+    return (
+        '<texture name="floor" type="2d" file="floor.png"/><texture name="wall" type="2d" file="wall.png"/>'
+        '<texture name="grain" type="cube" file="grain.png"/><texture name="weave" type="cube" file="weave.png"/>'
+        f'<material name="floor" texture="floor" texuniform="true" texrepeat="{repeat:.3f} {repeat:.3f}" '
+        f'reflectance="{shine:.3f}" specular="{shine:.3f}" shininess="0.5"/>'
+        f'<material name="wall" texture="wall" texuniform="true" texrepeat="{repeat:.3f} {repeat:.3f}" specular="0"/>'
+        '<material name="plain" texture="grain" specular="0.1"/>'
+    )
+
+
 def look_of(
-    random: np.random.Generator,
-    reach: float,
-    extent: np.ndarray,
-    yaw: float,
-    size: tuple[int, int],
-    pitch: float,
+    random: np.random.Generator, reach: float, extent: np.ndarray, yaw: float, size: tuple[int, int], pitch: float,
     avoid: frozenset[str],
-) -> Look:
+) -> Look:  # fmt: skip
     """The surroundings of a scene about the origin, `reach` metres wide to each side.
 
     The camera looks towards `yaw` and `pitch` degrees down. `extent` are points (n, 2) on the floor that things pass:
@@ -221,21 +238,8 @@ def look_of(
     if kind != "table top":
         bodies += clutter(random, reach, far, yaw)
     if kind == "room":
-        # What is not quite opaque casts no shadow, which would cover the wall itself with a moire pattern.
-        for turn, away in ((yaw, far + random.uniform(0.9, 2.0) * reach), (yaw + np.pi / 2, far + 2.5 * reach)):
-            x, y = np.cos(turn), np.sin(turn)
-            bodies += (
-                f'<geom type="plane" size="{8 * reach:.3f} {4 * reach:.3f} 1" material="wall" rgba="1 1 1 0.999" '
-                f'pos="{x * away:.3f} {y * away:.3f} {4 * reach:.3f}" xyaxes="{y:.6f} {-x:.6f} 0 0 0 1"/>'
-            )
-    assets = (
-        '<texture name="floor" type="2d" file="floor.png"/><texture name="wall" type="2d" file="wall.png"/>'
-        '<texture name="grain" type="cube" file="grain.png"/><texture name="weave" type="cube" file="weave.png"/>'
-        f'<material name="floor" texture="floor" texuniform="true" texrepeat="{repeat:.3f} {repeat:.3f}" '
-        f'reflectance="{shine:.3f}" specular="{shine:.3f}" shininess="0.5"/>'
-        f'<material name="wall" texture="wall" texuniform="true" texrepeat="{repeat:.3f} {repeat:.3f}" specular="0"/>'
-        '<material name="plain" texture="grain" specular="0.1"/>'
-    )
+        bodies += wall(reach, yaw, far + random.uniform(0.9, 2.0) * reach)
+        bodies += wall(reach, yaw + np.pi / 2, far + 2.5 * reach)
     photographed = kind != "room" and random.uniform() < 0.6
     backdrop = photographed_backdrop(random, *size, avoid) if photographed else drawn_backdrop(random, *size)
-    return Look(assets, bodies, visual, files, backdrop)
+    return Look(materials(repeat, shine), bodies, visual, files, backdrop)
