@@ -6,8 +6,7 @@ import numpy as np
 
 from .camera import Camera, draw_camera
 from .errors import NoWorldError
-from .forms import FORM_OF, Draft
-from .meshes import surface_of
+from .forms import FORM_OF, Draft, Form
 from .physics import simulate
 from .plan import ItemKey
 from .raster import depth_of, depths, hidden_share, id_picture, placed
@@ -116,7 +115,7 @@ def largest_hidden(draft: Draft, run: Run, camera: Camera) -> float:
 
     def depth(thing: Thing, sample: int) -> np.ndarray:
         vertices = placed(thing, run.centres[thing.name][sample], run.turns[thing.name][sample])
-        return depth_of(small, vertices, surface_of(thing.shape)[1])
+        return depth_of(small, vertices, thing.surface[1])
 
     own = depth(target, 0)
     columns = np.flatnonzero(np.isfinite(own).any(0))
@@ -130,9 +129,9 @@ def largest_hidden(draft: Draft, run: Run, camera: Camera) -> float:
     return worst
 
 
-def answer_of(draft: Draft, run: Run, camera: Camera) -> tuple[int | None, float | None]:
+def answer_of(draft: Draft, run: Run, camera: Camera, form: Form) -> tuple[int | None, float | None]:
     """The option's index, None if unclear; and the hidden share if that is what is asked."""
-    answer = FORM_OF[draft.form].judge(draft, run)
+    answer = form.judge(draft, run)
     if answer != -1:
         return answer, None
     share = largest_hidden(draft, run, camera)
@@ -198,7 +197,7 @@ def find_world(key: ItemKey, width: int, height: int) -> Accepted:
         run = simulate(draft.world)
         if not before_camera(draft, run, camera):
             continue
-        answer, hidden = answer_of(draft, run, camera)
+        answer, hidden = answer_of(draft, run, camera, FORM_OF[key.form])
         if answer != key.want or not holds(draft, key.want):
             continue
         factual = factual_run(draft)

@@ -29,10 +29,10 @@ class Arrow:
     along: bool
 
 
-def draw_style(random: np.random.Generator, along: bool) -> Arrow:
-    """A style of its own per item; half of all arrows are red as most are elsewhere."""
-    names = list(COLOURS)
-    colour = "red" if random.uniform() < 0.4 else names[int(random.integers(len(names)))]
+def draw_style(random: np.random.Generator, along: bool, avoid: str = "") -> Arrow:
+    """A style of its own per item, not in the colour `avoid`; half of all arrows are red as most are elsewhere."""
+    names = [name for name in COLOURS if name != avoid]
+    colour = "red" if random.uniform() < 0.4 and avoid != "red" else names[int(random.integers(len(names)))]
     style = STYLES[int(random.integers(len(STYLES)))]
     thickness = (3, 5, 8)[int(random.integers(3))]
     gap = 0.0 if random.uniform() < 0.5 else 0.8

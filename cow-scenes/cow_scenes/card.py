@@ -9,7 +9,7 @@ from .settings import Settings
 
 TEXT = """# What-if questions with known truth
 
-{count} items made with seed {seed}: Bullet computed the motion, Blender's Cycles drew it. Columns as in the public
+{count} items made with seed {seed}: {makers}. Columns as in the public
 CausalSpatial data: `id`, `question`, `answer`, `image`, `not_sure`. The configuration `physics` holds the task that the
 paper calls Trajectory. `truth/<configuration>/<id>/` holds what is known of each item: the picture without arrow or
 trail (`clean.jpg`), the same without the mover and its shadow (`background.jpg`), object ids (`ids.png`), depth
@@ -23,6 +23,12 @@ Licence of pictures and records: Apache-2.0. `manifest.json` has versions, argum
 """
 
 
+MAKERS = {
+    "first": "Bullet computed the motion, Blender's Cycles drew it",
+    "other": "MuJoCo computed the motion and drew it, before photographs that are CC0 or in the public domain",
+}
+
+
 def card_of(settings: Settings) -> str:
     """The card with the configurations' front matter."""
     plan = settings.plan()
@@ -32,7 +38,9 @@ def card_of(settings: Settings) -> str:
         lines += [f"- config_name: {subset}", "  data_files:", "  - split: test", f"    path: {subset}/test-*"]
     counts = {s: [sum(k.subset == s and k.level == lv for k in plan) for lv in LEVELS] for s in subsets}
     table = "\n".join(f"| {s} | {counts[s][0]} | {counts[s][1]} |" for s in subsets)
-    return "\n".join([*lines, "---", ""]) + TEXT.format(count=len(plan), seed=settings.seed, table=table)
+    return "\n".join([*lines, "---", ""]) + TEXT.format(
+        count=len(plan), seed=settings.seed, makers=MAKERS[settings.family], table=table
+    )
 
 
 def set_files(out: Path) -> list[Path]:

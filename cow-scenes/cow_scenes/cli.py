@@ -13,7 +13,7 @@ from .check import check_set
 from .errors import CheckError, ScenesError, UsageError
 from .make import make_set, missing
 from .pack import pack_set
-from .plan import LEVELS, TASKS
+from .plan import FAMILIES, LEVELS, TASKS
 from .pool import Failed
 from .settings import Settings
 
@@ -44,9 +44,10 @@ def make(
     out: Annotated[Path, typer.Option(help="Folder of the set; run again to go on with it.")],
     count: Annotated[int, typer.Option(help="Items in all, spread over tasks and levels.")] = DEFAULT.count,
     seed: Annotated[int, typer.Option(help="Same seed and arguments, same bytes.")] = DEFAULT.seed,
+    family: Annotated[str, typer.Option(help=f"{' or '.join(FAMILIES)}: Bullet and Blender, or MuJoCo.")] = "first",
     task: Annotated[list[str] | None, typer.Option(help=f"{', '.join(TASKS)} or all.")] = None,
     level: Annotated[list[str] | None, typer.Option(help="L1 or L2; both if not given.")] = None,
-    width: Annotated[int, typer.Option(help="Pixels.")] = DEFAULT.width,
+    width: Annotated[int, typer.Option(help="Pixels; of `other` a scale of its sizes, 832 is 1.")] = DEFAULT.width,
     height: Annotated[int, typer.Option(help="Pixels.")] = DEFAULT.height,
     samples: Annotated[int, typer.Option(help="Cycles samples per pixel.")] = DEFAULT.samples,
     quality: Annotated[int, typer.Option(help="JPEG quality.")] = DEFAULT.quality,
@@ -55,7 +56,7 @@ def make(
 ) -> None:
     """Make a set of items, or go on with one that was cut off."""
     tasks, levels = chosen(task or [], TASKS, "--task"), chosen(level or [], LEVELS, "--level")
-    settings = Settings(seed, count, tasks, levels, width, height, samples, quality, shard_rows)
+    settings = Settings(seed, count, tasks, levels, width, height, samples, quality, shard_rows, family)
     events = make_set(out, settings, processes)
     total = len(settings.plan())
     columns = (TextColumn("items"), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn())

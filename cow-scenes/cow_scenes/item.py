@@ -21,8 +21,9 @@ def question_picture(item: Accepted, clean: Image.Image, trail: Image.Image | No
     """The picture that is asked about, and the item's record."""
     if not item.draft.arrow:
         return trail or clean, meta_of(item, None)
-    arrow = draw_style(item.key.random("arrow"), item.draft.along)
     mover = item.draft.world.thing(item.draft.world.mover)
+    avoid = mover.colour if item.key.family == "other" else ""
+    arrow = draw_style(item.key.random("arrow"), item.draft.along, avoid)
     left, top, right, bottom = box_of(item.camera, mover, *still(mover))
     point = item.camera.project(np.array(mover.centre))
     ends = ends_of(arrow, point, direction_of(item), float(min(right - left, bottom - top)) / 2, clean.width)
@@ -40,9 +41,16 @@ def write_item(folder: Path, item: Accepted, settings: Settings, threads: int) -
     picture, meta = question_picture(item, clean, trail)
     pictures = {"image": picture, "clean": clean, "background": studio.render_background()}
     pictures |= {f"future_{n}": studio.render(n) for n in FUTURE}
+    write_files(folder, pictures, maps_of(item), meta, settings.quality)
+
+
+def write_files(
+    folder: Path, pictures: dict[str, Image.Image], maps: tuple[np.ndarray, np.ndarray], meta: dict, quality: int
+) -> None:
+    """Write an item's pictures, its ids and depth (metres), and its record."""
     for name, drawn in pictures.items():
-        drawn.save(folder / f"{name}.jpg", quality=settings.quality, optimize=True)
-    ids, depth = maps_of(item)
+        drawn.save(folder / f"{name}.jpg", quality=quality, optimize=True)
+    ids, depth = maps
     Image.fromarray(ids).save(folder / "ids.png", optimize=True)
     depth_picture(depth).save(folder / "depth.png", optimize=True)
     (folder / "meta.json").write_text(json.dumps(meta, separators=(",", ":")) + "\n")
@@ -56,7 +64,12 @@ def make_item(out: Path, key: ItemKey, settings: Settings, threads: int) -> None
     making = folder.parent / f"{TEMPORARY}{key.id}-{os.getpid()}"
     shutil.rmtree(making, ignore_errors=True)
     making.mkdir(parents=True)
-    write_item(making, find_world(key, settings.width, settings.height), settings, threads)
+    if key.family == "other":
+        from .other.item import write_other  # noqa: PLC0415
+
+        write_other(making, key, settings)
+    else:
+        write_item(making, find_world(key, settings.width, settings.height), settings, threads)
     try:
         making.rename(folder)
     except OSError:

@@ -50,6 +50,11 @@ def make_set(out: Path, settings: Settings, processes: int) -> Iterator[Made | F
     """
     if processes < 1:
         raise UsageError(f"--processes is {processes}; give 1 or more")
+    if settings.family == "other":
+        # Its libraries are an extra, and a missing one would fail every item.
+        from .other import require_libraries  # noqa: PLC0415
+
+        require_libraries()
     open_folder(out, settings)
     return make_missing(out, settings, processes)
 

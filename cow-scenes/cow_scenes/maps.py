@@ -14,7 +14,7 @@ DEPTH_SCALE = 0.00025
 def id_numbers(item: Accepted) -> dict[str, int]:
     """Values in `ids.png` by name: the objects in their order, then the table."""
     world = item.draft.world
-    names = [t.name for t in world.things] + (["table"] if world.table else [])
+    names = [*(t.name for t in world.things), *world.fixed]
     return {name: i + 1 for i, name in enumerate(names)}
 
 

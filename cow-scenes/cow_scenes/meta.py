@@ -5,7 +5,6 @@ import numpy as np
 from .accept import Accepted, still, trail_of
 from .arrows import Arrow
 from .camera import Camera
-from .catalogue import BOWL_OPENING
 from .maps import DEPTH_SCALE, id_numbers
 from .plan import ItemKey
 from .raster import placed
@@ -60,10 +59,11 @@ def direction_of(item: Accepted) -> np.ndarray:
 def hits_of(item: Accepted, run: Run) -> dict[str, int]:
     """First sample at which the mover touches each object."""
     mover, hits = item.draft.world.mover, {}
+    names = {t.name for t in item.draft.world.things}
     for contact in run.contacts:
         if mover in {contact.a, contact.b}:
             other = contact.b if contact.a == mover else contact.a
-            if other not in {"floor", "table"}:
+            if other in names:
                 hits.setdefault(other, contact.sample)
     return hits
 
@@ -90,7 +90,7 @@ def fit_of(item: Accepted) -> dict | None:
         return None
     mover, bowl = item.draft.world.thing(item.draft.world.mover), item.draft.world.thing(item.draft.target)
     return {
-        "width": round(mover.height, 4), "opening": round(2 * BOWL_OPENING * bowl.scale, 4),
+        "width": round(mover.width, 4), "opening": round(bowl.opening, 4),
         "rim": round(float(item.run.centres[bowl.name][-1][2]) + bowl.height / 2, 4),
     }  # fmt: skip
 

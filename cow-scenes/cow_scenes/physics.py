@@ -10,10 +10,10 @@ import numpy as np
 import pybullet as bullet
 
 from .pieces import pieces_of
-from .world import FPS, GONE, SAMPLES, SUBSTEPS, Contact, Run, Thing, World
+from .stepping import ContactLog, Touch, carried
+from .world import FPS, GONE, SAMPLES, SUBSTEPS, Run, Thing, World
 
 FRICTION, FLOOR_FRICTION, RESTITUTION, MASS = 0.5, 0.3, 0.5, 1.0
-CARRY_SECONDS, CARRY_HEIGHT = 0.6, 1.0
 GAP_REACH = 2.0
 """Metres within which the closest approach is measured."""
 
@@ -104,53 +104,11 @@ def populate(client: int, world: World) -> dict[int, str]:
     return names
 
 
-class ContactLog:
-    """Collects touches step by step; one that began less than a sample ago is the same touch."""
-
-    def __init__(self, names: dict[int, str]) -> None:
-        self.names = names
-        self.last: dict[tuple[str, str], int] = {}
-        self.open: dict[tuple[str, str], dict] = {}
-        self.found: list[tuple[tuple[str, str], dict]] = []
-
-    def step(self, client: int, step: int) -> None:
-        """Note what touches after `step` steps."""
-        forces: dict[tuple[str, str], list] = {}
-        for point in bullet.getContactPoints(physicsClientId=client):
-            if point[8] <= 0.001:
-                a, b = sorted((self.names[point[1]], self.names[point[2]]))
-                forces.setdefault((a, b), []).append((point[9], point[5]))
-        for pair, points in forces.items():
-            impulse = sum(force for force, _ in points) / (FPS * SUBSTEPS)
-            if step - self.last.get(pair, -1000) > SUBSTEPS:
-                self.open[pair] = {"step": step, "point": np.mean([at for _, at in points], 0), "impulse": 0.0}
-                if step > 1 or not ({"floor", "table"} & set(pair)):
-                    self.found.append((pair, self.open[pair]))
-            record = self.open[pair]
-            if step - record["step"] < SUBSTEPS:
-                record["impulse"] += impulse
-            self.last[pair] = step
-
-    def contacts(self) -> tuple[Contact, ...]:
-        """All touches in the order of time."""
-        return tuple(self.contact(*pair, record) for pair, record in self.found)
-
-    def contact(self, a: str, b: str, record: dict) -> Contact:
-        """One touch as it is told."""
-        x, y, z = (float(c) for c in record["point"])
-        step = record["step"]
-        return Contact(a, b, step / (FPS * SUBSTEPS), (x, y, z), float(record["impulse"]), -(-step // SUBSTEPS))
-
-
-def carried(world: World, time: float) -> list[float] | None:
-    """Where the hand holds the mover at a time; None once it is let go."""
-    if world.carry_to is None or time > CARRY_SECONDS:
-        return None
-    s = time / CARRY_SECONDS
-    s = s * s * (3 - 2 * s)
-    start, end = np.array(world.thing(world.mover).centre), np.array(world.carry_to)
-    x, y, z = start + (end - start) * s
-    return [float(x), float(y), float(z + CARRY_HEIGHT * s * (1 - s))]
+def touches_now(client: int, names: dict[int, str]) -> Iterator[Touch]:
+    """What touches after a step."""
+    for point in bullet.getContactPoints(physicsClientId=client):
+        if point[8] <= 0.001:
+            yield names[point[1]], names[point[2]], point[9], point[5]
 
 
 def gaps_now(client: int, names: dict[int, str], mover: int) -> dict[str, float]:
@@ -171,7 +129,7 @@ def simulate(world: World) -> Run:
         things = [t.name for t in world.things]
         centres = {n: np.tile(np.array(GONE), (SAMPLES, 1)) for n in things}
         turns = {n: np.tile(np.array([0.0, 0, 0, 1]), (SAMPLES, 1)) for n in things}
-        log, gaps = ContactLog(names), dict.fromkeys((n for n in things if n != world.mover), GAP_REACH)
+        log, gaps = ContactLog(FPS * SUBSTEPS), dict.fromkeys((n for n in things if n != world.mover), GAP_REACH)
         for sample in range(SAMPLES):
             for k in range(SUBSTEPS if sample else 0):
                 step = (sample - 1) * SUBSTEPS + k + 1
@@ -181,7 +139,7 @@ def simulate(world: World) -> Run:
                     bullet.resetBasePositionAndOrientation(bodies[world.mover], hand, turn, physicsClientId=client)
                     bullet.resetBaseVelocity(bodies[world.mover], [0] * 3, [0] * 3, physicsClientId=client)
                 bullet.stepSimulation(physicsClientId=client)
-                log.step(client, step)
+                log.step(touches_now(client, names), step)
             for name in things:
                 if name in bodies:
                     at, turn = bullet.getBasePositionAndOrientation(bodies[name], physicsClientId=client)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from .camera import Camera
-from .meshes import box, surface_of
+from .meshes import box
 from .world import Table, Thing
 
 
@@ -19,7 +19,7 @@ def turn_matrix(q: np.ndarray) -> np.ndarray:
 
 def placed(thing: Thing, centre: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Vertices (n, 3) of an object in the world."""
-    return surface_of(thing.shape)[0] * thing.scale @ turn_matrix(turn).T + centre
+    return thing.surface[0] * thing.scale @ turn_matrix(turn).T + centre
 
 
 def depth_of(camera: Camera, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -60,9 +60,7 @@ def depths(
     camera: Camera, things: tuple[Thing, ...], poses: dict[str, tuple[np.ndarray, np.ndarray]], table: Table | None
 ) -> dict[str, np.ndarray]:
     """Depth of each object on its own, by name; the table's is under `table`."""
-    found = {
-        t.name: depth_of(camera, placed(t, *poses[t.name]), surface_of(t.shape)[1]) for t in things if t.name in poses
-    }
+    found = {t.name: depth_of(camera, placed(t, *poses[t.name]), t.surface[1]) for t in things if t.name in poses}
     return found | ({"table": depth_of(camera, *table_mesh(table))} if table else {})
 
 

@@ -1,10 +1,12 @@
 """A world before and after it is run. These records hold no picture and no engine."""
 
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
-from .catalogue import HEIGHT, RADIUS
+from .catalogue import BOWL_OPENING, HEIGHT, RADIUS
+from .meshes import surface_of
 
 FPS = 30
 SAMPLES = 61
@@ -40,6 +42,21 @@ class Thing:
         """Metres."""
         return HEIGHT[self.shape] * self.scale
 
+    @property
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """The drawn mesh at scale 1: vertices (n, 3) about the centre, triangles (m, 3)."""
+        return surface_of(self.shape)
+
+    @property
+    def width(self) -> float:
+        """Metres: the narrowest round opening that it passes."""
+        return self.height
+
+    @property
+    def opening(self) -> float:
+        """Metres: the width of a container's opening."""
+        return 2 * BOWL_OPENING * self.scale
+
 
 @dataclass(frozen=True)
 class Table:
@@ -67,11 +84,16 @@ class World:
     removed: str | None = None
     carry_to: tuple[float, float, float] | None = None
 
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """Names of what is seen, has an id and never moves."""
+        return ("table",) if self.table else ()
+
     def thing(self, name: str) -> Thing:
         """The object of that name."""
         return next(t for t in self.things if t.name == name)
 
-    def turned(self, degrees: float, factor: float) -> "World":
+    def turned(self, degrees: float, factor: float) -> Self:
         """The same world with the mover's velocity turned about z and scaled: a slightly other push."""
         a = np.radians(degrees)
         x, y, z = self.velocity

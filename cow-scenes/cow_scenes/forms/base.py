@@ -21,6 +21,7 @@ class Draft:
     `question` has no options yet; `options` ends with the one that abstains. `arrow` says whether one is drawn,
     `along` whether it points as the mover moves. `trail_times` are seconds before t = 0 at which the mover is
     shown too. `via` is the object between the mover and the target. `view_yaw` (radians) fixes the camera's side.
+    A miss closer than `clear_gap` metres is left out.
     """
 
     form: str
@@ -34,6 +35,7 @@ class Draft:
     trail_times: tuple[float, ...] = ()
     via: str | None = None
     view_yaw: float | None = None
+    clear_gap: float = CLEAR_GAP
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ def hits_target(draft: Draft, run: Run) -> int | None:
     mover, target = draft.world.mover, draft.target
     contact = run.first(mover, target)
     if contact is None:
-        return 1 if run.gaps[target] >= CLEAR_GAP else None
+        return 1 if run.gaps[target] >= draft.clear_gap else None
     things = {t.name for t in draft.world.things}
     earlier = [c for c in run.contacts if c.time <= contact.time and mover in {c.a, c.b} and {c.a, c.b} <= things]
     alone = all({c.a, c.b} == {mover, target} for c in earlier)

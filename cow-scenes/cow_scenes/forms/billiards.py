@@ -4,7 +4,6 @@ import numpy as np
 
 from ..world import Run, World
 from .base import (
-    CLEAR_GAP,
     Draft,
     Form,
     Palette,
@@ -48,8 +47,9 @@ def judge(draft: Draft, run: Run) -> int | None:
         return None
     others = [c for c in run.contacts if not {c.a, c.b} <= {mover, via, target, "floor"}]
     if chain is None:
-        apart = np.linalg.norm(run.centres[via] - run.centres[target], axis=1).min() - 2 * RADIUS
-        return 1 if apart >= CLEAR_GAP else None
+        radii = draft.world.thing(via).radius + draft.world.thing(target).radius
+        apart = np.linalg.norm(run.centres[via] - run.centres[target], axis=1).min() - radii
+        return 1 if apart >= draft.clear_gap else None
     return 0 if chain.time < 1.8 and not any(c.time < chain.time for c in others) else None
 
 

@@ -5,7 +5,6 @@ import numpy as np
 from ..catalogue import SLIDING, STANDING
 from ..world import Run, World
 from .base import (
-    CLEAR_GAP,
     Draft,
     Form,
     Palette,
@@ -46,7 +45,7 @@ def judge(draft: Draft, run: Run) -> int | None:
     """Only whether the motion is free of touches (-1); the answer is read from the silhouettes."""
     mover = draft.world.mover
     touched = any(mover in {c.a, c.b} and "floor" not in {c.a, c.b} for c in run.contacts)
-    return None if touched or run.gaps[draft.target] < CLEAR_GAP else -1
+    return None if touched or run.gaps[draft.target] < draft.clear_gap else -1
 
 
 OCCLUDE = Form(draw, judge)

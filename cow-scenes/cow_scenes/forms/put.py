@@ -4,7 +4,7 @@ import numpy as np
 
 from ..catalogue import BOWL_OPENING, RADIUS
 from ..world import Run, World
-from .base import CLEAR_GAP, Draft, Form, Palette, Random, add_others, pick, spot, stand, unit
+from .base import Draft, Form, Palette, Random, add_others, pick, spot, stand, unit
 
 TOPS = {"cube": 0.15, "cylinder": 0.14}
 """Metres: half the width of what can be landed on; what falls into a mug or bowl does not clearly land on it."""
@@ -35,7 +35,7 @@ def judge_fall(draft: Draft, run: Run) -> int | None:
         return None
     if touched[0] == draft.target:
         return 0
-    return 1 if run.gaps[draft.target] >= CLEAR_GAP else None
+    return 1 if run.gaps[draft.target] >= draft.clear_gap else None
 
 
 def draw_place(random: Random, level: str, want: int) -> Draft:
