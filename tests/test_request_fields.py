@@ -91,6 +91,7 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "trajectory.points": ({}, PATH["points"], [[53, 118], [103, 68], [153, 118]]),
     "trajectory.fps": ({"trajectory": PATH}, 2, 8),
     "trajectory.visible": ({"trajectory": PATH}, [True] * 3, [False] * 3),
+    "trajectory.scale": ({"trajectory": PATH}, [1, 1, 1], [1, 0.5, 0.25]),
     "trajectory.tracks": ({"trajectory": PATH}, None, TWO),
     "trajectory.tracks_visible": ({"trajectory": PATH | {"tracks": TWO}}, None, [[True] * 3, [False] * 3]),
     "trajectory.anchors": ({"trajectory": PATH}, None, [[10, 10]]),
