@@ -14,7 +14,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
 from cow_service.narration import facts_of
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.records import Grounding, Intervention, LocatedObject, Motion, Trajectory
+from cow_service.records import Asked, Grounding, Intervention, LocatedObject, Motion, Trajectory
 from cow_service.stages.grounding import understood
 from cow_service.stages.motion import read_motion
 from cow_service.stages.reconstruction import obstacles_of
@@ -48,13 +48,20 @@ def located(name: str, bbox: tuple[float, float, float, float]) -> LocatedObject
 
 
 def put(
-    image: Image, relation: str, *targets: LocatedObject, mover=SMALL, name: str = "red ball", **request: Any
+    image: Image,
+    relation: str,
+    *targets: LocatedObject,
+    mover=SMALL,
+    name: str = "red ball",
+    asked: Asked | None = None,
+    **request: Any,
 ) -> tuple[Run, Grounding, Motion, Trajectory]:
     """Stages 2 and 3 of a ball that is put somewhere."""
     run = run_of(image, **({"num_frames": FRAMES, "ensemble": 20} | request))
     placed = Intervention(kind="place", object=located(name, mover), relation=relation, targets=targets)
     middle = (mover[0] + mover[2]) / 2, (mover[1] + mover[3]) / 2
     grounding = Grounding(object=name, point=middle, bbox=mover, interventions=(placed,), source="request")
+    grounding = grounding.model_copy(update={"asked": asked})
     grounding = understood(grounding, EmbeddedReader())
     motion = read_motion(run, grounding, None).value
     return run, grounding, motion, compute_trajectory(run, grounding, motion).value
@@ -108,6 +115,16 @@ class TestInto:
         assert told.placement.clearance < 0
         assert told.placement.above_rim is not None
         assert told.placement.above_rim > 0.5
+
+    @pytest.mark.parametrize(("width", "sure"), [(60, True), (116, False), (140, False), (230, True)])
+    def test_what_is_about_as_wide_as_the_opening_is_not_sure(self, width: int, sure: bool) -> None:
+        """Two outlines at two depths do not tell which of two like widths is the larger."""
+        box = (150 - width / 2, 290 - width / 2, 150 + width / 2, 290 + width / 2)
+        asked = Asked(relation="inside", target="blue bowl")
+        told = put(with_bowl(box), "into", located("blue bowl", BOWL), mover=box, asked=asked, ensemble=50)[3]
+        assert told.outcome is not None
+        assert told.outcome.sure == sure
+        assert sure or 0.1 < (told.outcome.probability or 0.0) < 0.85
 
     def test_without_an_ensemble_nothing_is_said_of_probabilities(self) -> None:
         told = put(with_bowl(SMALL), "into", located("blue bowl", BOWL), ensemble=0)[3]

@@ -1,7 +1,8 @@
 """The likeliest world, and the ensemble of worlds around it: what is shown, what is answered, and how sure that is.
 
 The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, or
-`SURE_OF_MISS` where a throw meets nothing, and robust where it has at least `ROBUST` of them.
+`SURE_OF_MISS` where a throw meets nothing, or `SURE_OF_FIT` of what is put into something, and robust where it has at
+least `ROBUST` of them.
 
 Worlds are run in batches, until those that are left are not likely to change that (a sequential test): what nearly all
 of the first batch agree on is settled.
@@ -28,6 +29,7 @@ SURE = 0.7  # share of the worlds from which an answer is given
 # The same of a throw whose heading out of the plane of the image nobody tells, where it meets nothing: a wrong guess of
 # the heading makes worlds miss, and hardly ever hit.
 SURE_OF_MISS = 0.85
+SURE_OF_FIT = 0.85  # the same of whether something fits where it is put: widths are told by two outlines at two depths
 ROBUST = 0.9
 # The chance, at most and at each look, that those which are left would change whether the answer is sure, and whether
 # it is robust, if they were drawn like those that were run.
@@ -49,6 +51,7 @@ class Query:
     subject: int = 0  # who does it
     among: tuple[int, ...] = ()  # the things that are meant; empty: any
     is_decidable: bool = True  # by worlds
+    sure: float = SURE  # share of the worlds from which an answer is given
     sure_of_miss: float = SURE  # share of the worlds from which it is answered that nothing happens
 
 
@@ -168,7 +171,7 @@ def _is_settled(decided: Decided, query: Query | None, count: int, size: int) ->
     share = decided.probability
     if query is not None and query.asked.form in ("whether", "when", "changes"):
         share = max(share, 1 - share)
-    sure = {SURE, SURE if query is None else query.sure_of_miss}
+    sure = {SURE} if query is None else {query.sure, query.sure_of_miss}
     return all(
         _chance_beyond(share * count, count, size, least) < may_change
         for least, may_change in (*((each, MAY_CHANGE) for each in sure), (ROBUST, MAY_CHANGE_ROBUST))
@@ -237,7 +240,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
         shown = 1 - happens if asked.negated else happens
     return Decided(
         probability=shown,
-        sure=probability >= (query.sure_of_miss if answer <= 0 else SURE),
+        sure=probability >= (query.sure_of_miss if answer <= 0 else query.sure),
         robust=probability >= ROBUST,
         depends_on=tuple(depends[:MOST_NAMED]),
         first=answer if asked.form in FIRST_MET and answer >= 0 else None,

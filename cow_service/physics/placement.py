@@ -25,6 +25,7 @@ MOST_CARRIED = 0.5  # of the clip
 SETTLES = 2.0  # s, at least, for which what is released is followed, whatever the clip shows
 DROP = 0.06  # of its half width: from so high it is released
 BESIDE_GAP = 0.5  # of its half width: between it and what it is put beside
+WIDTH_SIGMA, TURNED_SIGMA = 0.08, 0.25  # of the logarithm of a body's width against that of an opening
 AIM_SIGMA = 0.03  # of its half width, along and across: where it is released
 AIM_OFF = 0.01  # of its half width, to the right
 OFF_TOP = 0.1  # the same on a ball or a tip: nothing is put there so exactly that it stays
@@ -193,6 +194,8 @@ def settle(
                 body,
                 position=rest.position,
                 turn=rest.turn,
+                half_width=rest.half_width,
+                half_depth=rest.half_depth,
                 half_height=rest.half_height,
                 hollow=rest.hollow,
                 falls=i in put_bodies or body.falls,
@@ -239,6 +242,13 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
         whole = replace(target, half_height=half, position=(x, y + half - target.half_height, z), hollow=hollow)
         bodies[goal.targets[0]] = whole
     body = bodies[goal.body]
+    if goal.opening is not None:
+        # How wide it is against the opening is told by two outlines at two depths, of a box by a corner that turns.
+        sigma = TURNED_SIGMA if body.shape == "box" and not goal.opening.square else WIDTH_SIGMA
+        wider = math.exp(sigma * float(row[COLUMN["outline"]]))
+        sides = {name: wider * getattr(body, name) for name in ("half_width", "half_depth")}
+        round_too = {"half_height": wider * body.half_height} if body.shape == "sphere" else {}
+        bodies[goal.body] = body = replace(body, **sides, **round_too)
     x, y, z = _place_of_release(goal, bodies)
     aim = body.half_width * AIM_SIGMA
     tip = goal.relation == "onto" and bodies[goal.targets[0]].shape in ("sphere", "cone")

@@ -13,7 +13,7 @@ from cow_service.narration import OF_ITSELF, OF_TARGET, place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera, no_segments
-from cow_service.physics.ensemble import BY_EVENTS, SURE, SURE_OF_MISS, Query
+from cow_service.physics.ensemble import BY_EVENTS, SURE, SURE_OF_FIT, SURE_OF_MISS, Query
 from cow_service.physics.geometry import DepthMap, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
@@ -248,7 +248,7 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequenc
     sure_of_miss = SURE_OF_MISS if is_guess and motion.depth_deviation > 0 else SURE
     query = Query(asked, targets[0], subjects[0], known, sure_of_miss=sure_of_miss)
     if situation.carried is not None and asked.relation == "inside":
-        return query
+        return replace(query, sure=SURE_OF_FIT, sure_of_miss=SURE_OF_FIT)
     # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.
     is_present = situation.is_separated and query.subject <= len(situation.obstacles)
     is_seen = asked.relation in BY_EVENTS and not (on_floor[query.subject] and asked.relation == "lands")

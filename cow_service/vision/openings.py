@@ -18,7 +18,7 @@ OUTLINE = 1.5  # px: how wide it is
 BESIDE = 30.0  # degrees of the ellipse up and down from its ends: its sides
 EDGE = 4.0  # Lab units across the inner edge of a rim, in the mean: less is no edge
 THICKNESS = 0.93  # inner of outer radius, where no inner edge is seen
-MEASURED_SIGMA, ASSUMED_SIGMA = 0.04, 0.06  # of the logarithm of the opening's width
+MEASURED_SIGMA, ASSUMED_SIGMA, UNSEEN_SIGMA = 0.04, 0.06, 0.5  # of the logarithm of the opening's width
 TAPERED = 0.35  # of the rim's width: a floor is not narrower
 
 Rim = tuple[float, float, float, float]  # an ellipse: x, y, half width, half height, px
@@ -41,7 +41,7 @@ def measure_opening(image: Image, mask: CroppedMask, square: bool = False) -> Se
     """The opening of a thing that is known to be a container; where no rim is seen, that of common ones."""
     rim = _outer_rim(mask)
     if rim is None:
-        return SeenOpening(THICKNESS, ASSUMED_SIGMA, 1.0 if square else 0.7, square)
+        return SeenOpening(THICKNESS, UNSEEN_SIGMA, 1.0 if square else 0.7, square)
     x0, _, x1, _ = mask.bbox
     share = min(1.0, 2 * rim[2] / (x1 - x0))  # a handle stands beside the rim
     inner = _inner_share(image, mask, rim)
