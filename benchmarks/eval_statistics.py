@@ -67,7 +67,7 @@ def trial(design: Design, seed: int) -> tuple[bool, bool]:
         return np.stack([*sums, sizes], axis=1).astype(np.float64)
 
     looking = right(base + own)
-    found = primary_gain({f"placebo {n}": pairs(looking, right(base)) for n in range(design.placebos)}, design.scenes)
+    found = primary_gain({f"placebo {n}": (pairs(looking, right(base)), design.scenes) for n in range(design.placebos)})
     assert found is not None
     return found.gain.low <= design.gained <= found.gain.high, found.p < 0.05
 

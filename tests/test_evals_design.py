@@ -25,7 +25,7 @@ def arms(draw: st.DrawFn) -> Arm:
     fields: dict[str, Any] = {"content": content, "votes": draw(st.integers(1, 16)), "gate": draw(st.booleans())}
     if content not in ("none", "text"):
         fields |= {"frames": draw(st.sampled_from(MOMENTS)), "count": draw(st.integers(1, 64))}
-        fields |= {"size": draw(st.integers(16, 8192)), "image": content != "simulated" or draw(st.booleans())}
+        fields |= {"size": draw(st.integers(16, 8192)), "image": draw(st.booleans())}
     if content == "true":
         fields["error"] = draw(st.none() | st.sampled_from([0.0, 0.5, 2.0, 4.0]))
     return Arm.model_validate(fields)
@@ -43,6 +43,10 @@ def test_names_are_short_and_best_of_k_is_k_votes() -> None:
     assert {name: arm.name for name, arm in NAMED.items()} == {name: name for name in NAMED}
     assert arm_of("best-of-3") == arm_of("always:vote-3") == arm_of("content=simulated,votes=3")
     assert arm_of("content=simulated,frames=initial,votes=3").name == "always:initial:vote-3"
+    assert arm_of("placebo-still:no-image").with_content("simulated").name == "frames-only"
+    for wrong in ("always:initial:events", "content=still,content=true", "never:no-image"):
+        with pytest.raises(InvalidRequest):
+            arm_of(wrong)
     with pytest.raises(ValidationError):
         Arm(content="none", count=5)
 
@@ -80,25 +84,28 @@ def asked_of(*names: str, **changes: Any) -> RunInfo:
 
 def test_a_plan_fixes_the_analysis_and_the_run_says_where_it_departs(tmp_path: Path) -> None:
     before = asked_of("never", "always", "placebo-still")
-    plan = planned(before, 0.024, 0.2)
+    plan = planned(before, 0.024)
     assert (plan.primary, plan.placebos, plan.scenes_needed) == ("always", ("placebo-still",), 2726)
     told = describe(plan, {})
-    assert "2,726 scenes show a gain of 2.4 points" in told
-    assert "6 questions, 3 arms, 2 repeats: at most 36 calls with 108 pictures, and 6 simulations." in told
+    assert "2,726 scenes show a gain of 2.4 points over each" in told
+    assert "6 questions in 3 arms, asked 2 times: at most 36 calls with 108 pictures, and 6 simulations." in told
     (file := tmp_path / "plan.json").write_text(plan.model_dump_json())
     assert read_plan(file) == plan
-    assert departures(before.model_copy(update={"plan": plan}), 0) == []
-    other = asked_of("never", "always", "oracle", plan=plan, repeats=1, options={"data": "more.jsonl", "seed": 3})
-    found = departures(other, 4)
-    assert [each.partition(" ")[0] for each in found[:3]] == ["--data", "--generator", "--seed"]
-    assert found[3:] == [
+    assert departures(before.model_copy(update={"plan": plan}), 0, 0) == []
+    changes: dict[str, Any] = {"repeats": 1, "options": {"data": "x", "seed": 3}, "versions": {"cow-service": "0.2"}}
+    other = asked_of("never", "always", "oracle", plan=plan, data_digest="1" * 64, **changes)
+    assert departures(other, 4, 7) == [
+        "--generator cutout, not None",
+        "--seed None, not 3",
+        "the questions, pictures or truths of 'questions.jsonl' (6 of them, not 6)",
         "arms that were planned and not asked: placebo-still",
-        "arms that were not planned: oracle",
         "--repeats 2, not 1",
-        "4 questions without a reply",
+        "4 questions failed",
+        "7 questions were not asked yet",
+        "cow-service 0.1, not 0.2",
     ]
     with pytest.raises(InvalidRequest, match="needs a primary question"):
-        planned(asked_of("never", "always"), 0.024, 0.2)
+        planned(asked_of("never", "always"), 0.024)
     file.write_text("{}")
     with pytest.raises(InvalidRequest, match="is no plan"):
         read_plan(file)

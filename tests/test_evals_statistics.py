@@ -19,12 +19,15 @@ from cow_service.evals.statistics import (
     calibration,
     cluster_interval,
     cost,
+    effect_shown,
     gain,
     holm,
     power_of,
     primary_gain,
     rates,
     scenes_needed,
+    sign_flip_p,
+    upper_variance,
 )
 
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -170,12 +173,15 @@ def test_looking_must_beat_every_placebo() -> None:
     """The primary question: p is the largest, the gain the smallest, and of two signs nothing is said."""
     strong = np.array([[1.0, 0.0, 1.0]] * 12 + [[0.0, 0.0, 1.0]] * 20)
     weak = np.array([[1.0, 0.0, 1.0]] * 4 + [[0.0, 0.0, 1.0]] * 28)
-    found = primary_gain({"still": strong, "other": weak}, 32)
+    found = primary_gain({"still": (strong, 32), "other": (weak, 32)})
     assert found is not None
     assert (found.placebo, found.gain.gain, found.p) == ("other", 0.125, 0.125)
     assert found.gain.low == cluster_interval(weak)[0]
-    assert primary_gain({"still": strong, "other": weak[:, [1, 0, 2]]}, 32).p == 1.0  # pyright: ignore[reportOptionalMemberAccess]
-    assert primary_gain({}, 0) is None
+    opposed = primary_gain({"still": (strong, 32), "other": (weak[:, [1, 0, 2]], 32)})
+    assert opposed is not None
+    assert opposed.p == 1.0
+    assert primary_gain({}) is None
+    assert primary_gain({"still": (strong, 32), "other": (weak[:0], 0)}) is None, "one was not replied to"
 
 
 def test_votes_alone_gain_and_their_control_says_so() -> None:
@@ -195,10 +201,26 @@ def test_votes_alone_gain_and_their_control_says_so() -> None:
 
 
 def test_a_plan_asks_for_as_many_scenes_as_the_normal_law_says() -> None:
-    """0.2 discordant pairs and the paper's 2.4 points: some thousands."""
-    assert scenes_needed(0.024, 0.2) == 2726
-    assert power_of(0.024, 0.2, 2726) == pytest.approx(0.8, abs=1e-3)
-    assert power_of(0.024, 0.2, 100) < 0.1
+    """0.2 discordant pairs and the paper's 2.4 points: some thousands, and more to beat each of three placebos."""
+    assert scenes_needed(0.024, 0.2, 1) == 2726
+    assert scenes_needed(0.024, 0.2, 3) == 4160
+    for placebos, scenes in ((1, 2726), (3, 4160)):
+        assert power_of(0.024, 0.2, scenes, placebos) == pytest.approx(0.8, abs=1e-3)
+        assert effect_shown(scenes, 0.2, placebos) == pytest.approx(0.024, abs=1e-5)
+    assert power_of(0.024, 0.2, 100, 1) < 0.1
+    assert upper_variance(0.4, 400) == pytest.approx(0.16, rel=0.08)
+    assert upper_variance(0.4, 10) > 0.25, "few scenes say little"
+
+
+def test_a_sign_flip_test_is_exact() -> None:
+    """By all signs of few scenes, and with p far below what draws could tell for many."""
+    draws = np.random.default_rng(3)
+    for _ in range(20):
+        found = draws.integers(-4, 5, 8).astype(np.float64)
+        signs = np.array(np.meshgrid(*[[-1, 1]] * 8)).reshape(8, -1).T
+        assert sign_flip_p(found) == pytest.approx(np.mean(abs(signs @ abs(found)) >= abs(found.sum())))
+    assert 0 < sign_flip_p(np.ones(100)) < 1e-25
+    assert sign_flip_p(np.zeros(5)) == 1.0
 
 
 def test_calibration_counts_each_question_once() -> None:

@@ -29,7 +29,7 @@ from cow_service.cli.batch import print_summary
 from cow_service.cli.console import answer_table
 from cow_service.cli.main import app as cli
 from cow_service.client.display import answer_html
-from cow_service.errors import MllmUnavailable
+from cow_service.errors import MllmRefused, MllmUnavailable
 from cow_service.jobs.computing import KeyLocks, Outages, StoredStep
 from cow_service.jobs.database import Database
 from cow_service.mcp.results import answer_text
@@ -221,9 +221,10 @@ def test_where_imagining_fails_the_answer_of_the_gate_is_taken(service: Service,
 
 
 def test_a_model_that_cannot_be_asked_is_an_error_at_the_gate(service: Service, mllm: MllmServer) -> None:
-    mllm.say(say.status(400))
-    with pytest.raises(MllmUnavailable):
-        told(service, imagine="auto")
+    for status, error in ((400, MllmRefused), (404, MllmUnavailable)):
+        mllm.say(say.status(status))
+        with pytest.raises(error):
+            told(service, imagine="auto")
 
 
 def test_the_embedded_reader_is_asked_once_before_it_looks(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ app = typer.Typer(
     "fixes the analysis before.",
 )
 
-Out = Annotated[Path, option("Folder of the run; one in it is gone on with.", "--out", "-o")]
+Out = Annotated[Path, option("Folder of the run; a run that is in it is resumed.", "--out", "-o")]
 Prices = Annotated[
     Path | None, option("YAML or JSON: {MODEL: {input: 1.25, output: 10}}, per million tokens.", shown="none")
 ]
@@ -73,7 +73,7 @@ Repeats = Annotated[int | None, option("How often each question is asked in each
 Order = Annotated[Literal["shuffled", "data"] | None, option("Of the options.", shown="the preset's: shuffled")]
 Subsets = Annotated[Texts, option("Of CausalSpatial's layout only these; may be repeated.")]
 Limit = Annotated[int | None, option("Only the first so many questions.", min=1, shown="all")]
-Seed = Annotated[int, option("Of the order in which options are shown.")]
+Seed = Annotated[int | None, option("Of the order in which options are shown.", shown="0")]
 Reader = Annotated[str | None, option("Who grounds and reads motion for the imagination.", shown="the server's")]
 GeneratorName = Annotated[str | None, option("Who makes its frames.", shown="the server's")]
 BaseUrl = Annotated[str | None, option("Where the multimodal LLM is served.", shown="the provider's")]
@@ -107,7 +107,7 @@ def run(
     order: Order = None,
     subset: Subsets = None,
     limit: Limit = None,
-    seed: Seed = 0,
+    seed: Seed = None,
     reader: Reader = None,
     generator: GeneratorName = None,
     url: Annotated[str | None, option("The COW server.", shown="one is started in this process")] = None,
@@ -167,7 +167,7 @@ def plan(
     order: Order = None,
     subset: Subsets = None,
     limit: Limit = None,
-    seed: Seed = 0,
+    seed: Seed = None,
     reader: Reader = None,
     generator: GeneratorName = None,
     base_url: BaseUrl = None,
@@ -199,7 +199,7 @@ def _request(given: dict[str, Any]) -> Any:
     if given["plan"] is not None:
         plan = read_plan(given["plan"])
         names = [name for name in (*plan.options, "arm", "preset", "repeats") if name in given]
-        changed = [name for name in names if given[name] not in (None, [], False, 0)]
+        changed = [name for name in names if given[name] is not None and given[name] is not False]
         if changed:
             raise InvalidRequest(f"--plan says what is asked: leave --{changed[0].replace('_', '-')} out.")
         fields |= {name: plan.options[name] for name in fields.keys() & plan.options.keys()}
@@ -214,12 +214,14 @@ def _request(given: dict[str, Any]) -> Any:
     )
     # An arm of factors holds commas itself.
     named = [name for text in given["arm"] or () for name in ([text] if "=" in text else text.split(","))]
-    own = preset.arms if ask == "prompt" else ("never", "always")  # the service's own /answer shows no placebos
-    own = own if given["preset"] or not named else ()
+    own = preset.arms if given["preset"] or not named else ()
+    if given["preset"] is None and ask == "answer" and not named:
+        own = ("never", "always")  # the service's own /answer shows no placebos
     fields |= {
         "ask": ask,
         "arms": [*own, *(name.strip() for name in named if name.strip())],
         "repeats": given["repeats"] or preset.repeats,
+        "seed": given["seed"] or 0,
         "order": given["order"] or preset.order,
         "subsets": tuple(given["subset"] or ()),
     }

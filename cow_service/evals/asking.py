@@ -291,7 +291,8 @@ class AnswerAsker:
         return CaseReplies(tuple(reply for reply, _ in asked), tuple(found for _, found in asked))
 
     async def _ask(self, case: Case, imagine: Literal["always", "auto", "never"], trial: int) -> tuple[Reply, Evidence]:
-        options: Any = {**self.options, "frames": case.arm.frames_request, **({"seed": trial} if trial else {})}
+        seed = trial + case.arm.votes * (case.repeat - 1)  # an MLLM that takes seeds must not repeat itself
+        options: Any = {**self.options, "frames": case.arm.frames_request, **({"seed": seed} if trial else {})}
         image = self.pictures.path(case.item.image)
         ask = partial(self.client.answer, image, case.question, imagine=imagine, **options)
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))

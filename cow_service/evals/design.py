@@ -46,6 +46,8 @@ class Arm(Record):
         chosen = [name for name in OF_FRAMES if getattr(self, name) != type(self).model_fields[name].default]
         if chosen and not self.shows_frames:
             raise ValueError(f"{self.content} shows no frames: leave {' and '.join(chosen)} out")
+        if not self.image and not self.shows_frames:
+            raise ValueError(f"{self.content} shows no frames, so it needs the image")
         if self.error is not None and self.content != "true":
             raise ValueError("only frames of content=true are drawn with an error")
         return self
@@ -53,7 +55,8 @@ class Arm(Record):
     @property
     def name(self) -> str:
         """The shortest name that `arm_of` reads as this arm."""
-        same = {name: arm for name, arm in NAMED.items() if (arm.content, arm.image) == (self.content, self.image)}
+        same = {name: arm for name, arm in NAMED.items() if arm.content == self.content and self.image <= arm.image}
+        same = {name: arm for name, arm in same.items() if arm.image == self.image} or same
         base = next((name for name, arm in same.items() if arm.gate == self.gate), next(iter(same)))
         own, parts = same[base], [base]
         parts += [self.frames] if self.frames != own.frames else []
@@ -61,6 +64,7 @@ class Arm(Record):
         parts += [f"size-{self.size}"] if self.size != own.size else []
         parts += [f"vote-{self.votes}"] if self.votes != own.votes else []
         parts += ["gate"] if self.gate != own.gate else []
+        parts += ["no-image"] if self.image != own.image else []
         parts += [f"error-{self.error:g}"] if self.error is not None else []
         return ":".join(parts)
 
@@ -101,6 +105,7 @@ NAMED: dict[str, Arm] = {
 }
 BASELINE = "never"
 _SUFFIXES = {"count": "count", "size": "size", "vote": "votes", "error": "error"}  # of a name, and their factors
+_WORDS: dict[str, tuple[str, Any]] = {"gate": ("gate", True), "no-image": ("image", False)}
 _BEST_OF = re.compile(r"best-of-(\d+)")
 
 
@@ -143,6 +148,8 @@ def arm_of(text: str) -> Arm:
     if "=" in base:
         for part in text.split(","):
             name, _, value = part.strip().partition("=")
+            if name in given:
+                raise InvalidRequest(f"The arm '{text}' says {name} twice.")
             given[name] = value
     elif base in NAMED:
         given = NAMED[base].model_dump(exclude_defaults=True)
@@ -153,15 +160,15 @@ def arm_of(text: str) -> Arm:
         )
     for suffix in suffixes if "=" not in base else ():
         name, _, value = suffix.partition("-")
-        if suffix in MOMENTS:
-            given["frames"] = suffix
-        elif suffix == "gate":
-            given["gate"] = True
-        elif name in _SUFFIXES:
-            given[_SUFFIXES[name]] = value
-        else:
-            known = ", ".join(f":{each}" for each in (*MOMENTS, "gate", *(f"{name}-N" for name in _SUFFIXES)))
+        factor = (_WORDS | {each: ("frames", each) for each in MOMENTS}).get(suffix)
+        if factor is None and name in _SUFFIXES:
+            factor = _SUFFIXES[name], value
+        if factor is None:
+            known = ", ".join(f":{each}" for each in (*MOMENTS, *_WORDS, *(f"{name}-N" for name in _SUFFIXES)))
             raise InvalidRequest(f"The arm '{text}' has an unknown suffix ':{suffix}': there are {known}.")
+        if factor[0] in given:
+            raise InvalidRequest(f"The arm '{text}' says {factor[0]} twice.")
+        given[factor[0]] = factor[1]
     try:
         return Arm.model_validate(given)
     except ValidationError as error:

@@ -19,7 +19,7 @@ from cow_service.errors import CannotGround, CannotReadDirection, CowError, Mllm
 from cow_service.evals.design import Arm
 from cow_service.evals.items import Item, Pictures, Truth, question_text
 from cow_service.media.images import decode, decode_own, encode_png
-from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion, still_frame
+from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion
 from cow_service.records import Usage
 
 MAX_INTERRUPTS = 20  # of one run, each of which may have canceled the same job
@@ -130,43 +130,46 @@ class Imagination:
         found = replace(found, probability=None, event_shown=None, overlay=None)
         if arm.content == "still":
             pixels = decode(self._pictures.read(item.image)).pixels
-            still = self._pictures.add_made(still_frame(pixels, arm.size))
+            still = self._pictures.add_made(_sized(pixels, simulation))
             return replace(found, frames=(still,) * len(found.frames), simulated=False)
+        # Of a placebo the same moments are shown: other moments would be another difference.
+        moments = {"max_side": arm.size, "indices": [frame.index for frame in simulation.frames]}
         if arm.content == "other-item":
-            first = simulation.frames[0]
-            other = await self._of_another(arm, trial, item, first.width, first.height)
+            other = await self._of_another(arm, trial, item, simulation, moments)
         elif arm.content == "true":
             other = await self._along(simulation, arm, item)
         else:
-            changed = await self._simulate(item, arm, trial, motion=opposite_motion(simulation))
+            changed = await self._simulate(item, arm, trial, motion=opposite_motion(simulation), frames=moments)
             other = evidence_of(changed)
         usage, seconds = found.usage + other.usage, found.seconds + other.seconds
         return replace(other, probability=None, event_shown=None, overlay=None, usage=usage, seconds=seconds)
 
-    async def _of_another(self, arm: Arm, trial: int, item: Item, width: int, height: int) -> Evidence:
-        """Frames of this size (px) of another scene: in an order of the item's own, the first that can be simulated.
+    async def _of_another(
+        self, arm: Arm, trial: int, item: Item, simulation: AsyncSimulation, moments: dict[str, Any]
+    ) -> Evidence:
+        """Frames of another scene at these moments, as large as those of this one.
 
-        Raises `CannotGround` where none of several can.
+        Of the others, in an order of the item's own, the first that can be simulated. Raises `CannotGround` where none
+        of several can.
         """
 
         def rank(other: Item) -> bytes:
             return hashlib.sha256(f"{item.id}\n{trial}\n{other.id}".encode()).digest()
 
-        def fitted(frame: str) -> str:
-            pixels = decode_own(self._pictures.read(frame))
-            is_so = pixels.shape[:2] == (height, width)
-            return frame if is_so else self._pictures.add_made(encode_png(as_large_as(pixels, width, height)))
-
         for other in sorted((each for each in self._items if each.scene != item.scene), key=rank)[:MAX_DONORS]:
-            found = await self.evidence(other, arm.with_content("simulated"))
-            if found.refusal is None:
-                return replace(found, frames=tuple(map(fitted, found.frames)), path_error=None)
+            with suppress(*REFUSALS):
+                lent = await self._simulate(other, arm, 0, frames=moments)
+                found = await kept(replace(evidence_of(lent), overlay=None), self._client, self._pictures)
+                pixels = (decode_own(self._pictures.read(frame)) for frame in found.frames)
+                return replace(
+                    found, frames=tuple(self._pictures.add_made(_sized(each, simulation)) for each in pixels)
+                )
         raise CannotGround(f"None of {MAX_DONORS} other scenes could be simulated.")
 
     async def _truth(self, arm: Arm, trial: int, item: Item) -> Evidence:
         """What really happens, at the moments that the simulation's frames show; without one, at moments of its own.
 
-        Drawn along the true path, or of the true pictures those that are nearest to these moments.
+        Drawn along the true path, or of the true pictures those that are nearest to the simulation's moments.
         """
         truth, simulation = _truth_of(item), None
         with suppress(*REFUSALS):
@@ -177,9 +180,10 @@ class Imagination:
             if simulation is None or not truth.pictures:
                 raise
         nearest = [min(truth.pictures, key=lambda known: abs(known[0] - frame.time)) for frame in simulation.frames]
-        return replace(
-            evidence_of(simulation), frames=tuple(digest for _, digest in nearest), overlay=None, path_error=0.0
-        )
+        pixels = (decode(self._pictures.read(digest)).pixels for _, digest in nearest)
+        shown = tuple(self._pictures.add_made(_sized(each, simulation)) for each in pixels)
+        found = replace(evidence_of(simulation), probability=None, event_shown=None, overlay=None)
+        return replace(found, frames=shown, path_error=0.0)
 
     async def _along(self, simulation: AsyncSimulation | None, arm: Arm, item: Item) -> Evidence:
         """Frames that the generator draws along the true path, or off it by so much of the simulation's own error.
@@ -272,3 +276,9 @@ def _offsets(points: NDArray[np.float64], simulation: AsyncSimulation) -> NDArra
     fine = np.stack([np.interp(stamps, np.arange(len(path)), path[:, axis]) for axis in (0, 1)], axis=1)
     nearest = np.linalg.norm(points[:, None] - fine[None], axis=2).argmin(axis=1)
     return fine[nearest] - points
+
+
+def _sized(pixels: NDArray[np.uint8], simulation: AsyncSimulation) -> bytes:
+    """PNG of a picture (height, width, 3), as large as the simulation's frames."""
+    first = simulation.frames[0]
+    return encode_png(as_large_as(pixels, first.width, first.height))

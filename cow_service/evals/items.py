@@ -1,7 +1,6 @@
 """What is asked and what comes of it: an item is one question on one image, with its options and its truth."""
 
 import hashlib
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -177,15 +176,3 @@ class Observation(Record):
         if self.probability is None or self.happens is None:
             return None
         return (self.probability >= 0.5) == self.happens
-
-    def agrees_with(self, alone: Sequence[str | None]) -> str | None:
-        """Whether the simulation says what most of these replies from the image alone say.
-
-        Words for a table; None where the simulation says nothing, or is not asked for yes or no.
-        """
-        right, read = self.simulation_right, Counter(each for each in alone if each is not None).most_common(1)
-        if right is None or not read:
-            return None
-        if read[0][0] == self.abstain:
-            return "the image alone: not sure"
-        return "agree" if right == (read[0][0] == self.truth) else "contradict each other"

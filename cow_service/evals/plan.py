@@ -2,28 +2,29 @@
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals.design import GATE_VOTES, Arm, Order, primary
 from cow_service.evals.items import Ask
-from cow_service.evals.statistics import ALPHA, POWER, Cost, power_of, scenes_needed
+from cow_service.evals.statistics import ALPHA, POWER, Cost, effect_shown, power_of, scenes_needed
 from cow_service.records import Record
 from cow_service.records.world import Sha256
 
-FORMAT = 2
+FORMAT: Literal[2] = 2
 DISCORDANT = 0.2  # share of pairs of replies of which one alone is right, where no pilot tells
 METHOD = (
     "The difference in the share of right replies between the primary arm and each placebo with the same frames and "
     "votes, paired by question and repeat. Two-sided permutation test of the signs of whole scenes; p is the largest "
-    "of the placebos'. 95% interval with scenes as clusters. All other contrasts are adjusted together (Holm). An "
-    "unreadable reply is not right; a question without a reply in one of the two arms counts in neither."
+    "of the placebos' where the gains have one sign, else 1. 95% interval with scenes as clusters: its lower end is "
+    "the lowest of the placebos', its upper end the lowest of theirs at an error of 5% divided by their number. All "
+    "contrasts of the plan are adjusted together (Holm). An unreadable reply is not right; a question without a reply "
+    "in one of the two arms, or with frames in one alone, counts in neither."
 )
 
 
@@ -63,26 +64,22 @@ _OF_DESIGN = ("data_digest", "mllm", "ask", "arms", "repeats", "order", "seed", 
 class AnalysisPlan(RunRecord):
     """What is to be asked and how it is to be analysed, written before the first question is."""
 
-    format: int = FORMAT
+    format: Literal[2] = FORMAT
     primary: str = Field(description="The arm whose gain is the primary question.")
     placebos: tuple[str, ...] = Field(description="The arms of which it is to beat each.")
     method: str = METHOD
     alpha: float = ALPHA
     effect: float = Field(description="The gain that is hoped for, as a share of questions.")
-    variance: float = Field(description="Of the scenes' mean differences, as assumed or as a pilot run had it.")
-    scenes_needed: int = Field(description=f"For that gain, with a power of {POWER:.0%}.")
-    power: float = Field(description="Of the scenes that there are.")
-
-    @property
-    def digest(self) -> str:
-        """Of the whole plan."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+    variance: float = Field(description="Of the scenes' mean differences: assumed, or an upper bound by a pilot run.")
+    pilot: str | None = Field(default=None, description="Digest of the pilot's design, and how many scenes it had.")
+    scenes_needed: int = Field(description=f"For that gain over each placebo, with a power of {POWER:.0%}.")
+    power: float = Field(description="Of the scenes that there are, at least.")
 
 
 class RunInfo(RunRecord):
     """What a folder of results was asked: as much as it takes to ask the same again."""
 
-    format: int = FORMAT
+    format: Literal[2] = FORMAT
     faults: tuple[str, ...] = Field(default=(), description="Rows that were left out, and why.")
     notes: tuple[str, ...] = Field(default=(), description="What was found in the data and worked around, with counts.")
     rounds: int = Field(default=0, description="How often what had failed was asked again.")
@@ -107,11 +104,12 @@ def differences(before: RunRecord, now: RunRecord) -> list[str]:
     found = [
         f"--{name.replace('_', '-')} {before.options.get(name)}, not {now.options.get(name)}"
         for name in names
-        if before.options.get(name) != now.options.get(name)
+        # Where the data lies does not matter; what it holds does.
+        if name != "data" and before.options.get(name) != now.options.get(name)
     ]
-    if before.data_digest != now.data_digest and not found:
-        counts = f"{sum(before.counts.values())} questions, now {sum(now.counts.values())}"
-        found.append(f"the questions, pictures or truths of '{now.data}' have changed since ({counts})")
+    if before.data_digest != now.data_digest:
+        counts = f"{sum(before.counts.values())} of them, not {sum(now.counts.values())}"
+        found.append(f"the questions, pictures or truths of '{now.data}' ({counts})")
     if before.mllm != now.mllm and not found:
         found.append(f"the multimodal LLM {before.mllm}, not {now.mllm}")
     prompts = sorted(name for name in now.versions if name.startswith("prompts/"))
@@ -122,23 +120,24 @@ def differences(before: RunRecord, now: RunRecord) -> list[str]:
     ]
 
 
-def departures(run: RunInfo, failed: int) -> list[str]:
-    """Where a run does not follow its plan, in words; `failed` questions have no reply."""
+def departures(run: RunInfo, failed: int, unasked: int) -> list[str]:
+    """Where a run does not follow its plan, in words; so many questions failed, and so many were not asked yet."""
     plan = run.plan
     if plan is None:
         return []
     found = differences(plan, run)
     missing = [name for name in plan.arms if name not in run.arms]
-    added = [name for name in run.arms if name not in plan.arms]
     found += [f"arms that were planned and not asked: {', '.join(missing)}"] if missing else []
-    found += [f"arms that were not planned: {', '.join(added)}"] if added else []
     found += [f"--repeats {plan.repeats}, not {run.repeats}"] if plan.repeats != run.repeats else []
-    found += [f"{failed} questions without a reply"] if failed else []
-    old, new = (record.versions.get("cow-service") for record in (plan, run))
-    return found + ([f"cow-service {old}, not {new}"] if old != new else [])
+    found += [f"{failed} questions failed"] if failed else []
+    found += [f"{unasked} questions were not asked yet"] if unasked else []
+    for name in ("cow-service", "commit"):
+        if plan.versions.get(name) != run.versions.get(name):
+            found.append(f"{name} {plan.versions.get(name)}, not {run.versions.get(name)}")
+    return found
 
 
-def planned(info: RunInfo, effect: float, variance: float) -> AnalysisPlan:
+def planned(info: RunInfo, effect: float, variance: float = DISCORDANT, pilot: str | None = None) -> AnalysisPlan:
     """The plan of a run with these options. Raises `InvalidRequest` for one without a primary question."""
     question = primary(info.points)
     if question is None:
@@ -154,8 +153,9 @@ def planned(info: RunInfo, effect: float, variance: float) -> AnalysisPlan:
         placebos=tuple(each.name for each in placebos),
         effect=effect,
         variance=variance,
-        scenes_needed=scenes_needed(effect, variance),
-        power=power_of(effect, variance, info.scenes),
+        pilot=pilot,
+        scenes_needed=scenes_needed(effect, variance, len(placebos)),
+        power=power_of(effect, variance, info.scenes, len(placebos)),
     )
 
 
@@ -177,12 +177,12 @@ def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
     `costs` are those of a pilot's arms by name, where there was one.
     """
     items, points = sum(plan.counts.values()), f"{100 * plan.effect:g} points"
-    shown = 100 * math.sqrt(scenes_needed(1.0, plan.variance * 1e6) / 1e6 / max(plan.scenes, 1))
+    shown = 100 * effect_shown(max(plan.scenes, 1), plan.variance, len(plan.placebos))
     lines = [
-        f"Primary question: does {plan.primary} gain over each of {', '.join(plan.placebos)}?",
-        f"{plan.scenes_needed:,} scenes show a gain of {points} with a power of {POWER:.0%} (variance of scenes "
-        f"{plan.variance:.3f}). There are {plan.scenes:,}: a power of {plan.power:.0%}, or {POWER:.0%} for a gain of "
-        f"{shown:.1f} points.",
+        f"Primary question: does {plan.primary} gain over {' and over '.join(plan.placebos)}?",
+        f"{plan.scenes_needed:,} scenes show a gain of {points} over each, with a power of {POWER:.0%} or more "
+        f"(variance of scenes {plan.variance:.3f}). There are {plan.scenes:,}: a power of {plan.power:.0%} or more, or "
+        f"of {POWER:.0%} for a gain of {shown:.1f} points.",
     ]
     simulations: set[Any] = set()
     calls = pictures = 0
@@ -196,7 +196,7 @@ def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
             if arm.content in ("wrong-direction", "true"):
                 simulations |= {(frames, trial, arm.content, arm.error)}
     lines.append(
-        f"{items:,} questions, {len(plan.arms)} arms, {plan.repeats} repeats: at most {calls:,} calls with "
+        f"{items:,} questions in {len(plan.arms)} arms, asked {plan.repeats} times: at most {calls:,} calls with "
         f"{pictures:,} pictures, and {len(simulations) * items:,} simulations."
     )
     replies = items * plan.repeats

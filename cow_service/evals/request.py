@@ -143,7 +143,7 @@ def info_of(wanted: EvalRequest, found: Collected, items: Sequence[Item], arms: 
     )
 
 
-def merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:
+def merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
     """A run that goes on, with more arms or repeats perhaps. Raises `InvalidRequest` where the rest is not the same."""
     if before is None:
         return wanted
@@ -161,8 +161,6 @@ def merged(before: RunInfo | None, wanted: RunInfo, *, again: bool) -> RunInfo:
         "arms": {**before.arms, **wanted.arms},
         "repeats": max(before.repeats, wanted.repeats),
         "notes": tuple(dict.fromkeys((*before.notes, *notes))),
-        # Under the key of an earlier round a failed job would only be found again.
-        "rounds": before.rounds + again,
     }
     return before.model_copy(update=changes)
 

@@ -20,6 +20,7 @@ from inspect_ai.model import GenerateConfig, Model, ModelOutput, get_model
 from inspect_ai.scorer import Score, Scorer, Target, mean, scorer, std
 from inspect_ai.solver import Generate, Solver, TaskState, solver
 from inspect_ai.util import AdaptiveConcurrency
+from rich.text import Text
 
 from cow_service.adaptive import FIRST
 from cow_service.client import Client
@@ -29,9 +30,10 @@ from cow_service.evals import asking, request, runs
 from cow_service.evals.design import Order, arm_of, check_arms
 from cow_service.evals.items import Ask, Item, Observation, Pictures, question_text
 from cow_service.evals.loaders import CAUSALSPATIAL, load
-from cow_service.evals.plan import DISCORDANT, RunInfo, describe, planned
+from cow_service.evals.plan import RunInfo, describe, planned
 from cow_service.evals.report.summary import Price, summarize
 from cow_service.evals.session import EvalProgress, active_session, session
+from cow_service.evals.statistics import upper_variance
 from cow_service.readers.prompts import load_prompt
 
 MAX_RETRIES = 6  # of a call of the multimodal LLM, about three minutes: then the question has failed
@@ -164,14 +166,20 @@ def write_plan(
     """
     with tempfile.TemporaryDirectory() as folder:
         info, _ = prepare(wanted, Path(folder), lambda told: None)
-    variance, costs = DISCORDANT, {}
+    fixed, costs = planned(info, effect), {}
     if pilot is not None:
-        findings = summarize([runs.read_run(pilot)], prices)
-        if not findings.primaries:
-            raise InvalidRequest(f"The pilot '{pilot}' answers no primary question: it needs always and a placebo.")
-        variance = findings.primaries[0].found.gain.sd ** 2
+        before = runs.read_run(pilot)
+        findings = summarize([before], prices)
+        known = [each.gain for each in findings.contrasts if (each.name, each.task) == (fixed.primary, None)]
+        if not known or before.info.repeats != info.repeats or max(each.sd for each in known) == 0:
+            raise InvalidRequest(
+                f"The pilot '{pilot}' does not say how much scenes differ: it needs the arm {fixed.primary} and a "
+                f"placebo, --repeats {info.repeats}, and replies that differ."
+            )
+        scenes = min(each.scenes for each in known)
+        variance = upper_variance(max(each.sd for each in known), scenes)
+        fixed = planned(info, effect, variance, f"{before.info.design_digest}, {scenes} scenes")
         costs = {each.arm: each.cost for each in findings.arms}
-    fixed = planned(info, effect, variance)
     try:
         file.write_text(fixed.model_dump_json(indent=2) + "\n", encoding="utf-8")
     except OSError as error:
@@ -192,12 +200,15 @@ def evaluate(wanted: request.EvalRequest, tell: Callable[[str], None]) -> runs.E
         model = get_model("none/none") if wanted.ask == "answer" else get_model(wanted.mllm, base_url=wanted.base_url)
     except Exception as error:
         # Inspect's providers raise what they like: a missing package, key or name.
-        raise InvalidRequest(f"--mllm {wanted.mllm} cannot be used: {error}") from error
+        told = Text.from_markup(str(error)).plain
+        raise InvalidRequest(f"--mllm {wanted.mllm} cannot be used: {told}") from error
     # Inspect keeps replies in the folder: a reply that has come is never asked for again.
     os.environ["INSPECT_CACHE_DIR"] = str((wanted.out / runs.CACHE).resolve())
     logs = wanted.out / runs.LOGS
-    again = wanted.retry_failed and logs.is_dir() and runs.forget_failures(logs) > 0
-    info = request.merged(runs.read_info(wanted.out), begun, again=again)
+    info = request.merged(runs.read_info(wanted.out), begun)
+    if wanted.retry_failed and logs.is_dir() and runs.forget_failures(logs) > 0:
+        # Under the key of an earlier round a failed job would only be found again.
+        info = info.model_copy(update={"rounds": info.rounds + 1})
     _ask(wanted, info, items, model, settings)
     done = runs.read_run(wanted.out)
     # Only the replies tell which version of a model has replied.

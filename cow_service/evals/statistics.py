@@ -2,21 +2,18 @@
 
 import math
 import statistics
-import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import norm, permutation_test
+from scipy.stats import chi2, norm
 from scipy.stats import t as student_t
 
 from cow_service.evals.items import Observation
 from cow_service.records import Record
 
-RESAMPLES = 10_000
-BATCH = 500  # resamples that are held in memory together
 ALPHA, POWER = 0.05, 0.8
 
 
@@ -164,39 +161,37 @@ def gain_of(pairs: Pairs, questions: int) -> Gain:
 
 
 def sign_flip_p(differences: NDArray[np.float64]) -> float:
-    """Two-sided p of the scenes' differences (scenes,), of which all signs are equally likely where nothing is gained.
+    """Two-sided p of the scenes' differences (scenes,), whole numbers of which all signs are equally likely where
+    nothing is gained.
 
-    A permutation test of whole scenes, exact for few: questions on one scene may depend on each other as they like. Of
-    scenes with one question and one reply it is McNemar's exact test. The random numbers are fixed by the differences.
+    The exact permutation test of whole scenes, so that questions on one scene may depend on each other as they like. Of
+    scenes with one question and one reply it is McNemar's exact test.
     """
-    told = differences[differences != 0]
-    if len(told) < 2:
-        return 1.0
-    found = permutation_test(
-        (told,),
-        np.sum,
-        permutation_type="samples",
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=BATCH,
-        rng=np.random.default_rng(zlib.crc32(told.tobytes())),
-    )
-    return min(1.0, float(found.pvalue))
+    steps = np.abs(differences[differences != 0]).astype(np.int64)
+    law = np.ones(1)  # of the sum of those before, from its least value in steps of 2
+    for step in steps.tolist():
+        longer = np.zeros(len(law) + step)
+        longer[: len(law)] += law / 2
+        longer[step:] += law / 2
+        law = longer
+    sums = 2 * np.arange(len(law)) - len(law) + 1
+    return min(1.0, float(law[np.abs(sums) >= abs(differences.sum()) - 0.5].sum()))
 
 
-def primary_gain(placebos: Mapping[str, Pairs], questions: int) -> PrimaryGain | None:
-    """Of an arm over the strongest of its placebos, by their names; None where there is none.
+def primary_gain(placebos: Mapping[str, tuple[Pairs, int]]) -> PrimaryGain | None:
+    """Of an arm over the strongest of its placebos, by their names: pairs of replies and questions as of `pairs_of`.
 
-    Which placebo is the strongest is found out from the same replies, so one must not only test against that: the gain
-    is one where each placebo is beaten (an intersection-union test, Berger 1982). The lower end of the interval is the
-    lowest of all, the upper one the lowest of those with their error shared among the placebos.
+    None where there is no placebo, or one without replies. Which placebo is the strongest is found out from the same
+    replies, so one must not only test against that: the gain is one where each placebo is beaten (an intersection-union
+    test, Berger 1982). The lower end of the interval is the lowest of all, the upper one the lowest of those with their
+    error shared among the placebos.
     """
-    found = {name: gain_of(pairs, questions) for name, pairs in placebos.items() if len(pairs)}
-    if not found:
+    if not placebos or not all(len(pairs) for pairs, _ in placebos.values()):
         return None
+    found = {name: gain_of(*both) for name, both in placebos.items()}
     strongest = min(found, key=lambda name: found[name].gain)
     low = min(each.low for each in found.values())
-    high = min(cluster_interval(placebos[name], ALPHA / len(found))[1] for name in found)
+    high = min(cluster_interval(pairs, ALPHA / len(found))[1] for pairs, _ in placebos.values())
     one_sign = len({math.copysign(1, each.gain) for each in found.values() if each.gain}) == 1
     return PrimaryGain(
         placebo=strongest,
@@ -205,18 +200,34 @@ def primary_gain(placebos: Mapping[str, Pairs], questions: int) -> PrimaryGain |
     )
 
 
-def scenes_needed(effect: float, variance: float) -> int:
-    """How many scenes show such a gain (a share) with a power of 80% at 5%, two-sided.
+def _quantiles(placebos: int) -> float:
+    """The sum of the normal quantiles of level and power: each placebo may fail to be beaten in its share of cases."""
+    return float(norm.ppf(1 - ALPHA / 2) + norm.ppf(1 - (1 - POWER) / placebos))
 
-    `variance` is that of the scenes' mean differences: of one question and reply each, at most the share of
-    discordant pairs.
+
+def scenes_needed(effect: float, variance: float, placebos: int) -> int:
+    """How many scenes show such a gain (a share) over each of so many placebos with a power of 80% at 5%, two-sided.
+
+    At most: if all placebos are equally strong, and their replies independent. `variance` is that of the scenes' mean
+    differences: of one question and reply each, at most the share of discordant pairs.
     """
-    return math.ceil(variance * ((norm.ppf(1 - ALPHA / 2) + norm.ppf(POWER)) / effect) ** 2)
+    return math.ceil(variance * (_quantiles(placebos) / effect) ** 2)
 
 
-def power_of(effect: float, variance: float, scenes: int) -> float:
-    """How probable it is that so many scenes show such a gain; see `scenes_needed`."""
-    return float(norm.cdf(effect * math.sqrt(scenes / variance) - norm.ppf(1 - ALPHA / 2)))
+def effect_shown(scenes: int, variance: float, placebos: int) -> float:
+    """The gain that so many scenes show; the inverse of `scenes_needed`."""
+    return _quantiles(placebos) * math.sqrt(variance / scenes)
+
+
+def power_of(effect: float, variance: float, scenes: int, placebos: int) -> float:
+    """How probable it is, at least, that so many scenes show such a gain; see `scenes_needed`."""
+    missed = norm.sf(effect * math.sqrt(scenes / variance) - norm.ppf(1 - ALPHA / 2))
+    return max(0.0, float(1 - placebos * missed))
+
+
+def upper_variance(sd: float, scenes: int) -> float:
+    """A variance that is exceeded in one of five cases, of a standard deviation that so many scenes had."""
+    return sd**2 * (scenes - 1) / float(chi2.ppf(0.2, scenes - 1))
 
 
 def cluster_interval(pairs: Pairs, alpha: float = ALPHA) -> tuple[float, float]:

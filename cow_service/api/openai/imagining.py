@@ -213,7 +213,7 @@ def check_fields(chat: Chat, answerer: Answerer) -> None:
 
 
 def check_votable(chat: Chat, votes: int) -> None:
-    """Raises `InvalidRequest` where the question offers no answers, or the chat asks for several choices."""
+    """Raises `InvalidRequest` where the question offers no answers, or each vote would be several, or the same."""
     place, question = chat.question()
     if not read_choices(question, None):
         pointer = "/messages" if place < 0 else f"/messages/{place}/content"
@@ -221,6 +221,8 @@ def check_votable(chat: Chat, votes: int) -> None:
         raise wrong(pointer, f"{detail}: list them, or ask the model without :vote-{votes}")
     if chat.fields.get("n") not in (None, 1):
         raise wrong("/n", f"each vote is one reply: leave it out, or ask the model without :vote-{votes}")
+    if chat.fields.get("seed") is not None:
+        raise wrong("/seed", f"all votes would be the same reply: leave it out, or ask the model without :vote-{votes}")
 
 
 def _nothing_imagined(

@@ -1,7 +1,7 @@
 """What a report says of runs, computed once for all its forms: rates, contrasts, and why looking helps or hurts."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -35,12 +35,14 @@ class ArmSummary(Record):
 
 
 class Contrast(Record):
-    """What one arm gains over another one of the same run."""
+    """What one arm gains over another one."""
 
     name: str = Field(description="Of the arm, as in the report.")
     reference: str = Field(description="The arm that it is compared with.")
     task: str | None = Field(description="Null: all questions.")
     gain: Gain
+    is_exploratory: bool = Field(description="The plan of the run does not have one of the arms.")
+    abstains: bool = Field(description="The reference abstains always: what is gained is no more than right answers.")
 
 
 class Primary(Record):
@@ -48,9 +50,11 @@ class Primary(Record):
 
     run: int
     arm: str
+    name: str = Field(description="Of the arm, as in the report.")
     placebos: tuple[str, ...]
     found: PrimaryGain
     departures: tuple[str, ...] | None = Field(description="From the plan; null where there was none.")
+    explored: tuple[str, ...] = Field(description="Arms that were asked besides those of the plan.")
 
 
 class Split(Record):
@@ -104,11 +108,11 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
             name = f"{name} ({place + 1})" if any(each.name == name for each in arms) else name
             compared = None if arm.name == BASELINE else baseline_run(runs, run)
             baseline = [] if compared is None else compared.of_arm(BASELINE)
-            known = {BASELINE: baseline} | {
-                each.name: run.of_arm(each.name) for each in references(arm, run.info.points)
-            }
-            for reference, seen in known.items():
-                contrasts += _contrasts(name, reference, observations, seen)
+            compared_with = {BASELINE: baseline}
+            compared_with |= {each.name: run.of_arm(each.name) for each in references(arm, run.info.points)}
+            for reference, seen in compared_with.items():
+                explored = run.info.plan is not None and not {arm.name, reference} <= run.info.plan.arms.keys()
+                contrasts += _contrasts(name, reference, observations, seen, explored)
             if arm.content == "simulated" and not arm.gate:
                 splits += _splits(name, observations, baseline)
             of_arm = {each.task: each.gain for each in contrasts if (each.name, each.reference) == (name, BASELINE)}
@@ -131,78 +135,90 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
                     cost=statistics.cost(observations, *(() if price is None else (price.input, price.output))),
                 )
             )
-    adjusted = statistics.holm([each.gain.p for each in contrasts])
-    shown = tuple(
-        each.model_copy(update={"gain": each.gain.model_copy(update={"p_holm": p})})
-        for each, p in zip(contrasts, adjusted, strict=True)
+    # What a plan has is adjusted for itself: exploration must not cost it anything.
+    for is_exploratory in (False, True):
+        places = [place for place, each in enumerate(contrasts) if each.is_exploratory == is_exploratory]
+        adjusted = statistics.holm([contrasts[place].gain.p for place in places])
+        for place, p in zip(places, adjusted, strict=True):
+            gain = contrasts[place].gain.model_copy(update={"p_holm": p})
+            contrasts[place] = contrasts[place].model_copy(update={"gain": gain})
+    primaries = [_primary(place, run, several=len(runs) > 1) for place, run in enumerate(runs)]
+    return Findings(
+        arms=tuple(arms),
+        contrasts=tuple(contrasts),
+        primaries=tuple(each for each in primaries if each is not None),
+        splits=tuple(splits),
+        doses=tuple(doses),
     )
-    primaries = tuple(found for place, run in enumerate(runs) if (found := _primary(place, run)) is not None)
-    return Findings(arms=tuple(arms), contrasts=shown, primaries=primaries, splits=tuple(splits), doses=tuple(doses))
 
 
-def _contrasts(name: str, reference: str, seen: Sequence[Observation], other: Sequence[Observation]) -> list[Contrast]:
+def _contrasts(
+    name: str, reference: str, seen: Sequence[Observation], other: Sequence[Observation], explored: bool
+) -> list[Contrast]:
     """On all questions; over the image alone also on those of each task, where there are several."""
-    there, of_task = _by_task(other), _by_task(seen)
-    found = [(None, statistics.gain(seen, other))]
+    pairs: list[tuple[str | None, Sequence[Observation], Sequence[Observation]]] = [(None, seen, other)]
+    of_task, there = _by_task(seen), _by_task(other)
     if len(of_task) > 1 and reference == BASELINE:
-        found += [(task, statistics.gain(each, there.get(task, []))) for task, each in of_task.items()]
-    return [Contrast(name=name, reference=reference, task=task, gain=gain) for task, gain in found if gain is not None]
+        pairs += [(task, each, there.get(task, [])) for task, each in of_task.items()]
+    abstains = bool(other) and all(each.abstained for each in other if each.failure is None)
+    told = {"name": name, "reference": reference, "is_exploratory": explored, "abstains": abstains}
+    found = [(task, statistics.gain(*matched(one, two))) for task, one, two in pairs]
+    return [Contrast.model_validate({**told, "task": task, "gain": gain}) for task, gain in found if gain is not None]
 
 
-def _primary(place: int, run: EvalRun) -> Primary | None:
+def matched(seen: Sequence[Observation], other: Sequence[Observation]) -> tuple[list[Observation], list[Observation]]:
+    """Those that can be compared: where both arms are to show frames, pairs in which both showed equally many.
+
+    A placebo cannot always be made, as where a motion has no opposite: such a pair would compare frames with none.
+    """
+    both = [{(each.item, each.repeat): len(each.frames) for each in side} for side in (seen, other)]
+    if not all(any(shown.values()) for shown in both):
+        return list(seen), list(other)
+    kept = {place for place, count in both[0].items() if both[1].get(place) == count}
+    return tuple([each for each in side if (each.item, each.repeat) in kept] for side in (seen, other))  # pyright: ignore[reportReturnType]
+
+
+def _primary(place: int, run: EvalRun, *, several: bool) -> Primary | None:
     """Of a run: the question that its plan states, else that of its arms; None where it has no placebo."""
     plan, question = run.info.plan, primary(run.info.points)
     arm, placebos = ("", ()) if question is None else (question[0].name, tuple(each.name for each in question[1]))
     if plan is not None:
         arm, placebos = plan.primary, plan.placebos
-    pairs = {name: statistics.pairs_of(run.of_arm(arm), run.of_arm(name)) for name in placebos}
-    found = statistics.primary_gain(
-        {name: table for name, (table, _) in pairs.items()}, max((n for _, n in pairs.values()), default=0)
-    )
+    pairs = {name: statistics.pairs_of(*matched(run.of_arm(arm), run.of_arm(name))) for name in placebos}
+    found = statistics.primary_gain(pairs)
     if found is None:
         return None
     failed = sum(each.failure is not None for each in run.observations)
-    departed = None if plan is None else tuple(departures(run.info, failed))
-    return Primary(run=place, arm=arm, placebos=placebos, found=found, departures=departed)
+    unasked = len(run.items) * len(run.info.arms) * run.info.repeats - len(run.observations)
+    return Primary(
+        run=place,
+        arm=arm,
+        name=f"{run.info.mllm}, {arm}" if several else arm,
+        placebos=placebos,
+        found=found,
+        departures=None if plan is None else tuple(departures(run.info, failed, unasked)),
+        explored=() if plan is None else tuple(name for name in run.info.arms if name not in plan.arms),
+    )
 
 
 def _splits(name: str, seen: Sequence[Observation], baseline: Sequence[Observation]) -> list[Split]:
     """The gain by what is known of each question's simulation, where something is.
 
-    Whether the simulation was right, how far its path was off, whether it contradicts what the image alone made most
-    replies say, and whether its frames go on to the moment that is asked about.
+    Nothing here may depend on the baseline's replies: groups that are chosen by what is compared differ by themselves.
     """
     errors = sorted(each.path_error for each in seen if each.path_error is not None)
     middle = errors[len(errors) // 2] if errors else 0.0
-    alone: dict[str, list[str | None]] = defaultdict(list)
-    for each in baseline:
-        alone[each.item].append(each.read)
-    by: dict[str, Callable[[Observation], str | None]] = {
-        "simulation": lambda each: (
-            None if each.simulation_right is None else "right" if each.simulation_right else "wrong"
-        ),
-        f"path error ({100 * middle:.1f}% of the width in the middle)": lambda each: (
-            None if each.path_error is None else "smaller" if each.path_error < middle else "larger"
-        ),
-        "simulation and the image alone": lambda each: each.agrees_with(alone[each.item]),
-        "frames": lambda each: (
-            None
-            if each.event_shown is None
-            else "reach the moment asked about"
-            if each.event_shown
-            else "end before it"
-        ),
-    }
-    found: list[Split] = []
-    for what, value_of in by.items():
-        groups: dict[str, list[Observation]] = defaultdict(list)
-        for each in seen:
-            if (value := value_of(each)) is not None:
-                groups[value].append(each)
-        for value, group in sorted(groups.items()):
-            if (gain := statistics.gain(group, baseline)) is not None:
-                found.append(Split(name=name, by=what, value=value, gain=gain))
-    return found
+    groups: dict[tuple[str, str], list[Observation]] = defaultdict(list)
+    for each in seen:
+        if each.simulation_right is not None:
+            groups["simulation", "right" if each.simulation_right else "wrong"].append(each)
+        if each.path_error is not None:
+            by = f"path error ({100 * middle:.1f}% of the width in the middle)"
+            groups[by, "smaller" if each.path_error < middle else "larger"].append(each)
+        if each.event_shown is not None:
+            groups["frames", "reach the moment" if each.event_shown else "end before the moment"].append(each)
+    found = [(*place, statistics.gain(group, baseline)) for place, group in sorted(groups.items())]
+    return [Split(name=name, by=by, value=value, gain=gain) for by, value, gain in found if gain is not None]
 
 
 def baseline_run(runs: Sequence[EvalRun], run: EvalRun) -> EvalRun | None:

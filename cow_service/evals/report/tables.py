@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from cow_service.evals.asking import DIFFERENCES as READING
 from cow_service.evals.design import BASELINE
 from cow_service.evals.items import TASKS, Task
-from cow_service.evals.report.summary import ArmSummary, Findings
+from cow_service.evals.report.summary import ArmSummary, Contrast, Findings
 from cow_service.evals.runs import EvalRun
 from cow_service.evals.statistics import Cost, Gain, Rates, Spread
 
@@ -56,11 +56,12 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
 
-def tables(findings: Findings) -> tuple[Table, ...]:
-    """All tables that have rows."""
+def tables(findings: Findings, *, published: bool = False) -> tuple[Table, ...]:
+    """All tables that have rows; of the published data with the paper's figures beside them."""
     arms = findings.arms
     found = (
-        *(primary(findings), by_level(arms), overview(arms), contrasts(findings), splits(findings), doses(findings)),
+        *(primary(findings), by_level(arms, published), overview(arms), contrasts(findings, published=published)),
+        *(splits(findings), doses(findings)),
         *(calibration(arms), costs(arms)),
     )
     return tuple(table for table in found if table.rows)
@@ -71,17 +72,18 @@ def primary(findings: Findings) -> Table:
     rows: list[tuple[str, ...]] = []
     for each in findings.primaries:
         gain = each.found.gain
-        departed = "none" if not each.departures else "; ".join(each.departures)
-        planned = "no plan" if each.departures is None else f"departures: {departed}"
         told = f"{100 * gain.gain:+.2f}", f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}", p_text(each.found.p)
-        rows.append((each.arm, each.found.placebo, str(gain.questions), str(gain.scenes), *told, planned))
-    header = ("arm", "strongest placebo", "questions", "scenes", "gain, points", "95% interval", "p", "plan")
-    title = "Primary question: simulated frames against the strongest placebo, which must each be beaten"
+        planned = "no plan" if each.departures is None else "; ".join(each.departures) or "as planned"
+        explored = f" (explored besides: {', '.join(each.explored)})" if each.explored else ""
+        counts = str(gain.questions), str(gain.scenes)
+        rows.append((each.name, ", ".join(each.placebos), each.found.placebo, *counts, *told, planned + explored))
+    header = ("arm", "placebos", "strongest", "questions", "scenes", "gain, points", "95% interval", "p", "plan")
+    title = "Primary question: simulated frames must beat each placebo; the gain is that over the strongest"
     return Table("primary", title, header, tuple(rows))
 
 
-def by_level(summaries: Sequence[ArmSummary]) -> Table:
-    """As the paper prints it: right and abstained by task and level, with the paper's own figures below."""
+def by_level(summaries: Sequence[ArmSummary], published: bool) -> Table:
+    """As the paper prints it: right and abstained by task and level; of its data with its own figures below."""
     keys = {key for each in summaries for key in each.cells}
     levels = Counter(task for task, level in keys if level is not None)
     keys = {(task, level) for task, level in keys if level is None or levels[task] > 1}
@@ -92,7 +94,8 @@ def by_level(summaries: Sequence[ArmSummary]) -> Table:
         rows.append((each.name, "TPR", *(NONE if rates is None else _spread(rates.tpr) for rates in measured)))
         rows.append((each.name, "NSR", *(NONE if rates is None else _spread(rates.nsr) for rates in measured)))
     blank = (NONE,) * len(columns)
-    rows += [(f"{name} (paper)", "TPR", *blank, f"{value:.2f}") for name, value in PRINTED_TPR.items()]
+    if published:
+        rows += [(f"{name} (paper)", "TPR", *blank, f"{value:.2f}") for name, value in PRINTED_TPR.items()]
     header = ("arm", "%", *(f"{task} {level or ALL}" for task, level in columns), ALL)
     title = f"Right (TPR) and abstained (NSR) of all questions, mean ± SD over repeats, %; paper: {SOURCE}"
     return Table("levels", title, header, tuple(rows))
@@ -108,7 +111,7 @@ def overview(summaries: Sequence[ArmSummary]) -> Table:
         "NSR, %": lambda rates: _spread(rates.nsr),
         "TPR by paper's reading, %": lambda rates: _spread(rates.tpr_as_paper),
         "unreadable": lambda rates: str(rates.unreadable),
-        "imagined": lambda rates: f"{rates.imagined:.1%}",
+        "shown": lambda rates: f"{rates.imagined:.1%}",
         "refused": lambda rates: f"{rates.refused:.1%}",
     }
     rows = tuple((each.name, *(cell(each.rates) for cell in columns.values())) for each in summaries)
@@ -129,18 +132,28 @@ def _gain(gain: Gain) -> tuple[str, ...]:
     return tuple(cell(gain) for cell in _GAIN.values())
 
 
-def contrasts(findings: Findings, *, by_task: bool = True) -> Table:
-    """What each arm gains over those that it is compared with; by task also what the paper printed."""
+def contrasts(findings: Findings, *, by_task: bool = True, published: bool = False) -> Table:
+    """What each arm gains over those that it is compared with; of the published data also what the paper printed."""
     rows = [
-        (each.name, each.reference, each.task or ALL, *_gain(each.gain), p_text(each.gain.p), p_text(each.gain.p_holm))
+        (each.name, each.reference, each.task or ALL, *_gain(each.gain), *_p(each))
         for each in findings.contrasts
         if by_task or each.task is None
     ]
-    if rows and by_task:
+    if rows and by_task and published:
         printed = ((f"{PRINTED_MODEL} (paper)", task, f"{value:+.2f}") for task, value in PRINTED_GAINS.items())
         rows += [(name, "without", task, NONE, NONE, value, *(NONE,) * 5) for name, task, value in printed]
-    title = "Gains, paired by question and repeat, clustered by scene; Holm p is adjusted over all of these rows"
+    title = (
+        "Gains, paired by question and repeat, clustered by scene; Holm p is adjusted over all rows, those that a plan "
+        "does not have by themselves; over an arm that always abstains there is no p, and no gain of imagination"
+    )
     return Table("gains", title, ("arm", "over", "task", *_GAIN, "p", "Holm p"), tuple(rows))
+
+
+def _p(each: Contrast) -> tuple[str, str]:
+    """p, alone and adjusted; none where the reference always abstains, which is no gain of imagination."""
+    if each.abstains:
+        return "abstains", NONE
+    return p_text(each.gain.p), p_text(each.gain.p_holm) + (" (explored)" if each.is_exploratory else "")
 
 
 def splits(findings: Findings) -> Table:
@@ -184,19 +197,23 @@ def costs(summaries: Sequence[ArmSummary]) -> Table:
         "money in all": lambda cost: NONE if cost.money is None else f"{cost.money:.2f}",
     }
     rows = tuple((each.name, *(cell(each.cost) for cell in columns.values())) for each in summaries)
-    title = "Cost of a reply, simulations included, as if each were asked alone (means)"
+    title = "Cost of a reply as measured, simulations included; stages that were cached take little (means)"
     return Table("cost", title, ("arm", *columns), rows)
 
 
 def replies(runs: Sequence[EvalRun]) -> Table:
     """Every reply, a row each; for further analysis."""
-    header = ("mllm", "arm", "repeat", "item", "task", "level", "scene", "truth", "chosen", "right")
+    header = ("mllm", "arm", "repeat", "item", "task", "level", "scene", "truth", "chosen", "right", "read as paper")
+    header += ("frames", "refusal", "probability", "path error", "calls", "input tokens", "output tokens", "seconds")
     rows: list[tuple[str, ...]] = []
     for run in runs:
         for each in (each for each in run.observations if each.failure is None):
             question = each.item, each.task, each.level, each.scene
             chosen = each.truth, each.read or NONE, str(int(each.right))
-            rows.append((run.info.mllm, each.arm, str(each.repeat), *question, *chosen))
+            seen = each.read_as_paper, len(each.frames), each.refusal, each.probability, each.path_error
+            spent = each.calls, each.input_tokens, each.output_tokens, f"{each.seconds:.3f}"
+            others = (NONE if value is None else str(value) for value in (*seen, *spent))
+            rows.append((run.info.mllm, each.arm, str(each.repeat), *question, *chosen, *others))
     return Table("replies", "Every reply", header, tuple(rows))
 
 

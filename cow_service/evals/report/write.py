@@ -14,6 +14,7 @@ from cow_service.evals.runs import EvalRun
 
 SUFFIXES = (".svg", ".png")
 PNG_DPI = 150
+PUBLISHED = "causalspatial"  # in the name of the data of which the paper printed figures
 FORMATS = {"md": tables.markdown, "csv": tables.csv_text, "tex": tables.latex}
 
 
@@ -37,7 +38,8 @@ def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]
 
 def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
     (out / "tables").mkdir(parents=True, exist_ok=True)
-    known = tables.tables(findings)
+    published = all(PUBLISHED in run.info.data.lower() for run in runs)
+    known = tables.tables(findings, published=published)
     for table in known:
         for extension, text in FORMATS.items():
             (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
@@ -60,6 +62,8 @@ def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
         asked += [f"- left out: {fault}" for fault in info.faults]
         asked += [f"- failed: {' '.join(failure.split())}" for failure in failures]
     parts = [f"## {table.title}\n\n{tables.markdown(table)}" for table in known]
+    if not findings.primaries:
+        parts.insert(0, "No placebo was asked: a gain over the image alone may come from more pictures.")
     parts += [f"## {heading}\n\n" + "\n".join(f"- {each}" for each in told) for heading, told in differs.items()]
     (out / "report.md").write_text("\n\n".join(["# Evaluation", "\n".join(asked), *parts]) + "\n", "utf-8")
 

@@ -167,7 +167,7 @@ class MllmClient:
         prompt, parser, used = load_prompt(call.prompt), _ReplyParser(call.parse), RunUsage()
         schema = call.schema if self.model.supports_schema else None
         seconds = self._budget if given.until is None else min(self._budget, given.until - time.time())
-        model = RetryingModel(self.model.model, self.places, self._timeout, seconds, schema)
+        model = RetryingModel(self.model.model, self.places, self._timeout, seconds, schema, place_seconds=self._budget)
         images = [BinaryContent(image, media_type=MEDIA_TYPE) for image in call.images]
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
@@ -309,10 +309,13 @@ class RetryingModel(WrapperModel):
         schema: Schema | None,
         *,
         retries: bool = True,
+        place_seconds: float | None = None,
     ) -> None:
+        """`place_seconds`: how long a place is waited for, where that is not `seconds`."""
         super().__init__(wrapped)
         self._places, self._timeout, self._schema, self._retries = places, timeout, schema, retries
         self.seconds, self._ends = max(0.0, seconds), time.monotonic() + seconds
+        self._place_ends = time.monotonic() + (seconds if place_seconds is None else place_seconds)
         self.calls = 0
         self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens
@@ -364,8 +367,11 @@ class RetryingModel(WrapperModel):
         self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
     ) -> ModelResponse:
         async with AsyncExitStack() as stack:
+            now = time.monotonic()
+            # Where the server has asked for a longer pause than there is time, no place comes free in time.
+            ends = self._ends if self._places.limit.seconds_paused > self._ends - now else self._place_ends
             try:
-                with anyio.fail_after(max(0.0, self._ends - time.monotonic())):
+                with anyio.fail_after(max(0.0, ends - now)):
                     call = await stack.enter_async_context(self._places.held())
             except TimeoutError as error:  # without a place; what failed before tells more
                 if not self.failures and (pause := self._places.limit.seconds_paused):
