@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ValidationError
-
 from cow_service.errors import InvalidRequest
 from cow_service.evals.items import LETTERS, REAL, Pictures, Truth
 from cow_service.evals.loaders.rows import Collected, Known, Row, RowFault, Unread, collect
@@ -77,29 +75,24 @@ def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
     `future_12.jpg` shows sample 12; `fps` samples pass in a second. Raises `RowFault` for a track that is none.
     """
     try:
-        return _truth_of(scene, meta)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise RowFault(f"`{first['loc'][0]}` cannot be used: {first['msg']}") from error
+        fps, moved = meta.get("fps", SAMPLES_PER_SECOND), meta.get("object")
+        numbered = [(int("".join(filter(str.isdigit, path.stem)) or 0), path) for path in scene.glob(FUTURE)]
+        pictures = [(number / fps, path.read_bytes()) for number, path in sorted(numbered)]
+        if not pictures and not meta.get("track"):
+            return None
+        # Of each object a box, or one per sample.
+        boxes: dict[str, Any] = {name: given for name, given in (meta.get("boxes") or {}).items() if given}
+        sampled = {name: given for name, given in boxes.items() if isinstance(given[0], list)}
+        sides = [math.sqrt(max((x1 - x0) * (y1 - y0), 1.0)) for x0, y0, x1, y1 in sampled.get(str(moved), ())]
+        fields = {"fps": fps, "track": meta.get("track") or (), "scale": [side / sides[0] for side in sides]}
+        fields |= {"object": moved, "boxes": boxes | {name: given[0] for name, given in sampled.items()}}
+        truth = Truth.model_validate(fields)
     except (TypeError, ValueError, AttributeError, ZeroDivisionError, IndexError) as error:
-        raise RowFault(f"`fps`, `track`, `boxes` or `object` cannot be used: {error}") from error
-
-
-def _truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
-    fps, moved = meta.get("fps", SAMPLES_PER_SECOND), meta.get("object")
-    numbered = [(int("".join(filter(str.isdigit, path.stem)) or 0), path) for path in scene.glob(FUTURE)]
-    pictures = [(number / fps, path.read_bytes()) for number, path in sorted(numbered)]
-    if not pictures and not meta.get("track"):
-        return None
-    # Of each object a box, or one per sample.
-    boxes: dict[str, Any] = {name: given for name, given in (meta.get("boxes") or {}).items() if given}
-    sampled = {name: given for name, given in boxes.items() if isinstance(given[0], list)}
-    sides = [math.sqrt(max((x1 - x0) * (y1 - y0), 1.0)) for x0, y0, x1, y1 in sampled.get(str(moved), ())]
-    fields = {"fps": fps, "track": meta.get("track") or (), "scale": [side / sides[0] for side in sides]}
-    fields |= {"object": moved, "boxes": boxes | {name: given[0] for name, given in sampled.items()}}
-    if sides and len(sides) != len(fields["track"]):
-        raise RowFault(f"`boxes` has {len(sides)} of '{moved}' for {len(fields['track'])} points of `track`")
-    return Known(Truth.model_validate(fields), pictures)
+        why = str(error).splitlines()[0]
+        raise RowFault(f"`fps`, `track`, `boxes` or `object` cannot be used: {why}") from error
+    if truth.scale and len(truth.scale) != len(truth.track):
+        raise RowFault(f"`boxes` has {len(truth.scale)} of '{moved}' for {len(truth.track)} points of `track`")
+    return Known(truth, pictures)
 
 
 # What a column means, by its names; those of VLMEvalKit are among them.
