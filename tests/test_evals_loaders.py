@@ -150,6 +150,13 @@ def test_made_scenes_have_their_truth_and_both_levels(pictures: Pictures) -> Non
     assert {item.task for item in items} == {"collision", "trajectory", "compatibility", "occlusion"}
 
 
+def test_scenes_of_the_second_family_are_read_alike(pictures: Pictures) -> None:
+    items = load(str(ROOT / "cow-scenes" / "sample_other"), pictures).items
+    assert len(items) == 10
+    assert all(item.truth is not None and item.truth.shows(drawn=True) for item in items)
+    assert {item.task for item in items} == {"collision", "trajectory", "compatibility", "occlusion"}
+
+
 def test_scenes_with_truth_are_read(pictures: Pictures) -> None:
     items = {item.scene: item for item in load(str(EXAMPLES), pictures).items}
     assert len(items) == len(list(EXAMPLES.glob("*/meta.json")))
