@@ -7,7 +7,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
 
-.PHONY: demo serve test test-fast soak chaos lint openapi lock sbom bench clean
+.PHONY: demo serve test test-fast soak chaos lint openapi lock sbom bench pictures clean
 
 # Tools that the project is not built with, apart from what they look at.
 TOOLS ?= .tools
@@ -59,7 +59,10 @@ sbom: $(TOOLS)/.made ## write what the images install as CycloneDX, into dist
 # What `make bench` compares with: the latest release, or any revision that is named.
 RELEASE ?= $(shell git describe --tags --abbrev=0 2>/dev/null)
 
-bench: $(VENV)/.base ## the figures of the README, then pairs with the last release (RELEASE=REVISION: with another one)
+pictures: $(VENV)/.base ## the picture of the README, from an example
+	$(BIN)/python docs/pictures.py
+
+bench: $(VENV)/.base ## the figures of docs/figures.md, then pairs with the last release (RELEASE=REVISION: with another one)
 	$(BIN)/python benchmarks/scenes.py examples
 	$(BIN)/python benchmarks/answers.py examples
 	$(BIN)/python benchmarks/latency.py
