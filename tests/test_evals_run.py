@@ -41,7 +41,7 @@ ALL_ARMS = (
 )
 PICTURES_SHOWN = {"never": 1, "always": 4, "encounters": 1, "frames-only": 3, "oracle": 4}
 PICTURES_SHOWN |= {"placebo-still": 4, "placebo-item": 4, "oracle:error-2": 4}
-REPEATS = 2
+REPEATS = 1 if SCALE == 1 else 2
 MODEL = "openai-api/local/fake"
 READ_WITHIN = 1.5  # seconds after a reply was sent: the first one loads what reads it
 # What a run imports, Inspect's own parts among it.
@@ -188,7 +188,7 @@ def test_what_frames_are_worth_is_what_the_mllm_makes_of_them(done: Done) -> Non
     gained = done.arms["always"].gain
     assert gained is not None
     assert gained.low > 0
-    assert gained.helped > 10 > gained.hurt
+    assert gained.helped > 5 * REPEATS > gained.hurt
 
 
 def test_the_gate_asks_thrice_before_and_imagines_where_answers_differ(done: Done) -> None:
