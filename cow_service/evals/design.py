@@ -149,7 +149,7 @@ def arm_of(text: str) -> Arm:
         for part in text.split(","):
             name, _, value = part.strip().partition("=")
             if name in given:
-                raise InvalidRequest(f"The arm '{text}' says {name} twice.")
+                raise InvalidRequest(f"The arm '{text}' sets {name} twice: keep one.")
             given[name] = value
     elif base in NAMED:
         given = NAMED[base].model_dump(exclude_defaults=True)
@@ -167,7 +167,7 @@ def arm_of(text: str) -> Arm:
             known = ", ".join(f":{each}" for each in (*MOMENTS, *_WORDS, *(f"{name}-N" for name in _SUFFIXES)))
             raise InvalidRequest(f"The arm '{text}' has an unknown suffix ':{suffix}': there are {known}.")
         if factor[0] in given:
-            raise InvalidRequest(f"The arm '{text}' says {factor[0]} twice.")
+            raise InvalidRequest(f"The arm '{text}' sets {factor[0]} twice: keep one.")
         given[factor[0]] = factor[1]
     try:
         return Arm.model_validate(given)
@@ -185,8 +185,8 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
     for arm in arms:
         if ask not in arm.asks:
             raise InvalidRequest(
-                f"The service's own /answer has no arm '{arm.name}', only never, always and auto, with votes: use "
-                "--ask prompt with --mllm."
+                f"The service's own /answer has no arm '{arm.name}', only never, always and auto, each also with "
+                "votes: name a multimodal LLM with --mllm, and leave --ask out."
             )
         without = [item for item in items if item.truth is None or not item.truth.shows(drawn=arm.error is not None)]
         if arm.content == "true" and without:

@@ -161,11 +161,11 @@ def gain_of(pairs: Pairs, questions: int) -> Gain:
 
 
 def sign_flip_p(differences: NDArray[np.float64]) -> float:
-    """Two-sided p of the scenes' differences (scenes,), whole numbers of which all signs are equally likely where
-    nothing is gained.
+    """Two-sided p of the scenes' differences (scenes,), which are whole numbers.
 
-    The exact permutation test of whole scenes, so that questions on one scene may depend on each other as they like. Of
-    scenes with one question and one reply it is McNemar's exact test.
+    Where nothing is gained, each difference is as likely with the other sign: this is the exact test of that. It
+    permutes whole scenes, so questions on one scene may depend on each other. With one question and one reply per scene
+    it is McNemar's exact test.
     """
     steps = np.abs(differences[differences != 0]).astype(np.int64)
     law = np.ones(1)  # of the sum of those before, from its least value in steps of 2
