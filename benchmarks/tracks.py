@@ -26,7 +26,7 @@ from cow_service.errors import CowError
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.generator import CutoutGenerator
 from cow_service.generators.wan.tracks import CLIP_FPS, MAX_FRAMES
-from cow_service.narration import shown
+from cow_service.narration.story import shown
 from cow_service.physics.tracks import Density, with_tracks
 from cow_service.records import Simulation, Trajectory
 from cow_service.requests import SimulateRequest

@@ -55,7 +55,7 @@ class Row:
     push_error: float | None = None
     agrees: bool | None = None
     seconds: float | None = None
-    facts: str = ""
+    story: str = ""
 
 
 def measure(service: Service, folder: Path) -> Row | None:
@@ -91,7 +91,7 @@ def _row(folder: Path, form: str, meta: dict[str, Any], answer: Answer, trajecto
         push_error=_push_error(trajectory, meta),
         agrees=None if happens is None else _happens(trajectory, meta) == happens,
         seconds=None if simulation is None else simulation.timings.get("trajectory"),
-        facts="" if told is None else told.facts,
+        story="" if simulation is None else simulation.narration.story,
     )
 
 

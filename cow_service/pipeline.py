@@ -1,6 +1,7 @@
 """The pipeline: what happens to a request, stage by stage. The only file that names the stages in order."""
 
 from cow_service import errors
+from cow_service.narration.summary import narrate
 from cow_service.readers.options import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
@@ -37,6 +38,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
         grounding=grounding,
         motion=motion,
         trajectory=trajectory,
+        narration=narrate(grounding, trajectory, run.language),
         **dict(clip),
         reader=run.reader_info("grounding", "motion"),
         **run.accounts(*SIMULATION_STAGES),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,11 @@ from conftest import EXAMPLES, all_scenes, example
 from drawn import ball, block, floor, png_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sdk import SIMULATION
 
 from cow_service.media.images import encode_png
+from cow_service.narration.summary import narrate
+from cow_service.narration.words import phrases_of
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.answers import answer_from, choose_option, count_of, says_it_happens, seconds_of
 from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
@@ -25,7 +29,7 @@ from cow_service.readers.options import (
     read_choices,
     says_not_sure,
 )
-from cow_service.records import Answer, Asked, Outcome
+from cow_service.records import Answer, AnswerOption, Asked, Outcome, Simulation, Trajectory
 from cow_service.requests import AnswerRequest, OptionRequest
 from cow_service.service import Service
 
@@ -422,7 +426,7 @@ WHEN = Asked(form="when", relation="touches", target="vase")
 
 
 def outcome(asked: Asked, probability: float | None = 0.95, **values: Any) -> Outcome:
-    found: dict[str, Any] = {"object": asked.target, "sure": True, "robust": True, "facts": "It rolls."}
+    found: dict[str, Any] = {"object": asked.target, "sure": True, "robust": True}
     return Outcome(asked=asked, probability=probability, **(found | values))
 
 
@@ -466,7 +470,7 @@ CHOICES: list[tuple[Outcome, list[str], str | None]] = [
     (AT, ["500 ms", "1,5 s"], None),
     (AT, ["after half a second", "after two seconds"], None),
     (AT, ["soon", "late"], None),
-    (outcome(WHEN), ["1 s", "It never hits it"], "B"),
+    (outcome(WHEN, 0.04, time=0.9), ["1 s", "It never hits it"], "B"),
     (outcome(COUNT, count=2), ["one", "two", "three or more"], "B"),
     (outcome(COUNT, count=4), ["1", "2 objects", "three or more"], "C"),
     (outcome(COUNT, count=0), ["none", "1", "2"], "A"),
@@ -475,62 +479,87 @@ CHOICES: list[tuple[Outcome, list[str], str | None]] = [
 ]  # fmt: skip
 
 
+EN = phrases_of("en")
+
+
+def simulated(outcome: Outcome, **world: Any) -> Simulation:
+    """A simulation with an outcome, and nothing else in its world."""
+    given = {"outcome": outcome, "ensemble": 50, "law": "contact"} | world
+    old = Simulation.model_validate(SIMULATION)
+    trajectory = Trajectory.model_validate(old.trajectory.model_dump() | given)
+    narration = narrate(old.grounding, trajectory, "en")
+    return old.model_copy(update={"trajectory": trajectory, "narration": narration})
+
+
+def chosen(world: Outcome, options: Sequence[AnswerOption]) -> AnswerReading:
+    return choose_option(options, world, simulated(world).narration, EN)
+
+
 @pytest.mark.parametrize(("world", "options", "answer"), CHOICES)
 def test_the_option_that_says_what_the_world_says(world: Outcome, options: list[str], answer: str | None) -> None:
-    reading = choose_option(read_choices("?", options), world)
-    assert (reading.answer, reading.not_sure, reading.reasoning) == (answer, answer is None, "It rolls.")
-    assert bool(reading.notes) == (answer is None)
-    unsure = choose_option(read_choices("?", [*options, "Not sure"]), world)
+    reading = chosen(world, read_choices("?", options))
+    assert (reading.answer, reading.not_sure) == (answer, answer is None)
+    assert re.match("Not sure|Probably", reading.reasoning) is None or answer is None
+    unsure = chosen(world, read_choices("?", [*options, "Not sure"]))
     assert unsure.not_sure == (answer is None)
     assert unsure.answer == (answer or "ABCDEF"[len(options)] if "Not sure" not in options else unsure.answer)
 
 
 @pytest.mark.parametrize(
-    ("world", "said"),
+    ("world", "said", "why"),
     [
-        (YES, "Yes"),
-        (NO, "No"),
-        (outcome(FIRST, first="red cube"), "red cube"),
-        (outcome(FIRST), "Nothing"),
-        (AT, "After about 1.1 s"),
-        (outcome(WHEN), "Never"),
-        (outcome(COUNT, count=2), "2"),
+        (YES, "Yes", "Yes, it hits the vase. 48 of 50 simulated versions agree."),
+        (NO, "No", "No, it misses the vase. 48 of 50 simulated versions agree."),
+        (outcome(FIRST, first="red cube"), "red cube", "The red cube. 48 of 50 simulated versions agree."),
+        (outcome(FIRST), "Nothing", "It hits nothing. 48 of 50 simulated versions agree."),
+        (AT, "After about 1.1 s", "After about 1.1 s (1.0 to 1.3 s in most simulated versions). 48 of 50 simulated "
+         "versions agree."),
+        (outcome(WHEN, 0.04, time=0.9), "Never", "It misses the vase. 48 of 50 simulated versions agree."),
+        (outcome(COUNT, count=2), "2", "2 objects. 48 of 50 simulated versions agree."),
+        (outcome(COUNT, count=1), "1", "One object. 48 of 50 simulated versions agree."),
     ],
-)
-def test_an_open_question_is_answered_in_words(world: Outcome, said: str) -> None:
-    assert choose_option((), world) == AnswerReading(said, False, "It rolls.")
+)  # fmt: skip
+def test_an_open_question_is_answered_in_words(world: Outcome, said: str, why: str) -> None:
+    assert chosen(world, ()) == AnswerReading(said, False, why)
 
 
 @pytest.mark.parametrize(
-    ("world", "note"),
+    ("world", "why"),
     [
-        (outcome(HIT, object=None), "not found in the image"),
-        (outcome(HIT, None, sure=False), "could not be told apart"),
+        (outcome(HIT, object=None, sure=False), "Not sure: what the question asks about was not found"),
+        (outcome(HIT, None, sure=False), "Not sure: the objects in the image could not be told apart"),
         (
             outcome(HIT, 0.62, sure=False, depends_on=("heading", "speed")),
-            r"asked is 0\.62; .* which way it heads in depth",
+            "Not sure: it hits the vase in 31 of 50 simulated versions; it depends most on which way it heads in depth",
         ),
-        (outcome(FIRST, 0.4, first="red cube", sure=False), r"'red cube', is 0\.40"),
+        (outcome(HIT, 0.18, sure=False), "Probably not: it misses the vase in 41 of 50 simulated versions."),
+        (
+            outcome(FIRST, 0.4, first="red cube", sure=False),
+            "Not sure: the first one is the red cube in 20 of 50 simulated versions.",
+        ),
     ],
 )
-def test_why_it_is_not_sure(world: Outcome, note: str) -> None:
-    reading = choose_option(YES_NO, world)
+def test_why_it_is_not_sure(world: Outcome, why: str) -> None:
+    reading = chosen(world, YES_NO)
     assert (reading.answer, reading.not_sure) == ("C", True)
-    assert re.search(note, reading.notes[0])
+    assert reading.reasoning.startswith(why)
 
 
 def test_what_no_world_can_tell_is_said_so() -> None:
-    assert "did not understand" in answer_from(YES_NO, None, YES, simulated=True).notes[0]
-    assert "without a simulation" in answer_from(YES_NO, HIT, None, simulated=False).notes[0]
-    assert "does not tell" in answer_from(YES_NO, HIT, None, simulated=True).notes[0]
-    untold = outcome(HIT, probability=None)
-    assert "told apart" in answer_from(YES_NO, HIT, untold, simulated=True).notes[0]
-    assert "no worlds were run" in answer_from(YES_NO, HIT, untold, simulated=True, in_worlds=False).notes[0]
+    def why(asked: Asked | None, simulation: Simulation | None) -> str:
+        return answer_from(YES_NO, asked, simulation, EN).reasoning
+
+    assert "did not understand the question" in why(None, simulated(YES))
+    assert "without a simulation" in why(HIT, None)
+    assert "does not tell" in why(HIT, Simulation.model_validate(SIMULATION))
+    untold = outcome(HIT, probability=None, sure=False)
+    assert "told apart" in why(HIT, simulated(untold))
+    assert "no versions were simulated" in why(HIT, simulated(untold, ensemble=0))
     among = read_alternatives(parse(IF + "will it hit the red cube or the blue mug first?"))
-    other = answer_from((), FIRST, outcome(FIRST, first="green cone"), simulated=True, alternatives=among)
+    other = answer_from((), FIRST, simulated(outcome(FIRST, first="green cone")), EN, among)
     assert other.not_sure
-    assert "green cone" in other.notes[0]
-    assert answer_from((), FIRST, outcome(FIRST, first="blue mug"), True, among).answer == "blue mug"
+    assert "green cone" in other.reasoning
+    assert answer_from((), FIRST, simulated(outcome(FIRST, first="blue mug")), EN, among).answer == "blue mug"
 
 
 def answered(service: Service, image: bytes, question: str, **body) -> Answer:
@@ -548,7 +577,7 @@ def test_to_stay_where_it_is_put_is_to_end_there(service: Service) -> None:
     assert outcome is not None
     assert (outcome.asked.relation, outcome.asked.negated) == ("inside", False)
     assert told.answer == "A" or told.not_sure
-    assert "stays on top" in outcome.facts
+    assert "stays on top" in told.simulation.narration.story
 
 
 @pytest.mark.soak
@@ -609,7 +638,7 @@ def test_a_car_whose_way_is_not_known_is_not_guessed_about(service: Service) -> 
     told = answered(service, scene.image, scene.meta["question"].replace(" forward", ""))
     assert (told.simulation, told.not_sure) == (None, True)
     assert "cannot-read-direction" in told.warnings[0]
-    assert "without a simulation" in told.warnings[-1]
+    assert "without a simulation" in told.reasoning
 
 
 def test_a_rolling_ball_is_answered_from_its_world(service: Service) -> None:
@@ -618,12 +647,11 @@ def test_a_rolling_ball_is_answered_from_its_world(service: Service) -> None:
     camera = {"pitch": 28}  # it is drawn without perspective, as if from far away
     right = answered(service, image, question.format("right"), votes=3, baseline=True, camera=camera)
     assert (right.answer, right.option, right.not_sure, right.votes) == ("A", "Yes", False, {"A": 3})
-    assert right.reasoning.startswith("The red ball rolls to the right")
+    assert right.reasoning.startswith("Yes, it hits the blue cube after about ")
     assert right.warnings == ("The embedded reader gives the same answer every time: more votes say no more.",)
     assert right.baseline is not None
     assert right.simulation is not None
-    assert right.simulation.trajectory.outcome is not None
-    assert right.reasoning == right.simulation.trajectory.outcome.facts
+    assert right.reasoning == right.simulation.narration.summary
     assert (right.baseline.answer, right.baseline.not_sure) == ("C", True)
     assert right.usage.calls == 0
     assert answered(service, image, question.format("left"), camera=camera).answer == "B"

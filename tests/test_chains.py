@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import rigid
 
-from cow_service.narration import facts_of
+from cow_service.narration.story import Story
+from cow_service.narration.words import phrases_of
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import Meeting, WorldRun
@@ -141,14 +142,14 @@ def test_the_facts_tell_of_what_was_set_in_motion() -> None:
         "law": "contact", "fps": 10, "anchors": (), "bodies": bodies, "paths": [path(0, 1.0), path(1, -1.0)],
         "encounters": [touch, chain], "outcome": outcome | {"probability": 0.9}, "ensemble": 50,
     }  # fmt: skip
-    assert facts_of("blue ball", Trajectory.model_validate(given)) == (
-        "The blue ball rolls to the right and meets and pushes the cyan ball after 0.4 s; the cyan ball rolls to the "
-        "left and meets the white ball after 0.8 s; 45 of 50 worlds agree."
+    story = Story("blue ball", Trajectory.model_validate(given), phrases_of("en")).text()
+    assert story == (
+        "The blue ball rolls to the right and hits and pushes the cyan ball after about 0.4 s. The cyan ball rolls to "
+        "the left and hits the white ball after about 0.8 s."
     )
     given |= {"encounters": [touch], "outcome": outcome | {"probability": 0.1}}
-    assert "the cyan ball rolls to the left and does not touch the white ball; 45 of 50" in facts_of(
-        "blue ball", Trajectory.model_validate(given)
-    )
+    missed = Story("blue ball", Trajectory.model_validate(given), phrases_of("en")).text()
+    assert missed.endswith("The cyan ball rolls to the left and misses the white ball.")
 
 
 def _edge() -> float:

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from cow_service.narration import facts_of
-from cow_service.records import Asked, Body, Contact, Encounter, Outcome, Path, Trajectory
+from cow_service.narration.summary import narrate
+from cow_service.records import Asked, Body, Contact, Encounter, Grounding, Outcome, Path, Trajectory
 
 FRAMES, FPS = 21, 10.0
 BOX = (0.0, 0.0, 10.0, 10.0)
@@ -54,6 +54,10 @@ def outcome(asked: Asked, probability: float, name: str | None = "white cube", *
     return Outcome(asked=asked, object=name, probability=probability, sure=True, robust=True, **values)
 
 
+def grounded(name: str) -> Grounding:
+    return Grounding(object=name, point=(5.0, 5.0), bbox=BOX, source="embedded")
+
+
 BALL, CUBE = body("ball", "sphere"), body("white cube")
 THROWN = world(
     bodies=(body("ball", "sphere", "air"), CUBE),
@@ -73,80 +77,102 @@ LEAVES = Asked(relation="leaves")
 
 
 @pytest.mark.parametrize(
-    ("mover", "told", "sentence"),
+    ("mover", "told", "story", "summary"),
     [
         ("ball", THROWN,
-         "The ball bounces once, rolls on and meets the white cube after 1.1 s; 93 of 100 worlds agree."),
+         "The ball bounces once, rolls on and hits the white cube after about 1.1 s.",
+         "93 of 100 simulated versions agree."),
         ("the ball", THROWN.model_copy(update={"ensemble": 0}),
-         "The ball bounces once, rolls on and meets the white cube after 1.1 s."),
+         "The ball bounces once, rolls on and hits the white cube after about 1.1 s.",
+         ""),
         ("A ball", THROWN.model_copy(update={"outcome": outcome(HIT, 0.9)}),
-         "The ball bounces once, rolls on and meets the white cube after 1.1 s; 90 of 100 worlds agree."),
-        ("ball", world(), "The ball rolls to the right and touches nothing."),
-        ("ball", world(encounters_known=False), "The ball rolls to the right."),
+         "The ball bounces once, rolls on and hits the white cube after about 1.1 s.",
+         "Yes, it hits the white cube. 90 of 100 simulated versions agree."),
+        ("ball", world(), "The ball rolls to the right and hits nothing.",
+         ""),
+        ("ball", world(encounters_known=False), "The ball rolls to the right.",
+         ""),
         ("red mug", world(bodies=(body("red mug"), body("pink vase")), paths=(path(to=(-1.0, 0.0, 0.2), leaves=True),),
                           moving_until=1.8, ensemble=200,
                           outcome=outcome(Asked(relation="touches", target="pink vase"), 0.03, "pink vase")),
-         "The red mug slides to the left, does not touch the pink vase and leaves the image; 194 of 200 worlds agree."),
+         "The red mug slides to the left, misses the pink vase and leaves the image.",
+         "No, it misses the pink vase. 194 of 200 simulated versions agree."),
         ("red mug", world(bodies=(body("red mug"),), ensemble=200,
                           outcome=outcome(Asked(relation="touches", target="vase", negated=True), 0.97, "vase")),
-         "The red mug slides to the right and does not touch the vase; 194 of 200 worlds agree."),
+         "The red mug slides to the right and misses the vase.",
+         "Yes, it misses the vase. 194 of 200 simulated versions agree."),
         ("toy car", world(bodies=(body("toy car"), body("vase")), encounters=(occlusion("occludes", 0.45),),
                           ensemble=100, outcome=outcome(Asked(relation="covers", target="vase"), 0.9, "vase")),
-         "The toy car slides to the right and passes in front of the vase (hiding 45% of it) from 0.8 s on; "
-         "90 of 100 worlds agree."),
+         "The toy car slides to the right and passes in front of the vase (hiding 45% of it) from about 0.8 s "
+         "on.",
+         "Yes, it hides the vase. 90 of 100 simulated versions agree."),
         ("ball", world(encounters=(occlusion("occluded-by", 0.6),)),
-         "The ball rolls to the right, passes behind the vase (which hides 60% of it) from 0.8 s on and touches "
-         "nothing."),
+         "The ball rolls to the right, passes behind the vase (which hides 60% of it) from about 0.8 s on and "
+         "hits nothing.",
+         ""),
         ("ball", world(ensemble=100, outcome=outcome(Asked(relation="covers"), 0.05, None)),
-         "The ball rolls to the right and hides nothing; 95 of 100 worlds agree."),
+         "The ball rolls to the right and hides nothing.",
+         "No, it hides nothing. 95 of 100 simulated versions agree."),
         ("ball", world(bodies=(BALL, CUBE), encounters=(touch(),), ensemble=100,
                        outcome=outcome(Asked(relation="touches", among=("mug", "vase")), 0.02, None)),
-         "The ball rolls to the right, meets the white cube after 1.1 s and does not touch the mug or the vase; "
-         "98 of 100 worlds agree."),
+         "The ball rolls to the right, hits the white cube after about 1.1 s and misses the mug and the vase.",
+         "No, it misses the mug and the vase. 98 of 100 simulated versions agree."),
         ("ball", world(bodies=(BALL, CUBE), paths=(path(), path(1)), encounters=(touch(probability=None),)),
-         "The ball rolls to the right and meets and pushes the white cube after 1.1 s."),
+         "The ball rolls to the right and hits and pushes the white cube after about 1.1 s.",
+         ""),
         ("ball", world(bodies=(BALL, CUBE), paths=(path(), path(1, turned=90.0)), encounters=(touch(),),
                        moving_until=1.4),
-         "The ball rolls to the right, meets and tips over the white cube after 1.1 s and comes to rest after 1.4 s."),
-        ("ball", world(paths=(path(to=(0.0, 0.0, 0.0)),)), "The ball stays where it is and touches nothing."),
+         "The ball rolls to the right, hits and knocks over the white cube after about 1.1 s and comes to rest"
+         " after about 1.4 s.",
+         ""),
+        ("ball", world(paths=(path(to=(0.0, 0.0, 0.0)),)), "The ball stays where it is and hits nothing.",
+         ""),
         ("ball", world(bodies=(body("ball", "sphere", "air"),), paths=(path(to=(0.0, 1.0, 0.0)),)),
-         "The ball falls and touches nothing."),
+         "The ball falls and hits nothing.",
+         ""),
         ("ball", world(bodies=(BALL, CUBE, body("mug")), encounters=(touch(), touch("mug", 2, 15)), ensemble=100,
                        outcome=outcome(Asked(form="how-many", relation="touches"), 0.8, None, count=2)),
-         "The ball rolls to the right, meets the white cube after 1.1 s and meets the mug after 1.5 s; "
-         "80 of 100 worlds agree."),
+         "The ball rolls to the right, hits the white cube after about 1.1 s and hits the mug after about 1.5 "
+         "s.",
+         "2 objects. 80 of 100 simulated versions agree."),
         ("ball", world(bodies=(ROLLS, body("table")), contacts=(STANDS,), ensemble=100,
                        outcome=outcome(COUNTED, 0.9, None, count=0)),
-         "The ball rolls to the right and touches nothing but the table; 90 of 100 worlds agree."),
+         "The ball rolls to the right and hits nothing but the table.",
+         "It hits nothing. 90 of 100 simulated versions agree."),
         ("ball", world(bodies=(ROLLS, body("table")), contacts=(STANDS, FALLS), ensemble=100,
                        outcome=outcome(FALL, 0.9, None)),
-         "The ball rolls to the right, falls off the table onto the floor after 0.8 s and touches nothing else; "
-         "90 of 100 worlds agree."),
+         "The ball rolls to the right, falls off the table onto the floor after about 0.8 s and hits nothing "
+         "else.",
+         "Yes, it falls off the table onto the floor. 90 of 100 simulated versions agree."),
         ("ball", world(bodies=(ROLLS, body("table"), CUBE), encounters=(touch(number=2),), contacts=(STANDS,),
                        ensemble=100, outcome=outcome(FALL.model_copy(update={"negated": True}), 0.8, None)),
-         "The ball rolls to the right, meets the white cube after 1.1 s and does not fall off the table; "
-         "80 of 100 worlds agree."),
+         "The ball rolls to the right, hits the white cube after about 1.1 s and does not fall off the table.",
+         "Yes, it does not fall off the table. 80 of 100 simulated versions agree."),
         ("ball", world(bodies=(ROLLS, body("table")), contacts=(STANDS,),
                        outcome=outcome(Asked(relation="touches", target="table"), 0.0, "table")),
-         "The ball rolls to the right and is on the table from the start."),
+         "The ball rolls to the right and is on the table from the start.",
+         "No, it is on the table from the start."),
         ("ball", world(bodies=(body("ball", "sphere", "air"),), contacts=(FALLS,), outcome=outcome(FALL, 1.0, None)),
-         "The ball flies to the right, lands on the floor after 0.8 s and touches nothing else."),
+         "The ball flies to the right, lands on the floor after about 0.8 s and hits nothing else.",
+         "Yes, it lands on the floor."),
         ("ball", world(paths=(path(leaves=True),), moving_until=1.8, ensemble=100, outcome=outcome(LEAVES, 0.7, None)),
-         "The ball rolls to the right, leaves the image after 1.6 s and touches nothing; 70 of 100 worlds agree."),
+         "The ball rolls to the right, leaves the image after about 1.6 s and hits nothing.",
+         "Yes, it leaves the image. 70 of 100 simulated versions agree."),
         ("ball", world(ensemble=100, outcome=outcome(LEAVES, 0.1, None)),
-         "The ball rolls to the right, does not leave the image and touches nothing; 90 of 100 worlds agree."),
+         "The ball rolls to the right, does not leave the image and hits nothing.",
+         "No, it does not leave the image. 90 of 100 simulated versions agree."),
         ("ball", world(ensemble=100, outcome=outcome(Asked(form="when", relation="touches", target="mug"), 0.1, "mug")),
-         "The ball rolls to the right and does not touch the mug; 90 of 100 worlds agree."),
+         "The ball rolls to the right and misses the mug.",
+         "It misses the mug. 90 of 100 simulated versions agree."),
     ],
 )  # fmt: skip
-def test_what_happens(mover: str, told: Trajectory, sentence: str) -> None:
-    assert facts_of(mover, told) == sentence
+def test_what_happens(mover: str, told: Trajectory, story: str, summary: str) -> None:
+    narration = narrate(grounded(mover), told, "en")
+    assert narration.story == story
+    assert narration.summary.removeprefix(story).strip() == summary
 
 
-def test_the_sentence_stays_short() -> None:
+def test_the_story_stays_short() -> None:
     name = "the very long name of a thing that nobody would ever want to read again in full. " * 5
     told = world(bodies=(body(name), body(name)), encounters=tuple(touch(name, 1, frame) for frame in range(9)))
-    said = facts_of(name, told)
-    assert len(said) <= 300
-    assert said.count(". ") == 0
-    assert said.endswith(".")
+    assert len(narrate(grounded(name), told, "en").story) <= 300

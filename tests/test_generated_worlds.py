@@ -11,6 +11,8 @@ from drawn import Image, ball, block, floor
 from floors import TrueCamera, outline
 from runs import run_of
 
+from cow_service.narration.story import Story
+from cow_service.narration.words import phrases_of
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Trajectory
 from cow_service.stages.grounding import ground
@@ -108,7 +110,10 @@ def test_an_answer_does_not_depend_on_the_clip(motion: str) -> None:
         question = f"If the red ball {motion}, will it hit the blue block?"
         clips = [(17, 16.0), (49, 30.0), (81, 12.0), (161, 24.0)]
         found = [asked(image, question, num_frames=frames, fps=fps)[0].outcome for frames, fps in clips]
-        assert len({(each.probability, each.time, each.sure) for each in found}) == 1
+        assert len({(each.probability, each.time_band, each.sure) for each in found}) == 1
+        times = [each.time for each in found if each.time is not None]  # of what each clip shows
+        assert len(times) in (0, len(clips))
+        assert max(times, default=0.0) - min(times, default=0.0) < 0.02
 
 
 def test_what_happens_after_the_clip_is_told_as_such() -> None:
@@ -121,8 +126,8 @@ def test_what_happens_after_the_clip_is_told_as_such() -> None:
     assert short.outcome.probability == told.outcome.probability
     (met,) = (each for each in short.encounters if each.kind == "touches")
     assert (met.first_frame, met.time) == (short.num_frames - 1, then.time)
-    assert f"{met.time:.1f} s (after the clip ends)" in short.outcome.facts
-    assert "after the clip" not in told.outcome.facts
+    assert f"{met.time:.1f} s (after the clip ends)" in Story("red ball", short, phrases_of("en")).text()
+    assert "after the clip" not in Story("red ball", told, phrases_of("en")).text()
     assert not [each for each in short.contacts if each.time > clip]
 
 

@@ -469,7 +469,7 @@ def test_a_simulation_takes_two_calls_and_says_with_what(mllm: MllmServer, make)
         "name": "mllm",
         "model": "Qwen/Qwen3-VL-8B-Instruct",
         "revision": None,
-        "prompts": {"identify": 5, "locate": 2, "looking": 1},
+        "prompts": {"identify": 6, "locate": 2, "looking": 1},
         "stages": ["grounding", "motion"],
     }
     assert (told["grounding"]["source"], told["motion"]["source"], told["motion"]["cue"]) == (
@@ -717,7 +717,7 @@ def test_the_frames_follow_the_image_and_encounters_are_a_hypothesis(mllm: MllmS
     assert "hypothesis" in words
     assert "The yellow ball rolls" in words
     assert "The simulation came to this" in words or "meets these on its way" in words
-    assert told["reader"]["prompts"] == {"answer-with-frames": 4, "identify": 5, "locate": 2, "looking": 1}
+    assert told["reader"]["prompts"] == {"answer-with-frames": 4, "identify": 6, "locate": 2, "looking": 1}
     assert told["usage"]["calls"] == 3
 
 

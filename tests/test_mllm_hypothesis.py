@@ -1,4 +1,4 @@
-"""What a multimodal LLM is told of a simulation before it answers: the embedded reader's facts, as a hypothesis."""
+"""What a multimodal LLM reads of a simulation before it answers: story and agreement, as a hypothesis."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from cow_service.records import Intervention, LocatedObject, Simulation
 
 SHA = "0" * 64
 OPTIONS = read_choices("", ["Yes", "No", "Not sure"])
-FACTS = "The ball bounces once and meets\nthe white cube after 1.1 s."
 MUG = {"object": "the blue mug", "bbox": (60, 20, 80, 40), "first_frame": 8}
 
 
@@ -53,7 +52,7 @@ def prompt(removed: str | None = None, strips: bool = False, **trajectory: Any) 
 
 def outcome(**fields: Any) -> dict[str, Any]:
     asked = {"relation": "touches", "target": "the white cube"} | fields.pop("asked", {})
-    return {"asked": asked, "object": "the white cube", "sure": True, "robust": True, "facts": FACTS} | fields
+    return {"asked": asked, "object": "the white cube", "sure": True, "robust": True} | fields
 
 
 def test_the_outcome_is_told_as_a_hypothesis() -> None:
@@ -62,10 +61,10 @@ def test_the_outcome_is_told_as_a_hypothesis() -> None:
         encounters=[MUG | {"kind": "touches"}],
     )
     lines = text.splitlines()
-    assert "> The ball bounces once and meets the white cube after 1.1 s." in lines
-    assert "> In 93% of 200 computed worlds: the ball touches the white cube." in lines
+    story = "hits the blue mug after about 0.5 s (after the clip ends) and misses the white cube."
+    assert f"> The ball stays where it is, {story}" in lines
+    assert "> It hits the white cube in 186 of 200 simulated versions." in lines
     assert "> It depends most on how fast it moves, which way it heads in depth." in lines
-    assert "blue mug" not in text
     assert "a computed hypothesis about the first image" in text
     assert "It can be wrong" in text
     told = text[text.index("The simulation came to") : text.index("- `answer`")]
@@ -75,34 +74,34 @@ def test_the_outcome_is_told_as_a_hypothesis() -> None:
 @pytest.mark.parametrize(
     ("fields", "told"),
     [
-        ({"asked": {"negated": True}}, "the ball does not touch the white cube."),
-        ({"asked": {"relation": "covers", "negated": True}}, "the ball does not hide the white cube."),
-        ({"asked": {"relation": "covered"}}, "the ball is hidden by the white cube."),
-        ({"asked": {"target": None}, "object": None}, "the ball touches something."),
-        ({"asked": {"target": None, "negated": True}, "object": None}, "the ball does not touch anything."),
-        ({"asked": {"form": "which-first"}, "first": "red\nbox"}, "the first thing that the ball touches is red box."),
-        ({"asked": {"form": "which-first"}}, "the first thing that the ball touches is nothing."),
-        ({"asked": {"form": "how-many"}, "count": 2}, "the number of things that the ball touches is 2."),
-        ({"asked": {"form": "when"}, "time": 1.1, "time_band": (0.9, 1.4)}, "first after 1.10 s (0.90 to 1.40 s"),
+        ({"asked": {"negated": True}}, "It misses the white cube"),
+        ({"asked": {"relation": "covers", "negated": True}}, "It leaves the white cube in view"),
+        ({"asked": {"relation": "covered"}}, "It is hidden by the white cube"),
+        ({"asked": {"target": None}, "object": None}, "It hits something"),
+        ({"asked": {"target": None, "negated": True}, "object": None}, "It hits nothing"),
+        ({"asked": {"form": "which-first"}, "first": "red\nbox"}, "The first one is the red box"),
+        ({"asked": {"form": "which-first"}, "object": None}, "It hits nothing"),
+        ({"asked": {"form": "how-many"}, "count": 2}, "It is 2 objects"),
+        ({"asked": {"relation": "tips"}}, "The white cube is knocked over"),
+        ({"asked": {"within": 1.0}}, "It hits the white cube within 1.0 s"),
+        ({"asked": {"form": "changes"}}, "That makes a difference"),
     ],
 )
 def test_every_form_of_question_is_put_in_words(fields: dict[str, Any], told: str) -> None:
     text = prompt(outcome=outcome(probability=0.5, **fields))
-    (line,) = [line for line in text.splitlines() if line.startswith("> In 50% of 200 computed worlds: ")]
-    assert told in line
+    assert f"> {told} in 100 of 200 simulated versions." in text.splitlines()
     assert "depends" not in text
 
 
 def test_encounters_are_told_where_there_is_no_outcome() -> None:
     hidden = MUG | {"kind": "occludes", "share": 0.4, "probability": 0.9}
     text = prompt(encounters=[MUG | {"kind": "touches"}, hidden])
-    assert "> touches the blue mug, 0.50 s in" in text.splitlines()
-    line = "> passes in front of the blue mug, 0.50 s in, at most 40% covered; in 90% of 200 computed worlds"
+    assert "> hits the blue mug, 0.5 s in" in text.splitlines()
+    line = "> passes in front of the blue mug, 0.5 s in, at most 40% covered; in 180 of 200 simulated versions"
     assert line in text.splitlines()
     assert "a computed hypothesis" in text
     assert "The simulation found nothing" in prompt()
     assert "The simulation found nothing" not in prompt(encounters_known=False)
-    assert "The simulation found nothing" in prompt(outcome=outcome(facts=""))  # an outcome that tells nothing
 
 
 def test_a_law_without_contacts_is_told() -> None:
@@ -115,14 +114,13 @@ def test_both_worlds_of_a_removal_are_told_and_named() -> None:
     as_it_is = {"fps": 16, "paths": [path], "anchors": [], "ensemble": 200, "outcome": outcome(probability=0.02)}
     given = {"outcome": outcome(probability=0.97), "factual": as_it_is}
     text = prompt("The vase", strips=True, **given)
-    assert 'first strip, named "With the vase removed"' in text
+    assert 'first strip, named "Without the vase"' in text
     assert 'named "As it is"' in text
     lines = text.splitlines()
-    told = "in 97% of 200 computed worlds: the ball touches the white cube."
-    assert f"> With the vase removed, {told}" in lines
-    assert f"> As it is, {told.replace('97', '2')}" in lines
+    assert "> Without the vase: It hits the white cube in 194 of 200 simulated versions." in lines
+    assert "> As it is: It misses the white cube in 196 of 200 simulated versions." in lines
     without_strips = prompt("The vase", **given)
-    assert 'changed from the beginning: "With the vase removed"' in without_strips
+    assert 'changed from the beginning: "Without the vase"' in without_strips
     assert "strip" not in without_strips
     assert "changed" not in prompt()
 

@@ -16,6 +16,7 @@ from cow_service.errors import CannotGround, CowError
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
+from cow_service.narration.summary import narrate
 from cow_service.physics.draws import ensemble
 from cow_service.physics.engine import RigidShape, run_worlds
 from cow_service.physics.placement import PlacementGoal, settle
@@ -65,6 +66,11 @@ def computed(wanted: Run) -> StageResult[Trajectory]:
     return compute_trajectory(wanted, grounded, read_motion(wanted, grounded, None).value)
 
 
+def story_of(wanted: Run) -> str:
+    told = computed(wanted).value
+    return narrate(ground(wanted).value, told, "en").story
+
+
 def clip_of(wanted: Run) -> tuple[Trajectory, Clip]:
     grounded = ground(wanted).value
     motion = read_motion(wanted, grounded, None).value
@@ -87,8 +93,9 @@ class TestWorlds:
         assert told.outcome is not None
         assert factual.outcome is not None
         assert (told.outcome.probability, factual.outcome.probability) == (pytest.approx(1, abs=0.2), pytest.approx(0))
-        assert told.outcome.facts.startswith("With the post to the left of the cube, the red ball rolls to the right")
-        assert "; without that change, the red ball rolls to the right, meets" in told.outcome.facts
+        story = story_of(run(put("Post", "left-of", "the cube")))
+        assert story.startswith("With the post to the left of the cube: The red ball rolls to the right")
+        assert ". As it is: The red ball rolls to the right, hits" in story
         body = told.placed[0].body
         assert factual.bodies[body].bbox == POST
         x0, y0, x1, y1 = told.bodies[body].bbox
@@ -106,9 +113,8 @@ class TestWorlds:
         told = computed(run(*changes, image=image, objects=objects, question=question)).value
         assert {each.object for each in told.bodies} == {"red ball", "cube", "post"}
         assert next(each for each in told.bodies if each.object == "post").support == "cube"
-        assert told.outcome is not None
-        assert told.outcome.facts.startswith("Without the lid and with the post on the cube, the red ball")
-        assert "; without these changes, " in told.outcome.facts
+        story = story_of(run(*changes, image=image, objects=objects, question=question))
+        assert story.startswith("With the post on the cube and without the lid: The red ball")
         stacked = computed(
             run(put("post", "left-of", "cube"), put("lid", "onto", "post"), image=image, objects=objects)
         )

@@ -12,7 +12,7 @@ from runs import run_of
 from cow_service.errors import CannotGround
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
-from cow_service.narration import facts_of
+from cow_service.narration.summary import narrate
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Asked, Grounding, Intervention, LocatedObject, Motion, Trajectory
 from cow_service.stages.grounding import understood
@@ -99,11 +99,11 @@ class TestInto:
         assert touched.first_frame >= 15  # nothing is touched while it is carried
 
     def test_it_is_told_in_a_sentence(self) -> None:
-        told = put(with_bowl(SMALL), "into", located("blue bowl", BOWL))[3]
-        facts = facts_of("red ball", told)
-        assert facts.startswith("The red ball is carried over, is let go and goes in and stays inside")
+        _, grounding, _, told = put(with_bowl(SMALL), "into", located("blue bowl", BOWL))
+        narration = narrate(grounding, told, "en")
+        assert narration.story.startswith("The red ball is carried over, is released and goes in and stays inside")
         assert told.ensemble < 20, "what all of the first worlds agree on is settled"
-        assert facts.endswith(f"; {told.ensemble} of {told.ensemble} worlds agree.")
+        assert narration.summary.endswith(f" All {told.ensemble} simulated versions agree.")
 
     def test_a_large_one_does_not(self) -> None:
         _, _, _, told = put(with_bowl(BIG), "into", located("blue bowl", BOWL), mover=BIG)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jinja2.exceptions import SecurityError
 
-from cow_service.narration import direction_words
+from cow_service.narration.words import direction_words
 from cow_service.readers.mllm.answer import answer_schema
 from cow_service.readers.mllm.coordinates import CoordinateFrame
 from cow_service.readers.mllm.identify import Identified

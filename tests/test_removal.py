@@ -16,6 +16,7 @@ from cow_service.errors import InvalidRequest
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, create
 from cow_service.media.images import decode_own
+from cow_service.narration.summary import narrate
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.ensemble import Query, run_ensemble
@@ -71,8 +72,9 @@ class TestWorlds:
         assert factual.outcome is not None
         assert (told.outcome.probability, factual.outcome.probability) == (pytest.approx(1), pytest.approx(0))
         assert [each.object for each in told.encounters if each.kind == "touches"] == ["cube"]
-        assert told.outcome.facts.startswith("Without the Green block, the red ball rolls to the right, meets")
-        assert "; with it, the red ball rolls to the right, meets and pushes the Green block" in told.outcome.facts
+        story = narrate(grounding, told, "en").story
+        assert story.startswith("Without the Green block: The red ball rolls to the right, hits")
+        assert ". As it is: The red ball rolls to the right, hits and pushes the Green block" in story
         first, same = (told.bodies[0].position, factual.bodies[0].position)
         assert first == same, "both worlds have the same draws"
 

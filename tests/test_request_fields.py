@@ -128,6 +128,7 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "ensemble": ({}, 0, 6),
     "num_frames": ({}, 9, 12),
     "fps": ({}, 16, 24),
+    "language": ({}, "en", "ja"),
     "seed": ({}, 0, 1),
     "video": ({}, False, True),
     "live": ({}, False, True),

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.narration import shown
+from cow_service.narration.story import shown
 from cow_service.physics.camera import FloorCamera
 from cow_service.physics.tracks import Density, lifted, with_tracks
 from cow_service.records import Body, CameraEstimate, Footprint, Trajectory

@@ -126,4 +126,4 @@ def _reading(answer: Answer) -> str:
     outcome = None if simulation is None else simulation.trajectory.outcome
     if simulation is None or outcome is None:
         return "no outcome"
-    return f"{outcome.asked.model_dump(exclude_defaults=True)}; {outcome.facts}"
+    return f"{outcome.asked.model_dump(exclude_defaults=True)}; {simulation.narration.story}"

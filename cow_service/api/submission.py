@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request, Response
@@ -32,7 +32,7 @@ from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobSpec, JobState
 from cow_service.observability import logging as context
-from cow_service.records import TERMINAL, JobKind, Look
+from cow_service.records import TERMINAL, JobKind, Language, Look
 from cow_service.requests import ImageArtifact, LookRequest, SimulateRequest
 from cow_service.service import is_url
 from cow_service.stages.run import now
@@ -68,6 +68,18 @@ async def _owner(request: Request) -> str | None:
 
 Engine = Annotated[JobEngine, from_app("engine")]
 Owner = Annotated[str | None, Depends(_owner)]
+
+
+def language_of(header: str) -> Language | None:
+    """The language that an `Accept-Language` header prefers among those of narrations; None for English, which most
+    browsers send unasked: the question's own language says more."""
+    weights: dict[str, float] = {}
+    for tag, _, weight in (each.partition(";q=") for each in header.lower().split(",")):
+        with suppress(ValueError):  # of a weight that is no number
+            weights.setdefault(tag.strip()[:2], float(weight or 1))
+    known: list[Language] = [each for each in get_args(Language) if weights.get(each, 0.0) > 0]
+    best = max(known, key=lambda each: (weights[each], -[*weights].index(each)), default=None)
+    return None if best == "en" else best
 
 
 @dataclass(frozen=True)
@@ -185,6 +197,8 @@ class Submitter:
         raw = await receive(request)
         submission.image = raw.image
         body = await self.in_thread(submission.owner, partial(parse, raw, model))
+        if body.language is None and (language := language_of(request.headers.get("accept-language", ""))):
+            body = body.model_copy(update={"language": language})
         del raw
         if submission.image is None:
             release_body(request)

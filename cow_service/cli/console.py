@@ -70,10 +70,7 @@ def run_request(
     simulation = result.simulation if isinstance(result, Answer) else result
     if simulation is not None:
         print_stages(console, simulation)
-    if isinstance(result, Answer):
-        console.print(answer_table(result))
-        if result.reasoning:
-            console.print(f"[dim]reasoning[/]: {escape(result.reasoning)}")
+    print_answer(console, result)
     for warning in result.warnings:
         console.print(f"[yellow]warning[/]: {escape(warning)}")
     problem = result.simulation_problem if isinstance(result, Answer) else None
@@ -94,7 +91,7 @@ def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], 
 
 
 def print_stages(console: Console, simulation: Simulation) -> None:
-    """Prints a line for each stage: its time and its result; then the contacts and the outcome."""
+    """Prints a line for each stage: its time and its result; then the contacts and what happens."""
     grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
     x, y = grounding.point
     way = "" if motion.direction is None else f" ({motion.direction[0]:+.2f}, {motion.direction[1]:+.2f})"
@@ -112,8 +109,18 @@ def print_stages(console: Console, simulation: Simulation) -> None:
         console.print(f"[bold]{stage:<10}[/] {simulation.timings[stage]:5.2f} s  {escape(line)}")
     if contacts := display.contacts_words(trajectory):
         console.print(f"[dim]contacts[/]: {escape(contacts)}")
-    if trajectory.outcome is not None and (outcome := display.outcome_words(trajectory.outcome)):
-        console.print(f"[dim]outcome[/]: {escape(outcome)}")
+    console.print(f"[dim]story[/]: {escape(simulation.narration.story)}")
+
+
+def print_answer(console: Console, result: Simulation | Answer) -> None:
+    """Prints the answer with what it rests on, or the summary of a simulation."""
+    if isinstance(result, Simulation):
+        if result.narration.answer:
+            console.print(f"[bold]{escape(result.narration.summary)}[/]")
+        return
+    console.print(answer_table(result))
+    if result.reasoning:
+        console.print(f"[dim]reasoning[/]: {escape(result.reasoning)}")
 
 
 def _result_in(folder: Path) -> Simulation | None:

@@ -313,7 +313,7 @@ def _depth_map(path: Path | None, scale: float | None) -> dict[str, object]:
 
 def _placement(text: str) -> dict[str, object]:
     """What `--place` says, as an intervention."""
-    from cow_service.narration import PREPOSITIONS, RELATION_WORDS  # noqa: PLC0415 - it imports pydantic
+    from cow_service.narration.words import PREPOSITIONS, RELATION_WORDS  # noqa: PLC0415 - it imports pydantic
 
     words = "|".join(sorted(RELATION_WORDS, key=len, reverse=True))  # "in front of" before "in"
     pattern = rf"\s*(?P<object>.+?)\s+(?P<relation>{words})\s+(?P<targets>.+?)\s*"

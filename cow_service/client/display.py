@@ -49,22 +49,25 @@ def band_words(trajectory: records.Trajectory) -> str:
     if trajectory.law != "contact" or not trajectory.ensemble:
         return ""
     low, high = records.BAND_PERCENTILES
-    return f"band: where {high - low}% of {trajectory.ensemble} worlds have it, across and down apart"
+    return f"band: where {high - low}% of {trajectory.ensemble} simulated versions have it, across and down apart"
 
 
-def worlds(probability: float) -> str:
+def counted(probability: float, versions: int) -> str:
     """A probability as people read it."""
-    return f"{probability:.0%} of the worlds"
+    if not versions:
+        return f"probability {probability:.0%}"
+    return f"{round(probability * versions)} of {versions} simulated versions"
 
 
 def encounters_words(trajectory: records.Trajectory) -> str:
-    """What the mover encounters, when, and in how many worlds."""
+    """What the moving object encounters, when, and in how many versions."""
     met: list[str] = []
     for each in trajectory.encounters:
-        sure = "" if each.probability is None else f" ({worlds(each.probability)})"
-        met.append(f"{records.MEETINGS[each.kind]} {each.object} at {each.first_frame / trajectory.fps:.1f} s{sure}")
+        sure = "" if each.probability is None else f" ({counted(each.probability, trajectory.ensemble)})"
+        time = each.first_frame / trajectory.fps if each.time is None else each.time
+        met.append(f"{records.MEETINGS[each.kind]} {each.object} after {time:.1f} s{sure}")
     on = trajectory.bodies[0].support if trajectory.bodies else "floor"
-    nothing = "meets nothing" if on in ("floor", "air") else f"meets nothing but {on}, which it is on from the start"
+    nothing = "hits nothing" if on in ("floor", "air") else f"hits nothing but {on}, which it is on from the start"
     return ", ".join(met) or (nothing if trajectory.encounters_known else "encounters were not computed")
 
 
@@ -75,26 +78,7 @@ def contacts_words(trajectory: records.Trajectory) -> str:
     """
     names: dict[int | None, str] = {None: "the floor", **{i: body.object for i, body in enumerate(trajectory.bodies)}}
     first = [contact for contact in trajectory.contacts if contact.time > 0][:MAX_CONTACTS]
-    return ", ".join(f"{names[each.a]} and {names[each.b]} at {each.time:.1f} s" for each in first)
-
-
-def outcome_words(outcome: records.Outcome) -> str:
-    """What the question asks, as the world answers it, and how sure that is."""
-    form, value = outcome.asked.form, ""
-    share = "" if outcome.probability is None else f", {worlds(outcome.probability)}"
-    if form == "which-first":
-        value = f"first: {outcome.first or 'none'}{share}"
-    elif form == "how-many":
-        value = "" if outcome.count is None else f"count: {outcome.count}{share}"
-    elif form == "when" and outcome.time is not None:
-        band = "" if outcome.time_band is None else f" ({outcome.time_band[0]:.1f} to {outcome.time_band[1]:.1f} s)"
-        value = f"after {outcome.time:.1f} s{band}{share}"
-    elif form not in ("where", "what-happens") and outcome.probability is not None:  # of these the facts are the answer
-        value = f"what is asked happens in {worlds(outcome.probability)}"
-    doubt = f"it depends on {' and '.join(outcome.depends_on)}" if outcome.depends_on else ""
-    robust = "robust" if outcome.robust and outcome.sure and not doubt else ""
-    parts = outcome.facts.rstrip("."), value, "" if outcome.sure else "not sure", doubt, robust
-    return "; ".join(filter(None, parts))
+    return ", ".join(f"{names[each.a]} and {names[each.b]} after {each.time:.1f} s" for each in first)
 
 
 GetBytes = Callable[[str], bytes | None]  # the bytes of an artifact by its digest, where they are available
@@ -138,7 +122,8 @@ def describe_answer(answer: records.Verdict) -> str:
 
 def simulation_html(simulation: records.Simulation, get: GetBytes) -> str:
     """Overlay, video, the frames side by side, and what was found, as HTML that needs nothing from the network."""
-    return _block(simulation.question, _found(simulation, get))
+    said = _line(simulation.narration.summary, f"font-size:16px;font-weight:600;{_LONG_TEXT}")
+    return _block(simulation.question, said + _found(simulation, get))
 
 
 def answer_html(answer: records.Answer, get: GetBytes) -> str:
@@ -180,8 +165,8 @@ def _found(simulation: records.Simulation, get: GetBytes) -> str:
     lines = [simulation.motion.sentence + met]
     if contacts := contacts_words(trajectory):
         lines.append(f"Contacts: {contacts}.")
-    if trajectory.outcome is not None and (outcome := outcome_words(trajectory.outcome)):
-        lines.append(f"Outcome: {outcome}.")
+    if simulation.narration.story:
+        lines.append(simulation.narration.story)
     if trajectory.moving_until is not None:
         lines.append(f"Nothing moves in the image from {trajectory.moving_until:.1f} s on.")
     pictures = "".join(f'<div style="{row}">{figures}</div>' for figures in (large, frames))

@@ -79,7 +79,8 @@ async def tool_result(result: Simulation | Answer, client: AsyncClient, base_url
 
 def simulation_text(simulation: Simulation, video: str) -> str:
     """What moves, how, what it meets when; which picture is which; what to mind. `video` is where the clip is."""
-    return _text(_simulation_lines(simulation, video), simulation.warnings, simulation.image.sha256)
+    lines = simulation.narration.summary, *_simulation_lines(simulation, video)
+    return _text(filter(None, lines), simulation.warnings, simulation.image.sha256)
 
 
 def answer_text(answer: Answer, video: str) -> str:
@@ -118,11 +119,11 @@ def _simulation_lines(simulation: Simulation, video: str) -> Iterable[str]:
         f"It is the {simulation.grounding.object} at [{box}] in the image of {image.width} x {image.height} px; "
         f"{motion.kind}, {way}law {trajectory.law}."
     )
-    yield f"On its way (hypotheses): {display.encounters_words(trajectory)}."
+    yield f"It {display.encounters_words(trajectory)}."
     if contacts := display.contacts_words(trajectory):
         yield f"Contacts: {contacts}."
-    if trajectory.outcome is not None and (summary := display.outcome_words(trajectory.outcome)):
-        yield f"Outcome (a hypothesis of the simulated world): {summary}."
+    if simulation.narration.story:
+        yield f"What happens (a hypothesis, as all of this): {simulation.narration.story}"
     if trajectory.moving_until is not None:
         yield f"Nothing moves in the image from {trajectory.moving_until:.2f} s on."
     if not all(trajectory.path.visible):

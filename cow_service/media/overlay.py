@@ -224,9 +224,9 @@ def _draw(
     _dot(canvas, grounding.point, unit, LIGHT)
     labels = [Label(grounding.object, grounding.bbox, OUTLINE, below=False)]
     for encounter in trajectory.encounters:  # as in: hits white cube 1.1 s, 93%
-        kind = "hits" if encounter.kind == "touches" else MEETINGS[encounter.kind]
         sure = "" if encounter.probability is None else f", {round(100 * encounter.probability)}%"
-        text = f"{kind} {encounter.object} {encounter.first_frame / trajectory.fps:.1f} s{sure}"
+        time = encounter.first_frame / trajectory.fps if encounter.time is None else encounter.time
+        text = f"{MEETINGS[encounter.kind]} {encounter.object} {time:.1f} s{sure}"
         labels.append(Label(text, encounter.bbox, ENCOUNTERS[encounter.kind], below=True))
     labels += [Label(f"{name}, taken away", bbox, REMOVED, below=False) for name, bbox, _ in removed]
     labels += [Label(f"{each.name}, as it is", each.old_bbox, PLACED, below=False) for each in placed]

@@ -40,8 +40,8 @@ class Told:
     question: str
     verdict: str
     worlds: int  # that were run
-    agreeing: str  # how many of them say so; empty where none were counted
-    share: float | None
+    agreeing: str  # how many of them agree; empty where none were counted
+    share: float | None  # of the versions that agree
     futures: tuple[tuple[tuple[float, float], ...], ...]  # of the picture's width: the mover in other worlds
     path: tuple[tuple[float, float], ...]
     until: float  # s: nothing moves afterwards
@@ -51,17 +51,15 @@ class Told:
     def of(result: Simulation | Answer, simulation: Simulation, given: str) -> Told:
         """Of a job's result and its simulation; `given` is the direction in words, where not the question tells it."""
         trajectory, width = simulation.trajectory, simulation.image.width
-        outcome, path = trajectory.outcome, trajectory.paths[0]
-        share = None if outcome is None or not trajectory.ensemble else outcome.probability
-        says = "agree" if outcome is None or outcome.asked.form not in ("whether", "when", "changes") else "say yes"
-        agreeing = "" if share is None else f"{share:.0%} of {trajectory.ensemble} simulated worlds {says}"
+        path, narration = trajectory.paths[0], simulation.narration
+        share = None if trajectory.outcome is None else narration.share
         seen = path.points[: path.visible.index(False)] if False in path.visible else path.points
         met = [each.first_frame for each in trajectory.encounters]
         return Told(
             question=f"{result.question} (Asked of another direction: {given}.)" if given else result.question,
             verdict=verdict_of(result) or simulation.motion.sentence,
             worlds=trajectory.ensemble,
-            agreeing=agreeing,
+            agreeing="" if share is None else narration.agreement or narration.summary,
             share=share,
             futures=tuple(tuple((x / width, y / width) for x, y in future) for future in path.futures),
             path=tuple((x / width, y / width) for x, y in seen),
@@ -176,7 +174,8 @@ class _Sheet:
             for end, colour in ((x1, (70, 78, 76)), (round(x0 + told.share * (x1 - x0)), GREEN)):
                 cv2.rectangle(canvas, (x0, y - round(letter / 5)), (end, y + round(letter / 5)), colour, -1)
             margin += 0.33 * width
-        _put(canvas, told.agreeing, margin, line + LINE * letter * 0.8, letter, GREY)
+        agreeing = _cut(told.agreeing, letter, width - margin - MARGIN * width)
+        _put(canvas, agreeing, margin, line + LINE * letter * 0.8, letter, GREY)
 
     def draw_futures(self, frame: Image, opacity: float) -> None:
         """Other worlds' paths of the mover, translucent."""

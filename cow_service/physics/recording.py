@@ -10,7 +10,7 @@ import numpy as np
 
 from cow_service import records
 from cow_service.errors import CannotGround
-from cow_service.narration import cannot_stay
+from cow_service.narration.warnings import cannot_stay
 from cow_service.physics import events
 from cow_service.physics.ballistic import FreePath, latest, sampled
 from cow_service.physics.bodies import SeenBody

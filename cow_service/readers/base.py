@@ -8,7 +8,18 @@ from typing import Literal, Protocol
 from pydantic import Field
 
 from cow_service import records
-from cow_service.records import BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Point, Record, Source, Vector
+from cow_service.records import (
+    BBox,
+    Grounding,
+    Language,
+    LocatedObject,
+    MotionKind,
+    ObjectPrior,
+    Point,
+    Record,
+    Source,
+    Vector,
+)
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
 
@@ -69,6 +80,7 @@ class ReaderInput:
 
     scene: Scene
     question: str
+    language: Language = "en"  # of what is said of the simulation
     seed: int | None = None  # None: an MLLM is sent none, and draws as it likes
     motion_wanted: bool = True  # stage 2 is left to the reader, too
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: nobody need look for them
@@ -147,6 +159,7 @@ class GroundingReading:
     asked: records.Asked | None = None  # what the question wants to know; null where the reader cannot say
     changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
     is_doubtful: bool = False  # what is seen in the box may not be what it is called
+    language: Language | None = None  # of the question, as far as the reader can say
 
 
 @dataclass(frozen=True)

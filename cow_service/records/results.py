@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from cow_service.records.world import Artifact, BBox, Grounding, ImageInfo, Motion, Record, Sha256, Trajectory
+from cow_service.records.world import Artifact, BBox, Grounding, ImageInfo, Language, Motion, Record, Sha256, Trajectory
 
 FramePolicy = Literal["initial", "uniform", "events"]
 
@@ -109,12 +109,41 @@ class Result(Record):
     warnings: tuple[str, ...] = ()
 
 
+HAPPENS = 0.5  # probability from which something is said to happen
+
+
+class Narration(Record):
+    """What a simulation says, in words. Everything in it is also a field of the trajectory."""
+
+    language: Language = "en"
+    answer: str = Field(
+        default="",
+        description="The answer in a word or two, such as Yes; of questions where, or what happens, the story. Empty "
+        "where nothing is asked.",
+    )
+    summary: str = Field(
+        default="",
+        description="The answer as a sentence, and how many simulated versions agree, or why it is not sure.",
+    )
+    agreement: str = Field(
+        default="", description="The last sentence of the summary: how many versions agree. Empty where it is not sure."
+    )
+    share: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Share of the versions that agree with the summary. Null without an ensemble.",
+    )
+    story: str = Field(default="", description="How each object goes, what it hits, and how it ends.")
+
+
 class Simulation(Clip, Result):
     """The whole way from image and question to frames: what `POST /simulate` returns."""
 
     grounding: Grounding
     motion: Motion
     trajectory: Trajectory
+    narration: Narration = Field(default_factory=Narration, description="Empty in results of versions before 0.2.")
 
     @property
     def overlay_name(self) -> str:
@@ -258,18 +287,9 @@ def artifacts_of(result: Simulation | Answer) -> dict[str, Sha256]:
 
 
 def verdict_of(result: Simulation | Answer) -> str:
-    """What it comes to, in words: the answer, else what the worlds say; empty where nothing is asked."""
+    """The answer in words; of a simulation that of its narration, which is empty where nothing is asked."""
     if isinstance(result, Simulation):
-        outcome = result.trajectory.outcome
-        if outcome is None or outcome.asked.form in ("where", "what-happens"):
-            return "" if outcome is None else outcome.facts
-        if not outcome.sure:
-            return "Not sure"
-        if outcome.asked.form == "how-many":
-            return str(outcome.count)
-        if outcome.asked.form == "which-first":
-            return outcome.first or "Nothing"
-        return "Yes" if (outcome.probability or 0.0) >= 0.5 else "No"
+        return result.narration.answer
     return "Not sure" if result.answer is None else result.option or result.answer
 
 

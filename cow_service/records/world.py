@@ -51,6 +51,7 @@ PlaceRelation = Literal["into", "onto", "between", "in-front-of", "behind", "nex
 Until = Literal["contact", "out-of-view"]
 Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
 Opening = Literal["round", "square", "none"]
+Language = Literal["en", "de", "es", "fr", "zh", "ja"]
 
 
 AskedRelation = Literal["touches", "covers", "covered", "inside", "tips", "moves", "leaves", "lands"]
@@ -148,6 +149,7 @@ class Grounding(Record):
         default=False, description="The question speaks of a trail: balls that look alike, one after another, are one."
     )
     is_doubtful: bool = Field(default=False, description="As `LocatedObject.is_doubtful`, of what moves.")
+    language: Language | None = Field(default=None, description="Of the question, where a multimodal LLM says it.")
     source: Source
 
 
@@ -234,11 +236,9 @@ class Motion(Record):
 
 
 EncounterKind = Literal["touches", "occludes", "occluded-by"]
-MEETINGS: dict[EncounterKind, str] = {
-    "touches": "touches",
-    "occludes": "passes in front of",
-    "occluded-by": "passes behind",
-}  # what the mover does with the other object, in words
+MEETINGS: dict[EncounterKind, str] = {  # what the mover does with the other object, in words
+    "touches": "hits", "occludes": "passes in front of", "occluded-by": "passes behind",
+}  # fmt: skip
 BAND_PERCENTILES = (10, 90)  # of the points over the ensemble, across and down apart: what `Path.band` lies between
 Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "outline", "faint", "depth"]
 """What a world is uncertain of: `place` is how far from the camera and how high bodies are, `identity` whether things
@@ -459,12 +459,13 @@ class Outcome(Record):
     )
     first: str | None = Field(default=None, description="Of `which-first`: the object, null for none.")
     count: int | None = Field(default=None, description="Of `how-many`: the number.")
-    time: float | None = Field(default=None, description="Seconds until it first happens, the median of the worlds.")
+    time: float | None = Field(
+        default=None, description="Seconds until it first happens: in the version that is shown, else the median."
+    )
     time_band: tuple[float, float] | None = Field(default=None, description="Its 10th and 90th percentile, s.")
     sure: bool = Field(description="Whether the world is certain enough for an answer; else the answer is not sure.")
     robust: bool = Field(description="Whether at least 90% of the worlds give the answer.")
     depends_on: tuple[Doubt, ...] = Field(default=(), description="What the answer depends on, most first.")
-    facts: str = Field(default="", description="What happens, in one sentence made of the facts.")
 
 
 PlacementResult = Literal["inside", "sticks-out", "on-the-rim", "on-top", "beside", "overlaps", "falls-off", "tips"]
@@ -588,8 +589,10 @@ class Trajectory(Record):
 
     @model_validator(mode="before")
     @classmethod
-    def _read_one_path(cls, value: Any) -> Any:
-        """Reads results of older versions, whose only path lay in the trajectory itself."""
+    def _read_older(cls, value: Any) -> Any:
+        """Reads results of older versions: an outcome with its own narration, an only path in the trajectory itself."""
+        if isinstance(value, dict) and isinstance(value.get("outcome"), dict) and "facts" in value["outcome"]:
+            value = value | {"outcome": {name: part for name, part in value["outcome"].items() if name != "facts"}}
         if not isinstance(value, dict) or "paths" in value or "points" not in value:
             return value
         path = {name: value[name] for name in _OF_PATHS if name in value}

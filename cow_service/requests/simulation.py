@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator,
 
 from cow_service import records
 from cow_service.errors import shortened
-from cow_service.records import Record
+from cow_service.records import Language, Record
 from cow_service.requests.values import (
     Finite,
     Flag,
@@ -410,6 +410,12 @@ class SimulateRequest(Record):
         default=None,
         description="Answers to choose from: texts, which get the letters A, B, C..., or each with a letter of its "
         "own; by default those that the question lists. Used by `/answer`.",
+    )
+    language: Language | None = Field(
+        default=None,
+        description="Of the narration, and of what the embedded reader answers. By default that of the header "
+        "`Accept-Language`, unless it prefers English; else that of the question, where a multimodal LLM reads it; "
+        "else English.",
     )
     grounding: GroundingRequest | None = None
     motion: MotionRequest | None = None

@@ -6,7 +6,8 @@ from functools import partial
 
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
-from cow_service.narration import OF_ITSELF, OF_TARGET, same_name
+from cow_service.narration.story import OF_ITSELF, OF_TARGET
+from cow_service.narration.words import same_name
 from cow_service.perception.outlines import outlines_at, outlines_in
 from cow_service.readers.base import GroundingReading, NamedChange, SeenThing, WordReader
 from cow_service.readers.options import plain
@@ -74,6 +75,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         asked=reading.asked if request.asked is None else Asked(**dict(request.asked)),
         trail_named=question.trail_named,
         is_doubtful=reading.is_doubtful,
+        language=reading.language,
         source=source,
     )
     grounding = understood(grounding, run.backends.words())

@@ -71,7 +71,7 @@ def digest_of(values: Mapping[str, Any]) -> str:
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 15  # of stored results; raised where what a stage means or stores changes
+FORMAT = 16  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class KeyFields:
 
 TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "depth", "ensemble", "num_frames", "fps", "live")
 KEY_FIELDS: dict[Stage, KeyFields] = {
-    "gating": KeyFields(("question", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
+    "gating": KeyFields(("question", "language", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "grounding": KeyFields(
         ("seed", "left_to_reader"),
         "reader",
@@ -119,7 +119,9 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
     "depth": KeyFields((), perception=("depth",)),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),
     "generation": KeyFields(("clip_seed", "frames", "video"), "generator", perception=("inpainter",)),
-    "answering": KeyFields(("question", "seed", "options", "votes", "baseline", "imagine"), "reader", votes="votes"),
+    "answering": KeyFields(
+        ("question", "language", "seed", "options", "votes", "baseline", "imagine"), "reader", votes="votes"
+    ),
 }
 # Of a simulation its id and times do not decide an answer.
 _SIMULATION_FIELDS = {"grounding", "motion", "trajectory", "frames", "factual_frames"}

@@ -10,7 +10,7 @@ import numpy as np
 
 from cow_service import records
 from cow_service.errors import FieldError, InvalidRequest, field_of
-from cow_service.narration import bare_name, direction_words, place_words, same_name
+from cow_service.narration.words import bare_name, direction_words, place_words, same_name
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera
 from cow_service.physics.trail_fit import fit_throw, straight_direction

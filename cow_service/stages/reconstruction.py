@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from cow_service.errors import CannotGround
-from cow_service.narration import OF_ITSELF, OF_TARGET, place_words, same_name
+from cow_service.narration.story import OF_ITSELF, OF_TARGET
+from cow_service.narration.words import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera, no_segments

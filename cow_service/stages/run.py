@@ -22,7 +22,7 @@ from cow_service.observability.logging import rfc3339
 from cow_service.perception.base import Embedded, Perception
 from cow_service.physics.geometry import DepthMap
 from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
-from cow_service.records import Artifact, BBox, Cue, Estimate, Grounding, ReaderInfo, Record, Usage
+from cow_service.records import Artifact, BBox, Cue, Estimate, Grounding, Language, ReaderInfo, Record, Usage
 from cow_service.requests import AnswerRequest, DepthRequest, ImageArtifact, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
@@ -344,6 +344,7 @@ class Run(Generic[Request_co]):
         return ReaderInput(
             scene=scene or self.scene,
             question=self.request.question,
+            language=self.language,
             seed=self.request.seed,
             motion_wanted="motion" in self.request.left_to_reader,
             until=self.until,
@@ -351,6 +352,11 @@ class Run(Generic[Request_co]):
             check_canceled=self.check_canceled,
             cpu=self.cpu,
         )
+
+    @property
+    def language(self) -> Language:
+        """Of the narration: that of the request, else of the question as the reader read it, else English."""
+        return self.request.language or (self.grounding and self.grounding.language) or "en"
 
     @property
     def grounding(self) -> Grounding | None:

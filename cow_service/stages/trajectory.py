@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cow_service.media.images import encode_png, fit_within
-from cow_service.narration import warnings_of, with_facts
+from cow_service.narration.warnings import warnings_of
 from cow_service.physics.ballistic import FreePath
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.ensemble import EnsembleResult, Query, run_ensemble
@@ -62,9 +62,7 @@ def simulate_world(situation: Situation, world: WorldInput, query: Query | None,
     """
     given, known = situation.request.trajectory, situation.is_separated
     judged = [judge(situation, each) for each in run_ensemble(world, query, situation.request.ensemble)]
-    trajectories = [record_trajectory(*each, path, given, known) for each in judged]
-    changes = tuple(each for each in situation.grounding.interventions if each is not situation.carried)
-    first, *as_it_is = with_facts(situation.grounding.object, changes, trajectories)
+    first, *as_it_is = [record_trajectory(*each, path, given, known) for each in judged]
     factual = as_it_is[0].model_copy(update={"anchors": ()}) if as_it_is else None
     return first.model_copy(update={"factual": factual})
 

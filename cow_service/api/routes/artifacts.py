@@ -31,7 +31,7 @@ from cow_service.media.artifacts import extension_of
 from cow_service.media.images import decode
 from cow_service.media.share import Told, card, film, page
 from cow_service.media.video import animation
-from cow_service.narration import direction_words
+from cow_service.narration.words import direction_words
 from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
 
 CACHE_CONTROL = "max-age=31536000, immutable"  # bytes never change under their digest

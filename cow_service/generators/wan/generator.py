@@ -38,7 +38,7 @@ from cow_service.generators.wan.pipeline import (
 from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, WanOptions
 from cow_service.generators.wan.ranks import RankGroup
 from cow_service.generators.wan.tracks import STRIDE, Tracks, clip_length, tracks_of
-from cow_service.narration import shown
+from cow_service.narration.story import shown
 from cow_service.physics.tracks import Density, at_rate, with_tracks
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings

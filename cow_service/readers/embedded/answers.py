@@ -6,17 +6,17 @@ One rule for every form: `Outcome.sure` decides whether an answer is given, and 
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
-from cow_service.narration import DOUBTS
+from cow_service.narration.summary import happens
+from cow_service.narration.words import Phrases
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.asked import Unread
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import may_name, parse_noun_phrase
 from cow_service.readers.options import not_sure_option, plain, says_not_sure
-from cow_service.records import AnswerOption, Asked, Doubt, Outcome
+from cow_service.records import AnswerOption, Asked, Narration, Outcome, Simulation
 
 _YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECASE)
 # "No contact" says something of the event, "No, it stops" of what is asked.
@@ -170,127 +170,61 @@ def _digits(text: str) -> str:
     return " ".join(said.split())
 
 
-HAPPENS = 0.5  # probability from which what is asked happens
-
-NOT_ASKED = (
-    "Not sure, because the embedded reader did not understand {words}. It reads questions in English of whether, "
-    "when or where something hits, lands on, hides, enters, leaves, misses or is hidden by something, what it hits "
-    "first, how many things it hits, whether something is moved or tips, and what changes. Set COW_MLLM to ask a "
-    "multimodal LLM."
-)
 ALL_READ = Unread()
 MAX_UNREAD = 200  # characters
-NO_SIMULATION = "Not sure, because without a simulation there is nothing for the embedded reader to judge by."
-NO_OUTCOME = "Not sure, because the simulation does not tell what the question asks."
-NOT_FOUND = "Not sure, because what the question asks about was not found in the image under that name."
-NOT_TOLD = "Not sure, because nothing in the image tells what was asked: its objects could not be told apart."
-NO_WORLDS = (
-    "Not sure, because no worlds were run in which what is asked could be counted: `ensemble` is 0, or the trajectory "
-    "was given."
-)
-NO_OPTION = "The world's answer is '{said}', but not exactly one of the options says so."
-NOT_AMONG = "Not sure, because what is met first, '{said}', is not one of what the question asks about."
-NOT_IDENTIFIED = (
-    "Not sure, because something that the question names may be another thing, or a part; see the warnings."
-)
-NOT_CLEAR = "Not sure, because a thing that matters was not seen clearly; the warnings say which."
-TOO_FAINT = "Not sure, because something may stand in the way that is too faint to tell; the warnings say where."
-NOT_IN_MAP = "Not sure, because the depth map does not show what matters; the warnings say why."
-TOO_CLOSE = "Not sure: the probability of {what} is {probability:.2f}{depends}."
 
 
 def answer_from(
     options: Sequence[AnswerOption],
     asked: Asked | None,
-    outcome: Outcome | None,
-    simulated: bool,
+    simulation: Simulation | None,
+    say: Phrases,
     alternatives: Sequence[ObjectPhrase] = (),
     unread: Unread = ALL_READ,
-    in_worlds: bool = True,
 ) -> AnswerReading:
-    """The answer, and why it is not sure. `asked` and `alternatives` are read in the question, `unread` was not;
-    `in_worlds` says whether there is an ensemble.
+    """The answer, and why it is not sure, in the language of `say`. `asked` and `alternatives` are read in the
+    question, `unread` was not.
     """
-    if asked is None or not simulated or outcome is None:
+    outcome = None if simulation is None else simulation.trajectory.outcome
+    if asked is None:
         words = "', '".join(unread.turning or unread.beside)[:MAX_UNREAD]
-        named = NOT_ASKED.format(words=f"'{words}'" if words else "the question")
-        why = named if asked is None else NO_OUTCOME if simulated else NO_SIMULATION
-        return _unsure(options, why)
+        return _unsure(options, say("unsure-not-read", words=f"'{words}'" if words else say("the-question")))
+    if simulation is None or outcome is None:
+        return _unsure(options, say("unsure-no-simulation" if simulation is None else "unsure-no-outcome"))
     first = outcome.first
     if outcome.sure and first is not None and alternatives and not any(may_name(each, first) for each in alternatives):
-        return replace(_unsure(options, NOT_AMONG.format(said=first)), reasoning=outcome.facts)
-    return choose_option(options, outcome, in_worlds)
+        return _unsure(options, say("unsure-not-among", said=first))
+    return choose_option(options, outcome, simulation.narration, say)
 
 
-def choose_option(options: Sequence[AnswerOption], outcome: Outcome, in_worlds: bool = True) -> AnswerReading:
-    """The option that says what the world says, or its words where there are none; else not sure, and why."""
-    why = why_not_sure(outcome, in_worlds)
-    if why:
-        reading = _unsure(options, why)
-    elif not options:
-        reading = AnswerReading(_in_words(outcome), False)
-    else:
-        offered = [option for option in options if not says_not_sure(option.text)]
-        fitting = _fitting(offered, outcome)
-        if len(fitting) == 1:
-            reading = AnswerReading(fitting[0].letter, False)
-        else:
-            reading = _unsure(options, NO_OPTION.format(said=_in_words(outcome)))
-    return replace(reading, reasoning=outcome.facts)
-
-
-def why_not_sure(outcome: Outcome, in_worlds: bool = True) -> str:
-    """What keeps the world from an answer, in one sentence; empty where it gives one."""
-    if outcome.asked.target is not None and outcome.object is None:
-        return NOT_FOUND
-    if "depth" in outcome.depends_on:
-        return NOT_IN_MAP
-    if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
-        return NOT_TOLD if in_worlds else NO_WORLDS
-    if outcome.sure:
-        return ""
-    unseen: dict[Doubt, str] = {"identity": NOT_IDENTIFIED, "outline": NOT_CLEAR, "faint": TOO_FAINT}
-    told = next((why for doubt, why in unseen.items() if doubt in outcome.depends_on), None)
-    if told is not None:
-        return told
-    what = "what is asked" if outcome.asked.form == "whether" else f"the likeliest answer, '{_in_words(outcome)}',"
-    depends = f"; it depends most on {DOUBTS[outcome.depends_on[0]]}" if outcome.depends_on else ""
-    return TOO_CLOSE.format(what=what, probability=outcome.probability, depends=depends)
+def choose_option(
+    options: Sequence[AnswerOption], outcome: Outcome, narration: Narration, say: Phrases
+) -> AnswerReading:
+    """The option that says what the simulation says, or its words where there are none; else not sure, and why."""
+    if not outcome.sure:
+        return _unsure(options, narration.summary)
+    if not options:
+        return AnswerReading(narration.answer, False, reasoning=narration.summary)
+    fitting = _fitting([option for option in options if not says_not_sure(option.text)], outcome)
+    if len(fitting) == 1:
+        return AnswerReading(fitting[0].letter, False, reasoning=narration.summary)
+    return _unsure(options, say("unsure-no-option", said=narration.answer))
 
 
 def _unsure(options: Sequence[AnswerOption], why: str) -> AnswerReading:
     option = not_sure_option(options)
-    return AnswerReading(None if option is None else option.letter, True, notes=(why,))
-
-
-def _happens(outcome: Outcome) -> bool:
-    return outcome.probability is not None and outcome.probability >= HAPPENS
-
-
-def _in_words(outcome: Outcome) -> str:
-    """The answer to an open question."""
-    match outcome.asked.form:
-        case "whether" | "changes":
-            return "Yes" if _happens(outcome) else "No"
-        case "which-first":
-            return outcome.first or "Nothing"
-        case "when":
-            return "Never" if outcome.time is None else f"After about {outcome.time:.1f} s"
-        case "how-many":
-            return str(outcome.count)
-        case "where" | "what-happens":
-            return outcome.facts
+    return AnswerReading(None if option is None else option.letter, True, reasoning=why)
 
 
 def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
     """The options that say what the world says."""
     form, first = outcome.asked.form, outcome.first
     if form in ("whether", "changes"):
-        happens = _happens(outcome)
-        return [option for option in options if says_it_happens(option.text, outcome.asked) is happens]
+        is_yes = happens(outcome)
+        return [option for option in options if says_it_happens(option.text, outcome.asked) is is_yes]
     if form == "how-many":
         return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
-    if (form == "which-first" and first is None) or (form == "when" and outcome.time is None):
+    if (form == "which-first" and first is None) or (form == "when" and not happens(outcome)):
         return [option for option in options if names_none(option.text)]
     if form == "which-first" and first is not None:
         things = [option for option in options if not names_none(option.text)]

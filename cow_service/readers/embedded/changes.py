@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from cow_service.errors import CannotGround
-from cow_service.narration import same_name
+from cow_service.narration.words import same_name
 from cow_service.readers.embedded.english.asked import read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.questions import Question

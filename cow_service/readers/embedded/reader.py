@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from cow_service import __version__, records
 from cow_service.errors import CannotGround, CannotReadDirection
-from cow_service.narration import same_name
+from cow_service.narration.words import phrases_of, same_name
 from cow_service.physics.camera import depth_motion
 from cow_service.readers import base
 from cow_service.readers.base import MotionReading, ReaderInput
@@ -172,12 +172,9 @@ class EmbeddedReader:
     ) -> tuple[base.AnswerReading, ...]:
         """What the world tells of the question, the same for every vote; not sure where it does not."""
         question = parse(given.question)
-        trajectory = None if imagined is None else imagined.simulation.trajectory
-        outcome = None if trajectory is None else trajectory.outcome
-        alternatives = read_alternatives(question)
-        asked = read_asked(question) if grounding is None else grounding.asked
-        in_worlds = trajectory is None or trajectory.ensemble > 0
-        reading = answer_from(options, asked, outcome, imagined is not None, alternatives, unread(question), in_worlds)
+        simulation = None if imagined is None else imagined.simulation
+        asked, say = read_asked(question) if grounding is None else grounding.asked, phrases_of(given.language)
+        reading = answer_from(options, asked, simulation, say, read_alternatives(question), unread(question))
         if votes > 1:
             again = "The embedded reader gives the same answer every time: more votes say no more."
             reading = replace(reading, notes=(*reading.notes, again))

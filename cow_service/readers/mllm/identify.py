@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Self, get_args
 from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, field_validator, model_validator
 
 from cow_service import records
-from cow_service.narration import RELATION_WORDS
+from cow_service.narration.words import RELATION_WORDS
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import OtherMotionHint, StepReading
 from cow_service.readers.mllm import replies
@@ -88,6 +88,8 @@ def _way(written: object) -> tuple[records.Vector, float] | None:
 
 Name = Annotated[str, Field(min_length=1), BeforeValidator(replies.name_of)]
 _RELATION = BeforeValidator(lambda said: RELATION_WORDS.get(replies.text_of(said).lower().replace("_", "-")))
+_LANGUAGES = get_args(records.Language)
+_LANGUAGE = BeforeValidator(lambda said: code if (code := replies.text_of(said)[:2].lower()) in _LANGUAGES else None)
 _WAY = BeforeValidator(_way), WithJsonSchema(replies.one_of(*WAYS))
 
 
@@ -153,6 +155,7 @@ class Identified(Reply):
     until: Annotated[records.Until | None, _known(records.Until)] = None
     then: Annotated[tuple[Leg, ...], replies.usable(Leg)] = ()
     also_moving: Annotated[tuple[AlsoMoving, ...], replies.usable(AlsoMoving)] = ()
+    language: Annotated[records.Language | None, _LANGUAGE] = None
 
     @field_validator("asked", mode="before")
     @classmethod

@@ -132,6 +132,7 @@ class MllmReader:
             hints=hints if given.motion_wanted else None,
             prior=located.prior,
             asked=identified.asked,
+            language=identified.language,
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:

@@ -1,7 +1,7 @@
 // Numbers, times and states in words.
 
 export const percent = (share) => `${Math.round(100 * share)}%`;
-export const seconds = (value) => (value < 10 ? `${value.toFixed(value < 1 ? 2 : 1)} s` : `${Math.round(value)} s`);
+export const seconds = (value) => (value < 10 ? `${value.toFixed(1)} s` : `${Math.round(value)} s`);
 export const plural = (count, one, many = `${one}s`) => `${count} ${count === 1 ? one : many}`;
 
 export const MEETS = { touches: "hits", occludes: "passes in front of", "occluded-by": "passes behind" };

@@ -27,24 +27,22 @@ function Verdict({ title, verdict, kind }) {
   </article>`;
 }
 
-/** What share of the worlds says so, as a bar and in words. */
-function Worlds({ trajectory }) {
-  const { outcome, ensemble } = trajectory;
-  if (!outcome || outcome.probability === null || !ensemble) return null;
-  const when = outcome.time === null ? "" : `, after ${seconds(outcome.time)}`;
-  const band = outcome.time_band ? ` (${outcome.time_band.map((time) => time.toFixed(1)).join(" to ")} s)` : "";
-  return html`<p class="probability"><meter min="0" max="1" value=${outcome.probability} aria-hidden="true"></meter>
-    <span><b>${percent(outcome.probability)}</b> of ${plural(ensemble, "world")}${when}${band}</span></p>`;
+/** How many simulated versions agree with the summary, as a bar. */
+function Versions({ simulation: { narration, trajectory } }) {
+  if (!trajectory.outcome || narration.share === null) return null;
+  const count = Math.round(narration.share * trajectory.ensemble);
+  return html`<p class="probability"><meter min="0" max="1" value=${narration.share} aria-hidden="true"></meter>
+    <span><b>${count}</b> of ${plural(trajectory.ensemble, "simulated version")}</span></p>`;
 }
 
+/** What else the answer depends on: the summary of one that is not sure names the first. */
 function Depends({ outcome }) {
-  if (!outcome?.depends_on.length) return null;
-  return html`<p class="depends">It depends on ${outcome.depends_on.map((doubt) => DOUBTS[doubt] ?? doubt).join(", ")}.</p>`;
+  const rest = (outcome?.depends_on ?? []).slice(outcome?.sure ? 0 : 1);
+  if (!rest.length) return null;
+  return html`<p class="depends">It ${outcome.sure ? "" : "also "}depends on ${rest.map((doubt) => DOUBTS[doubt] ?? doubt).join(", ")}.</p>`;
 }
 
-function Facts({ outcome, said = "" }) {
-  return outcome?.facts && outcome.facts !== said && html`<p dir="auto">${outcome.facts}</p>`;
-}
+const Story = ({ simulation }) => simulation.narration.story && html`<p class="story" dir="auto">${simulation.narration.story}</p>`;
 
 function Cost({ made }) {
   const time = Object.values(made.timings).reduce((sum, value) => sum + value, 0);
@@ -81,15 +79,14 @@ export function Result({ state }) {
   return html`<section class=${`result ${run ? "old" : ""} ${state.isForeseeing && !run ? "faded" : ""}`} aria-label="Result" aria-busy=${Boolean(run)} data-job=${result.jobId}>
     ${run && html`<p class="hint">Of the request before:</p>`}
     ${answer && html`<${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />`}
-    ${simulation && html`${!answer && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p>`}
-      <${Worlds} trajectory=${simulation.trajectory} /><${Depends} outcome=${outcome} />
-      ${!answer && html`<${Facts} outcome=${outcome} />`}`}
+    ${simulation && !answer && html`<p class="reasoning" dir="auto">${simulation.narration.summary || simulation.motion.sentence}</p>`}
+    ${simulation && html`<${Versions} simulation=${simulation} /><${Depends} outcome=${outcome} />`}
     ${simulation?.trajectory.placement && html`<p>${`It ends ${simulation.trajectory.placement.result.replaceAll("-", " ")}.`}</p>`}
     ${isCompared && baseline}
     <${Warnings} warnings=${warnings} />
     ${simulation && !run && html`<${Share} jobId=${result.jobId} simulation=${simulation} />`}
     <details class="more"><summary>How it came about</summary>
-      ${answer && simulation && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p><${Facts} outcome=${outcome} said=${answer.reasoning} />`}
+      ${simulation && html`<p class="sentence" dir="auto">${simulation.motion.sentence}</p><${Story} simulation=${simulation} />`}
       ${!isCompared && baseline}
       ${answer && html`<${Gate} gate=${answer.gate} />`}
       ${!run && html`<${Stages} result=${result} />`}
@@ -122,7 +119,7 @@ function Other({ other }) {
     <h3>${label}</h3>
     ${status === "running" && html`<p role="status">Running…</p><progress aria-label=${`Progress of ${label}`}></progress>`}
     ${answer && html`<p class="said" dir="auto">${answerWords(answer)}</p>${answer.reasoning && html`<p class="reasoning" dir="auto">${answer.reasoning}</p>`}`}
-    ${simulation && html`<${Worlds} trajectory=${simulation.trajectory} /><${Depends} outcome=${simulation.trajectory.outcome} /><div class="filmstrip">${simulation.frames.map((frame) =>
+    ${simulation && html`<${Versions} simulation=${simulation} /><${Depends} outcome=${simulation.trajectory.outcome} /><div class="filmstrip">${simulation.frames.map((frame) =>
       html`<span class="shot" key=${frame.index}><${Shot} sha256=${frame.sha256} alt=${`Frame ${frame.index}`} /></span>`)}</div>`}
     ${(answer || simulation) && html`<${Cost} made=${answer ?? simulation} />`}
     ${problem && html`<p class="warning">${problem.detail}</p>`}

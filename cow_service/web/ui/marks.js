@@ -18,7 +18,7 @@ export function labelsOf(trajectory, isOld) {
   const met = new Set(encounters.map((encounter) => encounter.object));
   return [
     ...encounters.map((encounter) => ({
-      text: `${encounterWords(encounter, trajectory)}, ${seconds(encounter.first_frame / fps)}`, box: encounter.bbox, kind: `met ${encounter.kind}`, below: true,
+      text: `${encounterWords(encounter, trajectory)}, ${seconds(encounter.time ?? encounter.first_frame / fps)}`, box: encounter.bbox, kind: `met ${encounter.kind}`, below: true,
     })),
     ...bodies.slice(1).filter((body) => !met.has(body.object)).map((body) => ({ text: body.object, box: body.bbox, kind: "body" })),
   ];

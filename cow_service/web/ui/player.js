@@ -89,11 +89,13 @@ export function usePlayer(simulation, isBusy) {
 function marksOf(trajectory, fps) {
   const meets = trajectory.encounters.map((encounter) => ({
     frame: encounter.first_frame,
+    time: encounter.time ?? encounter.first_frame / fps,
     kind: encounter.kind,
     text: encounterWords(encounter, trajectory),
   }));
   const floor = trajectory.contacts.filter((contact) => contact.b === null).map((contact) => ({
     frame: Math.round(contact.time * fps),
+    time: contact.time,
     kind: "floor",
     text: `${trajectory.bodies[contact.a]?.object ?? "It"} meets the floor`,
   }));
@@ -110,7 +112,7 @@ export function Transport({ player, trajectory }) {
     <div class="timeline">
       <div class="marks">
         ${marks.map((mark, place) => html`<button key=${place} class=${`mark ${mark.kind}`} style=${{ left: `${(100 * mark.frame) / last}%` }}
-          title=${`${seconds(mark.frame / fps)}: ${mark.text}`} aria-label=${`Go to ${seconds(mark.frame / fps)}: ${mark.text}`}
+          title=${`${seconds(mark.time)}: ${mark.text}`} aria-label=${`Go to ${seconds(mark.time)}: ${mark.text}`}
           onClick=${() => player.seek(mark.frame)}></button>`)}
       </div>
       <input type="range" min="0" max=${last} value=${frame} aria-label="Frame of the clip"

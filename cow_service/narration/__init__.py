@@ -1,0 +1,1 @@
+"""Records in words: a simulation's answer and story in several languages, warnings and names in English."""

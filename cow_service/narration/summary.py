@@ -1,0 +1,235 @@
+"""The answer of a simulation in words: what the question asks, how many simulated versions agree, and the story."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from cow_service.narration.story import EVENTS, KINDS, OF_TARGET, Story
+from cow_service.narration.words import Phrases, capitalised, phrases_of
+from cow_service.records.results import HAPPENS, Narration
+
+if TYPE_CHECKING:
+    from cow_service.records import Doubt, Grounding, Language, Outcome, Trajectory
+
+LEANING = 2 / 3  # share of the simulated versions from which an answer that is not sure is called probable
+_UNSEEN: tuple[Doubt, ...] = ("identity", "outline", "faint")  # doubts of what is seen, which no simulation weighs
+_FITTING = ("inside", "on-top", "beside")  # results of a thing that ends as it was meant to
+_TOLD_BY_STORY = ("where", "what-happens")  # forms whose answer is the story
+
+
+def narrate(grounding: Grounding, trajectory: Trajectory, language: Language) -> Narration:
+    """A trajectory in words of a language."""
+    say = phrases_of(language)
+    summary = _Summary(grounding.object, trajectory, say)
+    story = summary.story.text()
+    if trajectory.factual is not None:
+        as_it_is = Story(grounding.object, trajectory.factual, say).text()
+        label = label_of_changes(grounding, trajectory, say)
+        told = ((label, story), (capitalised(say("as-it-is")), as_it_is))
+        story = say.templates["between"].join(say("labelled", label=label, story=text) for label, text in told)
+    outcome, agreement = trajectory.outcome, summary.agreement()
+    if outcome is None:
+        answer, said = "", story
+    elif not outcome.sure:
+        answer, said, agreement = say("not-sure"), summary.unsure(), ""
+    elif outcome.asked.form in _TOLD_BY_STORY:
+        answer, said = story, story
+    else:
+        answer, said = direct(outcome, say), summary.sentence()
+    return Narration(
+        language=language,
+        answer=answer,
+        summary=say.templates["between"].join(filter(None, (said, agreement))),
+        agreement=agreement,
+        share=summary.share() if trajectory.ensemble else None,
+        story=story,
+    )
+
+
+def direct(outcome: Outcome, say: Phrases) -> str:
+    """The answer to an open question, in as few words as there are for it; empty where only the story tells."""
+    match outcome.asked.form:
+        case "whether" | "changes":
+            return say("yes" if happens(outcome) else "no")
+        case "which-first":
+            return outcome.first or say("nothing")
+        case "when":
+            if outcome.time is None or not happens(outcome):
+                return say("never")
+            return say("after", time=say.seconds(outcome.time))
+        case "how-many":
+            return str(outcome.count or 0)
+        case "where" | "what-happens":
+            return ""
+
+
+def why_unsure(outcome: Outcome, in_worlds: bool, say: Phrases) -> str:
+    """Why the simulation cannot tell at all, in a sentence; empty where it gives an answer, sure or not."""
+    if outcome.asked.target is not None and outcome.object is None:
+        return say("unsure-not-found")
+    if "depth" in outcome.depends_on:
+        return say("unsure-depth")
+    if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
+        return say("unsure-unseen" if in_worlds else "unsure-uncounted")
+    doubt = None if outcome.sure else next((doubt for doubt in _UNSEEN if doubt in outcome.depends_on), None)
+    return "" if doubt is None else say(f"unsure-{doubt}")
+
+
+def found_in(mover: str, trajectory: Trajectory, say: Phrases) -> str:
+    """What most simulated versions have of what the question asks, and how many, in a sentence; empty without any."""
+    outcome = trajectory.outcome
+    if outcome is None or outcome.probability is None or not trajectory.ensemble:
+        return ""
+    return capitalised(say("stated", statement=_Summary(mover, trajectory, say).counted()))
+
+
+def label_of_changes(grounding: Grounding, trajectory: Trajectory, say: Phrases) -> str:
+    """What is changed before the motion, as in: With the vase on the box; empty where nothing is."""
+    put = {each.object for each in trajectory.placed}
+    removed = [each.object.object for each in grounding.interventions if each.kind == "remove"]
+    placed = [each for each in grounding.interventions if each.kind == "place" and each.object.object in put]
+    without = say.names(removed) if removed else ""
+    states = [
+        say(
+            f"at-{each.relation or 'into'}",
+            object=say.name(each.object.object),
+            target=say.names([target.object for target in each.targets]),
+        )
+        for each in placed
+    ]
+    having = say.joined(states) if states else ""
+    if without and having:
+        return say("with-without", placed=having, removed=without)
+    return say("without", object=without) if without else say("with", object=having) if having else ""
+
+
+def happens(outcome: Outcome) -> bool:
+    """Whether what the question asks happens, as most simulated versions have it."""
+    return outcome.probability is not None and outcome.probability >= HAPPENS
+
+
+class _Summary:
+    """The sentences about the outcome of one trajectory."""
+
+    def __init__(self, mover: str, trajectory: Trajectory, say: Phrases) -> None:
+        self._mover, self._trajectory, self._say = mover, trajectory, say
+        self._outcome = trajectory.outcome
+        self.story = Story(mover, trajectory, say)
+
+    def sentence(self) -> str:
+        """The answer as a sentence, as in: Yes, it hits the blue mug after about 0.8 s."""
+        outcome, say = self._given, self._say
+        form, time = outcome.asked.form, outcome.time
+        if form in ("whether", "changes"):
+            return say("answered", answer=direct(outcome, say), statement=self._statement(with_time=True))
+        said = self._statement(with_time=False)
+        if form == "which-first" and outcome.first is not None:
+            name = say.name(outcome.first)
+            said = name if time is None else say("first-at", object=name, time=say.seconds(time))
+        elif form == "how-many" and outcome.count:
+            said = self._count(outcome.count)
+        elif form == "when" and happens(outcome) and time is not None:
+            early, late = (say.seconds(each) for each in outcome.time_band or (time, time))
+            spread = {"early": early, "late": late} if early != late else {}
+            said = say("after-band" if spread else "after", time=say.seconds(time), **spread)
+        return capitalised(say("stated", statement=said))
+
+    def unsure(self) -> str:
+        """Why there is no answer, in a sentence, as in: Probably not: it misses the mug in 41 of 50 versions."""
+        outcome, say, share = self._given, self._say, self.share()
+        why = why_unsure(outcome, self._trajectory.ensemble > 0, say)
+        if why or share is None:
+            return why
+        leaning = share >= LEANING
+        key = "probably-not" if leaning and outcome.asked.form == "whether" and not happens(outcome) else "probably"
+        depends = say("depends", doubt=say(f"doubt-{outcome.depends_on[0]}")) if outcome.depends_on else ""
+        answer, statement = say(key if leaning else "not-sure"), self.counted()
+        return say("unsure", answer=answer, statement=statement, depends=depends)
+
+    def agreement(self) -> str:
+        """How many simulated versions agree with what is said, in a sentence; empty where none were counted."""
+        share, total = self.share(), self._trajectory.ensemble
+        if share is None or not total:
+            return ""
+        count = round(share * total)
+        return self._say("agree-all" if count == total > 1 else "agree", count=str(count), total=str(total))
+
+    def counted(self) -> str:
+        """What most versions say, and how many of them, as a clause. There must be an outcome with a probability."""
+        total, statement = self._trajectory.ensemble, self._statement(with_time=False)
+        count = str(round((self.share() or 0.0) * total))
+        return self._say("in-versions", statement=statement, count=count, total=str(total))
+
+    @property
+    def _given(self) -> Outcome:
+        assert self._outcome is not None  # nothing is asked otherwise
+        return self._outcome
+
+    def share(self) -> float | None:
+        """The share of the versions that agree with the answer or, where nothing is asked, with the story."""
+        outcome = self._outcome
+        if outcome is None or outcome.probability is None:
+            return self.story.agreement() if outcome is None else None
+        is_yes = outcome.asked.form not in ("whether", "when", "changes") or happens(outcome)
+        return outcome.probability if is_yes else 1 - outcome.probability
+
+    def _count(self, count: int) -> str:
+        return self._say("count-one") if count == 1 else self._say("count-many", count=str(count))
+
+    def _statement(self, *, with_time: bool) -> str:
+        """What is so in most versions, as a clause with its subject: it hits the blue mug."""
+        outcome, say, form = self._given, self._say, self._given.asked.form
+        if form == "changes":
+            return say("differs" if happens(outcome) else "differs-not")
+        if outcome.first is not None:
+            return say("first-is", thing=say.name(outcome.first))
+        if form == "how-many" and outcome.count:
+            return say("it-is", thing=self._count(outcome.count))
+        does = form in ("whether", "when") and happens(outcome) != outcome.asked.negated
+        return self._event(does, outcome.time if does and with_time else None)
+
+    def _event(self, does: bool, time: float | None) -> str:
+        """That what is asked about happens, or does not, with its time where one is given."""
+        outcome, say, asked = self._given, self._say, self._given.asked
+        key = EVENTS[asked.relation] if time is None or asked.relation == "inside" else f"{EVENTS[asked.relation]}-at"
+        meant = [outcome.object] if outcome.object is not None else list(asked.among)
+        if asked.relation in OF_TARGET and not meant:
+            return self._within(say(f"{EVENTS[asked.relation]}-{'any' if does else 'none'}"))
+        subjects = [say("subject", name=say.name(self._mover))]
+        if asked.relation in OF_TARGET:
+            subjects = [say.name(each) for each in meant]
+        elif outcome.subject is not None:
+            subjects = [say.name(outcome.subject)]
+        clause = self._within(self._clause(key, does, time, meant))
+        statements = [say("statement", subject=each, clause=clause) for each in subjects]
+        return say.joined(statements, "names-and" if asked.every or not does else "names-or")
+
+    def _clause(self, key: str, does: bool, time: float | None, meant: Sequence[str]) -> str:
+        """What its subject does, or does not."""
+        say, asked = self._say, self._given.asked
+        placement = self._trajectory.placement
+        if asked.relation == "inside" and placement is not None and (placement.result in _FITTING) == does:
+            return self.story.placed()
+        if asked.relation == "lands" and self._support():
+            key, meant = key.replace("land", "fall-off"), self._support()
+        if asked.partly and does:
+            key = f"{EVENTS[asked.relation]}-part"
+        if not does:
+            key = f"{key}-not" if meant or asked.relation not in KINDS else f"{key}-none"
+            key = "on-from-start" if asked.relation == "touches" and meant and meant == self._support() else key
+        last = "names-nor" if not does else "names-and" if asked.every else "names-or"
+        name = say.names(meant, last) if meant else say("something")
+        if time is None or not key.endswith("-at"):
+            return say(key.removesuffix("-at"), object=name)
+        return self.story.timed(key, time, object=name)
+
+    def _support(self) -> list[str]:
+        """What the thing that is asked about stands on, other than the floor."""
+        bodies, subject = self._trajectory.bodies, self._given.subject
+        on = next((body.support for body in bodies if body.object == subject), bodies[0].support if bodies else "floor")
+        return [] if on in ("floor", "air") else [on]
+
+    def _within(self, clause: str) -> str:
+        within = self._given.asked.within
+        return clause if within is None else self._say("within", clause=clause, time=self._say.seconds(within))

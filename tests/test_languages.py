@@ -1,0 +1,147 @@
+"""Narrations in every language: the templates are complete, and a request says which language it wants."""
+
+from __future__ import annotations
+
+import json
+import re
+from string import Formatter
+from typing import Any, get_args
+
+import httpx
+import pytest
+from conftest import EXAMPLES
+from drawn import floor
+from hypothesis import given
+from hypothesis import strategies as st
+from runs import run_of
+from servers import data_url
+from test_answer import CHOICES, simulated
+from test_facts import THROWN, grounded
+
+from cow_service.api.submission import language_of
+from cow_service.narration.summary import narrate
+from cow_service.narration.words import TEMPLATES, phrases_of
+from cow_service.readers.mllm.identify import read_identified
+from cow_service.records import Doubt, Language, PlacementResult, PlaceRelation
+from cow_service.stages.keys import StageResult
+
+LANGUAGES: tuple[Language, ...] = get_args(Language)
+OTHERS = [each for each in LANGUAGES if each != "en"]
+ENGLISH = phrases_of("en").templates
+# Words of English templates that would show that one was left untranslated.
+UNTRANSLATED = re.compile(r"\b(the|hits|after|simulated|because|which)\b")
+READ = {"en": "Yes", "de": "Ja", "es": "Sí", "fr": "Oui", "zh": "是", "ja": "はい"}
+
+
+def values_of(template: str) -> set[str]:
+    return {name for _, name, _, _ in Formatter().parse(template) if name}
+
+
+def test_there_is_a_file_for_every_language_of_a_request() -> None:
+    assert set(TEMPLATES.names()) == set(LANGUAGES)
+
+
+@pytest.mark.parametrize("language", OTHERS)
+def test_a_language_has_every_template_with_the_same_values(language: Language) -> None:
+    templates = phrases_of(language).templates
+    assert templates.keys() == ENGLISH.keys()
+    differing = {key for key, text in templates.items() if values_of(text) != values_of(ENGLISH[key])}
+    assert differing == {"subject"}, "English alone says `it` of what the question has named"
+    assert not [key for key, text in templates.items() if UNTRANSLATED.search(text)]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_every_word_of_the_records_has_a_template(language: Language) -> None:
+    templates = phrases_of(language).templates
+    wanted = {f"doubt-{each}" for each in get_args(Doubt)} | {f"at-{each}" for each in get_args(PlaceRelation)}
+    wanted |= {f"end-{each}" for each in get_args(PlacementResult)}
+    assert wanted <= templates.keys()
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_every_outcome_is_told_in_every_language(language: Language) -> None:
+    said = set[str]()
+    for world, _, _ in CHOICES:
+        simulation = simulated(world)
+        narration = narrate(simulation.grounding, simulation.trajectory, language)
+        assert narration.language == language
+        text = f"{narration.summary} {narration.story}"
+        assert not re.search(r"[{}]|None|  ", text)
+        said.add(narration.answer)
+    assert READ[language] in said
+
+
+@pytest.mark.parametrize(
+    ("language", "story"),
+    [
+        ("en", "The ball bounces once, rolls on and hits the white cube after about 1.1 s."),
+        ("de", "„ball“ springt einmal auf, rollt weiter und trifft nach etwa 1,1 s „white cube“."),
+        ("es", "«ball» rebota una vez, sigue rodando y choca con «white cube» tras unos 1,1 s."),
+        ("fr", "« ball » rebondit une fois, continue de rouler et heurte « white cube » après environ 1,1 s."),
+        ("zh", "“ball”弹起一次，继续滚动，约 1.1 秒后碰到“white cube”。"),
+        ("ja", "「ball」は1回弾みます。転がり続けます。約1.1秒後に「white cube」に当たります。"),
+    ],
+)  # fmt: skip
+def test_a_story_reads_as_its_language_does(language: Language, story: str) -> None:
+    assert narrate(grounded("ball"), THROWN, language).story.replace("\u00a0", " ") == story
+
+
+@pytest.mark.parametrize(
+    ("header", "language"),
+    [
+        ("de-CH,de;q=0.9,en;q=0.8", "de"),
+        ("en-US,en;q=0.9,fr;q=0.8", None),
+        ("pt-BR, fr;q=0.5, ja;q=0.7", "ja"),
+        ("ZH-hant", "zh"),
+        ("*", None),
+        ("", None),
+        ("de;q=0, es;q=nonsense, fr;q=0.1", "fr"),
+    ],
+)
+def test_a_header_names_the_language(header: str, language: Language | None) -> None:
+    assert language_of(header) == language
+
+
+@given(st.text())
+def test_any_header_is_read(header: str) -> None:
+    assert language_of(header) in (None, *OTHERS)
+
+
+def test_a_server_answers_in_the_language_of_the_field_else_of_the_header(http: httpx.Client) -> None:
+    image = data_url((EXAMPLES / "ball-and-mug" / "image.jpg").read_bytes()).replace("png", "jpeg", 1)
+    body = {
+        "image": image,
+        "question": "If the yellow ball moves along the floor to the right, will it hit the blue mug?",
+    }
+
+    def answered(headers: dict[str, str], **fields: Any) -> Any:
+        reply = http.post("/answer", json=body | fields, headers=headers)
+        assert reply.status_code == 200, reply.text
+        return reply.json()
+
+    german = answered({"Accept-Language": "de"})
+    assert german["answer"] == "Ja"
+    assert german["reasoning"].startswith("Ja, „yellow ball“ trifft nach etwa 0,8 s „blue mug“. ")
+    assert german["simulation"]["narration"]["language"] == "de"
+    assert german["reasoning"] == german["simulation"]["narration"]["summary"]
+    french = answered({"Accept-Language": "de"}, language="fr")
+    assert french["answer"] == "Oui"
+    assert set(french["reused"]) >= {"grounding", "motion", "trajectory", "generation"}, "nothing is simulated again"
+    assert answered({"Accept-Language": "en-GB"})["answer"] == "Yes"
+
+
+@pytest.mark.parametrize(("said", "language"), [("de", "de"), ("zh-Hans", "zh"), ("Klingon", None), (None, None)])
+def test_a_multimodal_llm_says_which_language_the_question_has(said: str | None, language: Language | None) -> None:
+    found = read_identified(json.dumps({"object": "ball", "kind": "linear", "language": said}))
+    assert found is not None
+    assert found.language == language
+
+
+def test_the_questions_language_counts_where_the_request_names_none() -> None:
+    read = grounded("ball").model_copy(update={"language": "es"})
+    run = run_of(floor(), question="?")
+    run.results["grounding"] = StageResult(value=read)
+    assert run.language == "es"
+    asked = run_of(floor(), question="?", language="en")
+    asked.results["grounding"] = StageResult(value=read)
+    assert asked.language == "en"
