@@ -1,4 +1,4 @@
-"""What a build makes first: the blocking classes of the SDK, from the async ones."""
+"""What a build makes: the blocking classes of the SDK, from the async ones, and the description for a package index."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 CLIENT = Path(__file__).parent / "cow_service" / "client"
 TWINS = {"async_client.py": "sync_client.py", "async_results.py": "sync_results.py"}
@@ -31,6 +32,17 @@ class CustomBuildHook(BuildHookInterface[Any]):
         """Write the twins, and have them packed though git ignores them."""
         write_twins()
         build_data["artifacts"] += [f"cow_service/client/{twin}" for twin in TWINS.values()]
+
+
+class DescriptionHook(MetadataHookInterface):
+    """Makes the README the project's description, without relative links and pictures: an index cannot resolve them."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set `readme`."""
+        text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
+        text = re.sub(r"!\[[^]]*]\((?!https?:)[^)]*\)\n*", "", text)
+        text = re.sub(r"\[([^]]*)]\((?!https?:)[^)]*\)", r"\1", text)
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}
 
 
 def write_twins() -> None:

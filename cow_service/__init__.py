@@ -1,3 +1,3 @@
 """COW: a service that lets a multimodal LLM look before it answers."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

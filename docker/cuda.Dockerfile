@@ -43,7 +43,7 @@ RUN pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /wheels 
 
 FROM ${PYTHON_IMAGE}
 ARG PYTHON_IMAGE
-ARG COW_VERSION=0.1.0
+ARG COW_VERSION=0.2.0
 LABEL org.opencontainers.image.title="COW (CUDA)" \
       org.opencontainers.image.description="An inference service that lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out." \
       org.opencontainers.image.version="${COW_VERSION}" \

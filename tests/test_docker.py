@@ -280,6 +280,13 @@ def test_labels_are_true(dockerfile: Path) -> None:
     assert labels["title"]
 
 
+def test_the_version_is_the_same_everywhere() -> None:
+    told = yaml.safe_load((DOCKER / "kubernetes" / "kustomization.yaml").read_text())["images"]
+    assert {image["newTag"] for image in told} == {f"cpu-{__version__}", f"cuda-{__version__}"}
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
+    assert f"\n## {__version__} (" in (ROOT / "CHANGELOG.md").read_text()
+
+
 def test_the_user_is_not_root_and_owns_the_volumes(dockerfile: Path) -> None:
     (user,) = texts(dockerfile, "USER")
     uid, gid = user.split(":")

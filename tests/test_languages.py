@@ -109,10 +109,8 @@ def test_any_header_is_read(header: str) -> None:
 
 def test_a_server_answers_in_the_language_of_the_field_else_of_the_header(http: httpx.Client) -> None:
     image = data_url((EXAMPLES / "ball-and-mug" / "image.jpg").read_bytes()).replace("png", "jpeg", 1)
-    body = {
-        "image": image,
-        "question": "If the yellow ball moves along the floor to the right, will it hit the blue mug?",
-    }
+    question = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
+    body = {"image": image, "question": question}
 
     def answered(headers: dict[str, str], **fields: Any) -> Any:
         reply = http.post("/answer", json=body | fields, headers=headers)

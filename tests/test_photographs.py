@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import base64
+import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import ROOT
 from drawn import clutter, png_bytes
+from typer.testing import CliRunner
 
-from cow_service.records import Outcome
+from cow_service.cli.main import app
+from cow_service.records import Outcome, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -39,3 +44,22 @@ def test_what_stands_in_a_shelf_is_not_surely_beside_what_stands_before_it(tmp_p
     assert outcome.probability is not None
     assert 0.2 < outcome.probability < 0.8
     assert "place" in outcome.depends_on
+
+
+def test_the_command_of_the_photograph_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of its README, and there is no answer without its boxes."""
+    page = (ROOT / "examples" / "photographs" / "README.md").read_text()
+    block = re.search(r"```sh\ncow (.*?)```", page, re.DOTALL)
+    assert block is not None
+    command, out = shlex.split(block[1].replace("\\\n", " ")), ["--no-video", "--out", str(tmp_path / "out")]
+    monkeypatch.chdir(ROOT)
+    environment = {"COW_DATA_DIR": str(tmp_path / "data"), "COW_READER": "embedded"}
+    result = CliRunner().invoke(app, [*command, *out], env=environment)
+    assert result.exit_code == 0, result.output
+    outcome = Simulation.model_validate_json((tmp_path / "out" / "simulation.json").read_text()).trajectory.outcome
+    assert outcome is not None
+    assert outcome.sure
+    assert outcome.probability == pytest.approx(0.91, abs=0.05)
+    result = CliRunner().invoke(app, [*command[:3], *out], env=environment)
+    assert result.exit_code == 1
+    assert "cannot-ground" in result.output

@@ -122,6 +122,7 @@ Policy = Literal["initial", "uniform", "events"]
 Kind = Literal["linear", "projectile", "fall", "static"]
 Law = Literal["contact", "ballistic"]
 Until = Literal["contact"]
+Language = Literal["en", "de", "es", "fr", "zh", "ja"]
 
 
 class Format(StrEnum):
@@ -150,7 +151,7 @@ FIELDS = {
     "max_side": "frames/max_side",
 }
 _NUMBERS = {"point": 2, "box": 4, "direction": 2}  # how many an option takes, with commas between
-_SAME_NAME = ("ensemble", "reader", "generator", "num_frames", "fps", "seed")
+_SAME_NAME = ("language", "ensemble", "reader", "generator", "num_frames", "fps", "seed")
 
 
 def request_body(
@@ -185,6 +186,7 @@ def request_body(
     depth: Annotated[Path | None, option("Depth map of the image: a grey PNG with 16 bits.", **EXISTING)] = None,
     depth_scale: Annotated[float | None, option("Metres per unit of the depth map.", shown="not known")] = None,
     trajectory: Annotated[Path | None, option("JSON with the `trajectory` of a request.", **EXISTING)] = None,
+    language: Annotated[Language | None, option("Language of answer and story.", shown="en")] = None,
     fields: Annotated[
         str | None,
         option('Other fields of the request: {"camera": {"pitch": 25}}.', "--request", metavar="JSON", shown="none"),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
     from cow_service import requests
-    from cow_service.records import Law
+    from cow_service.records import Language, Law
 
 DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
 RETRIES = 5
@@ -25,6 +25,7 @@ class SimulateOptions(TypedDict, total=False):
     """
 
     options: Sequence[str] | Sequence[requests.OptionRequest | Given] | None
+    language: Language | None
     grounding: requests.GroundingRequest | Given | None
     motion: requests.MotionRequest | Given | None
     trajectory: requests.TrajectoryRequest | Given | None

@@ -37,7 +37,7 @@ NESTED = {
 # Fields that are no arguments: `interventions` are `remove` and `place`, the rest is for programs.
 _LEFT_OUT = {
     *("grounding", "motion", "frames", "interventions", "trajectory", "camera", "depth", "ensemble", "fps"),
-    *("generator_options", "priority", "webhook", "live"),
+    *("generator_options", "priority", "webhook", "live", "language"),
 }
 _LEFT_OUT_OF = {"simulate": {"options"}, "answer": {"video"}}
 _OF_OBJECTS = ("object", "bbox")
