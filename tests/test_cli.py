@@ -93,7 +93,7 @@ def test_simulate_writes_frames_video_overlay_and_record(tmp_path: Path, picture
             assert seconds == pytest.approx(41 / 16, abs=0.05), name
     with Image.open(out / "sheet.png") as sheet:
         assert sheet.size == (4 * 320 + 3 * 4, 3 * 200 + 2 * 4)
-    for told in ("grounding", "red ball at (150, 200)", "linear (+1.00, +0.00)", "touches blue cube", "41-frame video"):
+    for told in ("grounding", "red ball at (150, 200)", "linear (+1.00, +0.00)", "hits blue cube", "41-frame video"):
         assert told in result.stdout
     assert not result.stderr
 

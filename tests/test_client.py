@@ -408,7 +408,7 @@ def test_reprs_are_short(client: Any) -> None:
     simulation = handle.wait()
     assert re.fullmatch(rf"<(Async)?JobHandle {handle.id}: simulate, succeeded>", repr(handle))
     assert re.fullmatch(
-        rf"<(Async)?Simulation {handle.id}: object touches blue object at [^;]+; 1 frames>", repr(simulation)
+        rf"<(Async)?Simulation {handle.id}: object hits blue object after [^;]+; 1 frames>", repr(simulation)
     )
     long = Simulation.model_validate({**SIMULATION, "grounding": {**SIMULATION["grounding"], "object": "a b\n" * 500}})
     assert len(repr(long)) < 200
@@ -425,7 +425,7 @@ def test_notebooks_show_pictures_and_need_no_network(client: Any) -> None:
     coded = re.findall(r'<video controls loop muted playsinline [^>]*src="data:video/mp4;base64,([^"]+)"', page)
     assert [base64.b64decode(one) for one in coded] == [answer.simulation.video_bytes()]
     worlds = answer.simulation.trajectory.ensemble
-    assert f"band: where 80% of {worlds} worlds have it" in page
+    assert f"band: where 80% of {worlds} simulated versions have it" in page
     assert not re.search(
         r'(?:src|href)="(?!data:(?:image/png|image/jpeg|video/mp4);base64)|url\(|<script|@import|/artifacts/', page
     )

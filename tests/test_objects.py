@@ -115,7 +115,7 @@ def test_an_object_given_twice_is_refused_and_the_mover_is_no_other(pixels: np.n
     assert caught.value.errors[0].pointer == "/objects/1"
     grounding, warnings = grounded(pixels, {"object": "ball", "bbox": MOVER}, {"object": "cube", "bbox": CUBE})
     assert [other.object for other in grounding.others] == ["cube"]
-    assert any("`objects.0` ('ball') lies where the mover is" in warning for warning in warnings)
+    assert any("`objects.0` ('ball') lies where the moving object is" in warning for warning in warnings)
 
 
 def fur(seed: int) -> np.ndarray:
@@ -180,7 +180,7 @@ def test_what_is_asked_about_and_was_not_located_is_warned_of(
     mover = {"bbox": MOVER, "object": "ball"}
     given = {"question": question, "grounding": mover, "objects": [{"object": "crate", "bbox": CUBE}]}
     result = ground(run_of(pixels, **given, **({} if asked is None else {"asked": asked})))
-    told = [each for each in result.warnings if each.startswith("What is asked about, ")]
+    told = [each for each in result.warnings if each.startswith("The question asks about ")]
     assert [each.split("'")[1] for each in told] == missing
 
 

@@ -190,7 +190,7 @@ def test_a_point_gives_the_whole_thing_or_asks_for_a_box(service: Service) -> No
         point = float(columns[place]), float(rows[place])
         found = simulate(service, CANDLE, grounding={"object": "blue candle", "point": point}).grounding
         assert mask_iou(mask_of(service, found.mask), mask) > 0.98
-    with pytest.raises(CannotGround, match=r"no two looks at it agree.*`grounding.bbox`") as refused:
+    with pytest.raises(CannotGround, match=r"two attempts to outline it disagree.*`grounding.bbox`") as refused:
         simulate(service, CANDLE, grounding={"point": (4.0, truth.image.shape[0] - 4.0)})
     assert refused.value.errors[0].pointer == "/grounding/point"
 
@@ -229,7 +229,7 @@ class DoubtingModels(TrueModels):
 def test_a_mover_on_whose_outline_no_two_looks_agree_is_not_moved(service: Service) -> None:
     truth = read_truth(CANDLE)
     service.perception = DoubtingModels(truth, "blue candle")
-    with pytest.raises(CannotGround, match=r"'blue candle'.*no two looks") as refused:
+    with pytest.raises(CannotGround, match=r"'blue candle'.*two attempts") as refused:
         simulate(service, CANDLE)
     assert "grounding.bbox" in (refused.value.remedy or "")
     given = {"object": "blue candle", "bbox": bbox_of(truth.thing("blue candle").mask)}
@@ -244,7 +244,7 @@ def test_nothing_is_sure_of_another_thing_on_whose_outline_no_two_looks_agree(se
     service.perception = DoubtingModels(read_truth(CANDLE), "cyan cone")
     answer: Answer = service.answer(AnswerRequest.model_validate(body_of(CANDLE)))
     assert answer.not_sure
-    assert any("'cyan cone' agree on its outline" in warning for warning in answer.warnings)
+    assert any("outline 'cyan cone' disagree" in warning for warning in answer.warnings)
 
 
 def test_nouns_that_rules_do_not_know_are_known_by_the_detector(service: Service) -> None:
@@ -328,7 +328,7 @@ def test_depth_that_cannot_be_used_is_not(service: Service, depth: Any, scale: f
     service.perception = Blind(read_truth(CANDLE), depth_level=0.0)
     found = simulate(service, CANDLE)
     assert found.trajectory.depth is None
-    assert any("depth model saw no distances" in warning for warning in found.warnings)
+    assert any("depth model saw no usable distances" in warning for warning in found.warnings)
 
 
 # --- the server's choice
@@ -345,7 +345,7 @@ def test_a_mover_by_its_mask_and_again_by_its_box_is_one_thing(service: Service)
     }
     found = simulate(service, CANDLE, **given)
     assert found.grounding.others == ()
-    assert any("lies where the mover is" in warning for warning in found.warnings)
+    assert any("lies where the moving object is" in warning for warning in found.warnings)
 
 
 def test_looks_of_several_threads_at_one_image_are_one(service: Service) -> None:

@@ -75,7 +75,7 @@ def test_frames_and_video(toys: Service, name: str) -> None:
     info = found.generator
     assert (info.name, info.steps, info.seed) == (name, 3 if name == "tiny-refine" else 4, 0)
     assert info.options["prompt"] == (
-        "The yellow ball rolls to the right and meets and pushes the blue mug after 0.8 s. The camera stays still."
+        "The yellow ball rolls to the right and hits and pushes the blue mug after about 0.8 s. The camera stays still."
     )
     assert (info.options["fps"], info.options["num_frames"]) == RATES[name]
     assert info.options["profile"] == "exact"

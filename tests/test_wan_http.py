@@ -161,7 +161,7 @@ def test_a_trajectory_of_many_tracks_keeps_each_ones_visibility(simulated: Path)
     found = Simulation.model_validate_json((simulated / "many-out" / "simulation.json").read_bytes())
     assert (visible[:41] == np.array(found.trajectory.path.tracks_visible).T).all()
     assert found.motion.sentence.startswith("The yellow ball")
-    assert any("lasts 5.00 s and the clip 2.50 s: its rest is not shown" in told for told in found.warnings)
+    assert any("lasts 5.00 s and the clip 2.50 s: the end of the path is not shown" in told for told in found.warnings)
 
 
 def test_a_trajectory_that_is_not_json(simulated: Path) -> None:

@@ -206,8 +206,7 @@ def request_body(
 ) -> dict[str, Any]:
     """The fields of the request that both commands have. Raises `InvalidRequest` naming the option that is wrong."""
     given = locals()
-    body: dict[str, Any] = {name: given[name] for name in _SAME_NAME}
-    body["generator_options"] = {}
+    body: dict[str, Any] = {name: given[name] for name in _SAME_NAME} | {"generator_options": {}}
     for text in own or []:
         own_name, equals, own_value = text.partition("=")
         if not own_name or not equals:

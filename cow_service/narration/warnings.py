@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 SURE = 0.9  # share of the worlds: where something is as it was meant in fewer, a warning says so
 HARDLY_SEEN = 0.25  # share of a thing that is seen
 _DOES_NOT_STAY: dict[records.PlacementResult, str] = {
-    "overlaps": "there is no room for it, and it overlaps",
-    "falls-off": "it does not stay there, but falls off",
-    "tips": "it does not stay there: it tips over, or tips over what it is put to",
+    "overlaps": "there is no room for it",
+    "falls-off": "it falls off",
+    "tips": "it tips over, or knocks something over",
 }
 _NOT_AS_MEANT: dict[records.PlacementResult, str] = {
     "sticks-out": "goes in but sticks out",
-    "on-the-rim": "does not go in, but lies on the rim",
+    "on-the-rim": "does not go in: it stays on the rim",
 }
 
 
@@ -41,9 +41,9 @@ def doubts_of(placed: PlacedBefore) -> tuple[str, ...]:
     if placed.result in _NOT_AS_MEANT:
         told.append(f"{where} {_NOT_AS_MEANT[placed.result]}.")
     elif placed.fits is not None and placed.fits < SURE:
-        told.append(f"{where} is there as it was meant in {placed.fits:.0%} of the computed worlds.")
+        told.append(f"{where} ends up as intended in {placed.fits:.0%} of the simulated versions.")
     if placed.visible < HARDLY_SEEN:
-        told.append(f"{where} is hardly to be seen in the frames: others hide it there, or it is outside the image.")
+        told.append(f"{where} is hardly visible in the frames: something hides it, or it is outside the image.")
     return tuple(told)
 
 
@@ -62,43 +62,45 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
     # Where a given path goes beside the motion, the object or the clip that were given with it.
     if given is not None and request.stated_motion is not None:
         found.append(
-            "Both `motion` and `trajectory` were given: the object follows the trajectory, the motion only words it."
+            "Both `motion` and `trajectory` were given: the object follows the trajectory; the motion only words it."
         )
     x0, y0, x1, y1 = grounding.bbox
     gap = 0.0 if given is None else math.dist(given.points[0], grounding.point)
     if request.grounding is not None and gap > OFF_CENTRE * max(x1 - x0, y1 - y0):
         found.append(
-            f"The given trajectory begins {gap:.0f} px from the object's centre: in the first frame it is drawn there."
+            f"The given trajectory starts {gap:.0f} px from the object's centre; the first frame shows it there."
         )
     # A path that ends where the clip does, or a frame beside it, is of its length.
     clip = (request.num_frames - 1) / request.fps
     path = clip if given is None else (len(given.points) - 1) / given.fps
     if abs(path - clip) * request.fps > 1.5:
-        happens = "its rest is not shown" if path > clip else "from its end on the object stays where it is"
+        happens = (
+            "the end of the path is not shown" if path > clip else "after the path ends, the object stays where it is"
+        )
         found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
     found += _of_depth(request, grounding, trajectory)
     found += [
-        f"Something may stand at ({(left + right) / 2:.0f}, {bottom:.0f}) that is too faint to tell: no world has it."
+        f"Something too faint to make out may stand at ({(left + right) / 2:.0f}, {bottom:.0f}); it is not simulated."
         for left, _, right, bottom in trajectory.faint
     ]
     if trajectory.outcome is not None and "outline" in trajectory.outcome.depends_on:
         outcome, met = trajectory.outcome, {each.object for each in trajectory.encounters}
         matter = {trajectory.bodies[0].object, outcome.subject, outcome.object} | met
         found += [
-            f"'{body.object}' was not seen clearly: give its box for an answer that may rest on it."
+            f"'{body.object}' was not seen clearly: give its box in `objects` to get an answer that may rely on it."
             for body in trajectory.bodies
             if not body.is_clear and body.object in matter
         ]
     found += [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
     found += [
-        f"'{each.object}', put {each.place}, was put there by the way in which that moves, not as the camera sees it."
+        f"'{each.object}', put {each.place}, was placed relative to the direction of motion, not as the camera sees it."
         for each in trajectory.placed
         if each.by_heading
     ]
     if trajectory.factual is not None and trajectory.placed:
         put = {each.body for each in trajectory.placed}
         found += [
-            f"'{body.object}' makes room for what is put there: it does not begin where the image shows it."
+            f"'{body.object}' makes room for what is put there, so it does not start where the image shows it."
             for index, (body, seen) in enumerate(zip(trajectory.bodies, trajectory.factual.bodies, strict=False))
             if index not in put and body.bbox != seen.bbox
         ]
@@ -111,24 +113,24 @@ def _of_depth(request: SimulateRequest, grounding: Grounding, trajectory: Trajec
     if request.depth is None or camera is None:
         return []
     if depth is None:
-        return ["The depth map was not used: the path is given, or that of the ballistic law."]
+        return ["The depth map was not used: the path was given, or the law is `ballistic`."]
     if not depth.is_of_scene:
         if depth.floor is not None:
-            why = f"does not show '{grounding.object}' where the image does, as something that rises above the floor"
+            why = f"does not show '{grounding.object}' as something standing above the floor where the image shows it"
         elif camera.source == "side-view":
-            why = "was given for a drawing that is seen from the side"
+            why = "was given for a drawing seen from the side"
         else:
-            why = "shows no floor that things could stand on"
+            why = "shows no floor for things to stand on"
         given = depth.source == "request"
         remedy = "Leave `depth` out, or give another map" if given else "Give a map as `depth`, or another picture"
-        return [f"The depth map {why}: nothing is answered from it. {remedy}."]
+        return [f"The depth map {why}, so there is no answer from it. {remedy}."]
     told = [
-        f"The depth map does not show '{body.object}' where the image does, as something that rises above the floor."
+        f"The depth map does not show '{body.object}' as something standing above the floor where the image shows it."
         for body in trajectory.bodies
         if body.footprint is not None and body.footprint.seen == 0
     ]
     pitch = None if request.camera is None else request.camera.pitch
     if pitch is not None and abs(camera.pitch - pitch) > APART:
-        seen = f"the floor of the depth map is looked down on by {camera.pitch:.0f}: the map is taken"
+        seen = f"the floor of the depth map says {camera.pitch:.0f}; the depth map is used"
         told.append(f"`camera.pitch` is {pitch:g} degrees, but {seen}.")
     return told

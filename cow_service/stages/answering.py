@@ -44,7 +44,7 @@ def answer_question(
         try:
             baseline, _ = answer(None)
         except MllmBadReply as error:
-            warnings = (f"There is no baseline: {error.detail}", *warnings)
+            warnings = (f"There is no baseline answer: {error.detail}", *warnings)
     return StageResult(value=Verdicts(verdict=verdict, baseline=baseline), warnings=warnings)
 
 
@@ -70,10 +70,10 @@ def ask(
     )
     warnings, lost = list(winner.notes), votes - len(readings)
     if lost:
-        warnings.append(f"{lost} of {votes} votes could not be read and do not count.")
+        warnings.append(f"{lost} of {votes} votes could not be read and were not counted.")
     tied = [name for name, count in counted.items() if count == most]
     if len(tied) > 1:
-        warnings.append(f"The votes are tied between {' and '.join(tied)}; the first one given was taken.")
+        warnings.append(f"The votes are tied between {' and '.join(tied)}; the first one was taken.")
     return verdict, tuple(warnings)
 
 

@@ -10,7 +10,7 @@ from cow_service.stages.keys import EstimatedDepth, StageResult
 from cow_service.stages.run import LEAST_NEAREST, Run
 
 FARTHEST = 65_535  # of 16 bits
-UNUSABLE = "The depth model saw no distances that could be used: the world rests on the picture alone."
+UNUSABLE = "The depth model saw no usable distances: the simulation relies on the picture alone."
 BEYOND = 50.0  # times the usual depth: sky and the like would take all steps of 16 bits
 
 

@@ -81,25 +81,27 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     grounding = understood(grounding, run.backends.words())
     warnings = [*reading.warnings, *warnings]
     warnings += [
-        f"`objects.{index}` ('{each.object}') lies where the mover is, and was taken for it."
+        f"`objects.{index}` ('{each.object}') lies where the moving object is, and was taken for it."
         for index, each in enumerate(given)
         if each not in beside
     ]
     if drawn:
         places = ", ".join(f"{name} at ({x:.0f}, {y:.0f})" for name, (x, y) in drawn)
         warnings.append(
-            f"Taken for drawn over the image though the question speaks of none: {places}. "
-            "A generator that cleans cues takes them out; `generator_options.clean_cues: false` keeps them."
+            f"Taken for annotations drawn over the image, although the question mentions none: {places}. "
+            "They are removed from the frames; `generator_options.clean_cues: false` keeps them."
         )
     if name := asked_of_itself(grounding):
-        warnings.append(f"A thing cannot meet itself, so what is asked of '{name}' is open: ask of another thing.")
+        warnings.append(
+            f"Something cannot hit itself, so the question about '{name}' has no answer: ask about another object."
+        )
     if request.asked is not None or source != "embedded":  # which warns of what it does not find
         known = [each.object for each in (mover, *others_of(grounding), *removed_of(grounding))]
         asked = grounding.asked
         named = () if asked is None else (asked.subject, asked.target, *asked.among)
         warnings += [
-            f"What is asked about, '{name}', was not found in the image, so the outcome is open: give it in `objects` "
-            "under this name."
+            f"The question asks about '{name}', which was not found in the image, so there is no outcome: give it in "
+            "`objects` under this name."
             for name in named
             if name is not None and not any(same_name(name, each) for each in known)
         ]
@@ -210,7 +212,11 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
         if len(found) == 1 or (found and may_guess):
             scene.preset_mask(found[0].bbox, lambda: found[0].mask)
             return Place(found[0].bbox, found[0].mask)
-        fault = f"{len(found)} things within each other lie there." if found else "no two looks at it agree."
+        fault = (
+            f"{len(found)} objects lie there, one inside the other."
+            if found
+            else "two attempts to outline it disagree."
+        )
         if not may_guess:
             raise _not_cut_out(f"The object at the point [{x:.0f}, {y:.0f}] is not clear: {fault}", pointer)
     cutout = scene.locate((x, y))
@@ -235,7 +241,7 @@ def _outlined_box(run: Run[SimulateRequest], bbox: BBox, field: str, warnings: t
     """What the segmenter sees in a box that the request gives; where it is not sure of it, nothing else is."""
     (outline,) = outlines_in(run.embedded(), [bbox])
     if outline is None or not outline.is_sure:
-        doubt = f"No two looks at what is in `{field}.bbox` agree on its outline: give it as `{field}.mask`."
+        doubt = f"Two attempts to outline what is in `{field}.bbox` disagree: give its outline as `{field}.mask`."
         return Place(bbox, None if outline is None else outline.mask, (*warnings, doubt), is_doubtful=True)
     run.scene.preset_mask(outline.bbox, lambda: outline.mask)
     return Place(outline.bbox, outline.mask, warnings)
@@ -267,7 +273,7 @@ def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> Grounding
     if own is None or not own.is_sure:
         box = ", ".join(f"{value:.0f}" for value in reading.bbox)
         raise CannotGround(
-            f"'{reading.object}' was looked for in [{box}], and no two looks at what is there agree on its outline.",
+            f"'{reading.object}' was looked for in [{box}], but two attempts to outline it disagree.",
             remedy=GIVE_PLACE,
         )
 
@@ -289,7 +295,7 @@ def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> Grounding
         for each in reading.interventions
     )
     doubts = [
-        f"No two looks at '{name}' agree on its outline: give it in `objects`, with its `mask`."
+        f"Two attempts to outline '{name}' disagree: give it in `objects`, with its `mask`."
         for name in dict.fromkeys(doubted)
     ]
     return replace(
@@ -369,7 +375,7 @@ def _find_interventions(
             faults = {
                 f"'{name}' is what moves: it cannot be taken away.": is_same_object(box, mover.bbox),
                 f"'{name}' is taken away twice: name each object once.": is_among(box, taken),
-                f"'{name}' is put somewhere, or something is put to it: it cannot be taken away.": is_among(box, used),
+                f"'{name}' takes part in another change: it cannot be taken away.": is_among(box, used),
             }
         else:
             relation = (each.relation or "to").replace("-", " ")
@@ -378,11 +384,11 @@ def _find_interventions(
             faults = {
                 f"'{name}' cannot be put {relation} itself.": is_among(box, targets),
                 f"'{name}' is put somewhere twice: name each object once.": twice,
-                f"'{gone[0] if gone else ''}' is taken away: it cannot be put, nor anything to it.": bool(gone),
+                f"'{gone[0] if gone else ''}' is taken away: nothing can be put there, nor it elsewhere.": bool(gone),
             }
         fault = next((fault for fault, holds in faults.items() if holds), None)
         if fault is not None and pointer is None:
-            raise CannotGround(f"{fault} Ask of another object, or state the change as `interventions`.")
+            raise CannotGround(f"{fault} Ask about another object, or state the change in `interventions`.")
         if fault is not None and pointer is not None:
             raise InvalidRequest(f"`{field_of(pointer)}`: {fault}", errors=(FieldError(pointer, fault),))
         found.append(each)
@@ -403,7 +409,7 @@ def _located(
     ):
         thing = next((thing for thing in things if same_name(thing.object, name)), None)
         if thing is None:
-            at, detail = "/objects", f"the question changes '{name}', and with `grounding` given nobody looks for it"
+            at, detail = "/objects", f"the question changes '{name}', which is not looked for when `grounding` is given"
             if pointer is not None:
                 known = ", ".join(f"'{each.object}'" for each in things)
                 detail = f"there is no '{name}' among the objects of the scene, which are {known}"

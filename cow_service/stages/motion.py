@@ -59,14 +59,14 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     unused = [name for name in _OF_A_LINE if getattr(reading, name) not in (None, ())]
     if reading.kind != "linear" and unused:
         reading = replace(reading, distance=None, duration=None, until=None, steps=())
-        ends = f"a {reading.kind} ends by what it meets"
+        ends = f"a {reading.kind} ends where it hits something"
         warnings.append(f"The {' and '.join(unused)} of the motion was not used: {ends}.")
     scale, doubts = scale_of(run, grounding, reading)
     reading = replace(reading, metres_per_pixel=scale)
     warnings += doubts
     if _is_up_the_floor(reading, grounding, request.law):
         warnings.append(
-            f"Up was taken to lead along the floor, away from the camera. If the {bare_name(grounding.object)} leaves "
+            f"'Up' was read as along the floor, away from the camera. If the {bare_name(grounding.object)} leaves "
             "the floor, say that it is lifted or thrown, or give `motion.rises`."
         )
         reading = replace(reading, depth=depth_motion(1.0)[1])
@@ -78,8 +78,7 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     # What nobody said: how fast a throw is, and the scale of lengths in metres.
     if motion.kind == "projectile" and not isinstance(reading.speed, Quantity) and not motion.trail:
         warnings.append(
-            f"How far a throw reaches depends on its speed: {motion.speed:.0f} px/s was assumed; "
-            "`motion.speed` sets it."
+            f"How far a throw goes depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it."
         )
     lengths = [each for each in (reading.speed, reading.distance) if isinstance(each, Quantity)]
     if motion.metres_per_pixel.source == "default" and any(each.unit in ("m", "m/s") for each in lengths):
@@ -131,7 +130,7 @@ def _with_request(reading: MotionReading, given: MotionRequest, grounding: Groun
         if len(found) != 1:
             seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
             pointer = f"/motion/others/{index}/object"
-            detail = f"'{each.object}' names {len(found)} of the located objects ({seen})"
+            detail = f"'{each.object}' matches {len(found)} of the located objects ({seen})"
             raise InvalidRequest(
                 f"`{field_of(pointer)}`: {detail}: give it in `objects` under this name.",
                 errors=(FieldError(pointer, detail),),
@@ -196,7 +195,7 @@ def scale_of(
     doubts: list[str] = []
     if told and max(told.values()) > MOST_APART * min(told.values()):
         said = ", ".join(f"{value:.4g} by {name}" for name, value in told.items())
-        doubts = [f"What is said of sizes disagrees by more than a factor of two, in metres per pixel: {said}."]
+        doubts = [f"The given sizes disagree by more than a factor of two, in metres per pixel: {said}."]
     if mapped is not None:
         return records.MetresPerPixel(value=mapped, source="depth"), doubts
     exact = [each for each in sizes if each[2]]

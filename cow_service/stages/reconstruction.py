@@ -305,7 +305,7 @@ def _goal(scene: Scene, placed: Intervention, bodies: Sequence[SeenBody]) -> Pla
         found.append(best)
     body, *targets = found
     if body in targets:
-        raise CannotGround(f"'{bodies[body].name}' cannot be put into, onto or beside itself.")
+        raise CannotGround(f"'{bodies[body].name}' cannot be put into, onto or next to itself.")
     if len(set(targets)) < len(targets):
         raise CannotGround(f"'{placed.targets[0].object}' and '{placed.targets[1].object}' were found at one place.")
     target, opening = bodies[targets[0]], None
@@ -317,21 +317,19 @@ def _goal(scene: Scene, placed: Intervention, bodies: Sequence[SeenBody]) -> Pla
         form = None if target.prior is None else target.prior.opening
         if form == "none":
             raise CannotGround(
-                f"'{target.name}' is no open container: nothing goes into it. Name a bowl, cup or box, or put it "
+                f"'{target.name}' is not an open container: nothing can go into it. Name a bowl, cup or box, or put it "
                 "`onto` it."
             )
         opening = measure_opening(scene.clean, target.mask, square=form == "square")
         if form is None and not opening.has_edge:
-            raise CannotGround(
-                f"No opening is seen in '{target.name}': call it what it is, such as a bowl, a cup or a box."
-            )
+            raise CannotGround(f"'{target.name}' shows no opening: call it what it is, such as a bowl, a cup or a box.")
         opening = replace(opening, foot_hidden=is_hidden)
     return PlacementGoal(placed.relation, tuple(targets), opening, side, body)
 
 
 def _says_no_place(name: str) -> CannotGround:
     return CannotGround(
-        f"Nothing says where '{name}' is put: give an intervention of kind `place` with its `relation` and `targets`."
+        f"Nothing says where '{name}' goes: give an intervention of kind `place` with its `relation` and `targets`."
     )
 
 
