@@ -31,8 +31,8 @@ function Verdict({ title, verdict, kind }) {
 function Versions({ simulation: { narration, trajectory } }) {
   if (!trajectory.outcome || narration.share === null) return null;
   const count = Math.round(narration.share * trajectory.ensemble);
-  return html`<p class="probability"><meter min="0" max="1" value=${narration.share} aria-hidden="true"></meter>
-    <span><b>${count}</b> of ${plural(trajectory.ensemble, "simulated version")}</span></p>`;
+  const label = `${count} of ${plural(trajectory.ensemble, "simulated version")} agree`;
+  return html`<p class="probability"><meter min="0" max="1" value=${narration.share} aria-label=${label} title=${label}></meter></p>`;
 }
 
 /** What else the answer depends on: the summary of one that is not sure names the first. */
