@@ -291,7 +291,7 @@ def test_simulate_over_stdio_returns_pictures_words_and_data(here: tuple[Session
     assert sizes(result) == [SIZE, *((frame["width"], frame["height"]) for frame in simulation["frames"])]
     for told in (
         "yellow ball",
-        f"touches blue mug at {last['first_frame'] / 16:.1f} s",
+        f"hits blue mug after {last['time']:.1f} s",
         simulation["image"]["sha256"],
     ):
         assert told in text(result)
