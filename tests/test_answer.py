@@ -629,7 +629,7 @@ def test_nothing_meets_itself(service: Service, itself: str) -> None:
     question = f"If the yellow ball moves opposite to the direction of the arrow, will it hit {itself}?"
     told = answered(service, example("ball-and-mug").image, question)
     assert told.not_sure
-    assert any("cannot meet itself" in warning for warning in told.warnings)
+    assert any("cannot hit itself" in warning for warning in told.warnings)
     assert not any("not understood" in warning for warning in told.warnings)
 
 

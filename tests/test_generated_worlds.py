@@ -154,7 +154,7 @@ class TestSizes:
         scale = 0.3 / max(box[2] - box[0], box[3] - box[1])
         for factor, disagrees in ((1.5, False), (2.5, True)):
             _, warnings = asked(image, asks, grounding=grounding, motion={"metres_per_pixel": factor * scale})
-            assert any("disagrees by more than a factor of two" in each for each in warnings) == disagrees
+            assert any("disagree by more than a factor of two" in each for each in warnings) == disagrees
 
 
 def up_of(told: Trajectory) -> np.ndarray:

@@ -85,6 +85,8 @@ class Story:
             self._subject = next((index for index, name in others if name == self._outcome.subject), None)
         asked = None if self._outcome is None else self._outcome.asked.relation
         self._leaving = self._subject if asked == "leaves" else None
+        # An event has one time; where the answer is not sure, what is shown may have another than most versions.
+        self._time_asked = self._outcome.time if self._outcome is not None and self._outcome.sure else None
         self._asked = self._asked_about()
 
     def text(self) -> str:
@@ -194,9 +196,9 @@ class Story:
         return self._say("rises" if y < 0 else "falls")
 
     def _time(self, encounter: Encounter) -> float:
-        """Seconds until an encounter begins; of the one that is asked about, the time of the outcome."""
-        if encounter is self._asked and self._outcome is not None and self._outcome.time is not None:
-            return self._outcome.time
+        """Seconds until an encounter begins; of the one that is asked about, the outcome's time, if sure."""
+        if encounter is self._asked and self._time_asked is not None:
+            return self._time_asked
         return encounter.first_frame / self._trajectory.fps if encounter.time is None else encounter.time
 
     def timed(self, key: str, time: float, **values: str) -> str:
@@ -230,14 +232,14 @@ class Story:
             key, seen = "leave", self._paths[body].visible if body in self._paths else ()
             happens = ((outcome.probability or 0.0) >= HAPPENS) != outcome.asked.negated
             time = seen.index(False) / trajectory.fps if False in seen else math.inf
-            time = outcome.time if happens and outcome.time is not None else time
+            time = self._time_asked if happens and self._time_asked is not None else time
         elif on == "floor" or (on == "air" and asked != "lands"):
             return None
         else:
             key = "land" if on == "air" else "fall-off"
             time = next((each.time for each in trajectory.contacts if each.a == body and each.b is None), math.inf)
-            if asked == "lands" and outcome is not None and time < math.inf:
-                time = outcome.time or time
+            if asked == "lands" and time < math.inf:
+                time = self._time_asked or time
         name = self._say.name(on)
         if time == math.inf:
             return (time, self._say(f"{key}-not", object=name)) if asked in OF_ITSELF else None
@@ -306,7 +308,7 @@ class Story:
         found = [(time, name) for time, name in found if self._is_meant(name)]
         if found:
             time, name = min(found, key=lambda each: each[0])
-            time = time if outcome.time is None else outcome.time
+            time = time if self._time_asked is None else self._time_asked
             return say.sentence(say.name(name), [self.timed(f"{key}-at", time)])
         if outcome.asked.among:
             return ""

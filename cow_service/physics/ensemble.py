@@ -114,9 +114,10 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     if query is not None and any(each is not None and each.sure for each in decided):
         shown = _agreeing(given, query, decided, rows, worlds, shown)
     for place, (each, world_shown) in enumerate(zip(decided, shown, strict=True)):
-        if query is not None and each is not None and each.time is not None:
-            time = float(_happens(query, world_shown.events)[0])  # one time for one event: that of what is shown
-            decided[place] = replace(each, time=time) if np.isfinite(time) else each
+        if query is not None and each is not None and each.time_band is not None:
+            time, (early, late) = float(_happens(query, world_shown.events)[0]), each.time_band
+            # One time for one event: that of what is shown, unless most others have it much earlier, or later.
+            decided[place] = replace(each, time=time) if early <= time <= late else each
     return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
 
 
