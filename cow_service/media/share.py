@@ -170,12 +170,13 @@ class _Sheet:
         _put(canvas, verdict, margin, top + 0.8 * LINE * large, large, LIGHT, bold=True)
         line = top + LINE * large
         if told.share is not None:
-            x0, x1, y = round(margin), round(margin + 0.3 * width), round(line + 0.65 * letter)
+            x0, x1, y = round(margin), round(margin + 0.16 * width), round(line + 0.65 * letter)
             for end, colour in ((x1, (70, 78, 76)), (round(x0 + told.share * (x1 - x0)), GREEN)):
                 cv2.rectangle(canvas, (x0, y - round(letter / 5)), (end, y + round(letter / 5)), colour, -1)
-            margin += 0.33 * width
-        agreeing = _cut(told.agreeing, letter, width - margin - MARGIN * width)
-        _put(canvas, agreeing, margin, line + LINE * letter * 0.8, letter, GREY)
+            margin += 0.19 * width
+        room = width - margin - MARGIN * width
+        small = letter * min(1.0, max(0.7, room / max(1.0, 1.1 * _across(told.agreeing, letter))))
+        _put(canvas, _cut(told.agreeing, small, room), margin, line + LINE * letter * 0.8, small, GREY)
 
     def draw_futures(self, frame: Image, opacity: float) -> None:
         """Other worlds' paths of the mover, translucent."""
