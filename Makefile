@@ -59,7 +59,7 @@ sbom: $(TOOLS)/.made ## write what the images install as CycloneDX, into dist
 # What `make bench` compares with: the latest release, or any revision that is named.
 RELEASE ?= $(shell git describe --tags --abbrev=0 2>/dev/null)
 
-pictures: $(VENV)/.base ## the picture of the README, from an example
+pictures: $(VENV)/.test ## the pictures of README and docs/, from the examples
 	$(BIN)/python docs/pictures.py
 
 bench: $(VENV)/.base ## the figures of docs/figures.md, then pairs with the last release (RELEASE=REVISION: with another one)

@@ -1,26 +1,33 @@
-"""Makes the picture of the README from an example: `make pictures`.
+"""Makes the pictures of the README and of these pages from the examples: `make pictures`.
 
-The example is asked twice: as its question has it, and with the arrow turned away. What is shown is what the service
-computes: the paths of other futures, the frames, and in how many of the worlds it happens.
+Everything shown is computed by the service: the paths of other futures, the frames, and in how many of the worlds it
+happens. The page is a screenshot, for which chromium must be installed; without it that picture stays as it is.
 """
 
+import io
 import math
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from playwright.sync_api import sync_playwright
 
 from cow_service.media.images import decode_own
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
+from cow_service.server import serving
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "ball-and-mug" / "image.jpg"
-HERO = Path(__file__).parent / "hero.webp"
+DOCS = Path(__file__).parent
+EXAMPLES = DOCS.parent / "examples"
+EXAMPLE = EXAMPLES / "ball-and-mug" / "image.jpg"
+HERO = DOCS / "hero.webp"
 ASKED = "If the yellow ball rolls this way, will it hit the blue mug?"
+QUESTION = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
 FIRST, TURN, ARROW = (0.983, 0.182), math.radians(-52), 105  # direction of the arrow; how far it is turned; px
 WIDTH, BAR, MS = 640, 58, 80  # px, px, ms of a frame
 INK, DIM, YES, NO, ORANGE = "#18211f", "#5b6663", "#0f7b4f", "#b3261e", "#e4572e"
@@ -92,19 +99,115 @@ def film(service: Service) -> list[Image.Image]:
         shown += [drawn(frames[0], asked, DIM, (start, to), (found, share)) for share in np.linspace(0, 1, 8)]
         fade = np.linspace(1, 0, len(frames))
         shown += [drawn(each, asked, DIM, None, (found, share)) for each, share in zip(frames, fade, strict=True)]
-        worlds = found.trajectory.ensemble
-        hits = round(outcome.probability * worlds)
-        word, colour = ("Yes", YES) if outcome.probability >= 0.5 else ("No", NO)
-        shown += [drawn(frames[-1], f"{word}: it hits the mug in {hits} of {worlds} simulated versions.", colour)] * 20
+        told = found.narration
+        colour = YES if outcome.probability >= 0.5 else NO
+        shown += [drawn(frames[-1], f"{told.answer}. {told.agreement}", colour)] * 20
     return shown
 
 
+def asked(service: Service, example: str, question: str, **fields: Any) -> Simulation:
+    """A simulation of an example, with pictures of its events."""
+    image = service.keep_image((EXAMPLES / example / "image.jpg").read_bytes()).sha256
+    body = {"image": {"artifact": image}, "question": question, "frames": {"max_side": WIDTH}, "video": False} | fields
+    return service.simulate(SimulateRequest.model_validate(body))
+
+
+def opened(service: Service, sha256: str) -> Image.Image:
+    """A kept picture."""
+    return Image.fromarray(decode_own(service.artifacts.read(sha256)))
+
+
+def in_row(panels: list[tuple[Image.Image, str]], width: int, gap: int = 10) -> Image.Image:
+    """Pictures side by side, each with a line below it."""
+    small = [each.convert("RGB").resize((width, round(each.height * width / each.width))) for each, _ in panels]
+    row = Image.new("RGB", (len(small) * (width + gap) - gap, small[0].height + 30), "white")
+    pen = ImageDraw.Draw(row)
+    for place, (each, (_, line)) in enumerate(zip(small, panels, strict=True)):
+        row.paste(each, (place * (width + gap), 0))
+        pen.text((place * (width + gap) + 2, each.height + 8), line, fill=INK, font=ImageFont.load_default(16))
+    return row
+
+
+def verdict(found: Simulation) -> str:
+    """The answer of a simulation, and how many versions agree."""
+    return f"{found.narration.answer}. {found.narration.agreement}"
+
+
+def ask_picture(service: Service) -> Image.Image:
+    """A question from the picture to the frames."""
+    found = asked(
+        service, "falling-ball", "If the black ball falls freely, will it land on the orange cylinder?", num_frames=17
+    )
+    frames = [(opened(service, each.sha256), f"{each.time:.2f} s") for each in found.frames[1:3]]
+    return in_row(
+        [
+            (Image.open(EXAMPLES / "falling-ball" / "image.jpg"), "your picture"),
+            (opened(service, found.overlay.sha256), "what COW reads and computes"),
+            *frames,
+        ],
+        320,
+    )
+
+
+def correct_picture(service: Service) -> Image.Image:
+    """A motion as it is read, and what two corrections change."""
+    read = asked(service, "ball-and-mug", QUESTION)
+    turned = asked(service, "ball-and-mug", QUESTION, motion={"direction": [1, -0.8]})
+    stopped = asked(service, "ball-and-mug", QUESTION, motion={"distance": 100})
+    return in_row(
+        [
+            (opened(service, found.overlay.sha256), f"{what}: {verdict(found)}")
+            for found, what in ((read, "as read"), (turned, "other direction"), (stopped, "100 px far"))
+        ],
+        430,
+    )
+
+
+def world_picture(service: Service) -> Image.Image:
+    """The futures of a throw."""
+    found = asked(
+        service,
+        "thrown-ball",
+        "If the pink ball is thrown in the direction of the arrow, will it hit the white cube?",
+        frames={"max_side": WIDTH, "indices": [0, 14]},
+    )
+    clean = drawn(opened(service, found.frames[0].sha256), "", INK, futures=(found, 1.0))
+    clean = clean.crop((0, 0, clean.width, clean.height - BAR))
+    end = opened(service, found.frames[-1].sha256)
+    return in_row([(clean, "likeliest path, and eight others"), (end, f"it hits the cube: {verdict(found)}")], 480)
+
+
+def page_picture(service: Service) -> Image.Image | None:
+    """The page with an answer, as chromium shows it."""
+    program = shutil.which("chromium")
+    if program is None:
+        return None
+    with serving(service) as address, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 840}, reduced_motion="reduce")
+        page.goto(address)
+        page.locator("input[type=file]").first.set_input_files(EXAMPLE)
+        page.locator("#question").fill(QUESTION)
+        page.locator("#question").press("Enter")
+        page.locator(".result[data-job]:not(.old)").wait_for(timeout=60_000)
+        page.wait_for_timeout(3_000)  # until the film and its frames are there
+        shot = page.screenshot()
+        browser.close()
+    return Image.open(io.BytesIO(shot)).resize((1000, 656))
+
+
 def main() -> None:
-    """Writes the film."""
-    with tempfile.TemporaryDirectory() as folder, Service(Settings(data_dir=Path(folder))) as service:
+    """Writes them."""
+    with tempfile.TemporaryDirectory() as folder, Service(Settings(data_dir=Path(folder), port=0)) as service:
         first, *others = film(service)
+        pictures = {"ask": ask_picture(service), "correct": correct_picture(service), "world": world_picture(service)}
+        pictures |= {"page": shown} if (shown := page_picture(service)) else {}
     first.save(HERO, save_all=True, append_images=others, duration=MS, loop=0, quality=72, method=6)
     print(f"{HERO.name}: {HERO.stat().st_size / 1e6:.2f} MB, {len(others) + 1} frames")
+    for name, picture in pictures.items():
+        file = DOCS / f"{name}.webp"
+        picture.save(file, quality=80, method=6)
+        print(f"{file.name}: {file.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ Given = Mapping[str, Any]  # a record as a plain mapping, checked by the server
 
 
 class SimulateOptions(TypedDict, total=False):
-    """All of `SimulateRequest` but image and question; docs/http.md and `cow_service.requests` say what each means.
+    """All of `SimulateRequest` but image and question: see docs/ask.md, docs/correct.md and `cow_service.requests`.
 
     `law` stands for `motion.law`. The `mask` of an object may be whatever an image may be, and an array of booleans;
     the `map` of a `depth` may be that, too, an array of 16-bit integers, or one of metres, nan where nothing is known.
