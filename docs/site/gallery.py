@@ -6,6 +6,7 @@ that is one script for all of them, which works from file://, too. The others ar
 
 import html
 import json
+import os
 import re
 import tempfile
 from functools import cache
@@ -15,10 +16,10 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from cow_service.media.images import decode_own
+from cow_service.media.images import decode_own, encode_jpeg, fit_within
 from cow_service.media.share import Told
 from cow_service.media.share import page as page_of
-from cow_service.media.video import frames_of, write_mp4
+from cow_service.media.video import Pixels, frames_of, write_mp4
 from cow_service.records import Simulation
 from cow_service.requests import AnswerRequest
 from cow_service.service import Service
@@ -55,8 +56,12 @@ SCENES = {
         f"{BULLET}/compatibility/Compatibility_Level_2_0+",
     ),
 }
+MOST = int(os.environ.get("COW_GALLERY", "6"))  # of each kind, at most: tests do with fewer
 SIDE, REST = 640, 0.8  # px, of a film; s that it goes on once nothing moves
 PART = re.compile(r'<script type="text/plain" id="(?!world")[^"]+">.*?</script>\n', re.DOTALL)
+# Brings the parts of the page into a scene's document, before its own script looks for them.
+ENGINE = """if (parent !== window) document.documentElement.classList.add("framed");
+document.body.insertAdjacentHTML("beforeend", """
 POLICY = "img-src data:", "script-src 'unsafe-inline'"
 FRAMED = """<style>.framed h1, .framed small { display: none }
 .framed main { padding: 0 }
@@ -70,72 +75,75 @@ def built() -> tuple[str, dict[str, bytes]]:
     """The Markdown of the gallery, and its files by name. Raises `ValueError` where one is not sure and right."""
     text, files = "", {}
     with tempfile.TemporaryDirectory() as data, Service(Settings(data_dir=Path(data), reader="embedded")) as service:
-        for title, folders in SCENES.items():
-            cards = "".join(card(service, folder, files) for folder in folders)
-            text += f'## {title}\n\n<div class="scenes">\n{cards}</div>\n\n'
+        for kind, (title, places) in enumerate(SCENES.items(), start=1):
+            cards = (card(service, place, f"{kind}-{n}", files) for n, place in enumerate(places[:MOST], start=1))
+            text += f'## {title}\n\n<div class="scenes">\n{"".join(cards)}</div>\n\n'
     return text, files
 
 
-def card(service: Service, place: str, files: dict[str, bytes]) -> str:
-    """The HTML of one scene; adds its files."""
+def asked(service: Service, place: str) -> tuple[bytes, Simulation, Told, str]:
+    """A scene's picture, its simulation, what it says, and what was given besides picture and question."""
     folder = ROOT / place.removesuffix(BOXED)
     picture, meta = (folder / "image.jpg").read_bytes(), json.loads((folder / "meta.json").read_text())
-    image = {"artifact": service.keep_image(picture).sha256}
-    request = {"image": image, "question": meta["question"], "live": True, "video": True}
+    image, question, given = {"artifact": service.keep_image(picture).sha256}, meta["question"], ""
+    request = {"image": image, "question": question, "live": True, "video": True}
     if place.endswith(BOXED):
-        width, height = meta["image_size"]
-        boxes = {name: clipped(box[0], width, height) for name, box in meta["boxes"].items()}
+        (width, height), given = meta["image_size"], "The boxes of the objects were given."
+        starts = {name: boxes[0] for name, boxes in meta["boxes"].items()}
+        boxes = {n: [max(0, x0), max(0, y0), min(width, x1), min(height, y1)] for n, (x0, y0, x1, y1) in starts.items()}
         request["grounding"] = {"object": meta["object"], "bbox": boxes.pop(meta["object"])}
         request["objects"] = [{"object": name, "bbox": box} for name, box in boxes.items()]
         if meta["motion"] != "fall":
-            request["motion"] = {"direction": meta["direction"]}
+            request["motion"], given = (
+                {"direction": meta["direction"]},
+                given.replace(" were", " and the direction were"),
+            )
     answer = service.answer(AnswerRequest.model_validate(request))
     simulation = answer.simulation
     outcome = None if simulation is None else simulation.trajectory.outcome
     if simulation is None or outcome is None or not outcome.sure or answer.answer != meta["answer"]:
         raise ValueError(f"{place}: {answer.option!r} is not the sure and right answer {meta['answer']}.")
-    told = Told.of(answer.model_copy(update={"question": meta["question"].partition(" Answer by ")[0]}), simulation, "")
-    name = f"{sum(each.endswith('.jpg') for each in files) + 1:02}"
+    short = answer.model_copy(update={"question": question.partition(" Answer by ")[0]})
+    return picture, simulation, Told.of(short, simulation, ""), given
+
+
+def card(service: Service, place: str, name: str, files: dict[str, bytes]) -> str:
+    """The HTML of one scene; adds its files."""
+    picture, simulation, told, given = asked(service, place)
     files[f"{name}.jpg"] = picture
-    live, size = simulation.trajectory.live, (simulation.image.width, simulation.image.height)
+    assert simulation.video is not None
+    frames, fps = frames_of(service.artifacts.read(simulation.video.sha256))
+    live, address = simulation.trajectory.live, ""
     if live is None:
-        files[f"{name}.mp4"] = film(service, simulation)
+        files[f"{name}.mp4"] = film(frames, fps, simulation.trajectory.moving_until)
         shown = f'<video src="gallery/{name}.mp4" poster="gallery/{name}.jpg" muted loop playsinline controls></video>'
     else:
+        address, first = f"gallery/{name}.html", f"{name}.jpg"
+        if simulation.grounding.interventions:  # what is taken away is in the picture, but not in the clip
+            first = f"{name}-first.jpg"
+            files[first] = encode_jpeg(frames[0])
         whole = page_of(decode_own(picture), service.artifacts.read(live.sha256).decode(), simulation, told).decode()
         files["engine.js"] = (ENGINE + json.dumps("".join(PART.findall(whole))) + ");\n").encode()
-        files[f"{name}.html"] = in_frame(PART.sub("", whole), f"{name}.jpg").encode()
-        shown = f'<img src="gallery/{name}.jpg" alt="" loading="lazy">'
-    boxed = " The boxes of its objects were given." if place.endswith(BOXED) else ""
-    link = "" if live is None else f' <a href="gallery/{name}.html">Larger</a>'
+        files[f"{name}.html"] = in_frame(PART.sub("", whole), first).encode()
+        shown, given = (
+            f'<img src="gallery/{name}.jpg" alt="" loading="lazy">',
+            f'{given} <a href="{address}">Larger</a>',
+        )
+    size = f"--width: {simulation.image.width}; --height: {simulation.image.height}"
+    said = f"<b>{html.escape(told.question)}</b> {html.escape(told.verdict.capitalize())}. {given}"
     return (
-        f'<figure class="scene" data-world="{"" if live is None else f"gallery/{name}.html"}" '
-        f'style="--width: {size[0]}; --height: {size[1]}">\n<div>{shown}</div>\n'
-        f"<figcaption><b>{html.escape(told.question)}</b> {html.escape(told.verdict)}.{boxed}{link}</figcaption>\n"
-        "</figure>\n"
+        f'<figure class="scene" data-world="{address}" style="{size}">\n<div>{shown}</div>\n'
+        f"<figcaption>{said}</figcaption>\n</figure>\n"
     )
 
 
-# Brings the parts of the page into a scene's document, before its own script looks for them.
-ENGINE = """if (parent !== window) document.documentElement.classList.add("framed");
-document.body.insertAdjacentHTML("beforeend", """
-
-
-def clipped(box: list[float], width: int, height: int) -> list[float]:
-    """The part of a box that is in the image."""
-    x0, y0, x1, y1 = box
-    return [max(0, x0), max(0, y0), min(width, x1), min(height, y1)]
-
-
-def film(service: Service, simulation: Simulation) -> bytes:
-    """The clip until nothing moves, as a small mp4."""
-    assert simulation.video is not None
-    frames, fps = frames_of(service.artifacts.read(simulation.video.sha256), SIDE)
-    until = simulation.trajectory.moving_until or len(frames) / fps
-    height, width = frames[0].shape[:2]
+def film(frames: list[Pixels], fps: float, until: float | None) -> bytes:
+    """A small mp4 of a clip, which ends soon after nothing moves any more."""
+    shown = [fit_within(frame, SIDE) for frame in frames[: round(((until or len(frames) / fps) + REST) * fps)]]
+    height, width = shown[0].shape[:2]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "film.mp4"
-        write_mp4(frames[: round((until + REST) * fps)], out, fps=fps, width=width, height=height)
+        write_mp4(shown, out, fps=fps, width=width, height=height)
         return out.read_bytes()
 
 

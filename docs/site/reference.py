@@ -189,9 +189,9 @@ def codes(text: str) -> str:
             "yes" if issubclass(kind, RETRYABLE) else "no",
             told.get(code, ""),
         )
-        for code, kind in errors.kinds().items()
+        for code, kind in sorted(errors.kinds().items())
     )
-    return table("code, status, meaning, sent again by the SDK, when, and what to do", rows)
+    return table("code, status, meaning, sent again by the SDK, when and what to do", rows)
 
 
 REFERENCE: dict[str, tuple[str, Callable[[], str]]] = {
