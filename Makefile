@@ -7,7 +7,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
 
-.PHONY: demo serve test test-fast soak chaos lint openapi lock sbom bench pictures clean
+.PHONY: demo serve test test-fast soak chaos lint openapi lock sbom bench pictures site clean
 
 # Tools that the project is not built with, apart from what they look at.
 TOOLS ?= .tools
@@ -62,6 +62,9 @@ RELEASE ?= $(shell git describe --tags --abbrev=0 2>/dev/null)
 pictures: $(VENV)/.test ## the pictures of README and docs/, from the examples
 	$(BIN)/python docs/pictures.py
 
+site: $(VENV)/.site ## the documentation as pages to open without a network: site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+
 bench: $(VENV)/.base ## the figures of docs/figures.md, then pairs with the last release (RELEASE=REVISION: with another one)
 	$(BIN)/python benchmarks/scenes.py examples
 	$(BIN)/python benchmarks/answers.py examples
@@ -72,7 +75,7 @@ bench: $(VENV)/.base ## the figures of docs/figures.md, then pairs with the last
 	$(if $(RELEASE),$(BIN)/python benchmarks/turns.py $(RELEASE) .,@echo "No release to compare with: name a revision by RELEASE=.")
 
 clean: ## remove what the other targets made
-	rm -rf $(VENV) $(TOOLS) demo dist build cow_service/client/sync_client.py cow_service/client/sync_results.py
+	rm -rf $(VENV) $(TOOLS) demo site dist build cow_service/client/sync_client.py cow_service/client/sync_results.py
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -84,10 +87,14 @@ $(VENV)/.base: pyproject.toml $(TWINS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable .
 	touch $@
 
+$(VENV)/.site: pyproject.toml tests/constraints.txt $(TWINS) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable ".[docs]" --constraint tests/constraints.txt
+	touch $@
+
 # Most of these packages' modules are never imported: they are not compiled beforehand.
 $(VENV)/.test: pyproject.toml tests/constraints.txt $(TWINS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --no-compile --editable ".[test]" --constraint tests/constraints.txt
-	touch $(VENV)/.base $@
+	touch $(VENV)/.base $(VENV)/.site $@
 
 $(TOOLS)/.made: Makefile
 	$(PYTHON) -m venv $(TOOLS)

@@ -64,7 +64,7 @@ class Settings(BaseSettings):
     )
 
     data_dir: Path = Field(default_factory=lambda: user_data_path("cow", appauthor=False))
-    """Folder for artifacts, the job database and temporary files; made if missing."""
+    """Folder for artifacts, the job database and temporary files, made if missing; by default the user's own."""
     artifacts: str | None = Field(default=None, min_length=1)
     """Where artifacts are kept: a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX; by
     default the folder `artifacts` of the data folder."""
