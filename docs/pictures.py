@@ -177,6 +177,22 @@ def world_picture(service: Service) -> Image.Image:
     return in_row([(clean, "likeliest path, and eight others"), (end, f"it hits the cube: {verdict(found)}")], 480)
 
 
+def photograph_picture(service: Service) -> Image.Image:
+    """A photograph with boxes from the request: what is cut out, and where it goes."""
+    image = service.keep_image((EXAMPLES / "photographs" / "coffee.jpg").read_bytes()).sha256
+    body = {
+        "image": {"artifact": image},
+        "question": "If the cup slides to the left, will it fall off the saucer?",
+        "grounding": {"object": "cup", "bbox": [172, 18, 405, 300]},
+        "objects": [{"object": "saucer", "bbox": [77, 66, 480, 388]}],
+        "frames": {"max_side": WIDTH, "indices": [16]},
+        "video": False,
+    }
+    found = service.simulate(SimulateRequest.model_validate(body))
+    frame = opened(service, found.frames[0].sha256)
+    return in_row([(opened(service, found.overlay.sha256), "what COW cuts out"), (frame, verdict(found))], 430)
+
+
 def page_picture(service: Service) -> Image.Image | None:
     """The page with an answer, as chromium shows it."""
     program = shutil.which("chromium")
@@ -201,6 +217,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, Service(Settings(data_dir=Path(folder), port=0)) as service:
         first, *others = film(service)
         pictures = {"ask": ask_picture(service), "correct": correct_picture(service), "world": world_picture(service)}
+        pictures["photographs"] = photograph_picture(service)
         pictures |= {"page": shown} if (shown := page_picture(service)) else {}
     first.save(HERO, save_all=True, append_images=others, duration=MS, loop=0, quality=72, method=6)
     print(f"{HERO.name}: {HERO.stat().st_size / 1e6:.2f} MB, {len(others) + 1} frames")
