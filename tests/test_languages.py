@@ -15,14 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from runs import run_of
 from servers import data_url
-from test_answer import CHOICES, simulated
+from test_answer import CHOICES, outcome, simulated
 from test_facts import THROWN, grounded
 
 from cow_service.api.submission import language_of
 from cow_service.narration.summary import narrate
 from cow_service.narration.words import TEMPLATES, phrases_of
 from cow_service.readers.mllm.identify import read_identified
-from cow_service.records import Doubt, Language, PlacementResult, PlaceRelation
+from cow_service.records import Asked, Doubt, Language, PlacementResult, PlaceRelation
 from cow_service.stages.keys import StageResult
 
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -77,13 +77,54 @@ def test_every_outcome_is_told_in_every_language(language: Language) -> None:
         ("en", "The ball bounces once, rolls on and hits the white cube after about 1.1 s."),
         ("de", "„ball“ springt einmal auf, rollt weiter und trifft nach etwa 1,1 s „white cube“."),
         ("es", "«ball» rebota una vez, sigue rodando y choca con «white cube» tras unos 1,1 s."),
-        ("fr", "« ball » rebondit une fois, continue de rouler et heurte « white cube » après environ 1,1 s."),
+        ("fr", "« ball » rebondit une fois, continue de rouler et heurte « white cube » au bout d'environ 1,1 s."),
         ("zh", "“ball”弹起一次，继续滚动，约 1.1 秒后碰到“white cube”。"),
         ("ja", "「ball」は1回弾みます。転がり続けます。約1.1秒後に「white cube」に当たります。"),
     ],
 )  # fmt: skip
 def test_a_story_reads_as_its_language_does(language: Language, story: str) -> None:
     assert narrate(grounded("ball"), THROWN, language).story.replace("\u00a0", " ") == story
+
+
+@pytest.mark.parametrize(
+    ("language", "one_is_missed", "neither_falls", "unsure"),
+    [
+        ("en", "it misses the mug or it misses the vase",
+         "the mug is not knocked over and the vase is not knocked over",
+         "Probably not: it misses the mug in 40 of 50 simulated versions; it depends most on how fast it moves."),
+        ("de", "„{}“ verfehlt „mug“ oder „{}“ verfehlt „vase“",
+         "„mug“ wird nicht umgestoßen und „vase“ wird nicht umgestoßen",
+         "Wahrscheinlich nicht – „{}“ verfehlt „mug“, und zwar in 40 von 50 simulierten Versionen; am meisten hängt es "
+         "davon ab, wie schnell die Bewegung ist."),
+        ("es", "«{}» no toca «mug» o «{}» no toca «vase»", "«mug» no vuelca y «vase» no vuelca",
+         "Probablemente no: en 40 de 50 versiones simuladas, «{}» no toca «mug»; depende sobre todo de la "
+         "velocidad del movimiento."),
+        ("fr", "« {} » ne touche pas « mug » ou « {} » ne touche pas « vase »",
+         "« mug » ne se renverse pas et « vase » ne se renverse pas",
+         "Probablement pas : dans 40 versions simulées sur 50, « {} » ne touche pas « mug » ; cela dépend surtout de "
+         "la vitesse du mouvement."),
+        ("zh", "“{}”不会碰到“mug”，或者“{}”不会碰到“vase”", "“mug”不会被撞倒，“vase”不会被撞倒",
+         "很可能不会：在 50 个模拟版本中的 40 个里，“{}”不会碰到“mug”；主要取决于它运动得多快。"),
+        ("ja", "「{}」は「mug」には当たりません、または「{}」は「vase」には当たりません",
+         "「mug」は倒されませんし、「vase」は倒されません",
+         "おそらく違います：「{}」は「mug」には当たりません（50通りのシミュレーションのうち40通り）。"
+         "主に動く速さによって変わります。"),
+    ],
+)  # fmt: skip
+def test_a_summary_reads_as_its_language_does(
+    language: Language, one_is_missed: str, neither_falls: str, unsure: str
+) -> None:
+    def summary(asked: Asked, probability: float, **values: Any) -> str:
+        simulation = simulated(outcome(asked, probability, **values))
+        mover = simulation.grounding.object
+        told = narrate(simulation.grounding, simulation.trajectory, language).summary
+        return told.replace("\u00a0", " ").replace(mover, "{}")
+
+    touches = Asked(relation="touches", among=("mug", "vase"), every=True)
+    assert one_is_missed in summary(touches, 0.02), "not to hit both is not to miss both"
+    assert neither_falls in summary(Asked(relation="tips", among=("mug", "vase")), 0.02)
+    hit = Asked(relation="touches", target="mug")
+    assert summary(hit, 0.2, sure=False, depends_on=("speed",)) == unsure
 
 
 @pytest.mark.parametrize(
@@ -119,7 +160,7 @@ def test_a_server_answers_in_the_language_of_the_field_else_of_the_header(http: 
 
     german = answered({"Accept-Language": "de"})
     assert german["answer"] == "Ja"
-    assert german["reasoning"].startswith("Ja, „yellow ball“ trifft nach etwa 0,8 s „blue mug“. ")
+    assert german["reasoning"].startswith("Ja, „yellow ball“ trifft nach etwa 0,8\u00a0s „blue mug“. ")
     assert german["simulation"]["narration"]["language"] == "de"
     assert german["reasoning"] == german["simulation"]["narration"]["summary"]
     french = answered({"Accept-Language": "de"}, language="fr")

@@ -98,7 +98,7 @@ def label_of_changes(grounding: Grounding, trajectory: Trajectory, say: Phrases)
         )
         for each in placed
     ]
-    having = say.joined(states) if states else ""
+    having = say.joined(states, "states-and") if states else ""
     if without and having:
         return say("with-without", placed=having, removed=without)
     return say("without", object=without) if without else say("with", object=having) if having else ""
@@ -201,9 +201,11 @@ class _Summary:
             subjects = [say.name(each) for each in meant]
         elif outcome.subject is not None:
             subjects = [say.name(outcome.subject)]
-        clause = self._within(self._clause(key, does, time, meant))
-        statements = [say("statement", subject=each, clause=clause) for each in subjects]
-        return say.joined(statements, "names-and" if asked.every or not does else "names-or")
+        # Not to hit each one is to miss one of them: it misses this one or it misses that one.
+        parts = [[each] for each in meant] if asked.every and not does and asked.relation not in OF_TARGET else [meant]
+        clauses = [self._within(self._clause(key, does, time, part)) for part in parts]
+        statements = [say("statement", subject=each, clause=clause) for each in subjects for clause in clauses]
+        return say.joined(statements, "every-and" if asked.every == does else "either-or")
 
     def _clause(self, key: str, does: bool, time: float | None, meant: Sequence[str]) -> str:
         """What its subject does, or does not."""

@@ -187,8 +187,9 @@ def answer_from(
     """
     outcome = None if simulation is None else simulation.trajectory.outcome
     if asked is None:
-        words = "', '".join(unread.turning or unread.beside)[:MAX_UNREAD]
-        return _unsure(options, say("unsure-not-read", words=f"'{words}'" if words else say("the-question")))
+        words = "\n".join(unread.turning or unread.beside)[:MAX_UNREAD].splitlines()
+        named = say.templates["names-comma"].join(say("quoted", words=each) for each in words)
+        return _unsure(options, say("unsure-not-read", words=named or say("the-question")))
     if simulation is None or outcome is None:
         return _unsure(options, say("unsure-no-simulation" if simulation is None else "unsure-no-outcome"))
     first = outcome.first
