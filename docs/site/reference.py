@@ -209,6 +209,7 @@ def on_config(config: MkDocsConfig) -> None:
     for group in config.nav or []:
         for pages in group.values():
             pages[:] = [each for each in pages if not isinstance(each, str) or each in known]
+    config.nav = [group for group in config.nav or [] if all(group.values())]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -228,6 +229,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     markdown = re.sub(r"(?<!!)\[([^\[\]]+)\]\(\.\./([^)\s]+)\)", turned, markdown)
     name = page.file.src_uri
+    if name in (*REFERENCE, "errors.md"):
+        page.meta.setdefault("search", {"boost": 2})
     if name == "errors.md":
         own = re.compile(r"^\| code \|.*\n\|[-| ]+\n(?:\|.*\n)+", re.MULTILINE)
         markdown = own.sub(lambda found: codes(found[0]), markdown) if own.search(markdown) else markdown + codes("")
