@@ -37,7 +37,8 @@ def table(head: str, rows: Rows) -> str:
     """A Markdown table; `head` has the names of its columns with commas between."""
     columns = head.split(", ")
     lines = [columns, ["---"] * len(columns), *rows]
-    cells = ([re.sub(r"\s+", " ", str(cell)).replace("|", "\\|") for cell in line] for line in lines)
+    cells = ([re.sub(r"\s+", " ", str(cell)) for cell in line] for line in lines)
+    cells = ([re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", cell) for cell in line] for line in cells)
     return "".join(f"| {' | '.join(line)} |\n" for line in cells) + "\n"
 
 
