@@ -37,7 +37,8 @@ def table(head: str, rows: Rows) -> str:
     """A Markdown table; `head` has the names of its columns with commas between."""
     columns = head.split(", ")
     lines = [columns, ["---"] * len(columns), *rows]
-    cells = ([re.sub(r"\s+", " ", str(cell)).replace("|", "\\|") for cell in line] for line in lines)
+    cells = ([re.sub(r"\s+", " ", str(cell)) for cell in line] for line in lines)
+    cells = ([re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", cell) for cell in line] for line in cells)
     return "".join(f"| {' | '.join(line)} |\n" for line in cells) + "\n"
 
 
@@ -209,6 +210,7 @@ def on_config(config: MkDocsConfig) -> None:
     for group in config.nav or []:
         for pages in group.values():
             pages[:] = [each for each in pages if not isinstance(each, str) or each in known]
+    config.nav = [group for group in config.nav or [] if all(group.values())]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -228,6 +230,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     markdown = re.sub(r"(?<!!)\[([^\[\]]+)\]\(\.\./([^)\s]+)\)", turned, markdown)
     name = page.file.src_uri
+    if name in (*REFERENCE, "errors.md"):
+        page.meta.setdefault("search", {"boost": 2})
     if name == "errors.md":
         own = re.compile(r"^\| code \|.*\n\|[-| ]+\n(?:\|.*\n)+", re.MULTILINE)
         markdown = own.sub(lambda found: codes(found[0]), markdown) if own.search(markdown) else markdown + codes("")
