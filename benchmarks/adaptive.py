@@ -1,4 +1,4 @@
-"""Measures calls that adapt, against a simulated MLLM that takes so many at once and refuses others with status 429.
+"""Measures calls that adapt, against a simulated MLLM that refuses calls beyond a limit with status 429.
 
     python benchmarks/adaptive.py [--questions 1320] [--seconds 2] [--accepts 64] [--only NAME] [--json FILE]
 

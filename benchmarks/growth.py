@@ -48,7 +48,7 @@ def of_size(megapixels: float) -> tuple[bytes, dict[str, Any]]:
 
 
 def of_objects(count: int) -> tuple[bytes, dict[str, Any]]:
-    """A picture of so many things that stand apart, the first of which moves."""
+    """A picture of that many separate objects; the first one moves."""
     height, width = 600, (COLUMNS + 2) * CELL
     image = np.full((height, width, 3), 170, np.uint8)
     image[:90] = 215

@@ -40,7 +40,7 @@ class Bench:
         time_parts(self.pipeline, self.clock)
 
     def put(self, form: Acceleration) -> None:
-        """Has the transformer run in another way from now on; what was compiled before is found again."""
+        """Has the transformer run in another way from now on; what was compiled before is reused."""
         if form == self._form:
             return
         self._form = None
