@@ -1,4 +1,4 @@
-"""How many calls to make at the same time: found out by making them, as the other side does not say (AIMD).
+"""Finds out how many calls the other side takes at the same time, as it does not say so (AIMD).
 
 The limit doubles every round trip until the first refusal, then halves. From there it doubles to just below the level
 that was refused, approaches that by one a round trip, and stays there for a while before it tries one more.
@@ -155,7 +155,7 @@ class AdaptiveLimit:
 
 @dataclass
 class Call:
-    """A call that holds a place: whoever makes it says what came of it."""
+    """A call that holds a place; its caller reports the outcome."""
 
     limit: AdaptiveLimit
     began: float

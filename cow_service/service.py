@@ -73,7 +73,7 @@ class Service:
             ("COW_GENERATOR", settings.generator, self.generators.names()),
         ):
             if name not in names:
-                raise SettingsError(f"Bad settings: {setting}={name!r}: there are only {', '.join(names) or 'none'}.")
+                raise SettingsError(f"Bad settings: {setting}={name!r}: known are {', '.join(names) or 'none'}.")
         for name in settings.checkpoints:
             manifest = find_manifest(name)
             if manifest is None or not OWN_PARTS & manifest.sources.keys():
@@ -110,7 +110,7 @@ class Service:
 
         Runs compute by `turn`, then first in, first out by `created_at` (RFC 3339, by default now).
 
-        Raises `InvalidRequest` for names of backends that nobody has, the errors of `digested` and of `images.decode`,
+        Raises `InvalidRequest` for unknown backends, the errors of `digested` and of `images.decode`,
         and whatever `progress` raises.
         """
         reader, generator = self._names_of(request)
@@ -193,7 +193,7 @@ class Service:
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
         """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
 
-        Raises `InvalidRequest` for backends that nobody has and for options that the generator does not take, and
+        Raises `InvalidRequest` for unknown backends and for options that the generator does not take, and
         `ReaderUnavailable` or `GeneratorUnavailable` where their modules are needed here and not installed.
         """
         reader, name = self._names_of(request)
@@ -219,7 +219,7 @@ class Service:
         is not in memory any more, and the errors of `fetch` and `images.decode`.
         """
         if self.settings.role == "api":
-            raise errors.PerceptionUnavailable("This server computes nothing (COW_ROLE=api): give a box instead.")
+            raise errors.PerceptionUnavailable("This server runs no models (COW_ROLE=api): give a box instead.")
         known = request.image.artifact if isinstance(request.image, ImageArtifact) and image is None else None
         if known is None and image is None:
             image = self.fetch(request.image)
@@ -296,7 +296,7 @@ class Service:
         return self.generators.get(name)
 
     def _names_of(self, request: SimulateRequest) -> tuple[str, str]:
-        """Its reader and its generator. Raises `InvalidRequest` for a name that nobody has."""
+        """Its reader and its generator. Raises `InvalidRequest` for an unknown name."""
         reader, generator = request.reader or self.settings.reader, request.generator or self.settings.generator
         for role, name, registry in (("reader", reader, self.readers), ("generator", generator, self.generators)):
             if name not in registry.names():
@@ -331,7 +331,7 @@ class Service:
 
 
 def open_artifact_store(settings: Settings) -> ArtifactStore:
-    """The store of COW_ARTIFACTS. Raises `SettingsError` where its library is missing or cannot be set up."""
+    """The store of COW_ARTIFACTS. Raises `SettingsError` if its library is missing or cannot be set up."""
     place = settings.artifacts
     if place is None or "://" not in place:
         return DiskArtifacts(Path(place).expanduser() if place else settings.data_dir / "artifacts")

@@ -76,7 +76,7 @@ class Station:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that goes wrong, and how it is set right again. `halts`: the station answers nobody meanwhile."""
+    """Something that goes wrong, and how it is set right again. `halts`: the station does not answer meanwhile."""
 
     name: str
     strike: Callable[[], object]

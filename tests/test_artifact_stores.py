@@ -245,7 +245,7 @@ def test_beyond_the_budget_the_oldest_go_first(settings, monkeypatch):
             database.reuse_result(f"job-{name}", "generation", [sha256])
             if name != "ab":
                 JobTable(database).cancel(f"job-{name}")
-        # An object store tells the times of its own clock, in whole seconds: here they are told.
+        # An object store reports times of its own clock, in whole seconds: here they are set.
         ages = dict(zip(kept.values(), (4000, 3000, 2000, 1000), strict=True))
         listed, now = [*store.listed()], time.time()
         aged = [type(one)(one.sha256, one.size, now - ages[one.sha256]) for one in listed]

@@ -593,7 +593,7 @@ def test_leaving_a_dead_server_is_still_leaving(hurried: Connect) -> None:
 
 
 def _leave(connect: Connect, url: str, when: threading.Event) -> None:
-    """Breaks off a simulation at that moment, as a person does at a terminal, or whoever cancels a task."""
+    """Interrupts a simulation at that moment, as a person at a terminal or a canceled task does."""
     if connect.kind == "async":
 
         async def ask() -> None:

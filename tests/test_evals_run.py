@@ -259,7 +259,7 @@ def test_a_plan_is_asked_and_followed(tmp_path: Path, items: list[Item], mllm: T
     assert "as planned" in done.stdout
     assert len(read_run(tmp_path / "run").observations) == 9
     refused = checked(imported.begin([*planned, "--seed", "4"], tmp_path, environment()).done(), 1)
-    assert "--plan says what is asked: leave --seed out." in refused.stderr
+    assert "The plan already sets --seed: leave that option out." in refused.stderr
     more = ["eval", str(SAMPLE), *own, "--arm", "encounters", "--limit", "3", "--out", str(tmp_path / "run")]
     departed = checked(imported.begin(more, tmp_path, environment()).done()).stdout
     assert "as planned (explored besides: encounters)" in departed
@@ -332,7 +332,7 @@ def test_killed_or_interrupted_no_reply_is_asked_for_twice(
         mllm.seconds = 0.6  # the signal comes long before the last reply
         told = struck(signal.SIGINT, 3)
         assert told.returncode == 130
-        assert "Interrupted. The same command goes on with it." in told.stderr
+        assert "Interrupted. Run the same command again to resume." in told.stderr
         assert "Traceback" not in told.stderr
         mllm.seconds = 0.0
         evaluated(imported, tmp_path / "struck", *arguments, mllm=mllm)

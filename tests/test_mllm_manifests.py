@@ -66,7 +66,7 @@ SERVED = {
     "anthropic/claude-opus-4.6": "claude-opus-4-6",
     "claude-haiku-4-5-20251001": "claude-haiku-4-5",
 }
-# They draw, speak or hear, or belong to families of which nothing is known here.
+# They draw, speak or hear, or belong to unknown families.
 STRANGERS = (
     "gemini-2.5-flash-image", "gemini-2.5-flash-preview-tts", "gemini-3-pro-image", "gemini-3.1-flash-lite-image",
     "gpt-5-codex", "gpt-4.1", "gpt-oss-20b", "claude-3-5-sonnet-20241022", "qwen3:8b", "qwen2.5-coder:7b",

@@ -155,7 +155,7 @@ def arm_of(text: str) -> Arm:
         given = NAMED[base].model_dump(exclude_defaults=True)
     else:
         raise InvalidRequest(
-            f"There is no arm '{text}': there are {', '.join(NAMED)}, each with suffixes such as :initial or :vote-3, "
+            f"There is no arm '{text}': arms are {', '.join(NAMED)}, each with suffixes such as :initial or :vote-3, "
             "or factors, such as content=simulated,frames=events,votes=1."
         )
     for suffix in suffixes if "=" not in base else ():
@@ -186,7 +186,7 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
         if ask not in arm.asks:
             raise InvalidRequest(
                 f"The service's own /answer has no arm '{arm.name}', only never, always and auto, each also with "
-                "votes: name a multimodal LLM with --mllm, and leave --ask out."
+                "votes: name a multimodal LLM with --mllm and leave --ask out."
             )
         without = [item for item in items if item.truth is None or not item.truth.shows(drawn=arm.error is not None)]
         if arm.content == "true" and without:

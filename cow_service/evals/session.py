@@ -105,7 +105,7 @@ def session(
 
 
 def active_session() -> Session | None:
-    """The session in which tasks run; None where they were started by Inspect's own command."""
+    """The session in which tasks run; None if they were started by Inspect's own command."""
     return _active[-1] if _active else None
 
 

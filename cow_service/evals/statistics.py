@@ -91,7 +91,7 @@ class Cost(Record):
 
 
 def rates(observations: Sequence[Observation]) -> Rates | None:
-    """Of one arm; None where nothing was replied to."""
+    """Of one arm; None if nothing was replied to."""
     replied = [each for each in observations if each.failure is None]
     if not replied:
         return None
@@ -137,7 +137,7 @@ def pairs_of(arm: Sequence[Observation], baseline: Sequence[Observation]) -> tup
 
 
 def gain(arm: Sequence[Observation], baseline: Sequence[Observation]) -> Gain | None:
-    """Of an arm over a baseline; None where no question was replied to in both."""
+    """Of an arm over a baseline; None if no question was replied to in both."""
     pairs, questions = pairs_of(arm, baseline)
     return gain_of(pairs, questions) if len(pairs) else None
 
@@ -181,7 +181,7 @@ def sign_flip_p(differences: NDArray[np.float64]) -> float:
 def primary_gain(placebos: Mapping[str, tuple[Pairs, int]]) -> PrimaryGain | None:
     """Of an arm over the strongest of its placebos, by their names: pairs of replies and questions as of `pairs_of`.
 
-    None where there is no placebo, or one without replies. Which placebo is the strongest is found out from the same
+    None if there is no placebo, or one without replies. Which placebo is the strongest is found out from the same
     replies, so one must not only test against that: the gain is one where each placebo is beaten (an intersection-union
     test, Berger 1982). The lower end of the interval is the lowest of all, the upper one the lowest of those with their
     error shared among the placebos.
@@ -270,7 +270,7 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibration | None:
-    """Of the told probabilities, each item once; None where none was told."""
+    """Calibration of the predicted probabilities, each item once; None if there are none."""
     told = {
         each.item: (each.probability, each.happens)
         for each in observations

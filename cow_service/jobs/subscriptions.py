@@ -75,7 +75,7 @@ class Subscription:
         return self._view, self._number
 
     def stop(self) -> None:
-        """Ends reading: nobody follows any more."""
+        """Stops reading: there are no followers left."""
         self._reading.cancel()
 
     async def _read_on(self, active: ActiveJobs, job_id: str) -> None:
@@ -84,7 +84,7 @@ class Subscription:
                 waiter.changed.clear()
                 try:
                     view = await asyncio.to_thread(self._read)
-                except Exception as error:  # noqa: BLE001 # whoever follows raises it
+                except Exception as error:  # noqa: BLE001 # the followers raise it
                     self._error, self.is_over = error, True
                     self._wake()
                     return

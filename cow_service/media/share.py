@@ -1,4 +1,4 @@
-"""What people pass on of a result: its film with question, futures and verdict, and a still of the same for a link."""
+"""Results to share: a film with question, futures and verdict, and a still picture of it for a link."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Told:
     question: str
     verdict: str
     worlds: int  # that were run
-    agreeing: str  # how many of them say so; empty where none were counted
+    agreeing: str  # how many of them say so; empty if none were counted
     share: float | None
     futures: tuple[tuple[tuple[float, float], ...], ...]  # of the picture's width: the mover in other worlds
     path: tuple[tuple[float, float], ...]
@@ -54,7 +54,7 @@ class Told:
         outcome, path = trajectory.outcome, trajectory.paths[0]
         share = None if outcome is None or not trajectory.ensemble else outcome.probability
         says = "agree" if outcome is None or outcome.asked.form not in ("whether", "when", "changes") else "say yes"
-        agreeing = "" if share is None else f"{share:.0%} of {trajectory.ensemble} simulated worlds {says}"
+        agreeing = "" if share is None else f"{share:.0%} of {trajectory.ensemble} simulated versions {says}"
         seen = path.points[: path.visible.index(False)] if False in path.visible else path.points
         met = [each.first_frame for each in trajectory.encounters]
         return Told(
@@ -71,7 +71,7 @@ class Told:
 
 
 def film(video: bytes, told: Told) -> bytes:
-    """An mp4: the futures fade over the first frame, the film plays, and the verdict is told.
+    """An mp4: the futures fade over the first frame, the film plays, and the verdict is shown.
 
     It is made smaller where it would not fit into a chat (`SMALL_ENOUGH`). Its frames are read as they are needed.
     """
@@ -152,7 +152,7 @@ class _Sheet:
             yield told
 
     def around(self, frame: Image, is_told: bool) -> Image:
-        """A frame with its words, the verdict among them where it is told."""
+        """A frame with its words, including the verdict if it is shown."""
         canvas = np.full((*self.shape, 3), DARK[0], np.uint8)
         canvas[self.above : self.above + self.frame[0]] = frame
         in_letters_thread(self._write, canvas, is_told)
@@ -196,7 +196,7 @@ WEB = Path(__file__).parents[1] / "web"
 
 
 def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
-    """HTML that needs no network: the picture [H, W, 3], and its worlds, computed anew while somebody drags the arrow.
+    """HTML that needs no network: the picture [H, W, 3], and its worlds, computed anew while you drag the arrow.
 
     `world` is the JSON of `trajectory.live`.
     """

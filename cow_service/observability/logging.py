@@ -48,7 +48,7 @@ def ids() -> dict[str, str]:
 
 
 def traceparent() -> str | None:
-    """The header that names the current span as the parent; None where there is none."""
+    """The header that names the current span as the parent; None if there is none."""
     span = get_current_span().get_span_context()
     if not span.is_valid:
         return None

@@ -39,7 +39,7 @@ class SeenBody:
     elongated: bool = False  # a vehicle: longer along its heading than across
     equal_sided: bool = False  # a cube: as wide as high
     is_form_known: bool = True  # its shape was seen or said; else how deep it is, is not known
-    stands_out: bool = True  # it was told from its surroundings: nothing else is seen to carry it
+    stands_out: bool = True  # it is separate from its surroundings: nothing else is seen to carry it
     taper: float = 1.0  # its width at its lower end, of that at its upper end
     point: Point | None = None  # px: of the mover, the one it was grounded at
 
@@ -88,7 +88,7 @@ class SeenBody:
     def rim(self) -> tuple[float, float] | None:
         """Minor to major axis of its round top as the upper edge of its outline shows it, and its deviation.
 
-        None where that edge is no half of an ellipse.
+        None if that edge is no half of an ellipse.
         """
         patch = self.mask.patch
         top = patch[: max(3, len(patch) // 6)]

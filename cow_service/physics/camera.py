@@ -310,7 +310,7 @@ def _far_end(floor: Floats, above: float, width: int) -> Floats | None:
 def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, int]) -> CameraFit | None:
     """The camera by the shadow of a ball in a box of an image of a size (width, height), px.
 
-    None where no likely camera and light would make that shadow of a ball in the air.
+    None if no likely camera and light would make that shadow of a ball in the air.
     """
     radius, middle = (ball[2] - ball[0] + ball[3] - ball[1]) / 4, np.array(size) / 2
     across = (np.array([ball[0] + ball[2], ball[1] + ball[3]]) / 2 - middle) / radius

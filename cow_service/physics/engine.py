@@ -53,10 +53,10 @@ class RigidShape:
     density: float = 1.0  # against that of the others
     friction: float = 0.5
     restitution: float = 0.5
-    starts: bool = False  # it is set in motion or let go; what is not sleeps until it is touched
+    starts: bool = False  # it is set in motion or released; others sleep until they are touched
     glides: bool = False  # keeps its velocity, without friction, until it meets another body
     falls: bool = True  # gravity acts on it
-    ghost: bool = False  # passes through everything; what it meets is told all the same
+    ghost: bool = False  # passes through everything, but its meetings are recorded
     course: Course | None = None  # of what glides: its legs, and where it stops
     hollow: Hollow | None = None  # it is an open container
     middle: float | None = None  # height of a solid body's centre of mass, of its height; None: as of one stuff
@@ -131,7 +131,7 @@ class WorldRun:
 
 
 Finished = Callable[[Floats, Floats], Mask]
-"""Of which worlds [K] the rest does not matter, by positions and velocities [K, 3] (m, m/s) of their first bodies."""
+"""Which worlds [K] may stop now, by positions and velocities [K, 3] (m, m/s) of their first bodies."""
 
 
 def run_worlds(
@@ -290,7 +290,7 @@ class _Engine:
         for number in range(frame * self.substeps, (frame + self.every) * self.substeps):
             time = number * step
             self.steer(number, step)
-            # Velocities before the step, of which meetings tell the change.
+            # Velocities before the step, from which the change at a meeting is computed.
             before = {(0, i): self.bodies[0][i].linvel for i in self.awake[0]} if self.is_alone else {}
             world.step()
             for event in drain():

@@ -26,10 +26,10 @@ BATCHES = (15, 30)  # worlds after which it is asked whether all that are wanted
 EVERY = 2  # frames of its clock between those that are recorded of the ensemble
 TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
 SURE = 0.7  # share of the worlds from which an answer is given
-# The same of a throw whose heading out of the plane of the image nobody tells, where it meets nothing: a wrong guess of
+# The same for a throw with an unknown heading out of the image plane that meets nothing: a wrong guess of
 # the heading makes worlds miss, and hardly ever hit.
 SURE_OF_MISS = 0.85
-SURE_OF_FIT = 0.85  # the same of whether something fits where it is put: widths are told by two outlines at two depths
+SURE_OF_FIT = 0.85  # the same for whether a put object fits: widths are measured by two outlines at two depths
 ROBUST = 0.9
 # The chance, at most and at each look, that those which are left would change whether the answer is sure, and whether
 # it is robust, if they were drawn like those that were run.
@@ -44,7 +44,7 @@ FIRST_MET: tuple[AskedForm, ...] = ("which-first", "where", "what-happens")  # t
 
 @dataclass(frozen=True)
 class Query:
-    """What is asked, with the bodies that it is about."""
+    """The question, with the bodies that it is about."""
 
     asked: Asked
     target: int | None = None  # None: any
@@ -85,7 +85,7 @@ class EnsembleResult:
     shown: ObservedWorlds
     ensemble: ObservedWorlds | None
     query: Query | None
-    decided: Decided | None  # null where nothing is asked, or there is no ensemble
+    decided: Decided | None  # null if nothing is asked, or there is no ensemble
 
 
 def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[EnsembleResult, ...]:
@@ -150,7 +150,7 @@ def _observed(world: WorldInput, worlds: Worlds, draws: Floats) -> ObservedWorld
 
 
 def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], draws: Floats) -> list[Decided | None]:
-    """What is decided of each world; None where worlds decide nothing."""
+    """What is decided of each world; None if worlds decide nothing."""
     decided: list[Decided | None] = []
     for asked, each in zip(queries, worlds, strict=True):
         if asked is None or not asked.is_decidable or (asked.asked.form == "changes" and len(worlds) == 1):
@@ -235,7 +235,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
     probability = shown = float(np.where(misread, 0.5, agrees).mean())  # what was misread tells neither way
     times = _happens(query, events)
     times = times[np.isfinite(times)]
-    if asked.form in ("whether", "when"):  # that what is asked happens, or, where it is negated, does not
+    if asked.form in ("whether", "when"):  # that the event happens, or, if negated, does not
         happens = probability if answer else 1 - probability
         shown = 1 - happens if asked.negated else happens
     return Decided(

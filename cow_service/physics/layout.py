@@ -35,9 +35,7 @@ ORDER = 17  # how far the draws of one body's depth are from those of the next
 NEAREST, FARTHEST = 0.05, 40.0  # depths, in those of the first body: what seems to lie elsewhere is put there
 BOX_SIDE = 0.82  # of the seen width of a box whose yaw is not known: its side
 HUNG, MAYBE_HUNG = 4.0, 0.5  # how much likelier it hangs over that than where the camera's priors have it; in clutter
-MAYBE_OFF = (
-    1.3  # deviations of the height of what, in clutter, may stand on a thing that nobody named: added to its own
-)
+MAYBE_OFF = 1.3  # deviations added to the height of an object that, in clutter, may stand on an unnamed one
 HUNG_SIGMA = 0.3  # of the mover's half width: how far ahead of the other it is
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 APART = 0.98  # of the distance of two bodies: together they are so wide at most

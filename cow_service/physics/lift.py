@@ -128,7 +128,7 @@ def above(
     depth_share: Floats | float = 1.0,
     taper: float = 1.0,
 ) -> LiftedBody | None:
-    """A body that stands on a horizontal plane at a height [K] (m); None where its foot lies at or above the horizon.
+    """A body that stands on a horizontal plane at a height [K] (m); None if its foot lies at or above the horizon.
 
     The foot is the middle of the box's lower edge; the body's middle lies half its depth there further away, which is
     `taper` of that at its top. A sphere's depth follows from its radius and its middle.

@@ -1,4 +1,4 @@
-"""The worlds of a result as they begin, for a program that runs them again elsewhere: the page does while one drags.
+"""The initial worlds of a result, for a program that runs them again elsewhere, as the page does while you drag.
 
 Coordinates are metres right, above the floor and ahead, the camera above their origin. Of what differs between worlds
 there is a list with a value for each, the likeliest world first; what is the same in all of them is one value.

@@ -1,4 +1,4 @@
-"""What becomes of a body that was put somewhere: in, on, over, beside, or fallen off, in each world of an ensemble.
+"""What happens to a body that was put somewhere: in, on, over, beside, or fallen off, in each world of an ensemble.
 
 The rule for `into`, by where things come to rest. What is wider than the opening, or whose lower end lies no more than
 a tenth of the container's depth below the rim, is `on-the-rim`: it is held up there. What has gone through the opening
@@ -243,7 +243,7 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
         bodies[goal.targets[0]] = whole
     body = bodies[goal.body]
     if goal.opening is not None:
-        # How wide it is against the opening is told by two outlines at two depths, of a box by a corner that turns.
+        # Its width relative to the opening is measured by two outlines at two depths, for a box by a corner that turns.
         sigma = TURNED_SIGMA if body.shape == "box" and not goal.opening.square else WIDTH_SIGMA
         wider = math.exp(sigma * float(row[COLUMN["outline"]]))
         sides = {name: wider * getattr(body, name) for name in ("half_width", "half_depth")}

@@ -138,7 +138,7 @@ class _Silhouettes:
         return seen + shift[:, None], (cosine >= FACING) | ~normals.any(axis=2)
 
     def fields(self, body: int, carried: tuple[Floats, Bools]) -> dict[str, Any]:
-        """Fields of a path: points of a body, and where they are seen; None where nothing ever hides one."""
+        """Fields of a path: points of a body, and where they are seen; None if nothing ever hides one."""
         # What is no simple shape, such as a bottle's neck, may be carried beside where it is drawn.
         points, seen = carried[0], carried[1] & self._covered(body, carried[0])
         # What stays where the image shows it is chosen where it is seen: only what moves can come before it.
@@ -229,7 +229,7 @@ def _level(shape: Shape, places: Floats, half: Floats) -> Floats:
 
 
 def at_rate(trajectory: Trajectory, fps: float, num_frames: int, lead: int = 0) -> Trajectory:
-    """What a generator is told, at another frame rate: straight on between frames, and at rest after the last.
+    """The trajectory at another frame rate, for a generator: linear between frames, at rest after the last.
 
     What is true at the frames before and after a time is true at that time. `lead` frames before the motion begins
     stay as they are, and are not counted. Encounters and the ensemble's paths, which count frames, are left out.

@@ -1,4 +1,4 @@
-"""What a reader that asks a multimodal LLM offers beside its readings: chats with that MLLM itself."""
+"""Chats with the MLLM of a reader, which such a reader offers besides its readings."""
 
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -47,7 +47,7 @@ class ChatReader(Protocol):
 
     @property
     def upstream(self) -> Upstream | None:
-        """Where chats can be sent on as they are; None where its MLLM does not speak OpenAI's protocol."""
+        """Where chats can be sent on as they are; None if its MLLM does not speak OpenAI's protocol."""
         ...
 
     async def chat(self, body: dict[str, Any]) -> ChatTurn:

@@ -83,7 +83,7 @@ def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
 
 
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
-    """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None where too few do."""
+    """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None if too few do."""
     rng = np.random.default_rng(0)  # the same outline must give the same circle
     a, b, c = np.moveaxis(outline[rng.integers(0, len(outline), (TRIES, 3))], 1, 0)  # [T, 2] each: not finite on a line
     ab, ac = b - a, c - a
@@ -117,7 +117,7 @@ NECK_STEP = 1.0  # Lab units between the neck and the floor beside it, in the me
 
 
 def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
-    """The mask [h, w] of the neck between a mouth and a body [h, w]; None where they are no one thing's.
+    """The mask [h, w] of the neck between a mouth and a body [h, w]; None if they are no one thing's.
 
     `lab` [h, w, 3] is the image in CIE Lab.
     """
@@ -152,7 +152,7 @@ BLUR = 0.25  # of the largest steps: less is the blur of an edge
 SIDE = 0.5  # of the object's width: how far away the sides are looked at, and the width of what is searched
 LEAST_SIDE = 5  # px at the working size
 UPPER_ROWS = 0.15  # of the object's height: where its middle is taken
-OFF_MIDDLE = 0.15  # of the object's width, by which it may stand beside that middle
+OFF_MIDDLE = 0.15  # of the object's width, by which it may be off that middle
 SUNK = 0.25  # of the object's height: so far below the object's upper end its foot may lie
 LEAST_HEIGHT, MOST_HEIGHT = 3, 0.6  # px at the working size: less is blur; of the object's height: more is no part
 SHARP = 0.6  # share of its outline that lies on edges

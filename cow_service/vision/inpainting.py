@@ -143,7 +143,7 @@ class _Surroundings:
 
 
 def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> _Surroundings | None:
-    """Within a margin (px) of a hole; None where there is no hole, or nothing else."""
+    """Within a margin (px) of a hole; None if there is no hole, or nothing else."""
     crop = window_of(hole, margin)
     if crop is None:
         return None
@@ -294,7 +294,7 @@ def _around(centre: int, reach: int, length: int) -> slice:
 
 
 def _best_offset(coarse: Floats32, todo: Mask, barred: Mask, y: int, x: int) -> tuple[int, int] | None:
-    """Rows and columns from a tile to the place that fits its surroundings best, or None where there is no place."""
+    """Rows and columns from a tile to the place that fits its surroundings best, or None if there is no place."""
     reach = TILE // 2 + CONTEXT
     window = _around(y, reach, coarse.shape[0]), _around(x, reach, coarse.shape[1])
     template = coarse[window]

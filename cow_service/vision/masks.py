@@ -134,7 +134,7 @@ def without_holes(mask: Mask) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class CroppedMask:
-    """A mask of an image, of which only the part that is not empty is stored."""
+    """A mask of an image; only the part that is not empty is stored."""
 
     shape: tuple[int, int]  # height and width of the image, px
     rows: slice

@@ -339,7 +339,7 @@ def _without_rim(one: _Found, balls: Mask) -> _Found:
 
 
 def _hidden(found: Sequence[_Found]) -> list[bool]:
-    """Of which of them much of the outline lies along one thing of another colour that ends lower in the image."""
+    """Which of them have much of their outline along one thing of another colour that ends lower in the image."""
     things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
     return [
         any(low > own[0] and not colours & own[1] and near[outline].mean() > HIDDEN for low, colours, near in things)

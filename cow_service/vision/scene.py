@@ -177,7 +177,7 @@ class Scene:
 
     @cached_property
     def regions(self) -> tuple[Region, ...]:
-        """Objects of the image, largest first; empty where it is too cluttered to tell."""
+        """Objects of the image, largest first; empty if it is too cluttered to tell."""
         if self.side_view is not None:
             drawn = (drawn_region(self.clean, shape) for shape in self.side_view.shapes)
             return tuple(sorted(drawn, key=lambda region: -region.mask.area))
@@ -404,7 +404,7 @@ def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
 
 MOST_IMAGES = 8
 ImageKey = tuple[str | None, str]
-"""Whose image it is, so that nobody learns by the time it takes what others ask about; and its SHA-256."""
+"""The owner of the image, so that timing does not reveal the images of others; and its SHA-256."""
 MOST_PIXELS = 13_000_000  # of all of them together: each holds some bytes per pixel
 
 

@@ -179,7 +179,7 @@ class _Floor:
 
 
 def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
-    """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None where it has none or several patches could be it."""
+    """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None if it has none or several patches could be it."""
 
     def find() -> Shadow | None:
         if scene.region_of(bbox) is None or bbox[2] - bbox[0] < LEAST_WIDTH:

@@ -146,7 +146,7 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
 
 
 def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
-    """The hollow drawing of which a stroke may be the rim, and that of which it may be the inside."""
+    """The hollow drawings whose rim, and whose inside, a stroke may be."""
     whole = without_holes(stroke.patch)
     if np.count_nonzero(whole & ~stroke.patch) > LEAST_INSIDE * np.count_nonzero(whole):
         inside = eroded(whole & ~stroke.patch, beyond=0)

@@ -168,7 +168,7 @@ def load_families() -> dict[str, Family]:
 
 @cache
 def find_manifest(name: str) -> Manifest | None:
-    """One shipped manifest; None where there is none of that name. Only its own file is read."""
+    """One shipped manifest; None for an unknown name. Only its own file is read."""
     return Manifest.model_validate(_parse(MANIFESTS.read(name))) if name in MANIFESTS.names() else None
 
 

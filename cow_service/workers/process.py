@@ -210,8 +210,8 @@ class Worker:
         except (EOFError, OSError):
             self._process.kill()  # also where it sent a message that is too long
         except ValidationError:
-            log.exception("the worker %s sent what is no message", self.name)
-            self.kill("crashed", "sent what is no message, and was ended")
+            log.exception("the worker %s sent an invalid message", self.name)
+            self.kill("crashed", "sent an invalid message, and was ended")
         self._ended.set()
         self._loaded.set()
         for inbox in list(self._inboxes.values()):

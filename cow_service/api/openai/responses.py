@@ -1,4 +1,4 @@
-"""OpenAI's responses: the chat that asks the same, and its reply as a response. What needs state is refused by name."""
+"""OpenAI's responses: converts them to chats and the replies back. Fields that need state are refused by name."""
 
 import time
 import uuid
@@ -145,7 +145,7 @@ def _as_object(value: Any, pointer: str) -> dict[str, Any]:
 
 
 def _array(value: Any, pointer: str) -> list[Any]:
-    """An array of the request, empty where it is left out."""
+    """An array of the request, empty if it is left out."""
     if value is not None and not isinstance(value, list):
         raise wrong(pointer, "is no array")
     return value or []

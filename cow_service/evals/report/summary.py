@@ -58,10 +58,10 @@ class Primary(Record):
 
 
 class Split(Record):
-    """The gain of simulated frames over the image alone, on the questions of which something is so."""
+    """The gain of simulated frames over the image alone, on a group of questions."""
 
     name: str
-    by: str = Field(description="What the questions are told apart by.")
+    by: str = Field(description="Property by which the questions are grouped.")
     value: str
     gain: Gain
 
@@ -179,7 +179,7 @@ def matched(seen: Sequence[Observation], other: Sequence[Observation]) -> tuple[
 
 
 def _primary(place: int, run: EvalRun, *, several: bool) -> Primary | None:
-    """Of a run: the question that its plan states, else that of its arms; None where it has no placebo."""
+    """Of a run: the question that its plan states, else that of its arms; None if it has no placebo."""
     plan, question = run.info.plan, primary(run.info.points)
     arm, placebos = ("", ()) if question is None else (question[0].name, tuple(each.name for each in question[1]))
     if plan is not None:
@@ -257,6 +257,6 @@ def read_prices(path: Path) -> dict[str, Price]:
         raise InvalidRequest(f"The prices '{path}' cannot be read: {error.strerror or error}.") from error
     except (yaml.YAMLError, ValidationError) as error:
         raise InvalidRequest(
-            f"'{path}' holds no prices: it must be like {{openai/gpt-5: {{input: 1.25, output: 10}}}}, per million "
+            f"'{path}' holds no prices: it must look like {{openai/gpt-5: {{input: 1.25, output: 10}}}}, per million "
             f"tokens. {str(error).splitlines()[0]}"
         ) from error

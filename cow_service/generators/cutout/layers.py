@@ -31,7 +31,7 @@ class CutoutOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    clean_cues: bool = Field(default=True, description="Take drawn arrows and boxes out of the frames.")
+    clean_cues: bool = Field(default=True, description="Remove drawn arrows and boxes from the frames.")
 
 
 @dataclass(frozen=True)

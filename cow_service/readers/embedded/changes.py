@@ -1,4 +1,4 @@
-"""Finds what a question takes away or puts somewhere. It refuses where that, or where it is put, is not found."""
+"""Finds what a question takes away or puts somewhere. It refuses if the object or its new place is not found."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from cow_service.vision.scene import Scene
 
 
 def check_changes(question: Question) -> None:
-    """Raises `CannotGround` where the mover is taken away, or something is put into itself."""
+    """Raises `CannotGround` if the mover is taken away, or something is put into itself."""
     asked = read_asked(question)
     about = () if asked is None else [name for name in (asked.subject, asked.target, *asked.among) if name is not None]
     for change in question.interventions:

@@ -246,7 +246,7 @@ def _foremost(
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase] = ()) -> Region | None:
-    """The one region that fits a phrase; None where none or several do."""
+    """The one region that fits a phrase; None if none or several do."""
     fitting = best_matches(regions, phrase, others)
     return fitting[0] if len(fitting) == 1 else None
 
@@ -254,7 +254,7 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
 def match_several(
     regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase], count: int | None
 ) -> list[Region]:
-    """The so many regions that fit a phrase such as "both mugs", or all; empty where it is not clear which."""
+    """The so many regions that fit a phrase such as "both mugs", or all; empty if it is not clear which."""
     fitting = _foremost(regions, phrase, others, count or 1)
     is_clear = len(fitting) == count
     if count is None:
@@ -281,7 +281,7 @@ TOP, LEGS = 0.05, 0.8  # of its height: a drawn table is as broad as it is at th
 
 
 def table_among(regions: Sequence[Region]) -> Region | None:
-    """The one region of a drawing seen from the side that has legs; None where none or several have."""
+    """The one region of a drawing seen from the side that has legs; None if none or several have."""
     rows = [(each, *(each.mask.patch[int(at * len(each.mask.patch))] for at in (TOP, LEGS))) for each in regions]
     found = [each for each, top, low in rows if top.mean() > LEGS and np.count_nonzero(np.diff(low, prepend=0) > 0) > 1]
     return found[0] if len(found) == 1 else None

@@ -25,7 +25,7 @@ UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that 
 FITS = 2.0  # misfit below which an outline is well described
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
 CIRCLE = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
-ODD = 0.05  # share of outlines that are nobody's: half hidden, or with a shadow
+ODD = 0.05  # share of outlines that fit no shape: half hidden, or with a shadow
 
 # Rows over which a width is taken, from the upper end, as shares of the height.
 BANDS = ((0.08, 0.2), (0.2, 0.35), (0.35, 0.5), (0.5, 0.8), (0.8, 0.95))
@@ -44,7 +44,7 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "car": ((0.3, 0.9), (0.82, 0.96), (0.2, 0.9), (0.5, 0.97), (0.85, 1.0), (0.75, 1.0), (0.2, 0.97)),
     "box": ((0.4, 1.6), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
 }
-# Share of things of which something reaches out on one side between their ends, or has a hole; of others `NO_HANDLE`.
+# Share of objects with a part that reaches out on one side between their ends, or a hole; for others `NO_HANDLE`.
 HANDLES = {"mug": 0.52, "cone": 0.45, "car": 0.3, "candle": 0.15}
 NO_HANDLE = 0.04
 _REACHES, _BARE = 0.15, 0.08  # of the width: so far out on one side at least, on the other at most
@@ -80,7 +80,7 @@ def is_unlike(region: Region, form: str) -> bool:
 
 
 def looks_like(region: Region) -> str | None:
-    """The noun of the one row of `OUTLINES` that an outline clearly is; None where it could be many things."""
+    """The noun of the one row of `OUTLINES` that an outline clearly is; None if it could be many things."""
     if region.is_hidden or is_cut(region, "ball"):
         return None
     ratio, form = max((log_ratio(region, form), form) for form in _TELLING)
@@ -112,7 +112,7 @@ def log_ratio(region: Region, form: str) -> float:
 
 
 def _density(measured: Sequence[float], form: str) -> float:
-    """exp(-misfit), over its integral over all outlines; or an outline that is nobody's."""
+    """exp(-misfit), over its integral over all outlines; or an outline that fits no shape."""
     (low, high), *shares = OUTLINES[form]
     sides = [math.log(high / low), *(end - start for start, end in shares)]
     integral = math.prod(side + 2 * step for side, step in zip(sides, _STEPS, strict=True))

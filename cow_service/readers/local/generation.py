@@ -179,7 +179,7 @@ class BatchRow:
     def take(self, token: int) -> None:
         """Adds the chosen token, and ends the reply where that completes it or reaches its limit.
 
-        Raises `RuntimeError` where the grammar does not go on, which its mask makes impossible.
+        Raises `RuntimeError` if the grammar does not go on, which its mask makes impossible.
         """
         if token in self.ends:
             self._end("stop")
@@ -191,7 +191,7 @@ class BatchRow:
         else:
             self.tokens.append(token)
             if self.matcher is not None and not self.matcher.consume_token(token):
-                raise RuntimeError(f"The grammar of a reply broke down: {self.matcher.get_error()}")
+                raise RuntimeError(f"The grammar of a reply failed: {self.matcher.get_error()}")
         if self.matcher is not None and self.matcher.is_stopped():
             self._end("stop")
         elif len(self.thought) + len(self.tokens) >= self.pending.limit:
@@ -279,7 +279,7 @@ class BatchGenerator:
         except ValueError as error:
             if not any(images):
                 raise
-            raise ImageUnreadable(f"The multimodal LLM does not take such an image: {error}.") from error
+            raise ImageUnreadable(f"The multimodal LLM cannot use this image: {error}.") from error
         inputs = inputs.to(self._model.device, dtype=self._model.dtype)
         counts: list[int] = inputs["attention_mask"].sum(-1).tolist()
         rows = [self._row(*row) for row in zip(batch, texts, counts, strict=True)]

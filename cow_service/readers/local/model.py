@@ -162,7 +162,7 @@ class LocalModel(Model[None]):
     ) -> ModelResponse:
         """The reply. Its finish reason is `length` where it was cut off, as the caller's limit or the model's wants it.
 
-        Raises `MllmUnavailable` where memory runs out, `ImageUnreadable` and the other errors of `images.decode` for
+        Raises `MllmUnavailable` if memory runs out, `ImageUnreadable` and the other errors of `images.decode` for
         images, and `UserError` for tools, files that are no images, schemas that replies cannot be held to, and
         settings out of range.
         """

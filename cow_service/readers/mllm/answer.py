@@ -64,7 +64,7 @@ def answer_schema(options: Sequence[AnswerOption], reasoning_length: int) -> rep
 
 
 def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
-    """The answer that a reply gives. Raises `ReplyError` where it gives none of the options, or more than one."""
+    """The answer that a reply gives. Raises `ReplyError` if it gives none of the options, or more than one."""
     said = replies.without_thinking(reply)
     parts = (part for value in replies.values_in(said) for part in replies.listed(value))
     objects = [replies.fields_of(part) for part in parts if isinstance(part, dict)]

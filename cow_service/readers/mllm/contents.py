@@ -1,4 +1,4 @@
-"""What a multimodal LLM can be shown beside a question: what was imagined, or a placebo in its place.
+"""What a multimodal LLM can be shown with a question: the imagined frames, or a placebo instead.
 
 A placebo has as many pictures of the same size, and tells nothing of what would happen. What the imagined frames gain
 over it is what imagining brings; what a placebo gains over the image alone is what more pictures bring.

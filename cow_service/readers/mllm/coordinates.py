@@ -107,7 +107,7 @@ class CoordinateFrame:
         return number(0, int(max(self._full)), kind)
 
     def point(self, written: object) -> Point:
-        """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""
+        """A point in pixels. Raises `ReplyError` if two numbers inside the image are not what was written."""
         return self._inside(*self._pairs(written, 1, "a point is 2 numbers")[0])
 
     def bbox(self, written: object) -> BBox:

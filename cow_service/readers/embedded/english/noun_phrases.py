@@ -225,7 +225,7 @@ def _with_mark(text: str, item: Item, links: Sequence[str], mark: Item) -> Item 
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
-    """The first noun phrase of a text such as "the red toy car"; None where there is none."""
+    """The first noun phrase of a text such as "the red toy car"; None if there is none."""
     found = items("the " + text.removeprefix("the "))
     phrase = next((item.phrase for item in found if item.phrase is not None), None)
     if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
@@ -348,7 +348,7 @@ def _head(name: str) -> str | None:
 
 
 def shape_of(name: str) -> Shape | None:
-    """The shape of what is called so; None where the noun does not say."""
+    """The shape of what is called so; None if the noun does not say."""
     head = _head(name)
     return next((shape for shape, nouns in _SHAPES.items() if head in nouns), None)
 
@@ -393,7 +393,7 @@ ContainerForm = Literal["round", "square", "none", "unknown"]
 def container_form(name: str) -> ContainerForm:
     """Round or square for what is called a container, `none` for a solid thing, `unknown` where the noun says nothing.
 
-    A box is a container: whoever means a solid one does not ask what goes into it.
+    A box is a container: a question about a solid one would not ask what goes into it.
     """
     head = _head(name)
     if head in lex.SETS["round"]:

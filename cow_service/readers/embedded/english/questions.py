@@ -1,4 +1,4 @@
-"""Parses a what-if question in English with plain rules: what moves, how, what else is named, what is asked.
+"""Parses a what-if question in English with plain rules: what moves, how, what else is named, and the question itself.
 
 No model and no list of nouns: verbs and function words are closed lists, the noun phrases are what lies between.
 """
@@ -116,7 +116,7 @@ def _best(found: Sequence[Item], candidates: Sequence[MotionCandidate]) -> Motio
     best = max(candidates, key=lambda candidate: candidate.rank, default=None)
     if best is None or best.asked or not best.moves or found[best.start].key != "while":
         return best
-    # In front of "while", where both are told: "the mug slides left by 20 px while the ball drops".
+    # In front of "while", where both motions are given: "the mug slides left by 20 px while the ball drops".
     told = [
         each
         for each in candidates
