@@ -23,9 +23,7 @@ HOLD_ROUNDS, HOLD_CALLS = 8, 64  # both pass at the refused level before one mor
 MAX_PAUSE_SECONDS = 60.0  # a server that asks for a longer pause is asked again after this time
 LATENCY_FACTOR = 2.0  # rise of the typical latency that halves the limit
 LATENCY_GAIN = 0.75  # a halving helped if the latency fell to this share: calls did wait for each other
-MIN_WINDOW = (
-    32  # calls whose latencies are compared: so many that a mix of short and long ones looks the same each time
-)
+MIN_WINDOW = 32  # calls whose latencies are compared: enough for a stable mix of short and long ones
 BASELINE_WEIGHT = 1 / 8  # of the last window in the long-run latency
 
 

@@ -40,7 +40,7 @@ from cow_service.vision.scene import SeenImages
 from cow_service.weights.manifests import check_modules, find_manifest, load_manifests
 from cow_service.weights.repositories import ready
 
-OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
+OWN_PARTS = frozenset(("transformer", "weights"))  # backends that an own checkpoint can replace
 WORD_READER = "embedded"  # it needs no weights: it reads the words of requests whose images another reader looks at
 Request = TypeVar("Request", bound=SimulateRequest)
 Place = TypeVar("Place", bound=PlaceRequest)
@@ -58,7 +58,7 @@ class Service:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.cpu = PrioritySemaphore(settings.concurrency)  # held around work on the CPU
-        self._devices: dict[str, PrioritySemaphore] = {}  # of generators that make only so many clips at the same time
+        self._devices: dict[str, PrioritySemaphore] = {}  # of generators with a limit of simultaneous clips
         self._guard = Lock()
         self.seen = SeenImages()  # what jobs have measured in images, for those that come with the same
         self.metrics = Metrics()
@@ -197,7 +197,7 @@ class Service:
         `ReaderUnavailable` or `GeneratorUnavailable` where their modules are needed here and not installed.
         """
         reader, name = self._names_of(request)
-        if self.settings.role != "api":  # else workers have what it lacks
+        if self.settings.role != "api":  # otherwise workers have what this process lacks
             check_modules(reader, errors.ReaderUnavailable)
             check_modules(name, errors.GeneratorUnavailable)
             for model in self.perception.names.values():

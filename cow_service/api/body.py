@@ -64,7 +64,7 @@ class RawBody:
     image: bytes | None = None
 
 
-MAX_PART_BYTES = 64 * 2**20  # of `request`, which may hold masks and a depth map; the whole body has a limit of its own
+MAX_PART_BYTES = 64 * 2**20  # of `request`, which may hold masks and a depth map; the body has a separate limit
 
 
 class _FormParser(MultiPartParser):

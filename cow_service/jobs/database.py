@@ -37,7 +37,7 @@ MAX_IDS = 500  # in one statement
 CONNECT_SECONDS = 4  # for a connection to PostgreSQL
 STALLED_SECONDS = 5.0  # longest use of a connection; a transaction needs milliseconds
 IDLE_SECONDS = 1.0  # after which it is asked for a sign of life before it is used again
-MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cut when it begins anew
+MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log; beyond, it is truncated when it restarts
 TABLES_LOCK = 0x434F5701  # of PostgreSQL, held while tables are created
 INCREMENTAL = 2  # SQLite's number of that mode
 VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
@@ -193,7 +193,7 @@ class Database:
                 rows = cursor.fetchall()  # all of them: SQLite gives a page back for each
                 return rows[0][0] if rows and rows[0] else 0
 
-            if pragma("auto_vacuum") != INCREMENTAL:  # the file of an earlier version: it is written anew once
+            if pragma("auto_vacuum") != INCREMENTAL:  # the file of an earlier version: it is rewritten once
                 if pragma("freelist_count") > pragma("page_count") / 2:
                     pragma("auto_vacuum=INCREMENTAL")
                     cursor.execute("VACUUM")

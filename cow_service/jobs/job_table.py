@@ -321,7 +321,7 @@ class JobTable:
         content: dict[str, Any] = unpacked(rows[0].result)
         if rows[0].trajectory is not None:
             (content.get("simulation") or content)["trajectory"] = unpacked(rows[0].trajectory)  # null until now
-        if rows[0].format < FORMAT:  # as it is written today; what a later version wrote goes out as it is
+        if rows[0].format < FORMAT:  # as this version writes it; results of later versions are returned unchanged
             model = Answer if found.job.kind == "answer" else Simulation
             content = model.model_validate(content).model_dump(mode="json")
         return replace(found, content=content)

@@ -100,7 +100,7 @@ class SessionLease(BackgroundThread):
     def _open(self) -> None:
         session = self._database.session()
         self._ask(session, "SELECT set_config('idle_session_timeout', %s, false)", f"{SILENCE_SECONDS:g}s")
-        self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held by who looks at it, for a moment
+        self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held briefly by whoever checks it
         self._session = session
 
     def _close(self) -> None:

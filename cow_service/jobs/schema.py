@@ -139,7 +139,7 @@ def schema_of(connection: sa.Connection) -> int:
                 f"The job database is of a later version of COW (schema {found.version}), on whose tables this one "
                 f"(schema {SCHEMA}) cannot serve: update it."
             )
-        if found is not None:  # else a restore has left the row out, and it is written anew
+        if found is not None:  # otherwise a restore has lost the row, and it is written again
             return found.version
     if BEFORE_SCHEMA_1 in there and JOBS.name not in there:
         raise StorageUnavailable(

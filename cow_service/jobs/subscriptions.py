@@ -58,7 +58,7 @@ class Subscription:
     def __init__(self, active: ActiveJobs, job_id: str, read: Callable[[], JobView]) -> None:
         """`read` blocks."""
         self.followers = 0
-        self.is_over = False  # nothing more is read: who comes now needs a subscription of their own
+        self.is_over = False  # reading has ended: new followers need another subscription
         self._read = read
         self._view: JobView | None = None
         self._number = 0  # of the view

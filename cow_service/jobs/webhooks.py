@@ -34,7 +34,7 @@ from cow_service.records import Job
 from cow_service.settings import Settings
 
 APPLICATION = "cow"  # as DBOS knows it
-QUEUE = "cow-webhook-receivers"  # in which every receiver has a share of its own
+QUEUE = "cow-webhook-receivers"  # shared equally by the receivers
 WORKFLOW = "webhook"  # the name of an attempt's workflow
 MAX_CONCURRENT_DELIVERIES = 100
 MAX_CONCURRENT_DELIVERIES_TO_ONE = 2  # receiver: one that is silent holds up its own calls alone
@@ -43,7 +43,7 @@ RETRY_SECONDS = (5, 30, 120, 600, 3600, 6 * 3600)  # before each further attempt
 JITTER = 0.2  # share
 SUCCESS = range(200, 300)
 MAX_REMOVED = 200  # records of calls, at a time
-GONE = 410  # the receiver wants no more
+GONE = 410  # the receiver wants no more calls
 
 log = logging.getLogger("cow_service")
 

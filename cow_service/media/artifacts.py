@@ -67,7 +67,7 @@ class ArtifactStore(ABC):
     """
 
     def __init__(self, scratch_folder: Path) -> None:
-        self.scratch_folder = scratch_folder  # that of the store, or beside the jobs where the store has no folder
+        self.scratch_folder = scratch_folder  # the store's folder, or one next to the jobs if the store has none
         self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
     @abstractmethod

@@ -414,7 +414,7 @@ def decode_data_url(url: str, pointer: str = "/image") -> bytes:
         raise _bad_image(f"`{field}` must be a data URL with base64: data:image/png;base64,...", pointer)
     declared = head["type"].lower()
     if not declared.startswith("image/") and declared not in ("", "application/octet-stream"):
-        # Of the image types, what the bytes are counts, and not what they are declared to be.
+        # The image type is detected from the bytes; the declared type is ignored.
         raise errors.ImageTypeUnsupported(
             f"The data URL of `{field}` declares {declared[:80]}: send image/png, image/jpeg or image/webp."
         )

@@ -36,7 +36,7 @@ class Label:
     below: bool  # rather than above the box
 
 
-# OpenCV loads its font anew in each thread that writes, which takes longer than all else that is drawn.
+# OpenCV loads its font again in each thread that writes, which takes longer than the rest of the drawing.
 _letters = ThreadPoolExecutor(1, "cow-letters")
 
 

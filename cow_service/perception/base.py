@@ -215,7 +215,7 @@ class Perception:
         """What the segmenter knows of an image, which is asked for only where it is new. There must be a segmenter."""
         segmenter = self.segmenter
         assert segmenter is not None, "called only if there is a segmenter"
-        with self._lock:  # also while it looks: who asks for the same image waits, and the model takes one at a time
+        with self._lock:  # also during a look: callers with the same image wait, and the model takes one at a time
             found = self._embeddings.get(key)
             if found is None:
                 pixels = image()

@@ -33,7 +33,7 @@ class LoadedModel:
     network: Any
     device: torch.device
     fingerprint: str
-    half: torch.dtype | None = None  # what it may compute in on a GPU; None: float32 only
+    half: torch.dtype | None = None  # precision that it may use on a GPU; None: float32 only
     _lock: Lock = field(default_factory=Lock)
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""The likeliest world, and the ensemble of worlds around it: what is shown, what is answered, and how sure that is.
+"""The likeliest world, and the ensemble of worlds around it, which give the frames, the answer and its certainty.
 
 The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, or
 `SURE_OF_MISS` where a throw meets nothing, or `SURE_OF_FIT` of what is put into something, and robust where it has at
@@ -34,7 +34,7 @@ ROBUST = 0.9
 # The chance, at most and at each look, that those which are left would change whether the answer is sure, and whether
 # it is robust, if they were drawn like those that were run.
 MAY_CHANGE, MAY_CHANGE_ROBUST = 0.01, 0.12
-MATTERS, MATTERS_OF = 0.2, 50  # correlation with the outcome from which a parameter is named, of so many worlds
+MATTERS, MATTERS_OF = 0.2, 50  # least correlation with the outcome to name a parameter, for that many worlds
 MOST_NAMED = 3
 
 KIND_OF: dict[AskedRelation, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
@@ -48,7 +48,7 @@ class Query:
 
     asked: Asked
     target: int | None = None  # None: any
-    subject: int = 0  # who does it
+    subject: int = 0  # the acting body
     among: tuple[int, ...] = ()  # the things that are meant; empty: any
     is_decidable: bool = True  # by worlds
     sure: float = SURE  # share of the worlds from which an answer is given
@@ -98,7 +98,7 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     given, queries = (world,), [query]
     if world.removed or world.placed_before:
         as_it_is = query
-        if query is not None and query.asked.form == "changes":  # of the world as it is: what it is that would change
+        if query is not None and query.asked.form == "changes":  # of the unchanged world: what would change
             form = "what-happens" if query.target is None else "whether"
             as_it_is = replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
         given, queries = (world, world.as_it_is()), [query, as_it_is]
@@ -163,7 +163,7 @@ def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], d
 
 
 def _is_settled(decided: Decided, query: Query | None, count: int, size: int) -> bool:
-    """Whether so many worlds, drawn from `size`, are not likely to say otherwise than all of them would.
+    """Whether the worlds run so far, drawn from `size`, most likely give the same answer as all of them.
 
     The worlds that agree are hypergeometrically distributed; what all of them would say differs where they cross a
     share, and is likeliest to do so just beyond it.
@@ -179,7 +179,7 @@ def _is_settled(decided: Decided, query: Query | None, count: int, size: int) ->
 
 
 def _chance_beyond(agreeing: float, count: int, size: int, share: float) -> float:
-    """The chance of so many agreeing ones, or of more extreme numbers, among `count` drawn from `size` worlds of which
+    """The chance of this many agreeing worlds, or a more extreme number, among `count` drawn from `size` worlds, where
     the agreeing share lies just beyond a share, on the other side than theirs."""
     least = ceil(share * size)  # of all, to reach it
     if agreeing >= share * count:

@@ -24,11 +24,11 @@ from cow_service.vision.types import Floats, Floats32, Mask
 
 SAMPLES = 6000  # pixels that the floor is sought in
 TRIES = 300  # planes through three of them
-LEVEL = math.radians(20)  # the floor rolls no more than that against the vertical that is assumed
+LEVEL = math.radians(20)  # largest roll of the floor against the assumed vertical
 STEEPEST, FLATTEST = math.radians(79), math.radians(-10)  # pitches at which a floor is a floor
 LEAST_TOLERANCE = 0.01  # of the depth: how far a pixel of the floor may lie off its plane
 BELOW = 3.0  # how much more a pixel that would lie under the floor counts than one on it
-LEAST_FLOOR = 0.1  # of the pixels that show no body: the floor has at least so many
+LEAST_FLOOR = 0.1  # smallest share of floor among the pixels that show no body
 FARTHEST = 8.0  # of the nearest depths: what lies beyond tells little of the floor that things stand on
 CELLS = 3, 4  # rows and columns: errors of a depth map are alike within such a part of the image
 SURE = 0.003  # of the depth: no map is more exact
@@ -40,10 +40,10 @@ TRIM = 2.0  # percent of the points at either end that are left out
 FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
 TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
 AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
-ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
+ALIKE = 0.3  # share of the depth error that remains if the error of the floor next to it is known
 GRAIN = 6  # over such a part of the width of an image the errors of depth maps change altogether
 BENT = 0.5  # of its width: with so much doubt of how deep a body is, the map does not tell
-ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
+ON_TOP = 0.3  # of a body's height: largest distance of its lower end from the top of its support
 BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
 SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
 LEAST_PART = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
@@ -205,7 +205,7 @@ def rise_above(given: DepthMap, measured: Measurement, boxes: Sequence[BBox]) ->
 
 
 def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], roll: float = 0.0) -> Floor | None:
-    """The floor in a depth map of an image with that focal length (px), beside bodies; None if none is seen.
+    """The floor in a depth map of an image with that focal length (px), outside bodies; None if no floor is visible.
 
     It is the plane, level but for the pitch of the camera, on which most pixels lie and beneath which hardly any do.
     `roll` (radians) is that of the vertical that is assumed.

@@ -21,7 +21,7 @@ from cow_service.physics.layout import FARTHEST
 from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
 from cow_service.vision.types import Floats
 
-DIGITS = 6  # significant: the engine computes with no more
+DIGITS = 6  # significant digits: the engine uses no more
 CONSTANTS: dict[str, float] = {
     "gravity": GRAVITY,
     "clock": CLOCK,

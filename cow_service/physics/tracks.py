@@ -39,7 +39,7 @@ Extent: TypeAlias = tuple[Any, Any, Any]  # numbers, or arrays [F]
 
 @dataclass(frozen=True)
 class Density:
-    """How many points a body gets: one for each square of `spacing` (px), but at least and at most so many."""
+    """How many points a body gets: one for each square of `spacing` (px), within limits."""
 
     spacing: float
     least: int
@@ -153,7 +153,7 @@ class _Silhouettes:
         return {"tracks": tuple(pairs(track) for track in tracks), "tracks_visible": hidden}
 
     def _covered(self, body: int, points: Floats) -> Bools:
-        """Whether points [F, N, 2] lie in a body's silhouette, or right beside it."""
+        """Whether points [F, N, 2] lie in a body's silhouette, or right next to it."""
         path, back = self._paths.get(body), points
         if path is not None:
             start = np.array(path.points[0] if self._poses or body else self._start)
@@ -167,7 +167,7 @@ class _Silhouettes:
 
 
 class _Grown:
-    """The hull of a mask, and what lies right beside it: outlines are seen with gaps, as on a side in the shade."""
+    """The hull of a mask and a margin, as visible outlines have gaps, for example on a shaded side."""
 
     def __init__(self, mask: CroppedMask) -> None:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * SAFE + 1,) * 2)

@@ -72,7 +72,7 @@ class ReaderInput:
     seed: int | None = None  # None: an MLLM is sent none, and draws as it likes
     motion_wanted: bool = True  # stage 2 is left to the reader, too
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: not to be searched
-    sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, beside the question's
+    sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, besides the question's
     until: float | None = None  # Unix time, s, after which an MLLM that refuses is not asked again; None: its own limit
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = lambda: None  # to be called while waiting; raises `Canceled`
@@ -146,7 +146,7 @@ class GroundingReading:
     mask: Mask | None = None  # [H, W] of the mover, where it does not follow from the box
     asked: records.Asked | None = None  # what the question wants to know; null if the reader cannot say
     changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
-    is_doubtful: bool = False  # what is seen in the box may not be what it is called
+    is_doubtful: bool = False  # the object in the box may not be the named one
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class MotionReading:
 
 @dataclass(frozen=True)
 class Imagined:
-    """What an answer may be drawn from besides the image: the simulation and its frames."""
+    """What an answer may use besides the image: the simulation and its frames."""
 
     simulation: records.Simulation
     frames: tuple[Image, ...]  # RGB [h, w, 3] of `simulation.frames`, in their order
@@ -223,7 +223,7 @@ class Reader(Protocol):
     """Whether the seed of a request changes anything. Of a reader without this attribute it is taken to."""
 
     def repeats_answers(self, votes: int) -> bool:
-        """Whether `answer` with so many votes gives the same ones each time that it is asked the same.
+        """Whether `answer` gives the same votes every time for the same input.
 
         Where not, its answers are samples: none is handed to two requests. Readers without this method are sampled.
         """

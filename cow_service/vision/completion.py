@@ -161,7 +161,7 @@ DARK, SHADE_DEPTH = 20, 0.65  # the percentile of its lightness that counts, and
 
 
 def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | None:
-    """The mask [h, w] of what stands on a part [h, w] that is not empty, or None. `taken` [h, w] are other objects.
+    """The mask [h, w] of objects on a part [h, w] that is not empty, or None. `taken` [h, w] are other objects.
 
     `lab` [h, w, 3] is the image in CIE Lab, `edges` [h, w] is set on its edges.
     """
@@ -222,7 +222,7 @@ FLAT = 1.5  # width of a dark part over its height, at least
 
 
 def is_underside(part: BBox, thing: BBox) -> bool:
-    """Whether the box [x0, y0, x1, y1] of a dark part lies at the lower end of a thing's, not before or beside it."""
+    """Whether the box [x0, y0, x1, y1] of a dark part lies at the lower end of a thing's, not before or next to it."""
     height = thing[3] - thing[1]
     width = min(part[2], thing[2] + BESIDE * height) - max(part[0], thing[0] - BESIDE * height)
     inside = width * (min(part[3], thing[3] + LOW * height) - max(part[1], thing[1]))
@@ -281,7 +281,7 @@ def white_sides(view: View, core: Mask) -> Mask:
             surely_white.add(top)
 
     def has_side(top: int, side: _Box, area: int, lit: bool) -> bool:
-        """Whether a side is that of a top: small beside it, and lit or right below it."""
+        """Whether a side belongs to a top: small compared with it, and lit or right below it."""
         x, y, w, _ = side
         tx, ty, tw, _, top_area = tops[top].tolist()
         hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > HANGS * w and y >= ty
@@ -304,7 +304,7 @@ def white_sides(view: View, core: Mask) -> Mask:
 
 
 def black_faces(view: View, black: Mask) -> Mask:
-    """Black patches with the lit faces beside them: dark patches between strong edges."""
+    """Black patches with the lit faces next to them: dark patches between strong edges."""
     faces = black.copy()
     if not black.any():
         return faces

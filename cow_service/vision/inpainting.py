@@ -1,4 +1,4 @@
-"""Inpainting: fills what is left behind when a thin drawing or a whole object is taken out of an image."""
+"""Inpainting: fills the hole after a thin drawing or a whole object is removed from an image."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,7 @@ def erase_drawing(image: Image, mask: Mask) -> Image:
 
 
 def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
-    """The image [H, W, 3] with a hole [H, W] closed: shading drawn in from the rim, texture taken from beside it.
+    """The image [H, W, 3] with a hole [H, W] closed: shading drawn in from the rim, texture copied from next to it.
 
     Pixels of `avoid` (other objects) give neither shading nor texture, unless nothing else is left. The object's own
     shadow around the hole gives none either; it fades out over the few pixels next to it.
@@ -120,7 +120,7 @@ def _mean_along(values: Floats32, band: Mask) -> Floats32:
 
 
 def shadow_beside(image: Image, hole: Mask, avoid: Mask) -> Mask:
-    """What is much darker [H, W] than most right around a hole, and none of `avoid`: the shadow of what stood there."""
+    """What is much darker [H, W] than most right around a hole, not in `avoid`: the shadow of the removed object."""
     found = np.zeros_like(hole)
     around = _surroundings(image, hole, avoid, round(SHADOW_REACH * float(np.sqrt(np.count_nonzero(hole)))) + 4)
     if around is not None:

@@ -76,7 +76,7 @@ class Position:
         return self.x - self.radius, self.y - self.radius, self.x + self.radius, self.y + self.radius
 
     def disc(self, shape: tuple[int, int], grown: float = 0.0) -> Mask:
-        """Mask [H, W], its radius larger by so many px."""
+        """Mask [H, W], its radius larger by a number of px."""
         ys, xs = np.ogrid[: shape[0], : shape[1]]
         return np.hypot(xs + 0.5 - self.x, ys + 0.5 - self.y) <= self.radius + grown
 
@@ -218,7 +218,7 @@ class _Search:
         return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
 
     def between(self, edges: Edges, a: Circle, b: Circle, inner: int) -> Chain | None:
-        """Two circles with so many others between them, evenly along an arc that bulges to one side or the other."""
+        """Two circles with others between them, evenly along an arc that bulges to one side or the other."""
         apart = math.dist(a.centre, b.centre)
         gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
         if not LEAST_GAP * mean < gap < MOST_GAP * mean:

@@ -40,7 +40,7 @@ class Resources:
         return found[name]
 
     def _files(self) -> dict[str, Traversable]:
-        # The wheel's own copy comes first: what lies beside an installed package is site-packages, not ours.
+        # The wheel's own copy comes first: the folder next to an installed package is site-packages, not ours.
         shipped = files("cow_service").joinpath("_shipped")
         root: Traversable = shipped if shipped.is_dir() else Path(__file__).resolve().parents[2]
         folder = root.joinpath(self.folder)

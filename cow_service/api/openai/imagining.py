@@ -31,7 +31,7 @@ OF_ANSWERS = {  # fields of an `AnswerRequest`, and what does the same for a cha
     "imagine": "is said by `model`",
     "options": "the MLLM reads them in the messages",
 }
-NAMED_FRAMES = {"count": 3, "max_side": 512}  # beside the policy of a model's name: as in the paper
+NAMED_FRAMES = {"count": 3, "max_side": 512}  # in addition to the policy in a model's name: as in the paper
 OF_CLIP = (
     "generator",
     "generator_options",

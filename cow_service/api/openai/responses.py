@@ -151,7 +151,7 @@ def _array(value: Any, pointer: str) -> list[Any]:
     return value or []
 
 
-# Of the request, repeated in the response; what it leaves out has the value that stands here.
+# Fields of the request, repeated in the response, with the defaults given here.
 REPEATED: dict[str, Any] = {
     "instructions": None, "max_output_tokens": None, "metadata": {}, "parallel_tool_calls": True, "temperature": None,
     "tool_choice": "auto", "tools": [], "top_p": None, "reasoning": {"effort": None, "summary": None},
@@ -165,7 +165,7 @@ def response_of(completion: dict[str, Any], request: dict[str, Any]) -> dict[str
     """The response for a whole completion; of several choices the first."""
     response = ResponseEvents(request, completion.get("model", ""))
     for chunk in chunks_of(completion, with_usage=True):
-        list(response.add(chunk))  # of the events, only what they add up to is wanted
+        list(response.add(chunk))  # only the sum of the events is wanted
     list(response.end())
     return response.response
 

@@ -59,7 +59,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Ground:
-    """The floor and what stands still on it, seen by the camera; image points are px of the clip."""
+    """The floor and the still objects on it, seen by the camera; image points are px of the clip."""
 
     camera: FloorCamera
     factor: float  # clip px per image px
@@ -89,7 +89,7 @@ class Ground:
         return self.factor * self.camera.project(position[None])[0]
 
     def depth(self, position: Floats) -> float:
-        """Metres along the camera's axis, of what can be projected."""
+        """Metres along the camera's axis, for points that can be projected."""
         return max(float(position[2]), NEAREST * self.camera.height)
 
     def shape_on_floor(self, position: Floats) -> Floats:

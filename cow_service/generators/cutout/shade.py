@@ -1,4 +1,4 @@
-"""Measures the shadow that an object casts on the floor beside it: where the floor is darker than further away.
+"""Measures the shadow that an object casts on the floor next to it: where the floor is darker than further away.
 
 A shadow is, per pixel and colour, the share of light that it takes away: dividing by what is left of the light takes it
 out of the image, and multiplying by that puts it back, with the floor's texture kept both times. In a shadow the floor
@@ -69,7 +69,7 @@ class Shade:
 
 
 def contact_shade(image: Image, body: Mask, box: BBox, floor: Mask) -> Shade | None:
-    """The shadow on the floor beneath and beside an object [h, w] that stands there; None if it has none.
+    """The shadow on the floor beneath and next to a standing object [h, w]; None if it has none.
 
     `floor` [h, w] is where there may be floor: no pixel of any object. Beneath the object it is continued from beside.
     """

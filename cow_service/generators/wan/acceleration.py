@@ -165,7 +165,7 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2, f
         for name in transformer._context_names:  # else the old one would be held until the next pass
             transformer._context_manager.set_context(name)
         return
-    transformer._reset_stateful_cache()  # removed and added anew, the hooks would be in another order
+    transformer._reset_stateful_cache()  # removing and adding them again would change the order of the hooks
 
 
 def pin(module: nn.Module) -> None:

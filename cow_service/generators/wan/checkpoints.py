@@ -28,7 +28,7 @@ from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsU
 from cow_service.weights.device import listed
 
 PREFIXES = ("model.diffusion_model.", "diffusion_model.")  # of names in one-file checkpoints
-SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by
+SCALE = ".scale_weight"  # one number per fp8 weight: its scale
 UNUSED = (".scale_input", "scaled_fp8")  # for fp8 arithmetic, and the marker that scales are there
 PICKLES = {".pth", ".pt", ".bin", ".ckpt", ".pkl", ".pickle"}
 FLOAT8 = {"F8_E4M3", "F8_E5M2"}

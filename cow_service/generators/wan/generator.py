@@ -244,7 +244,7 @@ class WanGenerator(WanLimits):
         noise = torch.randn(latent_shape(width, height, length, self._channels, self._cell), generator=random)
         progress(0.0)
         try:
-            # Before the texts: beside their encoder there may be no room for the VAE.
+            # Before the texts: with their encoder loaded there may be no room for the VAE.
             latents = None if coarse is None else self.pipeline.encode(coarse.frames)
             progress(0.0)
             clean, (prompt, negative) = cast(WanOptions, given.options).clean_cues, texts
@@ -262,7 +262,7 @@ class WanGenerator(WanLimits):
                 coarse=latents,
                 moving=None if coarse is None else latent_mask(coarse.moving, noise.shape),
             )
-            if self.profile.acceleration.offload == "model":  # else the last encoder stays beside the transformer
+            if self.profile.acceleration.offload == "model":  # else the last encoder stays with the transformer
                 self.pipeline.maybe_free_model_hooks()
             progress(0.0)
             latents = self.denoise(

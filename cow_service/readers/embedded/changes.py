@@ -72,7 +72,7 @@ def _both(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[Obje
 
 
 def without(regions: Sequence[Region], removed: Sequence[BBox]) -> tuple[Region, ...]:
-    """The regions of what is left where the things in some boxes are gone."""
+    """The regions that remain without the objects in some boxes."""
     return tuple(region for region in regions if not is_among(region.bbox, removed))
 
 
@@ -90,7 +90,7 @@ def find_placed(
             continue
         puts, others = f"puts '{change.object.text}'", [*question.others, change.object]
         known, found = [mover], list[LocatedObject]()
-        # The thing itself first, then what it is put to.
+        # The object itself first, then the ones that it is put to.
         for phrase in (change.object, *change.targets):
             if found and _is_plural(phrase) and change.relation == "between":
                 found += _both(without(regions, [found[0].bbox]), phrase, others)

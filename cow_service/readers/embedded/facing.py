@@ -199,7 +199,7 @@ def _seen(image: Image, mask: Mask, bbox: BBox) -> _Seen | None:
 
 
 def _labels(lab: Floats32, own: Mask, near: BBox) -> Labels:
-    """Labels [h, w] of a window whose pixels have these Lab colours, of what a mask and a box are about."""
+    """Labels [h, w] of a window whose pixels have these Lab colours, for a mask and a box."""
     lightness, chroma = lab[..., 0], np.hypot(lab[..., 1], lab[..., 2])
     inner = eroded(own) if eroded(own).any() else own
     paint, colour = float(np.median(lightness[inner])), np.median(lab[..., 1:][inner], axis=0)

@@ -32,7 +32,7 @@ class Said(TypedDict):
 
 
 def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | None = None) -> Said:
-    """The quantities of one leg; `way`, px, is how far it is to what it moves towards, `bbox` is that of what moves.
+    """The quantities of one leg; `way`, px, is the distance to the goal; `bbox` is the moving object's.
 
     Raises `CannotReadDirection`.
     """

@@ -20,7 +20,7 @@ Range = tuple[float, float]
 
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
-CONTRADICTS = 6.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
+CONTRADICTS = 6.0  # misfit above which an object is not the named one; whole objects under their own name reach 5.1
 UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
 FITS = 2.0  # misfit below which an outline is well described
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
@@ -58,7 +58,7 @@ _ALIKE = {
     "car": "bus truck van taxi lorry train",
 }  # fmt: skip
 _FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALIKE.items() for other in words(said)}
-# Rows that tell a thing for what it is (nearly anything can look like a box or a can), from this log ratio on.
+# From this log ratio on, a row identifies an object (nearly anything can look like a box or a can).
 _TELLING, _CLEARLY = ("ball", "bottle", "bowl", "car", "cone", "mug", "vase"), 1.5
 _PLAIN = ("ball", "box", "cube", "cylinder")
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
@@ -88,7 +88,7 @@ def looks_like(region: Region) -> str | None:
 
 
 def is_other_kind(region: Region, noun: str | None) -> bool:
-    """Whether an outline is that of another kind of thing for certain, as it is not where it is torn or half hidden."""
+    """Whether an outline certainly belongs to another kind of object; not certain if it is torn or half hidden."""
     form = form_of(noun)
     if form is None or is_cut(region, form):
         return False

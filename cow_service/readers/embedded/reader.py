@@ -170,7 +170,7 @@ class EmbeddedReader:
         imagined: base.Imagined | None,
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
-        """What the world tells of the question, the same for every vote; not sure where it does not."""
+        """The world's answer to the question, the same for every vote; not sure if it has none."""
         question = parse(given.question)
         trajectory = None if imagined is None else imagined.simulation.trajectory
         outcome = None if trajectory is None else trajectory.outcome
@@ -185,7 +185,7 @@ class EmbeddedReader:
 
 
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
-_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # what does so keeps touching what it stands on
+_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
 _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
 _SEVERAL = frozenset({"both", "two", "three", "all", "four", "several"})
 
@@ -236,8 +236,8 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
 def _bbox_of(
     regions: Sequence[Region], phrase: ObjectPhrase, mover: BBox, others: Sequence[ObjectPhrase]
 ) -> BBox | None:
-    """The box of the one region, besides the mover, that fits a phrase; what several fit stays unnamed."""
-    # What models outlined is a thing of its own, also where its box is nearly that of the mover before it.
+    """The box of the one region, besides the mover, that fits a phrase; None if several fit."""
+    # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
     beside = [each for each in regions if each.bbox != mover and (each.called or not is_same_object(each.bbox, mover))]
     region = matching.match_one(beside, phrase, others)
     return None if region is None else region.bbox

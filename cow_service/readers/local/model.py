@@ -105,7 +105,7 @@ PROFILE = ModelProfile(
     supports_tools=False,
     supports_json_schema_output=True,
     default_structured_output_mode="native",
-    # A grammar holds the reply to the schema but tells the model nothing: what it may write stands in its prompt.
+    # A grammar enforces the schema but tells the model nothing, so the prompt describes the schema, too.
     native_output_requires_schema_in_instructions=True,
 )
 

@@ -60,7 +60,7 @@ class PromptCall(Generic[T]):
     images: tuple[bytes, ...]
     schema: Schema
     parse: Callable[[str], T]
-    vote: int = 0  # each has a seed of its own
+    vote: int = 0  # each has its own seed
     temperature: float | None = None  # by default that of the manifest
 
 

@@ -92,7 +92,7 @@ class Surroundings(Reply):
 
 
 class Line(Reply):
-    """Which way the object moves, as far as the reply tells: `direction` in px of the upright image."""
+    """The object's direction of motion in the reply: `direction` in px of the upright image."""
 
     other_names: ClassVar = {"direction": _DIRECTION_KEYS[1:]}
     cue: Annotated[records.Cue | None, WithJsonSchema(replies.one_of(*CUES))]
@@ -278,7 +278,7 @@ def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wan
 
 
 def _places(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[WrittenPlace]:
-    """Places in a value, each with what it is called: by a field of its own, or by the field in which it stands."""
+    """Places in a value with their names, from a separate field or from the field that holds them."""
     if isinstance(value, list):
         parts = replies.listed(value)
         if parts and all(map(replies.is_number, parts)):

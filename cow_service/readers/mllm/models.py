@@ -25,14 +25,14 @@ OWN_PROTOCOL = ("anthropic", "google", "google-gla")  # these speak their own pr
 
 @dataclass(frozen=True)
 class ConfiguredModel:
-    """A model that can be called, and what is known of it."""
+    """A model that can be called, and what is known about it."""
 
     model: Model
     name: str  # as it is served
     manifest: Manifest
     family: Family
     deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
-    upstream: Upstream | None = None  # the OpenAI-compatible server; None for a protocol of its own
+    upstream: Upstream | None = None  # the OpenAI-compatible server; None for another protocol
 
     @property
     def supports_schema(self) -> bool:

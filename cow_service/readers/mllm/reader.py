@@ -36,7 +36,7 @@ DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing e
 
 
 class MllmReader:
-    """Asks one model for everything. It keeps its connections, and nothing of what it read."""
+    """Asks one model for everything. It keeps its connections, but no readings."""
 
     source: records.Source = "mllm"
 
@@ -67,7 +67,7 @@ class MllmReader:
     heeds_seed = True
 
     def repeats_answers(self, votes: int) -> bool:
-        """Only of a model that is deterministic at temperature 0, where that is what it is asked with."""
+        """True only for a model that is deterministic at temperature 0, if it is asked with that."""
         temperature = VOTING_TEMPERATURE if votes > 1 else self._model.manifest.defaults.get("temperature")
         return self._model.deterministic and temperature == 0
 

@@ -15,8 +15,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, mo
 Schema = dict[str, Any]
 
 MAX_LENGTH = 20_000  # characters behind the thinking; a longer reply is not looked through
-MAX_NAME = 120  # characters of an object's name, and of any text without a limit of its own
-MAX_LISTED = 4  # entries of a list without a limit of its own
+MAX_NAME = 120  # characters of an object's name, and of any text without another limit
+MAX_LISTED = 4  # entries of a list without another limit
 COORDINATES = "coordinates"  # key of a schema that stands for so many numbers as the model's family writes them
 _FENCE = re.compile(r"```[\w+-]*[ \t]*\n?(.*?)```", re.DOTALL)
 _THOUGHT = re.compile(r"</(?:think|thinking|thought|reasoning|seed:think)>|◁/think▷|<\|channel\|>final<\|message\|>")
@@ -108,7 +108,7 @@ def schema_of(*kinds: type[Reply], reasoning_length: int, numbers: Schema | None
 
 
 def words(longest: int) -> Schema:
-    """The schema of a text of at most so many characters."""
+    """The schema of a text with a maximum length."""
     return {"type": "string", "maxLength": longest}
 
 
@@ -220,7 +220,7 @@ def _bracketed(text: str) -> list[Any]:
     values: list[Any] = []
     for span in _spans(text):
         with suppress(ValueError, RecursionError):
-            values.append(repair_json(span, return_objects=True))  # which leaves well-formed JSON as it is
+            values.append(repair_json(span, return_objects=True))  # which does not change well-formed JSON
     return [value for value in values if isinstance(value, dict | list)]
 
 

@@ -11,7 +11,7 @@ from cow_service.readers.embedded.english.lexicon import ObjectPhrase, Word, key
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.records import AskedForm, AskedRelation
 
-# By the node of an act: the relation, and whether the subject of the clause is what it is done to.
+# By the node of an act: the relation, and whether the subject of the clause is its object.
 _ACTS = {
     act: (relation, table == "done_to")
     for table in ("does", "done_to")

@@ -261,7 +261,7 @@ def table_at_end(found: Sequence[Item]) -> tuple[ObjectPhrase | None, str]:
 
 
 def with_nouns(found: Sequence[Item]) -> list[Item]:
-    """The items, where a reference has what it means.
+    """The items, with references replaced by what they mean.
 
     "The red one" is of the kind that is asked for ("which cone", "which of the cones"), or of that of all things
     before it.
@@ -307,7 +307,7 @@ _PUTS = lex.words("put place insert set position lower stand stick pop plonk plo
 
 
 def with_places(found: Sequence[Item]) -> list[Item]:
-    """The items, each thing with what is said behind it of its place joined to one."""
+    """The items, each object joined with the words after it about its place."""
     texts = [item.phrase.text.lower() for item in found if item.phrase is not None]
 
     def join(at: int) -> tuple[Item, int] | None:
@@ -315,7 +315,7 @@ def with_places(found: Sequence[Item]) -> list[Item]:
         thing = item.thing
         if thing is None or at + 1 == len(found):
             return None
-        # "Push the ball behind the mug", "put the ball on the mug": where it gets to, not where it is.
+        # "Push the ball behind the mug", "put the ball on the mug": a destination, not where it is.
         moved = lex.moves(verb) or (verb is not None and verb.lemma in _PUTS)
         if moved and after not in {"that", "which", ","}:
             return None
