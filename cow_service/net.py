@@ -193,7 +193,7 @@ class Egress:
         self._allow = None if allow is None else HostList(allow)
 
     def fetch(self, url: str, most_bytes: int) -> bytes:
-        """The body at a URL, at most so long. Raises `NotAllowed` or `Unreachable`."""
+        """The body at a URL, up to a maximum length. Raises `NotAllowed` or `Unreachable`."""
         deadline = _Deadline(monotonic() + self.seconds)
         target = self._target(url, "The URL")
         for _ in range(MAX_REDIRECTS + 1):

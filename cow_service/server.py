@@ -195,7 +195,7 @@ def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
 
 
 def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngine, Readiness]:
-    """A server of its role that does not run yet, its engine, and what tells whether it is ready."""
+    """A server of its role that does not run yet, its engine, and its readiness check."""
     settings = service.settings
     if settings.role == "api":
         engine, readiness = JobEngine(service, Computer()), Readiness(service, lambda: None)
@@ -257,7 +257,7 @@ class HttpConnection(H11Protocol):
             self._stop_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Waits no more."""
+        """Stops waiting."""
         self._stop_timer()
         super().connection_lost(exc)
 

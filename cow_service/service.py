@@ -135,7 +135,7 @@ class Service:
         )
 
     def digested(self, request: Request, image: bytes | None = None) -> tuple[Request, list[File]]:
-        """The request with its pictures by their digests, and what is to be kept for it: nothing is yet.
+        """The request with its pictures by their digests, and the bytes to keep for it; nothing is kept yet.
 
         `image`: the bytes of its image, where they came apart from it. Raises `InvalidRequest`, the errors of `fetch`
         and of `images.check`. Masks are not decoded before they are needed.
@@ -191,7 +191,7 @@ class Service:
         return self._image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
-        """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
+        """Makes the cheap checks of a request at once; returns its reader and generator.
 
         Raises `InvalidRequest` for unknown backends and for options that the generator does not take, and
         `ReaderUnavailable` or `GeneratorUnavailable` where their modules are needed here and not installed.
@@ -266,7 +266,7 @@ class Service:
         self.close()
 
     def close(self) -> None:
-        """Lets go of what its backends hold open, such as connections."""
+        """Releases what its backends hold open, such as connections."""
         self.readers.close()
         self.generators.close()
         self.perception.close()

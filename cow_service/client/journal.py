@@ -73,7 +73,7 @@ class Question:
 def questions(
     items: Iterable[QuestionLike], defaults: Mapping[str, Any] | None = None, folder: Path | None = None
 ) -> Iterator[Question]:
-    """The questions of these items, each with an id: its own, else one made of what it asks.
+    """The questions of these items, each with an id: its own, else one derived from its content.
 
     `defaults` are fields of the request for those that do not have them. Files are looked for in `folder`. Raises
     `InvalidRequest` for an item without image or question, for what no JSON can hold, and for an id that comes twice.
@@ -102,7 +102,7 @@ def questions(
 
 
 def _read_item(item: Any, place: int, defaults: Mapping[str, Any], folder: Path | None) -> Question:
-    """A question, without an id where it has none of its own. Raises `InvalidRequest` for what is no `QuestionLike`."""
+    """A question; without an id unless it has one. Raises `InvalidRequest` if it is not a `QuestionLike`."""
     if isinstance(item, Question):
         question = replace(item, options={**defaults, **item.options}) if defaults else item
     else:

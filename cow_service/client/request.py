@@ -27,7 +27,7 @@ def to_json(value: Any) -> bytes:
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold of a record, of a NumPy array or number, or of a time; tuples and lists stay."""
+    """A JSON value for a record, a NumPy array or number, or a time; tuples and lists stay."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True)
     if hasattr(value, "tolist"):

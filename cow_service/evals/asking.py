@@ -1,4 +1,4 @@
-"""One question, asked once: the order of its options, who is asked, what is replied, and what is observed of it.
+"""One question, asked once: the order of its options, the model asked, its reply, and the observation made of it.
 
 There are two ways to ask: a multimodal LLM itself through Inspect, or the service's own `/answer`.
 """
@@ -111,7 +111,7 @@ class Case:
 
     @property
     def question(self) -> str:
-        """As it is asked."""
+        """The text of the question."""
         return question_text(self.item, self.order)
 
     @property
@@ -323,7 +323,7 @@ def message(digests: Iterable[str], text: str, pictures: Pictures) -> inspect_mo
 
 
 def conversation(case: Case, asked: CaseReplies, pictures: Pictures) -> list[inspect_model.ChatMessage]:
-    """What a viewer shows: what was asked last, every reply, and in the first repeat the overlay.
+    """The content for a viewer: the last question, every reply, and in the first repeat the overlay.
 
     What `/answer` sends is not known here; the image, the frames and the question stand for it.
     """

@@ -25,7 +25,7 @@ Order = Literal["shuffled", "data"]
 
 
 class Arm(Record):
-    """What is shown beside the image, and how often the question is asked."""
+    """What is shown with the image, and how often the question is asked."""
 
     content: Content = "none"
     frames: FramePolicy = Field(default="events", description="Which frames.")
@@ -201,7 +201,7 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
 
 
 def references(arm: Arm, asked: Sequence[Arm]) -> tuple[Arm, ...]:
-    """What an arm is compared with, of the arms that were asked: all contrasts that a report shows.
+    """The arms that an arm is compared with, among those asked: all contrasts of a report.
 
     The image alone; the image alone with as many calls; and of frames that are meant to tell something, each placebo
     with the same frames and votes.

@@ -95,7 +95,7 @@ class Pictures(DiskArtifacts):
     """A folder of pictures, by their digests. The same bytes are kept once."""
 
     def add(self, data: bytes) -> str:
-        """Keeps a picture; returns its digest. Raises what `decode` raises for what is none."""
+        """Keeps a picture; returns its digest. Raises the errors of `decode`."""
         if not self.has(hashlib.sha256(data).hexdigest()):
             decode(data)
         return self.add_made(data)

@@ -121,7 +121,7 @@ def differences(before: RunRecord, now: RunRecord) -> list[str]:
 
 
 def departures(run: RunInfo, failed: int, unasked: int) -> list[str]:
-    """Where a run does not follow its plan, in words; so many questions failed, and so many were not asked yet."""
+    """Departures of a run from its plan, in words, given the numbers of failed questions and of those not asked yet."""
     plan = run.plan
     if plan is None:
         return []
@@ -172,7 +172,7 @@ def read_plan(path: Path) -> AnalysisPlan:
 
 
 def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
-    """The plan in words: the primary question, how many scenes it needs, and what it takes.
+    """The plan in words: the primary question, the scenes it needs, and its cost.
 
     `costs` are those of a pilot's arms by name, where there was one.
     """

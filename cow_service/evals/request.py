@@ -144,7 +144,7 @@ def info_of(wanted: EvalRequest, found: Collected, items: Sequence[Item], arms: 
 
 
 def merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
-    """A run that goes on, with more arms or repeats perhaps. Raises `InvalidRequest` if the rest is not the same."""
+    """A resumed run, possibly with more arms or repeats. Raises `InvalidRequest` if anything else has changed."""
     if before is None:
         return wanted
     changed = differences(before, wanted)
@@ -166,7 +166,7 @@ def merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
 
 
 def versions() -> dict[str, str]:
-    """Of this service and its commit, of Python, of the packages that are installed, and of the prompts."""
+    """Versions of this service and its commit, of Python, of the installed packages, and of the prompts."""
     found = {"cow-service": __version__, "commit": _commit(), "python": platform.python_version()}
     for name in PACKAGES:
         try:

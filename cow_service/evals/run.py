@@ -160,7 +160,7 @@ def prepare(wanted: request.EvalRequest, folder: Path, tell: Callable[[str], Non
 def write_plan(
     wanted: request.EvalRequest, file: Path, effect: float, pilot: Path | None, prices: Mapping[str, Price]
 ) -> str:
-    """Writes the plan of a run that hopes for a gain of `effect` (a share of questions); returns what it says.
+    """Writes the plan of a run to detect a gain of `effect` (a share of questions); returns its text.
 
     A pilot run tells how much scenes differ, and what a reply costs. Raises as `evaluate` does.
     """

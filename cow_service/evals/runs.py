@@ -1,4 +1,4 @@
-"""A folder of results: what was asked, and what came of it, which stands in Inspect's logs alone."""
+"""A folder of results: the questions, and their outcomes, which are kept only in Inspect's logs."""
 
 import json
 from collections.abc import Iterable
@@ -67,7 +67,7 @@ def read_info(folder: Path) -> RunInfo | None:
 
 
 def read_run(folder: Path) -> EvalRun:
-    """A run and what came of it so far. Raises `InvalidRequest` for a folder that holds none."""
+    """A run and its outcomes so far. Raises `InvalidRequest` for a folder without a run."""
     info = read_info(folder)
     if info is None:
         raise InvalidRequest(f"'{folder}' holds no {RUN}: name the folder that `cow eval --out` wrote.")
@@ -114,7 +114,7 @@ def _observation(log: inspect_log.EvalLog, sample: inspect_log.EvalSample) -> Ob
 
 
 def forget_failures(folder: Path) -> int:
-    """Marks what failed, so that it is asked again; returns how many there were."""
+    """Marks failed questions to be asked again; returns their number."""
     count = 0
     for info in inspect_log.list_eval_logs(str(folder)):
         log = inspect_log.read_eval_log(info)

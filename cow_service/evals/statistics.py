@@ -62,7 +62,7 @@ class PrimaryGain(Record):
 
 
 class Bin(Record):
-    """Told probabilities between two bounds, and how often what they tell of happened."""
+    """Predicted probabilities between two bounds, and how often the event happened."""
 
     count: int
     told: float = Field(description="Mean of the probabilities.")
@@ -70,7 +70,7 @@ class Bin(Record):
 
 
 class Calibration(Record):
-    """How good the told probabilities are."""
+    """How good the predicted probabilities are."""
 
     count: int
     brier: float
@@ -206,7 +206,7 @@ def _quantiles(placebos: int) -> float:
 
 
 def scenes_needed(effect: float, variance: float, placebos: int) -> int:
-    """How many scenes show such a gain (a share) over each of so many placebos with a power of 80% at 5%, two-sided.
+    """How many scenes show a gain (a share) over each of several placebos with a power of 80% at 5%, two-sided.
 
     At most: if all placebos are equally strong, and their replies independent. `variance` is that of the scenes' mean
     differences: of one question and reply each, at most the share of discordant pairs.
@@ -215,18 +215,18 @@ def scenes_needed(effect: float, variance: float, placebos: int) -> int:
 
 
 def effect_shown(scenes: int, variance: float, placebos: int) -> float:
-    """The gain that so many scenes show; the inverse of `scenes_needed`."""
+    """The gain that a number of scenes shows; the inverse of `scenes_needed`."""
     return _quantiles(placebos) * math.sqrt(variance / scenes)
 
 
 def power_of(effect: float, variance: float, scenes: int, placebos: int) -> float:
-    """How probable it is, at least, that so many scenes show such a gain; see `scenes_needed`."""
+    """A lower bound of the probability that a number of scenes shows a gain; see `scenes_needed`."""
     missed = norm.sf(effect * math.sqrt(scenes / variance) - norm.ppf(1 - ALPHA / 2))
     return max(0.0, float(1 - placebos * missed))
 
 
 def upper_variance(sd: float, scenes: int) -> float:
-    """A variance that is exceeded in one of five cases, of a standard deviation that so many scenes had."""
+    """A variance that is exceeded in one of five cases, from the standard deviation of a number of scenes."""
     return sd**2 * (scenes - 1) / float(chi2.ppf(0.2, scenes - 1))
 
 
@@ -280,7 +280,7 @@ def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibrat
 
 
 def calibration_of(told: Sequence[tuple[float, bool]], bins: int = 10) -> Calibration:
-    """Of probabilities and whether what they are about happened: one or more."""
+    """Calibration of one or more probabilities and whether their events happened."""
     table = np.array(told, dtype=np.float64)
     base = table[:, 1].mean()
     places = np.minimum((table[:, 0] * bins).astype(int), bins - 1)

@@ -126,7 +126,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None = None) -> None:
-    """Sends all logs of the process through one format. Setting up once more replaces what was set up before."""
+    """Sends all logs of the process through one format. A second call replaces the first."""
     formatter = JsonFormatter() if settings.log_format == "json" else TextFormatter()
     level = settings.log_level.upper()
     problems, requests = logging.StreamHandler(err or sys.stderr), logging.StreamHandler(out or sys.stdout)

@@ -67,7 +67,7 @@ def start(environment: Mapping[str, str] = os.environ) -> bool:
 
 
 def stop() -> None:
-    """Exports what is left, within OTEL_EXPORTER_OTLP_TIMEOUT (10 s), and records no more."""
+    """Exports what is left, within OTEL_EXPORTER_OTLP_TIMEOUT (10 s), and stops recording."""
     global _provider
     provider, _provider = _provider, None
     if provider is not None:

@@ -262,7 +262,7 @@ class Download:
 
 
 def resolve(source: Source, weights_dir: Path, revision: str | None = None, *, endpoint: str | None = None) -> Download:
-    """What is missing of a source. The hub is asked only for what is not recorded. Raises `WeightsUnavailable`.
+    """The missing files of a source. The hub is asked only about files without a record. Raises `WeightsUnavailable`.
 
     `revision` is a branch, tag or commit; by default the recorded one, or at first the newest. `endpoint` is the hub's
     address, by default HF_ENDPOINT or the public one.

@@ -175,7 +175,7 @@ class Worker:
                 raise self._overdue(begun, canceled)
 
     def _overdue(self, begun: bool, canceled: bool) -> CowError:
-        """The error of a job whose time is over. A process that goes on with it is ended; one that loads goes on."""
+        """The error of a job past its time limit. A process still computing it is ended; one still loading is not."""
         if begun:
             self.kill("timeout", "was ended, as another job of it had to end")
         if canceled:

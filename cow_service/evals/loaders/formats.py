@@ -159,7 +159,7 @@ def _options(given: Any, fields: dict[str, Any]) -> list[str] | None:
 
 
 def _image(given: Any, folder: Path) -> bytes:
-    """The bytes of a picture: a file beside the table, base64, a data URL, or the bytes themselves."""
+    """The bytes of a picture: a file in the folder of the table, base64, a data URL, or the bytes themselves."""
     if isinstance(given, dict):  # as the Hugging Face libraries keep pictures
         given = given.get("bytes") or given.get("path")
     if isinstance(given, bytes):

@@ -18,7 +18,7 @@ _TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **
 
 
 class RowFault(ValueError):
-    """Why a row cannot be asked; its text says what is wrong with which value."""
+    """Why a row cannot be asked; the message names the value and the fault."""
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class Split(Record):
 
 
 class Dose(Record):
-    """The gain of frames whose path is off by so much, over the image alone."""
+    """The gain of frames with a given error of the path, over the image alone."""
 
     name: str
     error: float = Field(description="In units of the simulation's own error.")
@@ -155,7 +155,7 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
 def _contrasts(
     name: str, reference: str, seen: Sequence[Observation], other: Sequence[Observation], explored: bool
 ) -> list[Contrast]:
-    """On all questions; over the image alone also on those of each task, where there are several."""
+    """The gain on all questions; over the image alone also per task, if there are several."""
     pairs: list[tuple[str | None, Sequence[Observation], Sequence[Observation]]] = [(None, seen, other)]
     of_task, there = _by_task(seen), _by_task(other)
     if len(of_task) > 1 and reference == BASELINE:
@@ -202,7 +202,7 @@ def _primary(place: int, run: EvalRun, *, several: bool) -> Primary | None:
 
 
 def _splits(name: str, seen: Sequence[Observation], baseline: Sequence[Observation]) -> list[Split]:
-    """The gain by what is known of each question's simulation, where something is.
+    """The gain by known properties of each question's simulation.
 
     Nothing here may depend on the baseline's replies: groups that are chosen by what is compared differ by themselves.
     """

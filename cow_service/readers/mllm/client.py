@@ -416,7 +416,7 @@ def is_busy(error: errors.ModelAPIError) -> bool:
 
 
 def reason_of(error: errors.ModelAPIError) -> str:
-    """What went wrong and what to do about it, in words without addresses, keys or the server's own text."""
+    """What went wrong and what to do about it, without addresses, keys or the server's own text."""
     for kind, words in _REASONS:
         if isinstance(error, kind):
             return words
