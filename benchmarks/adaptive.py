@@ -43,7 +43,7 @@ class Mllm:
         self.reset()
 
     def reset(self) -> None:
-        """Counts anew."""
+        """Resets the counts."""
         self.at_once = self.most = self.calls = self.refused = 0
         self.first = self.last = 0.0
 

@@ -171,7 +171,7 @@ def outlined(picture: Path) -> TrueScene:
 
 
 def write_frames(service: Service, result: Simulation, file: Path) -> None:
-    """The first, a middle and the last frame of a clip beside each other."""
+    """The first, a middle and the last frame of a clip, side by side."""
     shown = (result.frames[0], result.frames[len(result.frames) // 2], result.frames[-1])
     pixels = [decode_own(service.artifacts.read(each.sha256)) for each in shown]
     file.write_bytes(encode_png(np.concatenate(pixels, axis=1)))

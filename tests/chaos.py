@@ -124,7 +124,7 @@ class Wave:
 def schedule(
     chance: random.Random, always: Fault, others: Sequence[Fault], waves: tuple[int, int], longest: float
 ) -> list[Wave]:
-    """So many waves with the fault `always`, and so many with one of the others, each as often; some with two."""
+    """Waves with the fault `always`, and waves with one of the others, each equally often; some with two."""
     deck: list[Fault] = []
     while len(deck) < waves[1]:
         deck += chance.sample(others, len(others))

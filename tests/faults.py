@@ -38,7 +38,7 @@ class Machine:
         self._set(0, error)
 
     def set_clock(self, seconds: int = 0) -> None:
-        """From now on the clock is ahead by so many seconds."""
+        """From now on the clock is ahead by a number of seconds."""
         self._set(8, seconds)
 
     def _set(self, place: int, value: int) -> None:

@@ -168,7 +168,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Reply:
-    """A response; `cut` leaves out so many bytes of its end, and the connection breaks there."""
+    """A response; `cut` leaves out that many bytes at its end, and the connection breaks there."""
 
     status: int = 200
     body: Any = None

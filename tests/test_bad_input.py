@@ -39,7 +39,7 @@ EXIF = b"\xff\xe1\0\x10Exif\0\0" + bytes(8)
 PROFILE = bad.chunk(b"iCCP", b"k\0\0" + bad.zeros(200 * bad.MEBI))
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 GROWTH = 50  # MB that a refused request may cost
-LIMIT = 3_000_000  # bytes of a body, as the server of conftest.py is told
+LIMIT = 3_000_000  # bytes of a body, as the server of conftest.py is set
 HEX = "0123456789abcdef" * 4
 
 
@@ -104,7 +104,7 @@ def little_memory(server: Server) -> Iterator[None]:
 
     if not Path("/proc/self/clear_refs").exists():
         pytest.skip("memory is read from Linux's /proc")
-    Path(f"/proc/{server.process.pid}/clear_refs").write_text("5")  # the peak begins anew
+    Path(f"/proc/{server.process.pid}/clear_refs").write_text("5")  # resets the peak
     before = now("VmRSS")
     yield
     assert now("VmHWM") - before < GROWTH, f"{before} MB became {now('VmHWM')} MB"

@@ -43,7 +43,7 @@ def asked(count: int, **others: Any) -> list[dict[str, Any]]:
 
 
 def written(folder: Path, items: list[dict[str, Any]]) -> Path:
-    """A file of questions, and the picture that they name beside it."""
+    """A file of questions, and the picture that they name in the same folder."""
     (folder / "ball.png").write_bytes(IMAGE)
     path = folder / "questions.jsonl"
     path.write_text("".join(json.dumps({**item, "image": "ball.png"}) + "\n" for item in items))
@@ -332,7 +332,7 @@ def test_what_passes_is_no_failure_of_a_question(kind: type[errors.CowError]) ->
 
 
 class Crowded:
-    """A server that answers so many requests at once, and refuses others as a full queue does."""
+    """A server that answers a limited number of requests at once, and refuses others as a full queue does."""
 
     def __init__(self, accepts: int, answer: dict[str, Any]) -> None:
         self.accepts, self.answer = accepts, answer

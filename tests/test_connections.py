@@ -86,7 +86,7 @@ def test_bodies_that_are_held_are_bounded(served: Served) -> None:
 
     padded = json.dumps(BODY).encode() + b" " * 800_000
     json_type = {"Content-Type": "application/json"}
-    for _ in range(3):  # what was read is held no more
+    for _ in range(3):  # what was read is no longer counted
         assert served.http.post("/simulate", content=padded, headers=json_type).status_code == 200
     with ExitStack() as stack:
         held = [unfinished(stack) for _ in range(3)]

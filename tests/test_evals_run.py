@@ -312,7 +312,7 @@ def test_killed_or_interrupted_no_reply_is_asked_for_twice(
             eventually(lambda: len(mllm.done) == sum(mllm.asked.values()))
 
         def struck(by: signal.Signals, replies: int) -> subprocess.CompletedProcess[str]:
-            """A run that is sent a signal after so many more replies."""
+            """A run that gets a signal after a number of further replies."""
             all_sent()  # also what the run before was lost with
             wanted = len(mllm.done) + replies
             asked = arguments_of(SAMPLE, tmp_path / "struck", *arguments, mllm=mllm)

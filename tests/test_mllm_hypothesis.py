@@ -1,4 +1,4 @@
-"""What a multimodal LLM is told of a simulation before it answers: the embedded reader's facts, as a hypothesis."""
+"""The description of a simulation in an MLLM's prompt: the embedded reader's facts, as a hypothesis."""
 
 from __future__ import annotations
 

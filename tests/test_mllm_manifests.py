@@ -73,7 +73,7 @@ STRANGERS = (
     "Qwen/Qwen3-8B", "Qwen/Qwen2-VL-7B-Instruct", "lmms-lab/llava-onevision-qwen2-7b-ov",
 )  # fmt: skip
 
-# Sizes as in the configurations beside the weights: those of the language model, then what differs in vision.
+# Sizes as in the configurations of the weights: those of the language model, then what differs in vision.
 TEXT = ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_key_value_heads", "intermediate_size")
 SMALL_VIT = {"depth": 24, "hidden_size": 1024, "intermediate_size": 4096, "deepstack_visual_indexes": [5, 11, 17]}
 VIT = {"depth": 27, "hidden_size": 1152, "intermediate_size": 4304, "deepstack_visual_indexes": [8, 16, 24]}

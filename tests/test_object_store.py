@@ -154,7 +154,7 @@ def test_who_waits_for_a_job_is_told_that_the_store_is_away(served, objects):
 
 
 def test_another_server_passes_the_bytes_on(served, objects, tmp_path):
-    """It has nothing in common with the first one but the store, and is told not to redirect."""
+    """It shares only the store with the first one, and is set not to redirect."""
     video = simulated(served, {**WITH_VIDEO, "seed": 3})["video"]
     settings = {"COW_ARTIFACTS": objects.url, "COW_ARTIFACTS_REDIRECT": "false", **objects.environment}
     with Served(tmp_path, **settings) as other:

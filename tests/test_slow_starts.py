@@ -36,7 +36,7 @@ app(["serve"])
 
 
 def bad_starts(folder: Path, *starts: str, **settings: str) -> Served:
-    """A server whose first worker processes start badly: each "dies", or takes so many seconds more."""
+    """A server whose first worker processes start badly: each "dies", or takes a number of seconds longer."""
     (folder / "site").mkdir()
     (folder / "site" / "sitecustomize.py").write_text(AT_START)
     (folder / "starts").write_text("\n".join(starts))

@@ -519,7 +519,7 @@ def test_names_and_revisions_that_cannot_be_pulled(toy: Callable[..., tuple[int,
     assert "'toy' has no part 'encoder'. Its parts: model, vae, other." in told
     code, told = toy("pull", "toy", "--revision", "main", "--revision", "vae=v1")
     assert code == 1
-    assert "Parts of 'acme/toy' share its folder" in told
+    assert "All parts from 'acme/toy' share a folder" in told
     assert toy("--json", "check", "toy")[0] == 2
 
 
