@@ -104,7 +104,7 @@ class CowError(Exception):
         headers: dict[str, str] | None = None,
     ) -> None:
         self.detail = shortened(detail, MAX_DETAIL)
-        self.remedy = remedy  # for HTTP callers; the CLI, the page and MCP replace it with their own
+        self.remedy = remedy  # for HTTP callers; CLI, page and MCP may replace it with their own
         super().__init__(f"{self.detail} {remedy}".rstrip())
         self.errors = errors[:MAX_FIELDS]
         self.headers = headers or {}  # of the HTTP response

@@ -97,7 +97,7 @@ def answer(
     ] = None,
     imagine: Annotated[
         Literal["always", "auto", "never"],
-        option("Simulate first; auto: only if answers from the image alone disagree or are unsure."),
+        option("Whether to simulate first; auto: only if answers from the image alone disagree."),
     ] = "always",
     no_imagine: Annotated[bool, option("The same as --imagine never.", "--no-imagine")] = False,
     imagine_votes: Annotated[int, option("With --imagine auto: answers to ask for from the image alone.")] = 3,
