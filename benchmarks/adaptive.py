@@ -1,4 +1,4 @@
-"""Measures calls that adapt, against a simulated MLLM that takes so many at once and refuses others with status 429.
+"""Measures calls that adapt, against a simulated MLLM that refuses calls beyond a limit with status 429.
 
     python benchmarks/adaptive.py [--questions 1320] [--seconds 2] [--accepts 64] [--only NAME] [--json FILE]
 
@@ -43,7 +43,7 @@ class Mllm:
         self.reset()
 
     def reset(self) -> None:
-        """Counts anew."""
+        """Resets the counts."""
         self.at_once = self.most = self.calls = self.refused = 0
         self.first = self.last = 0.0
 

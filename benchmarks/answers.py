@@ -1,4 +1,4 @@
-"""Measures answers: those of the embedded reader against scenes with known truth, and what asking an MLLM adds.
+"""Measures answers: the embedded reader's against scenes with known truth, and the overhead of asking an MLLM.
 
     python benchmarks/answers.py DIR ... [--runs N] [--json FILE] [--diagram FILE]
 

@@ -1,4 +1,4 @@
-"""Measures what a chat through COW takes longer than the same chat sent to its MLLM directly.
+"""Measures how much longer a chat through COW takes than the same chat sent to its MLLM directly.
 
     python benchmarks/chat.py [--runs N] [--json FILE]
 

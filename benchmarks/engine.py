@@ -1,4 +1,4 @@
-"""Measures what the job engine adds: a job through it, beside the same request through the service alone.
+"""Measures the overhead of the job engine: a job against the same request through the service alone.
 
     python benchmarks/engine.py [--runs N] [--database URL] [--json FILE]
 

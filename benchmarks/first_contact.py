@@ -156,7 +156,7 @@ def simulate(home: Path, profile: str, num_frames: int) -> Row:
 
 
 def frames_of(home: Path, profile: str) -> np.ndarray | None:
-    """Those that were kept, as grey levels [count, height, width, 3]; None where there are none."""
+    """Those that were kept, as grey levels [count, height, width, 3]; None if there are none."""
     files = sorted((home / f"out-{profile}").glob("frame*.*"))
     read = [image for file in files if (image := cv2.imread(str(file))) is not None]
     return np.stack(read).astype(np.float32) if read else None

@@ -41,14 +41,14 @@ COLUMNS, CELL = 8, 90  # of the objects beside the mover; px
 
 
 def of_size(megapixels: float) -> tuple[bytes, dict[str, Any]]:
-    """A photograph of so many millions of pixels, and its mover."""
+    """A photograph with a number of millions of pixels, and its mover."""
     scale = math.sqrt(megapixels * 1e6 / (PHOTO[0] * PHOTO[1]))
     image = photograph(round(PHOTO[0] * scale), round(PHOTO[1] * scale))
     return image, {**GIVEN, "grounding": {"bbox": [side * scale for side in MOVER]}}
 
 
 def of_objects(count: int) -> tuple[bytes, dict[str, Any]]:
-    """A picture of so many things that stand apart, the first of which moves."""
+    """A picture of that many separate objects; the first one moves."""
     height, width = 600, (COLUMNS + 2) * CELL
     image = np.full((height, width, 3), 170, np.uint8)
     image[:90] = 215
@@ -63,7 +63,7 @@ def of_objects(count: int) -> tuple[bytes, dict[str, Any]]:
 
 
 def of_frames(count: int) -> tuple[bytes, dict[str, Any]]:
-    """The smallest photograph, with a clip of so many frames."""
+    """The smallest photograph, with a clip of a number of frames."""
     image, request = of_size(MEGAPIXELS[0])
     return image, {**request, "num_frames": count, "video": True}
 
@@ -96,7 +96,7 @@ def slope(rows: list[dict[str, Any]], of: str) -> float:
 
 
 def plot(told: dict[str, Any], path: Path) -> None:
-    """The curves on logarithmic axes, beside a line of linear growth."""
+    """The curves on logarithmic axes, with a line of linear growth."""
     import matplotlib as mpl  # noqa: PLC0415 # of the extra `evals`
 
     mpl.use("svg")

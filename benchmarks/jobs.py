@@ -1,4 +1,4 @@
-"""What the jobs that are kept cost: lists of them, and tidying, by how many there are.
+"""Measures the cost of stored jobs: lists of them and clean-up, by their number.
 
     python benchmarks/jobs.py [--jobs 0,1000,10000,100000] [--database postgresql://...] [--json FILE]
 

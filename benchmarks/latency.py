@@ -95,7 +95,7 @@ def peak_memory_mb(pid: int) -> float:
 
 
 def kept_bytes(data: Path) -> dict[str, int]:
-    """What a data folder holds: the rows of the job database, and all files beside it."""
+    """What a data folder holds: the rows of the job database, and all other files."""
     with sqlite3.connect(data / "jobs.sqlite3") as database:
         pages, free, size = (
             database.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "freelist_count", "page_size")

@@ -1,4 +1,4 @@
-"""Measures the world that the page moves while somebody drags, against the server: do they tell the same?
+"""Compares the world that the page moves while you drag with the server's: do they agree?
 
     python benchmarks/live.py [--scenes FOLDER ...] [--count 20] [--drags 5] [--json FILE]
 
@@ -39,7 +39,7 @@ NEAREST = 0.08  # of its first depth: closer than this, a body has passed the ca
 
 
 def simulated(address: str, scene: Path, request: dict[str, Any]) -> dict[str, Any] | None:
-    """The result; None where the server refuses."""
+    """The result; None if the server refuses."""
     question = json.loads((scene / "meta.json").read_text())["question"]
     body = json.dumps({"live": True, "video": False, "frames": {"count": 1}} | request)
     files = {"image": ("image.jpg", (scene / "image.jpg").read_bytes())}

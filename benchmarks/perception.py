@@ -1,4 +1,4 @@
-"""Memory and time of the models that see, at their published sizes with random weights: how well they see is not told.
+"""Memory and time of the vision models at their published sizes with random weights; quality is not measured.
 
     python benchmarks/perception.py [NAME...]
 

@@ -1,10 +1,10 @@
-"""Asks what-if questions of photographs, with boxes drawn by hand: are there verdicts, and is one sure and wrong?
+"""Asks what-if questions of photographs, with boxes drawn by hand: is there a verdict, and is any sure but wrong?
 
     python benchmarks/photographs.py [DIR ...] [--masks [--depth]] [--frames DIR] [--json FILE]
 
 The pictures come from scikit-image, where it is installed, and from DIRs; questions of pictures that are found nowhere
 are skipped. A verdict is a probability of what is asked, sure or not. `truth` is what a person sees, and what the
-measured depth of the motorcycle says; None where nobody can tell. Sure and wrong is a wrong answer with more than 0.8.
+measured depth of the motorcycle says; None if that cannot be told. Sure and wrong is a wrong answer with more than 0.8.
 With --masks a stand-in for a segmenter outlines the things by hand-drawn polygons; with --depth the motorcycle has its
 measured depth, too. --frames writes three frames of each clip beside each other, to be looked at.
 """
@@ -107,7 +107,7 @@ OUTLINES: dict[str, dict[str, str]] = {
 }  # fmt: skip
 
 
-# What is asked; what moves, then the others that are given; the truth.
+# The question; the moving object, then the others that are given; the truth.
 QUESTIONS: dict[str, tuple[tuple[str, str, bool | None], ...]] = {
     "motorcycle_left.png": (
         ("If the motorcycle slides to the right, will it hit the shelf?", "motorcycle, shelf, bench", False),
@@ -171,7 +171,7 @@ def outlined(picture: Path) -> TrueScene:
 
 
 def write_frames(service: Service, result: Simulation, file: Path) -> None:
-    """The first, a middle and the last frame of a clip beside each other."""
+    """The first, a middle and the last frame of a clip, side by side."""
     shown = (result.frames[0], result.frames[len(result.frames) // 2], result.frames[-1])
     pixels = [decode_own(service.artifacts.read(each.sha256)) for each in shown]
     file.write_bytes(encode_png(np.concatenate(pixels, axis=1)))

@@ -51,7 +51,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Row:
-    """What one scene gave; None where a figure does not apply."""
+    """What one scene gave; None if a figure does not apply."""
 
     scene: str
     task: str

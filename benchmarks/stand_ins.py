@@ -43,7 +43,7 @@ class TrueCamera:
     """A pinhole camera without roll.
 
     `focal` and the principal point `centre` in px, `pitch` in degrees (positive looks down), `height` above the floor
-    in metres; the latter two are None where they are unknown.
+    in metres; the latter two are None if they are unknown.
     """
 
     focal: float
@@ -80,7 +80,7 @@ class TrueScene:
         raise KeyError(f"{self.name} has no {name!r}; it has {', '.join(each.name for each in self.things)}")
 
     def thing_in(self, bbox: BBox) -> TrueThing | None:
-        """The thing whose box overlaps a box most; None where none is the same object's."""
+        """The thing whose box overlaps a box most; None if none is the same object's."""
         best = max(self.things, key=lambda each: iou(each.bbox, bbox), default=None)
         return best if best and iou(best.bbox, bbox) >= SAME_OBJECT_IOU else None
 

@@ -1,4 +1,4 @@
-"""What one clean-up of artifacts costs, by how many there are: seconds, memory, and deletions a second.
+"""Measures the cost of one clean-up of artifacts, by their number: seconds, memory, and deletions a second.
 
     python benchmarks/sweep.py [--names 10000000] [--database postgresql://...] [--json FILE]
 
@@ -29,7 +29,7 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.stages.run import now as time_text
 
-LOOSE_EVERY = 10  # artifacts, of which one has no reference
+LOOSE_EVERY = 10  # one in so many artifacts has no reference
 SIZE = 100_000  # bytes of each
 DIGITS = 15  # of a name's number: with the rest of a digest's digits it sorts as text
 OLDEST = 7 * 24 * 3600.0  # s, since the first one was used

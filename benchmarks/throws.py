@@ -9,7 +9,7 @@ engine says with the true values whether the ball meets the target. Stage 3 sees
 shadow's ellipse and the direction in the image, each with a little noise; not camera, heights, depth or speed.
 Printed are the Brier score (mean squared difference of probability and truth), that of always saying the base rate, and
 how often answers are right. With `--bound` the same is printed of one who knows what no image tells: the camera, the
-bodies and how these throws are drawn, so that only heading, rise and speed are open. Nobody can be surer than that.
+bodies and how these throws are drawn, so that only heading, rise and speed are open. No reader can be surer than that.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Throw:
 
 
 def draw_throw(rng: np.random.Generator, wide: bool = False) -> Throw | None:
-    """A random throw, or None where not all of it is in the image."""
+    """A random throw, or None if not all of it is in the image."""
     pitch = math.radians(rng.uniform(16, 38))
     focal = WIDTH * rng.uniform(0.9, 1.15)
     distance = rng.uniform(2.9, 3.7)
@@ -112,7 +112,7 @@ def _body(shape: Shape, half: float, tall: float, where: Floats, velocity: Float
 
 
 def _box(camera: FloorCamera, body: RigidShape) -> BBox | None:
-    """The box of a body's outline; None where it leaves the image."""
+    """The box of a body's outline; None if it leaves the image."""
     turns = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     if body.shape == "sphere":
         rise = np.linspace(-np.pi / 2, np.pi / 2, 21)

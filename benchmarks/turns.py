@@ -74,7 +74,7 @@ class Served:
         return passed, self.cpu_ms() - before
 
     def rate(self, bodies: list[dict[str, Any]], callers: int) -> float:
-        """Requests a second of so many callers, each with one request at a time."""
+        """Requests per second of a number of callers, each with one request at a time."""
 
         def ask(body: dict[str, Any]) -> None:
             self.http.post("/simulate", json=body).raise_for_status()

@@ -40,7 +40,7 @@ class Bench:
         time_parts(self.pipeline, self.clock)
 
     def put(self, form: Acceleration) -> None:
-        """Has the transformer run in another way from now on; what was compiled before is found again."""
+        """Has the transformer run in another way from now on; what was compiled before is reused."""
         if form == self._form:
             return
         self._form = None
@@ -52,7 +52,7 @@ class Bench:
         self._form = form
 
     def passes(self, count: int = 2, num_frames: int | None = None, batch: int = 1) -> dict[str, Any]:
-        """Seconds of that many passes, one after the other, for clips of some length; what the last one comes to.
+        """Seconds of that many passes, one after the other, for clips of some length; and the result of the last one.
 
         `off_eager`: its relative distance from what the first form gave for the same inputs, which is the eager one.
         """
@@ -248,7 +248,7 @@ class Bench:
 
 
 def _lay_out(vae: nn.Module, dtype: torch.dtype, *, channels_last: bool) -> None:
-    nn.Module.to(vae, dtype)  # diffusers' own warns of modules that stay in float32, of which the VAE has none
+    nn.Module.to(vae, dtype)  # diffusers' own warns of modules that stay in float32, but the VAE has none
     layout = torch.channels_last_3d if channels_last else torch.contiguous_format
     for module in vae.modules():
         if isinstance(module, nn.Conv3d):

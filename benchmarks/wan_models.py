@@ -37,7 +37,7 @@ from cow_service.weights.manifests import Manifest, load_manifests
 
 SEED = 0
 SPREAD = 0.02  # of the random weights: what such models start their training with
-# umt5-xxl and CLIP ViT-H, as in the configurations beside Wan2.1's weights.
+# umt5-xxl and CLIP ViT-H, as in the configurations of Wan2.1's weights.
 TEXT_ENCODER: dict[str, Any] = {
     "vocab_size": 256384, "d_model": 4096, "d_kv": 64, "d_ff": 10240, "num_layers": 24, "num_heads": 64,
     "feed_forward_proj": "gated-gelu",

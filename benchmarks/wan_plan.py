@@ -1,4 +1,4 @@
-"""What a run of `wan_speed.py` will take, reckoned before it is begun: by operations, bytes, and what came out so far.
+"""Estimates the time of a run of `wan_speed.py` before it starts, from operations, bytes and earlier results.
 
 Every number here is a guess that the first results correct; none of them is a figure of the benchmark.
 """

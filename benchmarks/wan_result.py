@@ -1,4 +1,4 @@
-"""What one measurement of `wan_speed.py` came to: whatever goes wrong in it becomes its result."""
+"""The result of one measurement of `wan_speed.py`; an error in it becomes its result, too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measurements of a run within a budget, in the order of what they tell, and which of them there is time for.
+"""The measurements of a run within a budget, most informative first, and which of them there is time for.
 
 One build of the model serves all of them. A row is written as soon as it is known.
 """
@@ -37,7 +37,7 @@ class Row:
 
     name: str
     run: Callable[[Bench], dict[str, Any]]
-    form: Acceleration | None = None  # of the transformer; None where it does not matter
+    form: Acceleration | None = None  # of the transformer; None if it does not matter
     passes: float = 0.0  # of the full size, that it takes
     seconds: float = 0.0  # that it takes besides them
 

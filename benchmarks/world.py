@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Row:
-    """What one scene gave; None where a figure does not apply."""
+    """What one scene gave; None if a figure does not apply."""
 
     scene: str
     form: str
@@ -96,7 +96,7 @@ def _row(folder: Path, form: str, meta: dict[str, Any], answer: Answer, trajecto
 
 
 def _happens(trajectory: Trajectory, meta: dict[str, Any]) -> bool:
-    """Whether what is asked happens in the world that is shown."""
+    """Whether the event in question happens in the world shown."""
     if trajectory.placement is not None:
         return trajectory.placement.result == "inside"
     return _shown(trajectory, meta)
@@ -157,7 +157,7 @@ def _body_at(trajectory: Trajectory, box: list[float]) -> int | None:
 
 
 def _shown(trajectory: Trajectory, meta: dict[str, Any]) -> bool:
-    """Whether what is asked can be seen on the paths: by places and sizes, or by the share that is covered."""
+    """Whether the event in question can be seen on the paths: by places and sizes, or by the share that is covered."""
     told = trajectory.outcome
     body = _body_at(trajectory, meta["boxes"][meta["target"]][0])
     if body is None or told is None:

@@ -1,4 +1,4 @@
-"""How many calls to make at the same time: found out by making them, as the other side does not say (AIMD).
+"""Finds out how many calls the other side takes at the same time, as it does not say so (AIMD).
 
 The limit doubles every round trip until the first refusal, then halves. From there it doubles to just below the level
 that was refused, approaches that by one a round trip, and stays there for a while before it tries one more.
@@ -23,9 +23,7 @@ HOLD_ROUNDS, HOLD_CALLS = 8, 64  # both pass at the refused level before one mor
 MAX_PAUSE_SECONDS = 60.0  # a server that asks for a longer pause is asked again after this time
 LATENCY_FACTOR = 2.0  # rise of the typical latency that halves the limit
 LATENCY_GAIN = 0.75  # a halving helped if the latency fell to this share: calls did wait for each other
-MIN_WINDOW = (
-    32  # calls whose latencies are compared: so many that a mix of short and long ones looks the same each time
-)
+MIN_WINDOW = 32  # calls whose latencies are compared: enough for a stable mix of short and long ones
 BASELINE_WEIGHT = 1 / 8  # of the last window in the long-run latency
 
 
@@ -155,7 +153,7 @@ class AdaptiveLimit:
 
 @dataclass
 class Call:
-    """A call that holds a place: whoever makes it says what came of it."""
+    """A call that holds a place; its caller reports the outcome."""
 
     limit: AdaptiveLimit
     began: float

@@ -169,7 +169,7 @@ def spawn(module: str) -> Spawned:
 
 
 def spawn_ahead(module: str) -> None:
-    """Starts a process for the first caller of `spawn`: it imports what it needs while this one does."""
+    """Starts a process for the first caller of `spawn`, so that both processes import at the same time."""
     _ahead[module] = spawn(module)
 
 

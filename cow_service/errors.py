@@ -1,4 +1,4 @@
-"""Every error that a caller can meet.
+"""Every error that a caller can get.
 
     CowError
     ├── InvalidRequest             invalid-request          422
@@ -45,7 +45,7 @@
     ├── JobTimeout                 job-timeout              504
     └── InternalError              internal-error           500
 
-An error's docstring is its title on the wire. Its message says what was wrong, with the value, and what to do about it;
+An error's docstring is its title in the response. Its message says what was wrong, with the value, and how to fix it;
 it never holds a path, a trace or a secret. The SDK raises the same classes for the same codes.
 """
 
@@ -55,7 +55,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any
 
-TYPE_PREFIX = "urn:cow:problem:"  # of the URI that a problem's code is part of: a name, not an address
+TYPE_PREFIX = "urn:cow:problem:"  # a problem's type is this and its code: a name, not an address
 MAX_DETAIL = 2000  # characters
 MAX_FIELDS = 50  # of one error
 MAX_KEY = 80  # characters
@@ -80,7 +80,7 @@ def field_of(pointer: str) -> str:
 
 
 def shortened(text: str, most: int) -> str:
-    """The text, or its first `most` characters and how many there are: what callers send may be megabytes long."""
+    """The text, cut after `most` characters with its full length noted: callers may send megabytes."""
     return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"
 
 
@@ -104,11 +104,11 @@ class CowError(Exception):
         headers: dict[str, str] | None = None,
     ) -> None:
         self.detail = shortened(detail, MAX_DETAIL)
-        self.remedy = remedy  # what to give in a request; who has other means says so in words of their own
+        self.remedy = remedy  # for HTTP callers; CLI, page and MCP may replace it with their own
         super().__init__(f"{self.detail} {remedy}".rstrip())
         self.errors = errors[:MAX_FIELDS]
         self.headers = headers or {}  # of the HTTP response
-        self.usage: dict[str, Any] | None = None  # what was asked of a multimodal LLM before, where that was anything
+        self.usage: dict[str, Any] | None = None  # calls of a multimodal LLM before the failure, if any
         self.refusal: dict[str, Any] | None = None  # by the multimodal LLM's server: a `records.MllmRefusal`
 
     @property
@@ -138,19 +138,19 @@ class MalformedBody(InvalidRequest, code="malformed-body", status=400):
 
 
 class NotFound(CowError, code="not-found", status=404):
-    """There is nothing here."""
+    """Nothing is served at this address."""
 
 
 class MethodNotAllowed(CowError, code="method-not-allowed", status=405):
-    """This address does not take that method."""
+    """This address does not support that HTTP method."""
 
 
 class Unauthorized(CowError, code="unauthorized", status=401):
-    """The request has no valid key."""
+    """The request has no valid API key."""
 
 
 class OriginNotAllowed(CowError, code="origin-not-allowed", status=403):
-    """A web page from there may not use the server."""
+    """Web pages from that origin may not use the server."""
 
 
 class RateLimited(CowError, code="rate-limited", status=429):
@@ -166,7 +166,7 @@ class RangeNotSatisfiable(CowError, code="range-not-satisfiable", status=416):
 
 
 class BodyTooLarge(CowError, code="body-too-large", status=413):
-    """The body is larger than the server takes."""
+    """The body is larger than the server allows."""
 
 
 class BodyTooSlow(CowError, code="body-too-slow", status=408):
@@ -174,11 +174,11 @@ class BodyTooSlow(CowError, code="body-too-slow", status=408):
 
 
 class BodyTypeUnsupported(CowError, code="body-type-unsupported", status=415):
-    """The body has a media type that the server does not take."""
+    """The server does not accept bodies of that media type."""
 
 
 class ImageTooLarge(CowError, code="image-too-large", status=413):
-    """The image has more pixels than the server takes."""
+    """The image has more pixels than the server allows."""
 
 
 class ImageUnreadable(CowError, code="image-unreadable", status=422):
@@ -190,7 +190,7 @@ class ImageTypeUnsupported(CowError, code="image-type-unsupported", status=415):
 
 
 class ImageUrlNotAllowed(CowError, code="image-url-not-allowed", status=422):
-    """The image may not be fetched from that URL."""
+    """The server may not fetch images from that URL."""
 
 
 class ImageUrlUnreachable(CowError, code="image-url-unreachable", status=422):
@@ -198,7 +198,7 @@ class ImageUrlUnreachable(CowError, code="image-url-unreachable", status=422):
 
 
 class CannotGround(CowError, code="cannot-ground", status=422):
-    """An object that the question names could not be found, or not be used as it says."""
+    """An object in the question could not be found in the image, or does not allow what the question says."""
 
 
 class ObjectNotFound(CannotGround, code="object-not-found"):
@@ -206,19 +206,19 @@ class ObjectNotFound(CannotGround, code="object-not-found"):
 
 
 class CannotReadDirection(CowError, code="cannot-read-direction", status=422):
-    """The direction of the motion could not be read."""
+    """The direction of the motion could not be determined."""
 
 
 class ReaderUnavailable(CowError, code="reader-unavailable", status=503):
-    """The reader cannot run on this server."""
+    """The reader, the part that understands the question, cannot run on this server."""
 
 
 class PerceptionUnavailable(CowError, code="perception-unavailable", status=503):
-    """A model that the server sees with cannot run: it is missing, damaged, or does not fit into memory."""
+    """A vision model of the server cannot run: it is missing, damaged, or does not fit into memory."""
 
 
 class MllmBadReply(CowError, code="mllm-bad-reply", status=502):
-    """The multimodal LLM gave no reply that can be used."""
+    """The multimodal LLM gave no usable reply."""
 
 
 class MllmRefused(CowError, code="mllm-refused", status=422):
@@ -226,15 +226,15 @@ class MllmRefused(CowError, code="mllm-refused", status=422):
 
 
 class MllmUnavailable(CowError, code="mllm-unavailable", status=503):
-    """The multimodal LLM could not be asked."""
+    """The multimodal LLM could not be reached."""
 
 
 class GeneratorUnavailable(CowError, code="generator-unavailable", status=503):
-    """The generator cannot run on this server."""
+    """The generator, the part that makes the frames, cannot run on this server."""
 
 
 class WeightsUnavailable(GeneratorUnavailable, code="weights-unavailable"):
-    """Weights are missing here, or are not those that were recorded when they were downloaded."""
+    """Model weights are missing, or differ from what was downloaded."""
 
 
 class CheckpointInvalid(GeneratorUnavailable, code="checkpoint-invalid"):
@@ -246,11 +246,11 @@ class GeneratorOutOfMemory(CowError, code="generator-out-of-memory", status=503)
 
 
 class DeviceFailed(CowError, code="device-failed", status=503):
-    """The GPU failed in the middle of a clip."""
+    """The GPU failed while it made a clip."""
 
 
 class ModelNotFound(CowError, code="model-not-found", status=404):
-    """No model has that name."""
+    """There is no model of that name."""
 
 
 class JobNotFound(CowError, code="job-not-found", status=404):
@@ -262,7 +262,7 @@ class DownloadUnavailable(CowError, code="download-unavailable", status=409):
 
 
 class IdempotencyKeyReused(CowError, code="idempotency-key-reused", status=422):
-    """The idempotency key belongs to another request."""
+    """The idempotency key was used for another request."""
 
 
 class WebhookNotAllowed(CowError, code="webhook-not-allowed", status=422):
@@ -290,7 +290,7 @@ class StorageUnavailable(CowError, code="storage-unavailable", status=503):
 
 
 class WorkerEnded(CowError, code="worker-ended", status=500):
-    """The process that computed the job ended before the job was done."""
+    """The process that computed the job ended before the job was finished."""
 
 
 class JobTimeout(CowError, code="job-timeout", status=504):
@@ -298,16 +298,16 @@ class JobTimeout(CowError, code="job-timeout", status=504):
 
 
 class InternalError(CowError, code="internal-error", status=500):
-    """The server met an error of its own."""
+    """The server failed unexpectedly."""
 
 
 def unforeseen() -> InternalError:
-    """The error for an exception that is none of these, and whose text may tell what it should not."""
-    return InternalError("The server met an error that it did not foresee; its log has the trace.")
+    """The error for any other exception, whose text may hold a secret."""
+    return InternalError("An unexpected error happened in the server. Its log has the trace.")
 
 
 def kinds(base: type[CowError] = CowError) -> dict[str, type[CowError]]:
-    """Every kind of error that goes over the wire, by its code."""
+    """Every error class that a response can carry, by its code."""
     found = {base.code: base}
     for kind in base.__subclasses__():
         if kind.__module__ == __name__:
@@ -317,10 +317,10 @@ def kinds(base: type[CowError] = CowError) -> dict[str, type[CowError]]:
 
 @cache
 def install_line(extra: str) -> str:
-    """The command that installs an extra: in the checkout that this package runs from, where it does, else by name."""
+    """The command that installs an extra: editable where this package runs from a checkout, else by name."""
     try:
-        told = json.loads(distribution("cow-service").read_text("direct_url.json") or "{}")
+        origin = json.loads(distribution("cow-service").read_text("direct_url.json") or "{}")
     except PackageNotFoundError:
-        told = {}
-    is_checkout = told.get("dir_info", {}).get("editable", False)
+        origin = {}
+    is_checkout = origin.get("dir_info", {}).get("editable", False)
     return f'pip install -e ".[{extra}]"' if is_checkout else f'pip install "cow-service[{extra}]"'

@@ -51,22 +51,22 @@ class Unreachable(EgressError):
 
 # What others raise, and what becomes of it. The first row that fits is taken.
 TRANSLATED: tuple[tuple[type[Exception], type[EgressError], str], ...] = (
-    (ssl.SSLCertVerificationError, Unreachable, "The certificate of '{host}' is not one to trust for that name."),
-    (ssl.SSLError, Unreachable, "No TLS connection to '{host}' could be made."),
-    (socket.gaierror, Unreachable, "The host name '{host}' is not known. Check its spelling."),
-    (socket.herror, Unreachable, "The host name '{host}' is not known. Check its spelling."),
+    (ssl.SSLCertVerificationError, Unreachable, "The TLS certificate of '{host}' is not trusted for that name."),
+    (ssl.SSLError, Unreachable, "The TLS connection to '{host}' failed."),
+    (socket.gaierror, Unreachable, "The host name '{host}' is unknown. Check its spelling."),
+    (socket.herror, Unreachable, "The host name '{host}' is unknown. Check its spelling."),
     (TimeoutError, Unreachable, "'{host}' took too long."),
     (httpcore.TimeoutException, Unreachable, "'{host}' took too long."),
-    (ConnectionRefusedError, Unreachable, "'{host}' takes no connections at that port."),
+    (ConnectionRefusedError, Unreachable, "'{host}' refuses connections at that port."),
     (OSError, Unreachable, "The connection to '{host}' failed."),
     (httpcore.NetworkError, Unreachable, "The connection to '{host}' failed."),
     (httpcore.ProxyError, Unreachable, "The connection to '{host}' failed."),
     (httpcore.ConnectionNotAvailable, Unreachable, "The connection to '{host}' failed."),
     (httpcore.LocalProtocolError, NotAllowed, "The request to '{host}' cannot be written as HTTP."),
-    (httpcore.ProtocolError, Unreachable, "'{host}' does not speak HTTP, or broke off in the middle."),
-    (httpcore.UnsupportedProtocol, NotAllowed, "'{host}' is to be asked by something other than HTTP."),
+    (httpcore.ProtocolError, Unreachable, "'{host}' does not speak HTTP, or closed the connection early."),
+    (httpcore.UnsupportedProtocol, NotAllowed, "The URL of '{host}' is not HTTP. Give an http or https URL."),
     (httpx.InvalidURL, NotAllowed, "{host} cannot be read. Give one like https://images.example.org/1.png."),
-    (UnicodeError, NotAllowed, "{host} comes with characters that cannot be sent. Escape them."),
+    (UnicodeError, NotAllowed, "{host} contains characters that must be percent-encoded."),
     (ValueError, NotAllowed, "{host} cannot be read. Give one like https://images.example.org/1.png."),
 )
 
@@ -129,7 +129,7 @@ def is_address(host: str) -> bool:
 
 
 def host_name(raw: str) -> str | None:
-    """The host of a URL, lower case and IDNA, as name servers and certificates know it. None where it is no host.
+    """The host of a URL, lower case and IDNA, as name servers and certificates know it. None if it is no host.
 
     Whatever ends in a number is an address to the system's resolver (2130706433, 0x7f.1, 0177.0.0.1): here it must be
     one in the usual notation.
@@ -147,7 +147,7 @@ class HostList:
     """Hosts that may be asked.
 
     An entry is a name or an address, `name:port` for another port than 80 and 443, `*.example.org` for all names below
-    that one, or `*` for every host. Raises `ValueError` for an entry that is none of these.
+    that one, or `*` for every host. Raises `ValueError` for any other entry.
     """
 
     def __init__(self, entries: Iterable[str]) -> None:
@@ -193,7 +193,7 @@ class Egress:
         self._allow = None if allow is None else HostList(allow)
 
     def fetch(self, url: str, most_bytes: int) -> bytes:
-        """The body at a URL, at most so long. Raises `NotAllowed` or `Unreachable`."""
+        """The body at a URL, up to a maximum length. Raises `NotAllowed` or `Unreachable`."""
         deadline = _Deadline(monotonic() + self.seconds)
         target = self._target(url, "The URL")
         for _ in range(MAX_REDIRECTS + 1):
@@ -205,7 +205,7 @@ class Egress:
             with _translated("A redirect"):
                 where = str(target.url.join(where))
             target = self._target(where, "A redirect")
-        raise Unreachable(f"There were more than {MAX_REDIRECTS} redirects. Give the URL that they end at.")
+        raise Unreachable(f"There were more than {MAX_REDIRECTS} redirects. Give the final URL.")
 
     def post(self, url: str, body: bytes, headers: Mapping[str, str]) -> int:
         """Sends a body, and returns the HTTP status of the answer, which may be that of a redirect.
@@ -236,7 +236,7 @@ class Egress:
         raw = url.raw_host.decode("ascii")
         host = host_name(raw)
         if host is None:
-            raise NotAllowed(f"{what} names no host that can be asked: '{raw[:100]}'. Give a name or a plain address.")
+            raise NotAllowed(f"{what} has no usable host name: '{raw[:100]}'. Give a name or a plain address.")
         port = _DEFAULT_PORTS[url.scheme] if url.port is None else url.port
         if not 0 < port < 65536:
             raise NotAllowed(f"{what} names a port that does not exist: {str(port)[:20]}.")
@@ -275,7 +275,7 @@ class Egress:
             yield response
 
     def _addresses(self, target: _Target, deadline: _Deadline) -> list[str]:
-        """Where a host is now. Raises `NotAllowed` where any of it may not be connected to."""
+        """Where a host is now. Raises `NotAllowed` if any of it may not be connected to."""
         answer: Future[list[str]] = Future()
 
         def ask() -> None:
@@ -296,7 +296,7 @@ class Egress:
 
     def _check_addresses(self, target: _Target, addresses: list[str]) -> None:
         if not all(self.permitted(address) for address in addresses):
-            raise NotAllowed(f"{target.what} leads to the host '{target.host}', whose address is not a public one.")
+            raise NotAllowed(f"{target.what} leads to the host '{target.host}', which does not have a public address.")
 
     @cached_property
     def _tls(self) -> ssl.SSLContext:
@@ -324,7 +324,7 @@ class _Deadline:
         """Seconds, more than none. Raises `TimeoutError` after the end."""
         left = self.end - monotonic()
         if left <= 0:
-            raise TimeoutError("the time for this exchange is over")
+            raise TimeoutError("the time limit of this exchange has passed")
         return left
 
 
@@ -392,8 +392,8 @@ def _body(response: httpcore.Response, host: str, most_bytes: int) -> bytes:
         raise Unreachable(f"'{host}' answered with HTTP {response.status} instead of 200.")
     encodings = [value.lower() for value in _headers(response, b"content-encoding")]
     if any(value not in (b"", b"identity") for value in encodings):
-        raise Unreachable(f"'{host}' answered with a compressed body, although it was asked not to.")
-    too_long = Unreachable(f"What '{host}' sends is larger than {most_bytes} bytes.")
+        raise Unreachable(f"'{host}' answered with a compressed body, which was not requested.")
+    too_long = Unreachable(f"The response of '{host}' is larger than {most_bytes} bytes.")
     if any(int(length) > most_bytes for length in _headers(response, b"content-length")):
         raise too_long
     body = bytearray()

@@ -69,7 +69,7 @@ class Registry(Generic[Backend]):
         return name in self._made
 
     def close(self) -> None:
-        """Closes the backends that were made and can be closed; each is made anew when it is asked for again."""
+        """Closes the backends that were made and can be closed; each is created again on its next use."""
         with self._guard:
             made, self._made = self._made, {}
         for backend in made.values():

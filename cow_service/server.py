@@ -24,7 +24,7 @@ from cow_service.service import Service
 from cow_service.settings import SettingsError
 from cow_service.workers.pool import WorkerPool
 
-EVERYWHERE = ("0.0.0.0", "::")  # addresses at which a server listens, and nobody asks
+EVERYWHERE = ("0.0.0.0", "::")  # addresses to listen at, which callers cannot use
 LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
 LOAD_SECONDS = 3600.0  # longest that models may take to load where nothing is asked before
 START_POLL_SECONDS = 0.01
@@ -109,7 +109,7 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
         if ended.is_set():
             return
         engine.start()
-        log.info("this worker takes jobs: %s", ", ".join(service.settings.queues) or "of all queues")
+        log.info("this worker takes jobs from: %s", ", ".join(service.settings.queues) or "of all queues")
         ended.wait()
     finally:
         if engine.is_running:
@@ -185,7 +185,7 @@ def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
     try:
         while not server.started:
             if not thread.is_alive():
-                told = "The server in this process ended before it had begun; its log says why."
+                told = "The server in this process ended before it was ready; its log says why."
                 raise failures[0] if failures else StorageUnavailable(told)
             time.sleep(START_POLL_SECONDS)
         yield server.address
@@ -195,7 +195,7 @@ def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
 
 
 def _server(service: Service, pool: WorkerPool | None) -> tuple[Server, JobEngine, Readiness]:
-    """A server of its role that does not run yet, its engine, and what tells whether it is ready."""
+    """A server of its role that does not run yet, its engine, and its readiness check."""
     settings = service.settings
     if settings.role == "api":
         engine, readiness = JobEngine(service, Computer()), Readiness(service, lambda: None)
@@ -257,7 +257,7 @@ class HttpConnection(H11Protocol):
             self._stop_timer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Waits no more."""
+        """Stops waiting."""
         self._stop_timer()
         super().connection_lost(exc)
 

@@ -40,7 +40,7 @@ from cow_service.vision.scene import SeenImages
 from cow_service.weights.manifests import check_modules, find_manifest, load_manifests
 from cow_service.weights.repositories import ready
 
-OWN_PARTS = frozenset(("transformer", "weights"))  # what a checkpoint of one's own can stand in for
+OWN_PARTS = frozenset(("transformer", "weights"))  # backends that an own checkpoint can replace
 WORD_READER = "embedded"  # it needs no weights: it reads the words of requests whose images another reader looks at
 Request = TypeVar("Request", bound=SimulateRequest)
 Place = TypeVar("Place", bound=PlaceRequest)
@@ -58,7 +58,7 @@ class Service:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.cpu = PrioritySemaphore(settings.concurrency)  # held around work on the CPU
-        self._devices: dict[str, PrioritySemaphore] = {}  # of generators that make only so many clips at the same time
+        self._devices: dict[str, PrioritySemaphore] = {}  # of generators with a limit of simultaneous clips
         self._guard = Lock()
         self.seen = SeenImages()  # what jobs have measured in images, for those that come with the same
         self.metrics = Metrics()
@@ -73,7 +73,7 @@ class Service:
             ("COW_GENERATOR", settings.generator, self.generators.names()),
         ):
             if name not in names:
-                raise SettingsError(f"Bad settings: {setting}={name!r}: there are only {', '.join(names) or 'none'}.")
+                raise SettingsError(f"Bad settings: {setting}={name!r}: known are {', '.join(names) or 'none'}.")
         for name in settings.checkpoints:
             manifest = find_manifest(name)
             if manifest is None or not OWN_PARTS & manifest.sources.keys():
@@ -110,7 +110,7 @@ class Service:
 
         Runs compute by `turn`, then first in, first out by `created_at` (RFC 3339, by default now).
 
-        Raises `InvalidRequest` for names of backends that nobody has, the errors of `digested` and of `images.decode`,
+        Raises `InvalidRequest` for unknown backends, the errors of `digested` and of `images.decode`,
         and whatever `progress` raises.
         """
         reader, generator = self._names_of(request)
@@ -135,7 +135,7 @@ class Service:
         )
 
     def digested(self, request: Request, image: bytes | None = None) -> tuple[Request, list[File]]:
-        """The request with its pictures by their digests, and what is to be kept for it: nothing is yet.
+        """The request with its pictures by their digests, and the bytes to keep for it; nothing is kept yet.
 
         `image`: the bytes of its image, where they came apart from it. Raises `InvalidRequest`, the errors of `fetch`
         and of `images.check`. Masks are not decoded before they are needed.
@@ -191,13 +191,13 @@ class Service:
         return self._image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
-        """Says at once what is wrong with a request as far as that costs nothing; returns its reader and generator.
+        """Makes the cheap checks of a request at once; returns its reader and generator.
 
-        Raises `InvalidRequest` for backends that nobody has and for options that the generator does not take, and
+        Raises `InvalidRequest` for unknown backends and for options that the generator does not take, and
         `ReaderUnavailable` or `GeneratorUnavailable` where their modules are needed here and not installed.
         """
         reader, name = self._names_of(request)
-        if self.settings.role != "api":  # else workers have what it lacks
+        if self.settings.role != "api":  # otherwise workers have what this process lacks
             check_modules(reader, errors.ReaderUnavailable)
             check_modules(name, errors.GeneratorUnavailable)
             for model in self.perception.names.values():
@@ -219,7 +219,7 @@ class Service:
         is not in memory any more, and the errors of `fetch` and `images.decode`.
         """
         if self.settings.role == "api":
-            raise errors.PerceptionUnavailable("This server computes nothing (COW_ROLE=api): give a box instead.")
+            raise errors.PerceptionUnavailable("This server runs no models (COW_ROLE=api): give a box instead.")
         known = request.image.artifact if isinstance(request.image, ImageArtifact) and image is None else None
         if known is None and image is None:
             image = self.fetch(request.image)
@@ -266,7 +266,7 @@ class Service:
         self.close()
 
     def close(self) -> None:
-        """Lets go of what its backends hold open, such as connections."""
+        """Releases what its backends hold open, such as connections."""
         self.readers.close()
         self.generators.close()
         self.perception.close()
@@ -296,7 +296,7 @@ class Service:
         return self.generators.get(name)
 
     def _names_of(self, request: SimulateRequest) -> tuple[str, str]:
-        """Its reader and its generator. Raises `InvalidRequest` for a name that nobody has."""
+        """Its reader and its generator. Raises `InvalidRequest` for an unknown name."""
         reader, generator = request.reader or self.settings.reader, request.generator or self.settings.generator
         for role, name, registry in (("reader", reader, self.readers), ("generator", generator, self.generators)):
             if name not in registry.names():
@@ -331,7 +331,7 @@ class Service:
 
 
 def open_artifact_store(settings: Settings) -> ArtifactStore:
-    """The store of COW_ARTIFACTS. Raises `SettingsError` where its library is missing or cannot be set up."""
+    """The store of COW_ARTIFACTS. Raises `SettingsError` if its library is missing or cannot be set up."""
     place = settings.artifacts
     if place is None or "://" not in place:
         return DiskArtifacts(Path(place).expanduser() if place else settings.data_dir / "artifacts")

@@ -1,4 +1,4 @@
-"""Settings of the service, from the environment: each `COW_` plus the field's name in capitals."""
+"""Settings of the service, read from environment variables: `COW_` plus the field's name in capitals."""
 
 import base64
 import os
@@ -18,28 +18,26 @@ from pydantic_settings import SettingsError as UnreadableSetting
 KEY_NAME = r"^[A-Za-z0-9._-]{1,64}$"
 KEY_HASH = r"^sha256:[0-9a-f]{64}$"
 SECRET_BYTES = range(24, 65)  # as Standard Webhooks says
-MAX_SECRETS = 2  # that sign at the same time, while one takes over from the other
-# Without a name or a password before the bucket: they would be kept in the job database.
+MAX_SECRETS = 2  # that sign at the same time, while a new secret replaces an old one
+# Without user name or password: they would be kept in the job database.
 OBJECT_STORE = re.compile(r"(s3|gs|az)://[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._-]+)*/?")
 ORIGIN = r"^(\*|[a-z][a-z0-9+.-]*://[^/\s?#@A-Z]+)$"  # as browsers write it: lower case, no path
-
-
 MAX_WORKERS = 256
 WORKER_BYTES = 400e6  # of memory for each process that computes
 
 
 def usable_cores() -> int:
-    """How many processes may compute at the same time: one per core that this one may use, as far as memory allows."""
+    """How many processes may compute at the same time: one per available core, as far as memory allows."""
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-    with suppress(OSError, ValueError):  # of a container, where there is one: "max" is none
+    with suppress(OSError, ValueError):  # the limit of a container; "max" means none
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         cores = min(cores, max(1, round(float(quota) / float(period))))
     return max(1, min(cores, int(usable_memory() / 2 / WORKER_BYTES), MAX_WORKERS))
 
 
 def usable_memory() -> float:
-    """Bytes of memory that all processes here may take: the machine's, or those of the container."""
-    import psutil  # noqa: PLC0415 # the command line's help does without it
+    """Bytes of memory that all processes may use together: the machine's, or the container's."""
+    import psutil  # noqa: PLC0415 # keeps the command line's help quick
 
     memory = float(psutil.virtual_memory().total)
     with suppress(OSError, ValueError):
@@ -48,7 +46,7 @@ def usable_memory() -> float:
 
 
 class SettingsError(Exception):
-    """A setting has a value that cannot be used. The message names each one and what it takes."""
+    """A setting has an unusable value. The message names each such setting and what it takes."""
 
 
 class Settings(BaseSettings):
@@ -64,134 +62,128 @@ class Settings(BaseSettings):
     )
 
     data_dir: Path = Field(default_factory=lambda: user_data_path("cow", appauthor=False))
-    """Folder for artifacts, the job database and temporary files, made if missing; by default the user's own."""
+    """Folder for artifacts, the job database and temporary files; created if missing."""
     artifacts: str | None = Field(default=None, min_length=1)
-    """Where artifacts are kept: a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX; by
-    default the folder `artifacts` of the data folder."""
+    """Where images, frames and videos are kept: a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or
+    az://CONTAINER/PREFIX; by default the folder `artifacts` in the data folder."""
     artifacts_redirect: bool = True
-    """Whether callers are sent to the object store for artifacts, by signed URLs; if not, the server passes the bytes
-    on."""
+    """Redirect callers to signed URLs of the object store for artifacts; otherwise the server sends the bytes."""
     artifacts_max_gb: float | None = Field(default=None, gt=0)
-    """Artifacts that are kept, in GB (10^9 bytes): beyond, those that no job used for longest are removed; by default
-    age alone decides."""
+    """Most GB (10^9 bytes) of artifacts; beyond, the least recently used are removed. By default only age decides."""
     host: str = "127.0.0.1"
     """Address the server listens on."""
     port: int = Field(default=8000, ge=0, le=65535)
     """Port the server listens on; 0 takes a free one."""
     mllm: str | None = Field(default=None, min_length=1)
-    """Multimodal LLM to ask: a manifest's name, or provider:model."""
+    """Multimodal LLM to use: the name of a manifest, or provider:model."""
     mllm_base_url: str | None = Field(default=None, pattern=r"^https?://")
-    """Address of the server that serves it, OpenAI-compatible."""
+    """URL of the OpenAI-compatible server of the multimodal LLM."""
     mllm_api_key: SecretStr | None = None
-    """Its key; by default that of the provider's own environment variable."""
+    """API key of the multimodal LLM; by default from the provider's own environment variable."""
     mllm_model: str | None = Field(default=None, min_length=1)
-    """Name under which it is served, where that is not the manifest's."""
+    """Name of the multimodal LLM on its server, if different from the manifest's."""
     mllm_timeout: float = Field(default=60, gt=0, le=3600)
-    """Longest wait for one reply, seconds."""
+    """Longest wait for one reply of the multimodal LLM, seconds."""
     mllm_budget: float = Field(default=180, gt=0, le=7200)
-    """Longest wait with all retries, seconds."""
+    """Longest wait for the multimodal LLM including retries, seconds."""
     mllm_concurrency: int = Field(default=64, ge=1, le=1024)
-    """Most calls of it at the same time: there are as many as it takes without refusals and longer waits."""
+    """Most simultaneous calls of the multimodal LLM; lowered while it refuses calls or slows down."""
     reader: str = Field(default_factory=lambda values: "mllm" if values.get("mllm") else "embedded")
-    """Reader where a request names none; `mllm` where COW_MLLM is set."""
+    """Default reader, the part that understands the question; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"
-    """Generator where a request names none."""
+    """Default generator, the part that makes the frames."""
     perception: str = Field(default="none", min_length=1)
-    """Models that see: none, cpu, gpu, or names that `cow models` lists, one of each kind, with commas between."""
+    """Vision models: none, cpu, gpu, or comma-separated names of `cow models`, at most one of each kind."""
     max_image_megapixels: float = Field(default=25, gt=0, le=500)
-    """Largest image taken, in millions of pixels."""
+    """Largest image accepted, in millions of pixels."""
     max_body_mb: float = Field(default=32, gt=0, le=4096)
-    """Largest request body taken, in MB (10^6 bytes)."""
+    """Largest request body accepted, in MB (10^6 bytes)."""
     max_bodies_mb: float = Field(default=256, gt=0, le=65536)
-    """Request bodies that are held at the same time, in MB; more are refused with 503."""
+    """Most MB of request bodies held at the same time; further requests are refused with 503."""
     allow_image_urls: tuple[str, ...] = ()
-    """Hosts from which images given by URL are fetched, as JSON: names, name:port, *.name for all below it, * for every
-    public host; none by default."""
+    """Hosts that images may be fetched from, as JSON: name, name:port, *.name for its subdomains, * for every public
+    host; by default none."""
     body_timeout: float = Field(default=30, gt=0, le=3600)
     """Longest wait for a whole request body, seconds."""
     models_dir: Path | None = None
-    """Folder for weights; by default the folder `models` of the data folder."""
+    """Folder for model weights; by default the folder `models` in the data folder."""
     checkpoints: dict[str, Path] = Field(default_factory=dict)
-    """Checkpoints of your own (a folder, or one safetensors file of a transformer) to use instead of what `cow models
-    pull` brings, by name of the generator or multimodal LLM, as JSON."""
+    """Your own checkpoints to use instead of pulled weights, as JSON: name of the generator or multimodal LLM to a
+    folder, or to one safetensors file of a transformer."""
     profile: str = "exact"
     """How video models run: a profile of their manifest."""
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
-    """Where models run: cpu, cuda, cuda:1...; auto takes the first GPU, else the CPU."""
+    """Where models run: cpu, cuda, cuda:1...; auto uses the first GPU, else the CPU."""
     concurrency: int = Field(default_factory=usable_cores, ge=1, le=MAX_WORKERS)
     """Requests computed at the same time; others wait. By default one per CPU core, as memory allows."""
     workers: bool = True
-    """Compute in processes of their own, one per request at a time; 0: in that of the server, where a crash ends every
-    job and Python computes one at a time."""
+    """Compute in separate worker processes; 0: in the server's own process, where a crash ends every job and only one
+    job computes at a time."""
     role: Literal["all", "api"] = "all"
-    """What a server does: api takes requests and computes nothing, for which `cow worker` runs beside it on the same
-    job database; all does both."""
+    """What a server does: all accepts requests and computes them; api only accepts them, and needs `cow worker` on the
+    same job database."""
     metrics_port: int | None = Field(default=None, ge=1, le=65535)
-    """Port on which `cow worker` serves its metrics, at the address of COW_HOST; by default none. Servers have GET
-    /metrics."""
+    """Port for the metrics of `cow worker`, at COW_HOST; by default none. Servers have GET /metrics."""
     queues: tuple[str, ...] = ()
-    """Queues from which jobs are taken, as JSON: light, and the name of each backend with a device of its own, such as
-    ati; by default all."""
+    """Queues to take jobs from, as JSON: light, and the names of backends with a device of their own, such as ati; by
+    default all."""
     worker_memory_mb: float | None = Field(default=None, gt=0)
-    """Memory that one worker process may take, MB; its job fails with worker-ended beyond that. By default 80% of the
-    machine's."""
+    """Most MB of memory for one worker process, beyond which its job fails with worker-ended; by default 80% of all."""
     worker_jobs: int = Field(default=1000, ge=1)
-    """Jobs after which a worker process is replaced by a new one."""
+    """Number of jobs after which a worker process is replaced."""
     load_timeout: float = Field(default=600, gt=0, le=86_400)
-    """Seconds that a worker process may take to start and to load its backends; beyond that it is ended, and started
-    again."""
+    """Longest time for a worker process to start and load its backends, seconds; then it is restarted."""
     warmup: bool = True
-    """Compute something small before /readyz says ready, and compile a video model for clips of any size when it is
-    loaded; else the first requests take several times as long."""
+    """Run a tiny simulation before /readyz says ready, and compile video models when they are loaded, so that the first
+    requests are fast."""
     job_timeout: float = Field(default=3600, gt=0, le=604_800)
-    """Seconds that one job may compute in a worker process; beyond that it fails with job-timeout."""
+    """Longest computing time of one job, seconds; then it fails with job-timeout."""
     generator_concurrency: dict[str, Annotated[int, Field(ge=1, le=256)]] = Field(default_factory=dict)
-    """Clips that a generator makes at the same time, by its name, as JSON; by default 1 of a video model, and of others
-    as many as COW_CONCURRENCY."""
+    """Clips that a generator makes at the same time, as JSON: name to number; by default 1 for video models, and
+    COW_CONCURRENCY for others."""
     api_keys: dict[Annotated[str, Field(pattern=KEY_NAME)], Annotated[str, Field(pattern=KEY_HASH)]] = Field(
         default_factory=dict
     )
-    """Who may call, as JSON: name to the hash of its key, as `cow keys new NAME` prints them; by default whoever
-    reaches the server."""
+    """API keys, as JSON: name to hash of the key, as `cow keys new NAME` prints them; by default no key is needed."""
     admin_keys: tuple[str, ...] = ()
-    """Names of COW_API_KEYS whose holders administer the server, as JSON: GET /workers tells only them hosts, process
-    ids and ids of jobs; everybody where there are no keys."""
+    """Names in COW_API_KEYS that may see hosts, process ids and job ids in GET /workers, as JSON; without API keys
+    everyone may."""
     rate_limit: int | None = Field(default=None, ge=1, le=1_000_000)
-    """Requests a minute with one key, or from one address where there are no keys."""
+    """Most requests per minute for one key, or for one address if there are no keys."""
     rate_limit_mb: float | None = Field(default=None, gt=0, le=1_000_000)
-    """Request bodies, and images fetched by URL, in MB a minute, likewise; refused requests count, too."""
+    """Most MB per minute, by key or address, of request bodies and fetched images; refused requests count, too."""
     rate_limit_cpu: float | None = Field(default=None, gt=0, le=60_000)
-    """Seconds of CPU that reading these may take in a minute, likewise; refused requests count, too."""
+    """Most CPU seconds per minute, by key or address, for reading bodies and images; refused requests count, too."""
     cors_origins: tuple[Annotated[str, Field(pattern=ORIGIN)], ...] = ()
-    """Origins of web pages that may use the server, as JSON, such as https://app.example.org; * for all of them where
-    keys are set."""
+    """Origins of web pages that may use the server, as JSON, such as https://app.example.org; * for all, if API keys
+    are set."""
     log_format: Literal["text", "json"] = "text"
-    """How the server's logs are written."""
+    """Format of the server's logs."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """The least important messages that the server logs."""
+    """Lowest level of log messages."""
     database_url: SecretStr | None = None
     """Job database: sqlite:///FILE or postgresql://USER:PASSWORD@HOST/NAME; by default a file in the data folder."""
     migrate: bool = True
-    """Create and update the tables of the job database at the start; false where `cow migrate` does so before, with
-    rights that servers and workers need not have."""
+    """Create and update the tables of the job database at start; set to false if you run `cow migrate` before, with
+    rights that servers and workers do not need."""
     queue_limit: int = Field(default=1000, ge=1, le=1_000_000)
-    """Jobs that wait or run; more are refused with queue-full."""
+    """Most jobs that wait or run; further requests are refused with queue-full."""
     queue_limit_per_key: int | None = Field(default=None, ge=1, le=1_000_000)
-    """Of them, those of one key; by default half of them where there are several keys."""
+    """Most jobs of one key that wait or run; by default half of COW_QUEUE_LIMIT if there are several keys."""
     running_limit_per_key: int | None = Field(default=None, ge=1, le=1_000_000)
-    """Jobs of one key that are computed at the same time, in all processes together; to be set for workers, too. By
-    default as many as there are places."""
+    """Most jobs of one key that compute at the same time, in all processes; set it for workers, too. By default no
+    limit."""
     key_weights: dict[str, Annotated[float, Field(ge=0.01, le=100)]] = Field(default_factory=dict)
-    """Shares of keys while several have jobs that wait, by their names, as JSON; by default 1 for each."""
+    """Shares of keys while several of them have waiting jobs, as JSON: name to weight; by default 1 each."""
     job_retention_hours: float = Field(default=168, gt=0, le=87_600)
     """Age at which finished jobs are removed, hours."""
     shutdown_grace: float = Field(default=10, ge=0, le=3600)
-    """Seconds that running jobs are given when the server stops; what is not done then goes on at the next start."""
+    """Time that running jobs get to finish when the server stops, seconds; the rest continue at the next start."""
     outage_budget: float = Field(default=600, ge=0, le=86400)
-    """Seconds that a running job waits for a database or a disk that is away, before it fails."""
+    """Longest time that a running job waits for an unavailable database or disk before it fails, seconds."""
     webhook_secret: SecretStr | None = None
-    """Secret that signs webhooks (Standard Webhooks, whsec_...); without it none are called. Two with a space between
-    them both sign: the new one and the old one, until every receiver knows the new one."""
+    """Secret that signs webhooks (Standard Webhooks, whsec_...); without it none are called. To rotate it, give the new
+    and the old one with a space between: both sign."""
 
     @field_validator("artifacts")
     @classmethod
@@ -212,7 +204,7 @@ class Settings(BaseSettings):
     def _of_keys(cls, names: Collection[str], info: ValidationInfo) -> Collection[str]:
         unknown = set(names) - info.data.get("api_keys", {}).keys()
         if unknown:
-            raise ValueError(f"{min(unknown)[:64]!r} is no name of COW_API_KEYS: `cow keys new` makes one")
+            raise ValueError(f"{min(unknown)[:64]!r} is not a name in COW_API_KEYS: create it with `cow keys new`")
         return names
 
     @field_validator("cors_origins")
@@ -234,12 +226,12 @@ class Settings(BaseSettings):
         return secret
 
     def is_admin(self, owner: str | None) -> bool:
-        """Whether the owner of a key administers the server; None: there are no keys."""
+        """Whether the owner of a key administers the server; None: the server has no keys."""
         return owner is None or owner in self.admin_keys
 
     @property
     def own_queue_limit(self) -> int:
-        """Jobs of one key that wait or run."""
+        """Most jobs of one key that wait or run."""
         shared = max(1, self.queue_limit // 2) if len(self.api_keys) > 1 else self.queue_limit
         return min(self.queue_limit, self.queue_limit_per_key or shared)
 
@@ -249,27 +241,27 @@ class Settings(BaseSettings):
         return self.models_dir or self.data_dir / "models"
 
     def dump_secrets(self) -> str:
-        """All settings as JSON, secrets too, for a process of this server: `Settings.model_validate_json` reads it."""
+        """All settings as JSON, with secrets, for another process of this server (`Settings.model_validate_json`)."""
         values = {name: value.get_secret_value() if isinstance(value, SecretStr) else value for name, value in self}
         return to_json(values).decode()
 
     def has(self, name: str) -> bool:
-        """Whether a setting, by its name in the environment (COW_...), is set."""
+        """Whether a setting is set, by its environment variable (COW_...)."""
         return getattr(self, name.removeprefix("COW_").lower()) is not None
 
     def own_parts(self, name: str) -> tuple[str, ...]:
-        """Parts of a model that come from a checkpoint of one's own, and need not be pulled."""
+        """Parts of a model that come from the operator's own checkpoint, and need not be pulled."""
         checkpoint = self.checkpoints.get(name)
         if checkpoint is None or not checkpoint.exists():
             return ()
         return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
 
 
-# Messages about settings that may hold a secret, whose value is not repeated.
+# Messages about settings that may hold a secret, without their value.
 SECRET_SETTINGS = {
     "mllm_base_url": "must begin with http:// or https://",
     "artifacts": "must be a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX, without "
-    "credentials: those come from variables of their own, such as AWS_*",
+    "credentials: set these by the provider's own variables, such as AWS_*",
     "webhook_secret": "must be whsec_ and the base64 of 24 to 64 random bytes, or two of them",
     "api_keys": 'must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes ("sha256:" and 64 '
     "hexadecimal digits), a different one for each; it takes no plain keys. `cow keys new NAME` makes both",

@@ -39,7 +39,7 @@ def picture(folder: Path, number: int, name: str = "", size: tuple[int, int] = (
 
 
 def item(number: int, image: str, task: Task, level: str) -> Item:
-    """A question with four options, the last of which is unsure."""
+    """A question with four options; the last one is unsure."""
     texts = ("It hits the <blue> cube.", "It passes the cube.", "It stops before it.", "I am not sure.")
     start = f"If the red ball number {number} moves to the right, what happens?\nA. "
     return Item(

@@ -18,7 +18,7 @@ HOW_TO_GET_IT = "chromium is not installed: apt-get install --no-install-recomme
 WIDE, NARROW = 1280, 390  # CSS px
 SIZES = {WIDE: {"width": WIDE, "height": 900}, NARROW: {"width": NARROW, "height": 844}}
 FAILED_REQUEST = "Failed to load resource"  # how chromium tells of a response that is an error, or of none
-# The policy's violations are told to the page as events; chromium's own words for them are not of one form.
+# The page gets violations of the policy as events; chromium's own messages for them vary.
 TELL_VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
     console.error(`Content-Security-Policy: ${event.violatedDirective} ${event.blockedURI} ${event.sample}`));"""
 
@@ -162,7 +162,7 @@ def arrow_tip(page: Page) -> Point:
 
 
 def path(page: Page) -> str:
-    """The path of what moves, as SVG."""
+    """The path of the moving object, as SVG."""
     return page.locator("path.path").first.get_attribute("d") or ""
 
 

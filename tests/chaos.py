@@ -39,7 +39,7 @@ OWN, OTHERS = (200, 202, 503), (404, 503)  # what callers may be told of their o
 
 @dataclass(frozen=True)
 class Told:
-    """What a tenant was told in one answer: about a request of its own, a job in its list, or another tenant's job."""
+    """One answer to a tenant: about a request of its own, a job in its list, or another tenant's job."""
 
     tenant: str
     status: int
@@ -124,7 +124,7 @@ class Wave:
 def schedule(
     chance: random.Random, always: Fault, others: Sequence[Fault], waves: tuple[int, int], longest: float
 ) -> list[Wave]:
-    """So many waves with the fault `always`, and so many with one of the others, each as often; some with two."""
+    """Waves with the fault `always`, and waves with one of the others, each equally often; some with two."""
     deck: list[Fault] = []
     while len(deck) < waves[1]:
         deck += chance.sample(others, len(others))
@@ -351,7 +351,7 @@ class Caller(threading.Thread):
         self._laboratory.note(told)
 
     def _call(self, method: str, path: str, **options: Any) -> httpx.Response | None:
-        """The answer of one of the servers; None where there was none, which only one that is struck may do."""
+        """The answer of one of the servers; None if there was none, which only one that is struck may do."""
         server = self._chance.choice(self._laboratory.servers)
         halts, was_halted = server.halts, server.is_halted
         try:
@@ -393,7 +393,7 @@ def one_machine(folder: Path) -> Generator[tuple[Laboratory, Fault, list[Fault]]
 
 @contextmanager
 def fleet(folder: Path) -> Generator[tuple[Laboratory, Fault, list[Fault]]]:
-    """Two servers, one of which computes nothing, and a worker; PostgreSQL and an object store. A crash of PostgreSQL,
+    """Two servers, one of them without computing, and a worker; PostgreSQL and an object store. A crash of PostgreSQL,
     and all other faults, those of networks among them.
     """
     settings, keys = tenants()

@@ -21,7 +21,7 @@ def floor(width: int = 640, height: int = 400, grey: int = 150, seed: int = 0) -
 
 
 def clutter(width: int, height: int, seed: int = 0) -> Image:
-    """Coloured texture full of edges, as a photograph of a workshop has it: no object can be told from another."""
+    """Coloured texture full of edges, as a photograph of a workshop has it: its objects cannot be told apart."""
     rng = np.random.default_rng(seed)
     patches = cv2.resize(rng.integers(30, 220, (15, 20, 3), np.uint8), (width, height), interpolation=cv2.INTER_CUBIC)
     image = np.clip(patches + rng.normal(0, 25, (height, width, 3)), 0, 255).astype(np.uint8)

@@ -72,7 +72,7 @@ def use_webhooks(settings: Settings, metrics: Metrics) -> None:
 
 
 def end_jobs(engine: JobEngine, seconds: float = 30.0 * SLOWNESS) -> None:
-    """Cancels the jobs that an earlier test left behind, and waits until nobody works on them.
+    """Cancels the jobs that an earlier test left behind, and waits until no process works on them.
 
     Else they would go on with the next test's service, and ask its multimodal LLM about another image.
     """

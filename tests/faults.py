@@ -38,7 +38,7 @@ class Machine:
         self._set(0, error)
 
     def set_clock(self, seconds: int = 0) -> None:
-        """From now on the clock is ahead by so many seconds."""
+        """From now on the clock is ahead by a number of seconds."""
         self._set(8, seconds)
 
     def _set(self, place: int, value: int) -> None:
@@ -76,7 +76,7 @@ class Station:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that goes wrong, and how it is set right again. `halts`: the station answers nobody meanwhile."""
+    """Something that goes wrong, and how it is set right again. `halts`: the station does not answer meanwhile."""
 
     name: str
     strike: Callable[[], object]

@@ -61,7 +61,7 @@ class Hub:
     stall: dict[str, int] = field(default_factory=dict)  # bytes after which nothing more comes, by path
     stalled: threading.Event = field(default_factory=threading.Event)
     go_on: threading.Event = field(default_factory=threading.Event)
-    spoilt: set[str] = field(default_factory=set)  # paths of which other bytes come than are listed
+    spoilt: set[str] = field(default_factory=set)  # paths whose bytes differ from those listed
     asked: list[Asked] = field(default_factory=list)
     listings: list[str] = field(default_factory=list)  # revisions
 

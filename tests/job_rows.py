@@ -15,7 +15,7 @@ STEP = 100
 
 
 def add_job(database: Database, job_id: str, owner: str | None = None, **more: Any) -> bool:
-    """Adds a job; False where there is one of that id."""
+    """Adds a job; False if there is one of that id."""
     step, queue = more.pop("step", STEP), more.pop("queue", "light")
     request = {"image": {"artifact": "0" * 64}, "question": "?"}
     asked = {"kind": "simulate", "request": request, "reader": "embedded", "generator": "cutout"}

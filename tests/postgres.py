@@ -36,7 +36,7 @@ class PostgresServer:
         self._run("createdb", "-h", "127.0.0.1", "-p", str(self.port), "-U", "cow", "cow")
 
     def start(self) -> None:
-        # What nobody waits for is written late: a crash shows what should have been waited for.
+        # Commits without a waiter are written late, so a crash shows which ones should have been waited for.
         options = f"-p {self.port} -h 127.0.0.1 -k {self._folder} -c wal_writer_delay=10s"
         self._run("pg_ctl", "-D", self._data, "-l", str(self._folder / "log"), "-w", "-o", options, "start")
 
@@ -61,7 +61,7 @@ class PostgresServer:
         subprocess.run(command, check=False, cwd="/")
 
     def _run(self, program: str, *arguments: str) -> None:
-        # Nobody reads the server's output: it would keep a pipe open.
+        # The server's output is not read: it would keep a pipe open.
         command = [*self._as_user, str(self._programs / program), *arguments]
         subprocess.run(command, check=True, cwd="/", stdout=subprocess.DEVNULL, timeout=60)
 

@@ -1,4 +1,4 @@
-"""What tests of the SDK share: both clients called in one manner, and a server that answers what it is told to."""
+"""What tests of the SDK share: both clients called in the same way, and a server with scripted answers."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
 
 
 class Hurried:
-    """A module of clocks in which nobody sleeps, but what they would have slept is known."""
+    """A clock module whose sleeps return at once and are recorded."""
 
     def __init__(self, module: Any, slept: list[float]) -> None:
         self._module, self._slept = module, slept
@@ -168,7 +168,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Reply:
-    """A response; `cut` leaves out so many bytes of its end, and the connection breaks there."""
+    """A response; `cut` leaves out that many bytes at its end, and the connection breaks there."""
 
     status: int = 200
     body: Any = None

@@ -57,7 +57,7 @@ BODY: dict[str, Any] = {
 
 
 def slow(seconds: float, seed: int = 0, **others: Any) -> dict[str, Any]:
-    """A request that takes so long, in at least 40 steps, after each of which it can be ended."""
+    """A request that takes that long, in at least 40 steps; it can be ended after each."""
     options = {"generator": "slow", "generator_options": {"seconds": seconds}, "frames": {"count": 40}}
     return {**BODY, **options, "num_frames": 80, "seed": seed, **others}
 

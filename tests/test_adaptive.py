@@ -1,4 +1,4 @@
-"""The adaptive limit: on a clock of its own, against servers that accept so many calls at once; then on sockets."""
+"""The adaptive limit: on a simulated clock, against servers with a limit of calls; then on sockets."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Simulation:
         self.limit = AdaptiveLimit(self.most, lambda: self.now)
 
     def run(self, calls: int) -> float:
-        """How long so many calls take, where refused ones are made again at once."""
+        """How long a number of calls take, if refused ones are repeated at once."""
         events: list[tuple[float, int, str, float]] = []
         todo, done, number = calls, 0, 0
         while done < calls:

@@ -102,7 +102,7 @@ def test_every_put_of_a_batch_follows_the_retry_policy_of_its_owner(store):
 def test_a_batch_is_there_when_its_block_ends(store):
     with store.batch() as put:
         artifacts = [put(name.encode() * 500, "image/png") for name in ("ab", "cd", "ef")]
-        with pytest.raises(ValueError, match="'image/gif' is not kept"):
+        with pytest.raises(ValueError, match="'image/gif' is not supported"):
             put(DATA, "image/gif")
     assert [store.get(each.sha256) for each in artifacts] == artifacts
 
@@ -113,7 +113,7 @@ def test_what_is_not_there_is_named(store):
             with pytest.raises(ArtifactNotFound, match=r"send the image again|64 lower-case hex digits"):
                 call(name)
     assert store.delete([SHA256], time.time() + LONG) == set()
-    with pytest.raises(ValueError, match="'image/gif' is not kept"):
+    with pytest.raises(ValueError, match="'image/gif' is not supported"):
         store.put(DATA, "image/gif")
 
 
@@ -245,7 +245,7 @@ def test_beyond_the_budget_the_oldest_go_first(settings, monkeypatch):
             database.reuse_result(f"job-{name}", "generation", [sha256])
             if name != "ab":
                 JobTable(database).cancel(f"job-{name}")
-        # An object store tells the times of its own clock, in whole seconds: here they are told.
+        # An object store reports times of its own clock, in whole seconds: here they are set.
         ages = dict(zip(kept.values(), (4000, 3000, 2000, 1000), strict=True))
         listed, now = [*store.listed()], time.time()
         aged = [type(one)(one.sha256, one.size, now - ages[one.sha256]) for one in listed]

@@ -113,7 +113,7 @@ def test_another_store_on_the_same_folder_finds_it(store, folder):
 
 
 def test_an_unknown_media_type_is_a_programming_error(store, folder):
-    with pytest.raises(ValueError, match="'image/gif' is not kept: use one of image/png"):
+    with pytest.raises(ValueError, match="'image/gif' is not supported: use one of image/png"):
         store.put(DATA, "image/gif")
     assert not folder.exists()
 

@@ -39,7 +39,7 @@ EXIF = b"\xff\xe1\0\x10Exif\0\0" + bytes(8)
 PROFILE = bad.chunk(b"iCCP", b"k\0\0" + bad.zeros(200 * bad.MEBI))
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 GROWTH = 50  # MB that a refused request may cost
-LIMIT = 3_000_000  # bytes of a body, as the server of conftest.py is told
+LIMIT = 3_000_000  # bytes of a body, as the server of conftest.py is set
 HEX = "0123456789abcdef" * 4
 
 
@@ -104,7 +104,7 @@ def little_memory(server: Server) -> Iterator[None]:
 
     if not Path("/proc/self/clear_refs").exists():
         pytest.skip("memory is read from Linux's /proc")
-    Path(f"/proc/{server.process.pid}/clear_refs").write_text("5")  # the peak begins anew
+    Path(f"/proc/{server.process.pid}/clear_refs").write_text("5")  # resets the peak
     before = now("VmRSS")
     yield
     assert now("VmHWM") - before < GROWTH, f"{before} MB became {now('VmHWM')} MB"
@@ -253,7 +253,7 @@ def test_what_the_service_makes_holds_nothing_of_the_photographer(http: httpx.Cl
         data = http.get(url).content
         for mark in (secret.encode(), b"Exif", b"eXIf", b"tEXt", b"zTXt", b"iTXt", b"GPS", b"xmp", b"2024:01:01"):
             assert mark not in data, url
-    # The input is kept as it was sent, under its own digest: whoever holds that may have it.
+    # The input is kept as it was sent, under its own digest: anyone who knows that may have it.
     assert http.get("/artifacts/" + simulation["image"]["sha256"]).content == photo
 
 
@@ -306,7 +306,7 @@ def test_base64_in_lines_is_taken(http: httpx.Client) -> None:
     [
         pytest.param({"question": "a" * 1_000_000}, "1000000 characters", id="question of 1 MB"),
         pytest.param({"question": "red\0ball"}, "NUL (U+0000) at position 3", id="question with NUL"),
-        pytest.param({"question": ""}, 'is empty, got "". Ask such as', id="empty question"),
+        pytest.param({"question": ""}, 'is empty, got "". Ask, for example:', id="empty question"),
         pytest.param({"question": " \t\n\u00a0"}, "empty", id="blank question"),
         pytest.param({"question": "\u200b\u200c\u200d\u2060\ufeff"}, "5 blank or invisible", id="zero-width question"),
         pytest.param({"question": None}, "/question", id="null question"),
@@ -329,7 +329,7 @@ def test_base64_in_lines_is_taken(http: httpx.Client) -> None:
         pytest.param({"grounding": {"point": [75, 100], "object": " "}}, "empty", id="blank object"),
         pytest.param({"grounding": {"point": [75, 100], "colour": 1}}, "/grounding/colour", id="nested unknown field"),
         pytest.param({"grounding": []}, "/grounding", id="grounding array"),
-        pytest.param({"motion": {"direction": [0, 0]}}, "must have a length", id="zero direction"),
+        pytest.param({"motion": {"direction": [0, 0]}}, "must not have zero length", id="zero direction"),
         pytest.param({"motion": {"direction": [1, 2, 3]}}, "/motion/direction", id="direction of three"),
         pytest.param({"motion": {"direction": [1, True]}}, "true", id="direction with true"),
         pytest.param({"motion": {"direction": [1, 0], "speed": -1}}, "-1", id="negative speed"),
@@ -537,8 +537,8 @@ FORMS: dict[str, tuple[bytes, int, str]] = {
     "no name": (part(None, b"a") + END, 400, '"name"'),
     "a part header of 1 MB": (part("image", PNG, file="a", header=LONG_HEADER) + END, 400, "multipart"),
     "10,000 part headers": (part("image", PNG, file="a", header=b"X: y\r\n" * 10_000) + END, 400, "multipart"),
-    "two images": (FILE + FILE + ASKED + END, 422, "`image` stands in the form more than once"),
-    "two questions": (FILE + ASKED + ASKED + END, 422, "`question` stands in the form more than once"),
+    "two images": (FILE + FILE + ASKED + END, 422, "`image` appears more than once in the form"),
+    "two questions": (FILE + ASKED + ASKED + END, 422, "`question` appears more than once in the form"),
     "an endless name": (FILE + ASKED + part("s" * 3000, b"") + END, 422, "(3000 characters)"),
     "image as a field": (part("image", PNG) + ASKED + END, 422, "file part"),
     "question as a file": (FILE + part("question", b"?", file="q") + END, 422, "plain field"),

@@ -43,7 +43,7 @@ def asked(count: int, **others: Any) -> list[dict[str, Any]]:
 
 
 def written(folder: Path, items: list[dict[str, Any]]) -> Path:
-    """A file of questions, and the picture that they name beside it."""
+    """A file of questions, and the picture that they name in the same folder."""
     (folder / "ball.png").write_bytes(IMAGE)
     path = folder / "questions.jsonl"
     path.write_text("".join(json.dumps({**item, "image": "ball.png"}) + "\n" for item in items))
@@ -332,7 +332,7 @@ def test_what_passes_is_no_failure_of_a_question(kind: type[errors.CowError]) ->
 
 
 class Crowded:
-    """A server that answers so many requests at once, and refuses others as a full queue does."""
+    """A server that answers a limited number of requests at once, and refuses others as a full queue does."""
 
     def __init__(self, accepts: int, answer: dict[str, Any]) -> None:
         self.accepts, self.answer = accepts, answer
@@ -617,7 +617,7 @@ def test_a_file_that_cannot_be_asked_is_refused_before_anything_is_sent(
     [
         (("--url", "127.0.0.1:8000"), "must begin with http://"),
         (("--url", "http://127.0.0.1:1"), "server-unreachable"),
-        (("--out", "questions.jsonl"), "'questions.jsonl' cannot be written"),
+        (("--out", "questions.jsonl"), "Cannot write to 'questions.jsonl'"),
     ],
 )
 def test_what_keeps_a_batch_from_beginning_is_told_at_once(
@@ -645,7 +645,7 @@ def test_an_interrupt_ends_at_once_and_loses_nothing(tmp_path: Path) -> None:
             began = time.monotonic()
             _, said = process.communicate(timeout=20)
         assert process.returncode == 130
-        assert "The same command goes on with it" in said
+        assert "Run the same command again to resume." in said
         assert "Traceback" not in said
         assert time.monotonic() - began < 3, "it waited for jobs"
         result = run(path, "-o", out, "--url", str(served.http.base_url))
@@ -673,7 +673,7 @@ def test_a_long_batch_that_is_killed_three_times(fast: Served, tmp_path: Path) -
     concurrency = 8
     how = ("-o", str(out), "--url", str(fast.http.base_url), "--concurrency", str(concurrency))
     draw = random.Random()
-    # One in each of three parts, the last of which leaves room: more results come while a process is being killed.
+    # One in each of three parts; the last leaves room, as more results come while a process is being killed.
     moments = [draw.randrange(part * many // 10, (part + 1) * many // 10) for part in (1, 3, 5)]
     print("killed at", moments)  # pytest shows it when the test fails
 

@@ -432,7 +432,7 @@ def test_a_caller_who_leaves_a_stream(served: Served, chat: Any, key: str | None
         return
     with pytest.raises(AssertionError):
         eventually(lambda: served.job(job)["status"] != "running", within=1)
-    with ThreadPoolExecutor(1) as pool:  # whoever comes back hears the rest
+    with ThreadPoolExecutor(1) as pool:  # a returning caller gets the rest
         again = pool.submit(lambda: chunks_of(chat, extra_headers=headers, **slowly(21)))
         served.http.post(f"/jobs/{job}/cancel")
         with pytest.raises(openai.APIError) as caught:

@@ -129,7 +129,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     result = cow(tmp_path, "demo", "--out", "file/below")
     assert result.returncode == 1
     assert result.stderr.splitlines()[0] == "folder-not-writable: The results cannot be written."
-    assert "'file/below' cannot be written: Not a directory. Choose another place with --out." in result.stderr
+    assert "Cannot write to 'file/below': Not a directory. Choose another place with --out." in result.stderr
 
 
 def test_a_choice_that_there_is_not_is_told_with_those_there_are(tmp_path: Path, picture: Path) -> None:
@@ -185,7 +185,7 @@ def test_what_is_taken_away_and_how_far_it_goes(tmp_path: Path, picture: Path) -
     assert simulation.trajectory.factual is not None
     assert simulation.motion.distance == 60
     wrong = cow(tmp_path, "simulate", str(picture), QUESTION, "--place", "the ball near the box")
-    assert "--place takes a thing, a relation (into, onto," in wrong.stderr
+    assert "--place takes an object, a relation (into, onto," in wrong.stderr
 
 
 def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
@@ -202,10 +202,10 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
         (
             ["If the pink car moves left, what?"],
             1,
-            "cannot-ground: An object that the question names could not be found, or not be used as it says.",
+            "cannot-ground: An object in the question could not be found in the image, or does not allow what the",
         ),
-        (["If the red ball moves forward, what?"], 1, "Here: --direction DX,DY."),
-        ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers with commas between"),
+        (["If the red ball moves forward, what?"], 1, "Use --direction DX,DY (x right, y down)."),
+        ([QUESTION, "--point", "1;2"], 1, "--point takes 2 numbers separated by commas"),
         ([QUESTION, "--box", "1,2,3"], 1, "--box takes 4 numbers"),
         ([QUESTION, "--direction", "left"], 1, "such as -1,0 for to the left (x right, y down); got 'left'."),
         (
@@ -219,11 +219,11 @@ def test_a_box_and_a_fall(tmp_path: Path, picture: Path) -> None:
             "foo: there is no such field, got 1. --request takes these fields: ",
         ),
         ([QUESTION, "--request", "r.json"], 1, "Give an object: "),
-        ([""], 1, 'question: is empty, got "". Ask such as \'If the red ball moves'),
+        ([""], 1, 'question: is empty, got "". Ask, for example: \'If the red ball moves'),
         ([QUESTION, "--distance", "-5"], 1, "motion.distance: Input should be greater than 0, got -5"),
         ([QUESTION, "--kind", "projectile"], 1, "needs a `direction`"),
-        ([QUESTION, "--object", "x"], 1, "goes with --point, --box or --trajectory"),
-        ([QUESTION, "--depth-scale", "0.001"], 1, "--depth-scale goes with --depth"),
+        ([QUESTION, "--object", "x"], 1, "needs --point, --box or --trajectory"),
+        ([QUESTION, "--depth-scale", "0.001"], 1, "--depth-scale needs --depth"),
         ([QUESTION, "--generator", "dream"], 1, "There is no generator 'dream'. There are: ati, cutout,"),
         ([QUESTION, "--option", "steps"], 1, "--option takes NAME=VALUE"),
         ([QUESTION, "--option", "steps=4"], 1, "/generator_options/steps"),
@@ -266,7 +266,7 @@ def test_models_and_doctor(tmp_path: Path) -> None:
     assert "cutout" in [m.name for m in models.generators]
     result = cow(tmp_path, "doctor")
     assert result.returncode == 0, result.stdout + result.stderr
-    assert "The default request can be served." in result.stdout
+    assert "Everything that a default request needs is ready." in result.stdout
     report = json.loads(cow(tmp_path, "doctor", "--json").stdout)
     assert report["cow"] == __version__
     assert report["packages"]["fastapi"]
@@ -286,7 +286,7 @@ def test_the_doctor_finds_what_is_wrong(tmp_path: Path) -> None:
 def test_a_default_backend_that_is_not_there_stops_the_start(tmp_path: Path) -> None:
     result = cow(tmp_path, "serve", COW_GENERATOR="dream")
     assert result.returncode == 2
-    assert "COW_GENERATOR='dream': there are only ati, cutout" in result.stderr
+    assert "COW_GENERATOR='dream': known are ati, cutout" in result.stderr
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path, picture: Path) -> None:

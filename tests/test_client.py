@@ -120,7 +120,7 @@ def _digest(data: bytes) -> str:
 def test_images_of_every_kind(address: str, tmp_path: Path) -> None:
     with Client(address) as client:
         client.simulate(IMAGE, QUESTION, **SMALL)
-        boxed = SMALL | {"grounding": {"bbox": [42, 62, 78, 98]}}  # in black and white no object is told from the rest
+        boxed = SMALL | {"grounding": {"bbox": [42, 62, 78, 98]}}  # in black and white no object stands out
         for name, image in _kinds_of_images(tmp_path).items():
             simulation = client.simulate(image, QUESTION, **boxed)
             assert (simulation.image.width, simulation.image.height) == (240, 160), name

@@ -110,7 +110,7 @@ def test_refusals_at_the_door_are_tried_again(hurried: Connect, code: str) -> No
 def test_retry_after_is_heeded_and_capped(
     hurried: Connect, monkeypatch: pytest.MonkeyPatch, retry_after: str | int, least: float, most: float
 ) -> None:
-    """A number of seconds, or a date so many seconds from now: also one of the old form, which is in GMT as well."""
+    """A number of seconds, or a date that many seconds from now, also in the old form, which is in GMT as well."""
     forms = [retry_after]
     if isinstance(retry_after, int):
         then = time.time() + retry_after
@@ -593,7 +593,7 @@ def test_leaving_a_dead_server_is_still_leaving(hurried: Connect) -> None:
 
 
 def _leave(connect: Connect, url: str, when: threading.Event) -> None:
-    """Breaks off a simulation at that moment, as a person does at a terminal, or whoever cancels a task."""
+    """Interrupts a simulation at that moment, as a person at a terminal or a canceled task does."""
     if connect.kind == "async":
 
         async def ask() -> None:

@@ -61,7 +61,7 @@ def test_more_idle_connections_than_files_lock_nobody_out(served: Served) -> Non
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 2 * FILES + 100)), hard))
     with ExitStack() as stack:
-        for _ in range(2 * FILES):  # at once: nobody waits for the connection before
+        for _ in range(2 * FILES):  # all at once
             one = stack.enter_context(socket.socket())
             one.setblocking(False)
             one.connect_ex(served.host_and_port)
@@ -86,7 +86,7 @@ def test_bodies_that_are_held_are_bounded(served: Served) -> None:
 
     padded = json.dumps(BODY).encode() + b" " * 800_000
     json_type = {"Content-Type": "application/json"}
-    for _ in range(3):  # what was read is held no more
+    for _ in range(3):  # what was read is no longer counted
         assert served.http.post("/simulate", content=padded, headers=json_type).status_code == 200
     with ExitStack() as stack:
         held = [unfinished(stack) for _ in range(3)]

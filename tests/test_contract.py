@@ -25,7 +25,7 @@ CLASSES = [c for _, c in inspect.getmembers(errors, inspect.isclass) if issubcla
 
 
 def get(app: FastAPI, path: str) -> httpx.Response:
-    """One request to the app itself; an error that nobody handled is answered, not raised."""
+    """One request to the app itself; an unhandled error is answered, not raised."""
 
     async def ask() -> httpx.Response:
         transport = httpx.ASGITransport(app, raise_app_exceptions=False)

@@ -25,7 +25,7 @@ generator = CutoutGenerator()
 
 
 def ignore(done: float) -> None:
-    """Nobody listens."""
+    """There is no listener."""
 
 
 def shot(

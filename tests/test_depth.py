@@ -263,7 +263,7 @@ class TestRequest:
         [
             (depth_png(np.full((200, 320), 3.0)), "320 x 200 px where the upright image has 640 x 400"),
             (depth_png(np.full((400, 640), np.nan)), "is empty"),
-            (png_bytes(PICTURE), "grey with 16 bits"),
+            (png_bytes(PICTURE), "save it as 16-bit grey"),
             (depth_png(CAMERA.depth())[:-400], "damaged"),
         ],
     )

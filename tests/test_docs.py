@@ -41,7 +41,7 @@ DOCKER = """#!/bin/sh
 echo "$@" >> "$DOCKER_ASKED"
 """
 PIP = """#!/bin/sh
-# What it is told is looked at later. Downloads, and installs from downloads, are not done; all else is pip's.
+# Its arguments are checked later. Downloads, and installs from downloads, are not done; all else is pip's.
 echo "$@" >> "$PIP_ASKED"
 case " $* " in
   *" download "*|*" --no-index "*) ;;
@@ -308,7 +308,7 @@ def succeeded(result: subprocess.CompletedProcess[str], what: str) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_what_docker_and_pip_were_told_exists(checkout: Checkout) -> None:
-    """The stand-ins write down what they are told."""
+    """The stand-ins record their arguments."""
     wanted = [block.text for block in blocks("docs/production.md") if re.search("docker |pip download", block.text)]
     run_commands(checkout, "\n".join(wanted))
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]

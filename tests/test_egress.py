@@ -137,7 +137,7 @@ def url(site: Site, path: str = "/image", host: str = "images.test") -> str:
 
 def test_a_body_is_fetched(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY"):
-        monkeypatch.setenv(name, "http://127.0.0.1:9")  # nobody is there: it would fail if it were asked
+        monkeypatch.setenv(name, "http://127.0.0.1:9")  # no server is there: a request to it would fail
     assert egress(site).fetch(url(site), MOST) == BODY
     assert egress(site).fetch(url(site, host="IMAGES.test."), len(BODY)) == BODY
     method, path, headers, _ = site.asked[1]
@@ -178,7 +178,7 @@ def test_a_length_that_lies(site: Site) -> None:
     site.pages["/two"] = lambda page: page.write(b"HTTP/1.1 200 OK\r\ncontent-length: 1\r\ncontent-length: 2\r\n\r\n")
     assert egress(site).fetch(url(site, "/more"), MOST) == b"x" * 10
     for path in ("/fewer", "/not", "/two"):
-        with pytest.raises(Unreachable, match="broke off"):
+        with pytest.raises(Unreachable, match="closed the connection early"):
             egress(site).fetch(url(site, path), MOST)
 
 
@@ -244,13 +244,13 @@ def test_a_receiver_that_takes_no_bytes_is_left(site: Site) -> None:
 def test_nobody_there(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-    with pytest.raises(Unreachable, match="takes no connections"):
+    with pytest.raises(Unreachable, match="refuses connections"):
         Egress(None, resolve=names(), permitted=lambda ip: True).fetch(f"http://images.test:{port}/", MOST)
 
     def unknown(host: str, port: int) -> list[str]:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
-    with pytest.raises(Unreachable, match="not known"):
+    with pytest.raises(Unreachable, match="is unknown"):
         egress(site, resolve=unknown).fetch(url(site), MOST)
     with pytest.raises(Unreachable, match="no address"):
         egress(site, resolve=lambda *_: []).fetch(url(site), MOST)
@@ -413,7 +413,7 @@ def test_refused(bad: str) -> None:
 @pytest.mark.usefixtures("unconnected")
 def test_the_address_behind_a_name_is_not_told() -> None:
     inside = Egress(["*"], resolve=lambda *_: ["10.9.8.7"])
-    with pytest.raises(NotAllowed, match=r"'intranet\.example', whose address is not a public one") as refused:
+    with pytest.raises(NotAllowed, match=r"'intranet\.example', which does not have a public address") as refused:
         inside.fetch("http://intranet.example/", MOST)
     assert "10.9" not in str(refused.value)
 
@@ -445,7 +445,7 @@ def test_a_name_that_changes_is_asked_once_and_held_to(site: Site) -> None:
 
 
 def test_the_next_address_is_taken_where_one_does_not_answer(site: Site) -> None:
-    """Nobody listens on IPv6 there."""
+    """No server listens on IPv6 there."""
     way = egress(site, resolve=lambda *_: ["::1", "127.0.0.1"], permitted=lambda ip: True)
     assert way.fetch(url(site), MOST) == BODY
 
@@ -633,7 +633,7 @@ def test_every_hop_is_checked(site: Site, where: str) -> None:
 
 def test_a_location_that_is_no_text(site: Site) -> None:
     site.pages["/bytes"] = lambda page: page.write(b"HTTP/1.1 302 Found\r\nlocation: /\xff\xfe\r\n\r\n")
-    with pytest.raises(EgressError, match="cannot be sent"):
+    with pytest.raises(EgressError, match="percent-encoded"):
         egress(site).fetch(url(site, "/bytes"), MOST)
 
 
@@ -732,7 +732,7 @@ def test_tls_is_of_the_name_although_the_address_is_asked(secure: Site, certific
 
 
 def test_no_tls_where_it_is_wanted(site: Site) -> None:
-    with pytest.raises(Unreachable, match="No TLS connection"):
+    with pytest.raises(Unreachable, match="The TLS connection"):
         egress(site).fetch(url(site).replace("http:", "https:"), MOST)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]

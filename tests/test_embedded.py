@@ -104,7 +104,7 @@ def test_a_part_of_the_way_is_told_from_its_end() -> None:
     assert motion.distance is not None
     assert motion.distance.value == pytest.approx(162, abs=3)  # half of 150 to 475
     question = "If the red ball rolls right but stops halfway, will it hit the cube?"
-    assert "not to what" in refusal(CannotReadDirection, drawn(False), question)
+    assert "not where to" in refusal(CannotReadDirection, drawn(False), question)
 
 
 def test_several_legs_and_a_second_mover() -> None:

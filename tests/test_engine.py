@@ -19,7 +19,7 @@ BESIDE = rigid(position=(0.0, RADIUS, 5.0))  # out of the way
 
 
 def run(*bodies: RigidShape, frames: int = 49, beside: bool = False) -> WorldRun:
-    """One world; `beside` a second one, as an ensemble has it."""
+    """One world; with `beside`, in an ensemble with a second one."""
     return run_worlds([bodies] * (2 if beside else 1), frames, FPS)[0]
 
 

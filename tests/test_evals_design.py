@@ -107,7 +107,7 @@ def test_a_plan_fixes_the_analysis_and_the_run_says_where_it_departs(tmp_path: P
     with pytest.raises(InvalidRequest, match="needs a primary question"):
         planned(asked_of("never", "always"), 0.024)
     file.write_text("{}")
-    with pytest.raises(InvalidRequest, match="is no plan"):
+    with pytest.raises(InvalidRequest, match="is not a plan"):
         read_plan(file)
 
 

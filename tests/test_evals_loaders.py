@@ -205,8 +205,8 @@ FAULTS: dict[str, tuple[str, str]] = {
     "an address": (json.dumps({**ROW, "image": "http://x/1.png"}), "line 2: `image` must not be an address"),
     "no picture": (json.dumps({**ROW, "image": base64.b64encode(b"no").decode()}), "line 2: the image cannot be used"),
     "unknown column": (json.dumps({**ROW, "image": "1.png", "anwser": "A"}), "column `anwser`: did you mean `answer`"),
-    "no such option": (json.dumps({**ROW, "image": "1.png", "answer": "D"}), "none of the options: 'D'"),
-    "other text": (json.dumps({**ROW, "image": "1.png", "answer": "(A) No"}), r"none of the options: '\(A\) No'"),
+    "no such option": (json.dumps({**ROW, "image": "1.png", "answer": "D"}), "not one of the options: 'D'"),
+    "other text": (json.dumps({**ROW, "image": "1.png", "answer": "(A) No"}), r"not one of the options: '\(A\) No'"),
     "the same id": (json.dumps({**ROW, "image": "1.png", "question": "Other? (A) a (B) b"}), "the id 'q1' stands in"),
     "the same row": (
         json.dumps({**ROW, "id": "q2", "image": "1.png"}),
@@ -217,7 +217,7 @@ FAULTS: dict[str, tuple[str, str]] = {
         r"asks the same as questions.jsonl, line 1 with another answer, \(B\)",
     ),
     "no options": (json.dumps({**ROW, "id": "q2", "image": "1.png", "question": "What?"}), "lists no options"),
-    "half a line": (json.dumps({**ROW, "image": "1.png"})[:30], "line 2: no whole JSON .* was the file written"),
+    "half a line": (json.dumps({**ROW, "image": "1.png"})[:30], "line 2: not complete JSON .* was the file written"),
     "no object": ("[1]", "line 2: must be an object, got list"),
 }
 
@@ -235,7 +235,7 @@ def test_what_cannot_be_asked_is_named_by_its_row_or_left_out(fault: str, tmp_pa
 
 
 def test_files_that_were_not_written_to_their_end_are_named(tmp_path: Path, pictures: Pictures) -> None:
-    for form, message in (("csv", "row 2: has 3 cells for 6 columns"), ("parquet", "no whole Parquet file")):
+    for form, message in (("csv", "row 2: has 3 cells for 6 columns"), ("parquet", "not a complete Parquet file")):
         path = written(tmp_path, form)
         path.write_bytes(path.read_bytes()[: path.stat().st_size // (2 if form == "csv" else 3)])
         if form == "csv":
@@ -245,7 +245,7 @@ def test_files_that_were_not_written_to_their_end_are_named(tmp_path: Path, pict
     scene = tmp_path / "scenes" / "one"
     scene.mkdir(parents=True)
     (scene / "meta.json").write_text('{"question": "Wil')
-    with pytest.raises(InvalidRequest, match=r"one/meta.json: no whole JSON"):
+    with pytest.raises(InvalidRequest, match=r"one/meta.json: not complete JSON"):
         load(str(scene.parent), pictures)
 
 
@@ -267,17 +267,17 @@ def test_a_data_set_of_the_hub_is_downloaded_and_read(tmp_path: Path) -> None:
         )
         assert done.stdout == "['occlusion/0/0']\n", done.stderr
         assert one.downloads() == ["occlusion/train.parquet"], "only what is read"
-    assert "The data set 'someone/nothing' is no folder here, and could not be had from the hub" in unknown.stderr
+    assert "The data set 'someone/nothing' is not a folder, and could not be downloaded" in unknown.stderr
 
 
 def test_a_shard_that_was_cut_off_is_refused_always(tmp_path: Path, pictures: Pictures) -> None:
-    """Of other faults the published layout's rows are left out: of these nobody knows how many are missing."""
+    """Rows of the published layout with other faults are left out: here it is unknown how many are missing."""
     for subset in ("collision", "occlusion"):
         pq.write_table(pa.Table.from_pylist([row_of(subset, 60, 1)]), file_in(tmp_path / subset))
     shard = tmp_path / "collision" / "train.parquet"
     shard.write_bytes(shard.read_bytes()[:-20])
     for skip_faulty in (False, True):
-        with pytest.raises(InvalidRequest, match=r"collision/train.parquet: no whole Parquet file"):
+        with pytest.raises(InvalidRequest, match=r"collision/train.parquet: not a complete Parquet file"):
             load(str(tmp_path), pictures, skip_faulty=skip_faulty)
     with pytest.raises(InvalidRequest, match="has no subset 'physics'"):
         load(str(tmp_path), pictures, subsets=["occlusion", "physics"])

@@ -259,7 +259,7 @@ def test_a_plan_is_asked_and_followed(tmp_path: Path, items: list[Item], mllm: T
     assert "as planned" in done.stdout
     assert len(read_run(tmp_path / "run").observations) == 9
     refused = checked(imported.begin([*planned, "--seed", "4"], tmp_path, environment()).done(), 1)
-    assert "--plan says what is asked: leave --seed out." in refused.stderr
+    assert "The plan already sets --seed: leave that option out." in refused.stderr
     more = ["eval", str(SAMPLE), *own, "--arm", "encounters", "--limit", "3", "--out", str(tmp_path / "run")]
     departed = checked(imported.begin(more, tmp_path, environment()).done()).stdout
     assert "as planned (explored besides: encounters)" in departed
@@ -312,7 +312,7 @@ def test_killed_or_interrupted_no_reply_is_asked_for_twice(
             eventually(lambda: len(mllm.done) == sum(mllm.asked.values()))
 
         def struck(by: signal.Signals, replies: int) -> subprocess.CompletedProcess[str]:
-            """A run that is sent a signal after so many more replies."""
+            """A run that gets a signal after a number of further replies."""
             all_sent()  # also what the run before was lost with
             wanted = len(mllm.done) + replies
             asked = arguments_of(SAMPLE, tmp_path / "struck", *arguments, mllm=mllm)
@@ -332,7 +332,7 @@ def test_killed_or_interrupted_no_reply_is_asked_for_twice(
         mllm.seconds = 0.6  # the signal comes long before the last reply
         told = struck(signal.SIGINT, 3)
         assert told.returncode == 130
-        assert "Interrupted. The same command goes on with it." in told.stderr
+        assert "Interrupted. Run the same command again to resume." in told.stderr
         assert "Traceback" not in told.stderr
         mllm.seconds = 0.0
         evaluated(imported, tmp_path / "struck", *arguments, mllm=mllm)

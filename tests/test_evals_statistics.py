@@ -160,7 +160,7 @@ def test_few_scenes_say_nothing_and_unanimous_ones_little() -> None:
 @pytest.mark.parametrize(("scenes", "share"), [(7, 0.9), (12, 0.8), (25, 0.92), (120, 0.02)])
 @pytest.mark.parametrize("together", [1, 5])
 def test_intervals_hold_where_scenes_are_few_or_nearly_alike(scenes: int, share: float, together: int) -> None:
-    """Also where a scene's replies are all the same: five of them tell no more than one."""
+    """Even if a scene's replies are all the same: five of them say no more than one."""
     trials, held = 60 * SCALE, 0
     for number in range(trials):
         right = (np.random.default_rng(number).random(scenes) < share).astype(float)

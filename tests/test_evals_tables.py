@@ -35,7 +35,7 @@ def summaries(asked: EvalRun, tmp_path_factory: pytest.TempPathFactory) -> Findi
 
 @pytest.mark.parametrize("form", FORMS)
 def test_tables_are_as_they_were(form: str, summaries: Findings) -> None:
-    """A change that is wanted: write what is told here into tests/data/evals."""
+    """A wanted change: write the reported text into tests/data/evals."""
     told = "\n".join(f"{table.title}\n{FORMS[form](table)}" for table in tables(summaries, published=True))
     assert told == (GOLDEN / f"tables.{form}").read_text(encoding="utf-8")
 

@@ -26,7 +26,7 @@ RED, BLUE = (200, 30, 30), (40, 60, 200)
 def drawing(rng: np.random.Generator, bearing: float) -> Image | None:
     """A red ball and a blue block on a floor, which lies at a bearing (radians, 0 to the right) from it.
 
-    None where not both are in the image, or one hides a part of the other.
+    None if not both are in the image, or one hides a part of the other.
     """
     camera = TrueCamera(rng.uniform(15, 45), 0.0, 640 * rng.uniform(0.8, 1.4), rng.uniform(1.0, 2.0))
     middle = camera.on_floor((320 + rng.uniform(-120, 120), 210 + rng.uniform(-60, 60)))

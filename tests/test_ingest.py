@@ -146,7 +146,7 @@ def test_no_decoder_runs_where_requests_are_taken(served: Served) -> None:
 
 
 def sent(served: Served, stack: ExitStack, key: str, body: bytes, size: int) -> socket.socket:
-    """A request with so much of its body."""
+    """A request with a part of its body."""
     one = stack.enter_context(socket.create_connection(served.host_and_port, timeout=30))
     head = f"POST /simulate HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {KEYS[key]}\r\nContent-Type: application/json"
     one.sendall(f"{head}\r\nContent-Length: {size}\r\n\r\n".encode() + body)

@@ -21,7 +21,7 @@ FILE, REPOSITORY = "big-lama.safetensors", "michaelgold/big-lama"
 
 
 def ignore(done: float) -> None:
-    """Nobody listens."""
+    """There is no listener."""
 
 
 @pytest.fixture

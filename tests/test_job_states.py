@@ -67,7 +67,7 @@ class Jobs(RuleBasedStateMachine):
         if same is not None:
             return multiple()
         assert job not in self.known
-        self.deleted.discard(job)  # a key that is free again comes to the same id
+        self.deleted.discard(job)  # a key that is free again gives the same id
         self.known[job] = Known(key, body)
         return job
 

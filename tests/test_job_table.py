@@ -216,7 +216,7 @@ def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_wit
 
 
 def test_results_of_a_deleted_job_lock_nobody_out(database: Database, tmp_path: Path) -> None:
-    """Not even as long as somebody holds the error, whose traceback holds the statement that failed."""
+    """Not even while the error is kept, whose traceback holds the failed statement."""
     take_new_job(database, "job", "me")
     JobTable(database).delete(["job"])
     with pytest.raises(Canceled) as held:

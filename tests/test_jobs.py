@@ -448,7 +448,7 @@ def numbers(events: list[dict[str, Any]]) -> list[int]:
 
 
 def lasting(events: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Without progress, which is told once."""
+    """Without progress, which is reported once."""
     return [event for event in events if "id" in event]
 
 
@@ -745,7 +745,7 @@ def test_one_key_with_many_bodies_at_the_same_time_is_one_of_them(served: Served
 
 @pytest.mark.slow
 def test_a_key_is_free_as_soon_as_its_running_job_is_deleted(served: Served) -> None:
-    """What still ends of the old job tells nobody who waits for the new one."""
+    """The end of the old job does not notify callers who wait for the new one."""
     key = {"Idempotency-Key": new_key()}
     old = served.submit(slow(20, seed=51), **key)
     served.rendering(old["id"])
@@ -781,7 +781,7 @@ def test_a_clip_is_the_same_whether_its_object_was_found_before_or_not(served: S
     # What a mask says is not what is cut from its box.
     body = {**BODY, "image": data_url(picture(33)), "grounding": {"mask": mask}}
     first = served.http.post("/simulate", json=body).json()
-    other = served.http.post("/simulate", json={**body, "seed": 1}).json()  # which this generator does not heed
+    other = served.http.post("/simulate", json={**body, "seed": 1}).json()  # which this generator ignores
     assert other["reused"] == STAGES[:3]
     assert other["frames"] == first["frames"]
     more = served.http.post("/simulate", json={**body, "num_frames": 6}, headers=FRESH).json()
@@ -840,7 +840,7 @@ def test_a_full_queue_takes_no_more(emptied: Served) -> None:
         assert int(response.headers["retry-after"]) >= 1
     with socket.create_connection(emptied.host_and_port, timeout=20) as raw:
         raw.sendall(post(b"x" * 100, length=30_000_000))  # the rest of it is never sent
-        answer = raw.makefile("rb").read()  # to its end: whoever does not read the body closes the connection
+        answer = raw.makefile("rb").read()  # to its end: an unread body would close the connection
     assert answer.startswith(b"HTTP/1.1 503 ")
     assert b"urn:cow:problem:queue-full" in answer
     emptied.http.post(f"/jobs/{jobs[0]['id']}/cancel")

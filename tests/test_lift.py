@@ -221,7 +221,7 @@ class TestLayout:
         assert np.linalg.norm(way) * METRES == pytest.approx(9.81 * t * t / 2, rel=0.05)
 
     def fallen(self, x: float, radii: float | None = None) -> np.ndarray:
-        """How far ahead [K], m, what is let go hangs of a box that is lower in the image."""
+        """How far ahead [K], m, a released object hangs, with a box that is lower in the image."""
         bodies = body((x, 60, x + 40, 100), "sphere"), body((290, 200, 350, 270))
         fit = prior(0.0)
         if radii is not None:  # above the floor, for certain

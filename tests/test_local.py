@@ -525,7 +525,7 @@ def test_an_error_finds_whom_it_belongs_to(toy: LocalModel) -> None:
 
 
 def test_memory_that_runs_out(toy: LocalModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A batch that does not fit is split; a call that does not fit alone is told what to do, and others go on."""
+    """A batch that does not fit is split; one that does not fit alone gets an error with a remedy; others go on."""
 
     def narrow(model: Any, args: Any, given: dict[str, Any]) -> None:
         rows, tokens = given["input_ids"].shape

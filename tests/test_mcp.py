@@ -295,14 +295,12 @@ def test_simulate_over_stdio_returns_pictures_words_and_data(here: tuple[Session
         simulation["image"]["sha256"],
     ):
         assert told in text(result)
-    begun = [
-        told[1:] for told in session.told if told[2] != "queued"
-    ]  # where it waits for its turn, that is told first
+    begun = [told[1:] for told in session.told if told[2] != "queued"]  # a wait for its turn is reported first
     assert begun[0] == (1.0, "grounding")
     assert session.told[-1] == (1.0, 1.0, "succeeded")
     done = [told[0] for told in session.told]
     assert done == sorted(set(done))
-    # Nobody can open an address of a service in this process: the protocol itself brings the video.
+    # Addresses of a service in this process cannot be opened: the protocol itself brings the video.
     assert simulation["video"]["url"].startswith("cow://artifacts/")
     assert simulation["video"]["url"] in text(result)
     [video] = session.portal.call(session.client.read_resource, simulation["video"]["url"]).contents
@@ -353,17 +351,17 @@ def test_a_tool_takes_what_people_know_better(here: tuple[Session, Path]) -> Non
             ("cannot-read-direction", "`direction` [dx, dy]"),
         ),
         ({"image": "nowhere.png"}, ("invalid-request", "image: there is no file", "absolute path")),
-        ({"image": __file__}, ("invalid-request", "is no PNG, JPEG or WebP")),
+        ({"image": __file__}, ("invalid-request", "is not a PNG, JPEG or WebP file")),
         ({"image": "0" * 64}, ("artifact-not-found", "Send the image itself")),
         ({"image": "https://example.org/a.png"}, ("image-url-not-allowed", "COW_ALLOW_IMAGE_URLS")),
         ({"image": "data:image/png;base64,AAAA"}, ("image-type-unsupported", "image")),
         ({"bbox": [1, 2, 3]}, ("invalid-request", "bbox/3: ")),
         ({"bbox": [9, 9, 9, 9]}, ("invalid-request", "bbox: [x0, y0, x1, y1] must have x1 and y1 at least 2 px")),
-        ({"object": "ball"}, ("invalid-request", "give either `bbox` or `point`")),
+        ({"object": "ball"}, ("invalid-request", "give exactly one of `bbox`, `point` and `mask`")),
         ({"motion_kind": "projectile"}, ("invalid-request", "needs a `direction`")),
         ({"frames_count": 1000}, ("invalid-request", "frames_count: ")),
         ({"generator": "nobody"}, ("invalid-request", "generator: There is no generator 'nobody'", "cutout")),
-        ({"bBox": [1, 2, 3, 4]}, ("invalid-request", "bBox: there is no such argument", "bbox")),
+        ({"bBox": [1, 2, 3, 4]}, ("invalid-request", "bBox: is not an argument of this tool", "bbox")),
         ({"question": 7}, ("invalid-request", "question: ")),
     ],
 )
@@ -430,7 +428,7 @@ def test_over_http_the_caller_has_the_key(keyed: str, alice: Session) -> None:
 @pytest.mark.parametrize("image", [str(SCENE), SCENE.as_uri(), "~/image.jpg", "image.jpg", ""])
 def test_over_http_no_file_is_read(alice: Session, image: str) -> None:
     told = failure(alice.call("simulate", image=image, question=MOVES))
-    assert "files of the server's machine are not read" in told
+    assert "this server reads no local files" in told
 
 
 def test_foreign_pages_and_names_are_refused(keyed: str) -> None:
@@ -449,7 +447,7 @@ def test_foreign_pages_and_names_are_refused(keyed: str) -> None:
 
 
 class Door(BaseHTTPRequestHandler):
-    """A server that lets nobody in, and writes down with which keys they came."""
+    """A server that refuses everyone, and records the keys that were sent."""
 
     keys: list[str | None]
 
@@ -486,7 +484,9 @@ def test_callers_from_elsewhere_bring_their_own_key(tmp_path: Path, listening: t
         door.server_close()
     assert keys == [f"Bearer {BOB}"]
     open_to_all = "0.0.0.0" in listening
-    assert open_to_all == ("Whoever reaches 0.0.0.0 can use the COW server behind it" in (tmp_path / "log").read_text())
+    assert open_to_all == (
+        "Anyone who can reach 0.0.0.0 can use the COW server behind it" in (tmp_path / "log").read_text()
+    )
 
 
 class Raw:
@@ -535,7 +535,7 @@ class Raw:
             pass
 
     def ended(self) -> tuple[int, str]:
-        """Exit code and log; nothing else came on standard output, and nobody is left."""
+        """Exit code and log; standard output has nothing else, and no process is left."""
         out, err = self.process.communicate(timeout=30)
         assert all(json.loads(line)["jsonrpc"] == "2.0" for line in out.splitlines())
         with pytest.raises(ProcessLookupError):

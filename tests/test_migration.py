@@ -1,4 +1,4 @@
-"""`cow migrate` makes the tables; what runs later needs no more than to read and write them."""
+"""`cow migrate` creates the tables; servers and workers need only rights to read and write them."""
 
 from __future__ import annotations
 

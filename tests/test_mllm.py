@@ -283,7 +283,7 @@ def test_one_failure_is_got_over(script, code, mllm: MllmServer, make) -> None:
         (say.shaped({"choices": []}), "mllm-unavailable", "could not be read"),
         (say.slow(3), "mllm-unavailable", "in time"),
         (say.finished("", "content_filter"), "mllm-bad-reply", "content filter"),
-        ("no idea", "mllm-bad-reply", "gave no reply that can be used"),
+        ("no idea", "mllm-bad-reply", "gave no usable reply"),
         ("", "mllm-bad-reply", "gave no reply"),
     ],
     ids=lambda value: None,
@@ -558,7 +558,7 @@ def test_a_served_name_finds_its_manifest(served: str, manifest: str) -> None:
     ("name", "base_url", "provider"),
     [
         ("claude-opus-4-6", None, "anthropic"),
-        ("claude-opus-4-6", "http://127.0.0.1:8001/v1", None),  # served by one's own server, whoever made the model
+        ("claude-opus-4-6", "http://127.0.0.1:8001/v1", None),  # served by one's own server
         ("anthropic:claude-opus-4-6", "http://127.0.0.1:8001", "anthropic"),
     ],
 )

@@ -66,14 +66,14 @@ SERVED = {
     "anthropic/claude-opus-4.6": "claude-opus-4-6",
     "claude-haiku-4-5-20251001": "claude-haiku-4-5",
 }
-# They draw, speak or hear, or belong to families of which nothing is known here.
+# They draw, speak or hear, or belong to unknown families.
 STRANGERS = (
     "gemini-2.5-flash-image", "gemini-2.5-flash-preview-tts", "gemini-3-pro-image", "gemini-3.1-flash-lite-image",
     "gpt-5-codex", "gpt-4.1", "gpt-oss-20b", "claude-3-5-sonnet-20241022", "qwen3:8b", "qwen2.5-coder:7b",
     "Qwen/Qwen3-8B", "Qwen/Qwen2-VL-7B-Instruct", "lmms-lab/llava-onevision-qwen2-7b-ov",
 )  # fmt: skip
 
-# Sizes as in the configurations beside the weights: those of the language model, then what differs in vision.
+# Sizes as in the configurations of the weights: those of the language model, then what differs in vision.
 TEXT = ("hidden_size", "num_hidden_layers", "num_attention_heads", "num_key_value_heads", "intermediate_size")
 SMALL_VIT = {"depth": 24, "hidden_size": 1024, "intermediate_size": 4096, "deepstack_visual_indexes": [5, 11, 17]}
 VIT = {"depth": 27, "hidden_size": 1152, "intermediate_size": 4304, "deepstack_visual_indexes": [8, 16, 24]}

@@ -1,4 +1,4 @@
-"""What a multimodal LLM may say besides: sizes, supports, depth and speed as priors, and boxes of what is around."""
+"""Optional parts of an MLLM's reply: sizes, supports, depth and speed as priors, and boxes of other objects."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def test_callers_are_sent_to_the_store(served, objects, keys):
     head = served.http.head(video["url"])
     assert (head.status_code, head.headers["content-length"]) == (200, str(len(whole)))
     assert served.http.get(video["url"], headers={"If-None-Match": f'"{video["sha256"]}"'}).status_code == 304
-    # Whose it is comes first: nobody else is sent anywhere.
+    # Ownership is checked first: other callers are not redirected.
     others = {"Authorization": f"Bearer {keys['bob']}"}
     problem(served.http.get(video["url"], headers=others), 404, "artifact-not-found")
 
@@ -149,12 +149,12 @@ def test_who_waits_for_a_job_is_told_that_the_store_is_away(served, objects):
         finally:
             objects.start()
     problem(told, 503, "storage-unavailable")
-    assert "The job goes on" in told.json()["detail"]
+    assert "The job continues" in told.json()["detail"]
     assert served.ended(told.headers["location"].removeprefix("/jobs/"))["status"] == "succeeded"
 
 
 def test_another_server_passes_the_bytes_on(served, objects, tmp_path):
-    """It has nothing in common with the first one but the store, and is told not to redirect."""
+    """It shares only the store with the first one, and is set not to redirect."""
     video = simulated(served, {**WITH_VIDEO, "seed": 3})["video"]
     settings = {"COW_ARTIFACTS": objects.url, "COW_ARTIFACTS_REDIRECT": "false", **objects.environment}
     with Served(tmp_path, **settings) as other:

@@ -42,7 +42,7 @@ def events(touches=None, occludes=None, covered=None, count=COUNT, bodies=4, sta
 
 
 def share(value: float, time: float = 1.0) -> np.ndarray:
-    """Times of which a share is finite, spread evenly over the draws."""
+    """Times, a share of them finite, spread evenly over the draws."""
     return np.where(np.argsort(np.argsort(np.modf(np.arange(COUNT) * 0.618)[0])) < value * COUNT, time, NEVER)
 
 
@@ -174,7 +174,7 @@ class TestDraws:
 
 @pytest.mark.parametrize("agreeing", [0, 5, 12, 15, 16, 25, 34, 35, 36, 44, 45, 46, 50])
 def test_worlds_left_out_would_rarely_have_changed_the_verdict(agreeing: int) -> None:
-    """Of 50 worlds of which so many agree, some are run: how often does a stop say otherwise than all of them?"""
+    """Some of 50 worlds are run: how often does an early stop give another answer than all of them?"""
     size, tries, random = 50, 400, np.random.default_rng(agreeing)
     changed_sure = changed_robust = 0
     whole = agreeing / size

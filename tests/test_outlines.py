@@ -136,7 +136,7 @@ def test_a_name_of_what_is_not_there_means_nothing(noun: str) -> None:
 
 
 def cup(reach: int) -> SeenBody:
-    """A vessel 60 px wide and 80 px high with a handle that reaches so many px to the right."""
+    """A vessel 60 px wide and 80 px high with a handle of a given length in px on the right."""
     mask = np.zeros((200, 300), bool)
     mask[60:140, 100:160] = True
     mask[80:120, 160 : 160 + reach] = True

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @dataclass(frozen=True)
 class Caller:
-    """Somebody with a key."""
+    """A caller with a key."""
 
     http: httpx.Client
 

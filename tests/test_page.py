@@ -78,7 +78,7 @@ def test_everything_is_corrected_by_touch(server: Server, windows: Windows) -> N
     touch_in_picture(page, (way, (way[0], way[1] + 40)))
     second = result(page, before=first)
     assert path(page) != at_first
-    expect(page.get_by_text("The path is yours.")).to_be_attached()
+    expect(page.get_by_text("You changed the path.")).to_be_attached()
 
     touch_in_picture(page, (arrow_tip(page), (101, 10)))
     third = result(page, before=second)
@@ -118,7 +118,7 @@ def test_what_is_not_understood_is_told_with_questions_that_would_be(server: Ser
     notice = page.locator(".notice.problem")
     expect(notice).to_contain_text("it reads English")
     expect(notice).not_to_contain_text("grounding")
-    instead = page.get_by_role("list", name="Questions that would be understood").get_by_role("button")
+    instead = page.get_by_role("list", name="Suggested questions").get_by_role("button")
     expect(instead.first).to_contain_text("If the ")
     instead.first.click()
     result(page)

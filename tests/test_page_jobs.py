@@ -46,7 +46,7 @@ def test_a_link_to_a_job_opens_the_same_view(served: Served, windows: Windows, w
         assert said(page) == job["result"]["answer"] == "No"
         assert page.locator("#question").input_value() == QUESTION
         if width == NARROW:
-            page.get_by_text("What was read, to correct").click()
+            page.get_by_text("Correct what was read").click()
         expect(page.get_by_label("Name of object 1")).to_have_value("blue cube")
         assert arrow_tip(page)[0] < 60
         assert_fits(page)
@@ -89,7 +89,7 @@ def test_the_list_of_jobs(served: Served, windows: Windows) -> None:
     page = windows.open(address(served))
     page.get_by_role("link", name="Jobs").click()
     rows = page.locator(".job")
-    expect(rows.filter(has_text="unicorn").locator(".warning")).to_contain_text("Draw a box around what moves")
+    expect(rows.filter(has_text="unicorn").locator(".warning")).to_contain_text("Draw a box around the moving object")
     assert shown_pictures(page, ".job .thumb img") >= 2
 
     page.get_by_label("Status").select_option("failed")

@@ -1,4 +1,4 @@
-"""The world that moves while somebody drags: the page's physics against the server's, and what a drag shows."""
+"""The world that moves while you drag: the page's physics against the server's, and what a drag shows."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_worlds_are_told_only_where_they_are_asked_for_and_can_be_aimed(server: 
 def foretold(page: Page) -> str:
     """What the worlds of the page say, once all have."""
     words = page.locator(".foretold b")
-    expect(words).to_contain_text("of 50 worlds")
+    expect(words).to_contain_text("of 50 simulated versions")
     return words.inner_text()
 
 
@@ -157,14 +157,14 @@ def test_a_page_that_was_passed_on_computes_without_a_network(server: Server, wi
     file.write_bytes(httpx.get(f"{server.address}/jobs/{job['id']}/download?format=page").content)
     page = windows.open(file.as_uri(), offline=True)
     told = page.get_by_role("status")
-    expect(told).to_have_text("Yes: 50 of 50 worlds")
+    expect(told).to_have_text("Yes: 50 of 50 simulated versions")
     tip = page.get_by_role("button").bounding_box()
     assert tip is not None
     x, y = tip["x"] + tip["width"] / 2, tip["y"] + tip["height"] / 2
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x - 40, y - 200, steps=5)
-    expect(told).to_have_text("No: 50 of 50 worlds")
+    expect(told).to_have_text("No: 50 of 50 simulated versions")
     page.mouse.up()
 
 

@@ -94,7 +94,7 @@ def test_the_pointer_lights_what_is_under_it(seen: Seen) -> None:
 def test_a_click_takes_it_and_another_one_what_is_within(seen: Seen) -> None:
     seen.page.locator("#question").fill("If the red ball moves to the left, will it hit the blue cube?")
     seen.page.mouse.click(*seen.at(CUBE))
-    expect(seen.page.get_by_text("Click again for another of the 2 things")).to_be_visible()
+    expect(seen.page.get_by_text("Click again for another of the 2 objects")).to_be_visible()
     whole = seen.request["grounding"]["mask"]
     seen.page.mouse.click(*seen.at(CUBE))
     expect(seen.page.locator("rect.mover")).to_have_attribute("y", "69")
@@ -137,7 +137,7 @@ def test_another_object_is_clicked_and_named(seen: Seen) -> None:
 
 
 def test_what_the_question_names_is_shown_and_taken(seen: Seen) -> None:
-    chips = seen.page.get_by_role("list", name="What was found, to take as what moves").get_by_role("button")
+    chips = seen.page.get_by_role("list", name="Objects found: choose the moving one").get_by_role("button")
     seen.page.locator("#question").press_sequentially(QUESTION, delay=5)
     expect(chips).to_have_text(["red ball", "blue cube"])
     assert seen.asked("look", "question") == [QUESTION]

@@ -49,11 +49,11 @@ def test_questions_and_names_are_text(server: Server, windows: Windows, text: st
     page = windows.open(f"{server.address}/?job={made['id']}", NARROW)
     title = page.title()
     assert result(page) == made["id"]
-    page.get_by_text("What was read, to correct").click()
+    page.get_by_text("Correct what was read").click()
     field = page.locator("#question")
     assert field.input_value() == text
     assert field.evaluate("field => getComputedStyle(field).direction") == ("rtl" if "ذ" in text else "ltr")
-    expect(page.get_by_label("Name of what moves")).to_have_value(name)
+    expect(page.get_by_label("Name of the moving object")).to_have_value(name)
     expect(page.locator("text.name.mover")).to_have_text(name if len(name) <= 36 else f"{name[:35]}…")
     no_markup(page, title)
     page.get_by_role("link", name="Jobs").click()

@@ -1,4 +1,4 @@
-"""What is put somewhere before another motion: where it stands then, what the motion comes to, and how it is drawn."""
+"""What is put somewhere before another motion: its new place, the result of the motion, and how it is drawn."""
 
 from __future__ import annotations
 
@@ -275,7 +275,7 @@ SIZES = st.floats(0.05, 0.4)
 def test_what_stays_where_it_is_put_begins_at_rest(
     shape: Any, half: float, tall: float, target: Any, width: float, height: float, relation: Any
 ) -> None:
-    """No part of it lies in another thing, so that it gains no energy when all are let go."""
+    """No part of it lies in another thing, so that it gains no energy when all are released."""
     tall = half if shape == "sphere" else tall
     mover = RigidShape("sphere", 0.15, 0.15, 0.15, (-3.0, 0.15, 3.0))
     under = RigidShape(target, width, width, height, (0.0, height, 3.0))

@@ -1,4 +1,4 @@
-"""What is put into, onto, between and beside things, on drawn scenes: what becomes of it, and how it is shown."""
+"""Objects put into, onto, between and next to others, on drawn scenes: the results, and how they are shown."""
 
 from __future__ import annotations
 

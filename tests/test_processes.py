@@ -108,7 +108,7 @@ def test_a_server_shows_its_workers_and_queues(served: Served) -> None:
 def test_jobs_of_another_version_are_told_of(served: Served) -> None:
     """As after a change of the workflow version with jobs in the queue."""
     *others, waits = (served.submit(slow(seconds, seed=4))["id"] for seconds in (20, 20, 0.1))
-    served.rendering(others[0])  # the second one is taken beside it, the third stays in the queue
+    served.rendering(others[0])  # the second one runs at the same time, the third stays in the queue
 
     def set_version(version: str) -> None:
         with sqlite3.connect(served.data / "jobs.sqlite3") as database:
@@ -167,7 +167,7 @@ def test_only_administrators_are_told_where_processes_are(tmp_path: Path) -> Non
 
 
 def test_an_administrator_has_a_key() -> None:
-    with pytest.raises(ValidationError, match="'bob' is no name of COW_API_KEYS"):
+    with pytest.raises(ValidationError, match="'bob' is not a name in COW_API_KEYS"):
         Settings(api_keys={"alice": hash_of("cow_alice")}, admin_keys=("bob",))
 
 

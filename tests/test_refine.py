@@ -183,7 +183,7 @@ class Spread(FlowMatchEulerDiscreteScheduler):
 
 @torch.no_grad()
 def test_without_a_coarse_clip_it_is_diffusers_own_sampling() -> None:
-    """Wan2.2-TI2V: the first latent frame is the picture's and has no noise, and each token is told how noisy it is."""
+    """Wan2.2-TI2V: the first latent frame is the picture's and has no noise, and each token carries its noise level."""
     pipeline = make_tiny(MODELS["tiny-refine"].architecture)
     width, height, frames, steps = 96, 64, 9, 3
     picture = np.random.default_rng(0).integers(0, 255, (height, width, 3), np.uint8)

@@ -326,7 +326,7 @@ SAID = {  # what people also call them
 }  # fmt: skip
 
 
-# On a light floor silver and grey, darker and of its hue, cannot be told from a shadow.
+# On a light floor silver and grey, darker and of its hue, cannot be distinguished from a shadow.
 @pytest.mark.parametrize(
     ("name", "ground"),
     [(name, ground) for name in sorted(CSS) for ground in (70, 225) if ground < 200 or name not in ("silver", "gray")],

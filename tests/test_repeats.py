@@ -135,7 +135,7 @@ def test_repeats_have_the_mean_and_the_variance_of_the_model(
     fourth = variance * (1 - 3 * variance)  # the fourth central moment of a draw of 0 or 1
     assert abs(statistics.mean(drawn) - rate) < 3 * (variance / REPEATS) ** 0.5
     assert abs(statistics.variance(drawn) - variance) < 3 * ((fourth - variance**2) / REPEATS) ** 0.5
-    # One request imagined, whoever was first; the others took that, and each drew its own answer all the same. Of quick
+    # One request imagined, the first one; the others used that, and each still drew its own answer. Of quick
     # stages those that run at the same moment do not wait for each other.
     reused = Counter(stage for each in found for stage in each["reused"])
     assert reused.keys() == set(SIMULATED if imagine == "always" else [])
@@ -265,7 +265,7 @@ def test_what_the_gate_saw_and_what_it_cost_is_shown_everywhere(
              for n, each in enumerate((found, reused))]  # fmt: skip
     (tmp_path / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert print_summary(tmp_path) == 0
-    said = "asked of the MLLM: 6 calls, 600 tokens in, 60 out; without reuse 7 calls, 700 tokens in, 70 out"
+    said = "multimodal LLM: 6 calls, 600 tokens in, 60 out; without reuse 7 calls, 700 tokens in, 70 out"
     assert said in capsys.readouterr().out
 
 
@@ -323,7 +323,7 @@ class _Crash(BaseException):
 def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
     ends_in: Stage, drawn_again: bool, service: Service, mllm: MllmServer, tmp_path: Path
 ) -> None:
-    """What was stored before the crash is taken; only an answer that nobody ever had is drawn again."""
+    """What was stored before the crash is taken; only an answer that was never delivered is drawn again."""
     answers(mllm, list("ABA"), looking="B")
     database = Database(Settings(data_dir=tmp_path))
     database.create_tables()

@@ -55,7 +55,7 @@ TO = {"grounding": {"object": "red ball", "bbox": BALL}, "objects": [BLOCKS, {"o
 STEPS = [{"direction": [0, 1], "distance": 30}, {"direction": [1, 0]}]
 OTHER = {"object": "blue block", "direction": [0, 1]}
 ASKED = {"relation": "touches", "target": "blue block"}
-# Fields with what is given beside them and two of their values.
+# Fields, other fields that they need, and two values of each.
 CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "image": ({}, BASE["image"], sent(block(PICTURE, (100, 100, 120, 131), GREEN))),
     "question": ({}, BASE["question"], "If the red ball rolls to the left, will it hit the blue block?"),

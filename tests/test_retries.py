@@ -1,4 +1,4 @@
-"""Callers are told of a store that is away; jobs wait for it."""
+"""While a store is down, callers get an error and jobs wait."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_who_waits_for_a_job_is_told_of_a_store_that_is_away(tmp_path: Path, mon
         path.unlink()
     folder.rmdir()
     folder.write_text("in its place")
-    with pytest.raises(StorageUnavailable, match=r"cannot be used .* The job goes on when that is over"):
+    with pytest.raises(StorageUnavailable, match=r"cannot be used .* The job continues when that is fixed"):
         check.check()
     folder.unlink()
     check.check()

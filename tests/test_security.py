@@ -46,7 +46,7 @@ UNKNOWN = [
 
 
 def app_of(tmp_path: Path, **settings: object) -> FastAPI:
-    """An app whose engine does not run: what is asked here needs no job."""
+    """An app whose engine does not run: the requests here need no job."""
     return create_app(JobEngine(Service(Settings(data_dir=tmp_path / "data", **settings))))
 
 
@@ -168,7 +168,7 @@ def test_cow_keys_new(monkeypatch: pytest.MonkeyPatch) -> None:
     assert key_owner(key, load_settings().api_keys) == "alice"
     assert set(load_settings().api_keys) == {"alice", "bob"}
     assert CliRunner().invoke(cow, ["keys", "new", "bob"]).exit_code == 1
-    assert "no name for a key" in CliRunner().invoke(cow, ["keys", "new", "a b"]).output
+    assert "cannot be the name of a key" in CliRunner().invoke(cow, ["keys", "new", "a b"]).output
 
 
 @pytest.mark.parametrize(
@@ -253,7 +253,7 @@ def test_what_refused_requests_use_counts(tmp_path: Path, setting: str, per_minu
 
     (first, refused), of_bob = asyncio.run(run())
     assert [code(first), code(refused), code(of_bob)] == ["malformed-body", "rate-limited", "malformed-body"]
-    assert f"takes {unit} a minute" in refused.json()["detail"]
+    assert f"allows {unit} per minute" in refused.json()["detail"]
     assert int(refused.headers["retry-after"]) >= 1
 
 

@@ -25,7 +25,7 @@ HASHES = {name: hash_of(key) for name, key in KEYS.items()}
 
 
 class Caller:
-    """Somebody with a key."""
+    """A caller with a key."""
 
     def __init__(self, served: Served, key: str) -> None:
         headers = {"Authorization": f"Bearer {key}"}

@@ -36,7 +36,7 @@ app(["serve"])
 
 
 def bad_starts(folder: Path, *starts: str, **settings: str) -> Served:
-    """A server whose first worker processes start badly: each "dies", or takes so many seconds more."""
+    """A server whose first worker processes start badly: each "dies", or takes a number of seconds longer."""
     (folder / "site").mkdir()
     (folder / "site" / "sitecustomize.py").write_text(AT_START)
     (folder / "starts").write_text("\n".join(starts))
@@ -92,5 +92,5 @@ def test_a_second_worker_that_cannot_start_is_tried_more_and_more_rarely(tmp_pat
         (tmp_path / "starts").write_text("dies\n" * 1000)
         both[1].kill()
         served.http.post("/simulate", json=BODY).raise_for_status()  # by the first
-        eventually(lambda: re.search("3 were started in vain. Another one is started 1 s later", served.log()))
+        eventually(lambda: re.search("3 starts have failed. Another one is started 1 s later", served.log()))
         assert served.http.get("/readyz").is_success

@@ -57,7 +57,7 @@ def step(
 
 
 def stored(store: StoredStep, key: StageKey, compute: Callable[[], StageResult[Any]]) -> tuple[StageResult[Any], bool]:
-    """What a job comes to that has this stage alone."""
+    """The result of a job that has only this stage."""
     found = store("motion", key, compute)
     store.flush()
     return found

@@ -16,7 +16,7 @@ CODE = [cell for cell in TOUR["cells"] if cell["cell_type"] == "code"]
 
 
 def shown(source: str, namespace: dict[str, Any]) -> Any:
-    """Runs a cell; what its last line comes to, where that is an expression."""
+    """Runs a cell; returns the value of its last line, if that is an expression."""
     cell = ast.parse(source)
     last = ast.Expression(cell.body.pop().value) if isinstance(cell.body[-1], ast.Expr) else None  # type: ignore[attr-defined]
     exec(compile(cell, "cell", "exec"), namespace)

@@ -125,7 +125,7 @@ class TestWhatHappens:
         assert (told.outcome.probability, told.outcome.sure) == (None, False)
 
     def test_futures_are_worlds_of_the_ensemble(self) -> None:
-        """Where all of them are told, the band is made of them."""
+        """If all of them are listed, they make up the band."""
         told = simulated(scene(BESIDE), [BESIDE], ensemble=8)
         is_sane(told)
         futures = np.array(told.path.futures)

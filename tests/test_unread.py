@@ -19,7 +19,7 @@ from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN = (200, 30, 30), (50, 80, 200), (50, 150, 50)
 
-# Words that no rule reads, in the part that asks or moves; of the second group, beside it.
+# Words that no rule reads, in the clause that asks or moves; the second group outside of it.
 TURNING = """
 If the ball rolls anywhere but left, does it hit the mug? | anywhere
 If the ball does not roll left but hops, does it hit the mug? | does not

@@ -426,7 +426,7 @@ def test_offloaded_parts_compute_the_same(offload: str, options: dict[str, Any],
 
 
 def test_weights_are_pinned_one_by_one(monkeypatch: pytest.MonkeyPatch):
-    """Pinned memory needs a GPU, so copies stand for it: each is in its place before the next one is made."""
+    """Pinned memory needs a GPU, so copies stand for it: each one is complete before the next one is made."""
     block: Any = toy().transformer.blocks[0]
     weights, before = list(block.parameters()), [weight.clone() for weight in block.parameters()]
     pinned: list[Tensor] = []

@@ -113,7 +113,7 @@ def test_a_profile_names_what_was_chosen(monkeypatch: pytest.MonkeyPatch, caplog
 
 
 def test_the_next_start_chooses_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the second timing would say; another set of backends, or a damaged file, is timed anew."""
+    """Whatever the second timing would say; another set of backends, or a damaged file, is timed again."""
     kept, timed = tmp_path / "data" / "attention.json", list[tuple[str, ...]]()
 
     def time_them(names: tuple[str, ...], *_: object) -> tuple[TimedBackend, ...]:

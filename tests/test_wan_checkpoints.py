@@ -251,7 +251,7 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
     ("config", "said"),
     [
         ("{", "config.json cannot be read"),
-        ("[]", "config.json is no JSON object"),
+        ("[]", "config.json is not a JSON object"),
         (
             json.dumps(ARCHITECTURE | {"_class_name": "WanModel", "num_heads": 0}),
             "does not make a Wan transformer: ZeroDivisionError",

@@ -238,7 +238,7 @@ def test_running_out_of_memory(toys: Service, monkeypatch: pytest.MonkeyPatch) -
     assert caught.value.code == "generator-out-of-memory"
     assert caught.value.__cause__ is None  # no traceback that holds the tensors
     assert pictures(simulate(toys, video=False)) == before
-    assert calls["embed_image"] == 1  # what was kept had been let go
+    assert calls["embed_image"] == 1  # the cached value had been released
 
 
 def test_a_gpu_that_fails(toys: Service) -> None:

@@ -91,7 +91,7 @@ def test_a_caller_who_goes_away_ends_the_work(tmp_path: Path) -> None:
             return {"type": "http.disconnect"}
 
         async def send(message: dict[str, Any]) -> None:
-            """Nobody is there to hear."""
+            """There is no listener."""
 
         scope = {
             "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "path": "/simulate",
@@ -119,7 +119,7 @@ def test_the_tracks_of_a_simulation_as_files(simulated: Path) -> None:
     for suffix in ("pth", "npy"):
         exported = cow(simulated, "tracks", "out/simulation.json", "--out", f"tracks.{suffix}")
         assert exported.returncode == 0, exported.stderr
-        assert "5 tracks of what moves, 6 of what stays and 8 anchors over 81 frames" in exported.stdout
+        assert "5 tracks of moving objects, 6 of still ones and 8 of the background over 81 frames" in exported.stdout
     simulation = Simulation.model_validate_json((simulated / "out" / "simulation.json").read_bytes())
     path, anchors = simulation.trajectory.path, simulation.trajectory.anchors
     points = np.load(simulated / "tracks.npy")[0]
@@ -133,7 +133,7 @@ def test_the_tracks_of_a_simulation_as_files(simulated: Path) -> None:
     [
         (("image.jpg", "--out", "a.npz"), "image.jpg is not a simulation"),
         (("out/simulation.json", "--out", "a.csv"), "suffix '.csv'"),
-        (("out/simulation.json", "--out", "absent/a.npz"), "cannot be written"),
+        (("out/simulation.json", "--out", "absent/a.npz"), "Cannot write to"),
     ],
 )
 def test_what_cannot_be_done_is_said(simulated: Path, arguments: tuple[str, ...], said: str) -> None:

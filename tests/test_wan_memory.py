@@ -91,7 +91,7 @@ def test_float8_is_kept_only_where_there_is_some(
     monkeypatch.setattr(memory, "detect_capabilities", lambda device: None)
     monkeypatch.setattr(memory, "refusals", lambda wanted, machine: ())
     monkeypatch.setattr(memory, "_room", lambda device: 10**12)
-    with pytest.raises(GeneratorUnavailable, match=r"'small-float8': .*keeps the float8 .* has some.*COW_CHECKPOINTS"):
+    with pytest.raises(GeneratorUnavailable, match=r"'small-float8': .*needs a checkpoint .* float8.*COW_CHECKPOINTS"):
         check_machine(ATI, "small-float8", here(checkpoint), GPU)
     monkeypatch.setattr(memory, "_room", lambda device: 20_000)
     with pytest.raises(GeneratorUnavailable) as caught:

@@ -333,7 +333,7 @@ def test_what_is_reckoned_grows_with_the_clip() -> None:
 def test_the_plan_says_what_would_be_run_and_runs_nothing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], model: str
 ) -> None:
-    monkeypatch.setattr(wan_models, "build", None)  # whoever builds a model fails
+    monkeypatch.setattr(wan_models, "build", None)  # building a model fails
     monkeypatch.setattr(wan_speed, "choose_device", lambda name, unavailable: CPU)
     monkeypatch.setattr(sys, "argv", ["wan_speed.py", "--model", model, "--plan", "--budget", "60"])
     assert wan_speed.main() == 0

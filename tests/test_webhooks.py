@@ -1,4 +1,4 @@
-"""Webhooks: signed as Standard Webhooks says, tried again until heard, and never sent to where nobody may send."""
+"""Webhooks: signed as Standard Webhooks says, repeated until they succeed, and never sent to forbidden addresses."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_an_end_is_told_once_and_signed(
     data = Job.model_validate(told["data"])
     assert (data.id, data.status, data.result) == (job, status, None)
     assert (data.problem is None) == (status == "succeeded")
-    # Whoever asks for the job from there gets it as it ended.
+    # A receiver that asks for the job gets it as it ended.
     assert message.job is not None
     asked = message.job.json()
     assert (asked["status"], asked["finished_at"], asked["problem"]) == (

@@ -405,9 +405,9 @@ def test_a_spoilt_record_is_told_and_no_path_in_it_is_followed(hub: Hub, folder:
     good = record.read_text()
     for spoilt in ("", "{}", good.replace("vae/", "../"), good.replace('"version": 1', '"version": 2')):
         record.write_text(spoilt)
-        with pytest.raises(WeightsUnavailable, match=r"acme--toy/cow\.lock\.json, is spoilt: delete it"):
+        with pytest.raises(WeightsUnavailable, match=r"acme--toy/cow\.lock\.json, is damaged: delete it"):
             check(SOURCE, folder)
-        assert "is spoilt" in refusal(hub, folder)
+        assert "is damaged" in refusal(hub, folder)
         assert not ready(manifest(SOURCE), folder)
 
 
@@ -512,14 +512,14 @@ def test_names_and_revisions_that_cannot_be_pulled(toy: Callable[..., tuple[int,
         assert toy(command, "cutout") == (0, "cutout needs no weights.\n")
         code, told = toy(command, "dream")
         assert code == 1
-        assert "There is no model 'dream'. With weights to download there are:" in told
+        assert "There is no model 'dream'. Models with weights to download:" in told
         assert "toy" in told
     code, told = toy("pull", "toy", "--revision", "encoder=main")
     assert code == 1
     assert "'toy' has no part 'encoder'. Its parts: model, vae, other." in told
     code, told = toy("pull", "toy", "--revision", "main", "--revision", "vae=v1")
     assert code == 1
-    assert "Parts of 'acme/toy' share its folder" in told
+    assert "All parts from 'acme/toy' share a folder" in told
     assert toy("--json", "check", "toy")[0] == 2
 
 

@@ -25,7 +25,7 @@ def save_lively(network: Any, folder: Path) -> None:
 
 
 def make_sam(folder: Path) -> None:
-    """As it is published: a model for videos, of which the part for images is used."""
+    """As it is published: a model for videos; only its part for images is used."""
     hiera = Sam2HieraDetConfig(
         hidden_size=8, image_size=[SIDE, SIDE], embed_dim_per_stage=[8, 16, 32, 64], blocks_per_stage=[1, 1, 2, 1],
         num_attention_heads_per_stage=[1, 1, 2, 2], window_size_per_stage=[4, 4, 4, 4], global_attention_blocks=[3],

@@ -44,7 +44,7 @@ class TruthMllm:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def reply(self, body: dict[str, Any]) -> tuple[str, str]:
-        """What is asked, as a key, and the reply."""
+        """The question, as a key, and the reply."""
         content = body["messages"][-1]["content"]
         text = "".join(part["text"] for part in content if part["type"] == "text")
         pictures = [part["image_url"]["url"] for part in content if part["type"] == "image_url"]
@@ -83,7 +83,7 @@ class _Handler(BaseHTTPRequestHandler):
         time.sleep(self.mllm.seconds)
         choice = {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text}}
         head = {"id": "x", "object": "chat.completion", "created": 0, "model": body["model"]}
-        sent = math.inf  # where nobody is there any more
+        sent = math.inf  # if the caller has left
         with suppress(OSError):
             self.send(200, {**head, "choices": [choice], "usage": TOKENS})
             sent = time.monotonic()

@@ -45,7 +45,7 @@ def items(path: Path = SEEN) -> list[dict[str, Any]]:
 
 
 def verdicts(service: Service, path: Path = SEEN, part: slice = slice(None)) -> Iterator[Verdict]:
-    """What each item comes to."""
+    """The result of each item."""
     for item in items(path)[part]:
         yield verdict(service, item)
 
@@ -104,7 +104,7 @@ def _reads_as(answer: Answer, expect: dict[str, Any]) -> bool:
 
 
 def _asks(asked: Asked, wanted: dict[str, Any], mover: str) -> bool:
-    """Whether what was read is what is asked: "the mug is covered by the ball" is "the ball covers the mug"."""
+    """Whether the question was read correctly: "the mug is covered by the ball" is "the ball covers the mug"."""
     relation, subject, target = wanted["relation"], wanted["subject"], wanted["target"]
     if relation in ("covers", "covered") and asked.relation != relation:
         relation, subject, target = asked.relation, target, subject or mover

@@ -1,4 +1,4 @@
-"""A generator that takes its time and writes down every clip that it begins: what a crash must not make it do again.
+"""A slow generator that records every clip it begins, to show that a crash does not repeat work.
 
 The folder of this file on PYTHONPATH registers it as `slow`, exactly as an installed package would.
 """

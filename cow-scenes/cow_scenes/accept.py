@@ -130,7 +130,7 @@ def largest_hidden(draft: Draft, run: Run, camera: Camera) -> float:
 
 
 def answer_of(draft: Draft, run: Run, camera: Camera, form: Form) -> tuple[int | None, float | None]:
-    """The option's index, None if unclear; and the hidden share if that is what is asked."""
+    """The option's index, None if unclear; and the hidden share if the question is about that."""
     answer = form.judge(draft, run)
     if answer != -1:
         return answer, None

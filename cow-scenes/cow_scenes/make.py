@@ -1,4 +1,4 @@
-"""Makes a set, or goes on with one that was cut off."""
+"""Makes a set, or resumes an interrupted one."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Spawned processes that make items; one that dies costs its item only, which is tried once more."""
+"""Spawned processes that make items; if one dies, only its item is lost, and is tried once more."""
 
 import multiprocessing
 import os
@@ -66,7 +66,7 @@ def serve(pipe: Connection, out: Path, settings: Settings, threads: int) -> None
             os._exit(3)
         try:
             make_item(out, key, settings, threads)
-        except Exception as error:  # noqa: BLE001 - whatever an item raises is told, the process goes on
+        except Exception as error:  # noqa: BLE001 - any error of an item is reported, and the process goes on
             pipe.send(f"{type(error).__name__}: {error}")
         else:
             pipe.send(None)

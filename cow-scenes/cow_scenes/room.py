@@ -1,4 +1,4 @@
-"""The room around the objects: what of it is drawn at random, and its depth. No picture is drawn here."""
+"""The room around the objects: its random parts and its depth. No picture is drawn here."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""How a set is made: everything that its bytes depend on, and what they do not."""
+"""How a set is made: settings that its bytes depend on, and settings that they do not."""
 
 from dataclasses import asdict, dataclass
 from importlib.metadata import version

@@ -49,7 +49,7 @@ def row_of(out: Path, key: ItemKey) -> dict:
 
 
 def write_shards(out: Path, settings: Settings) -> None:
-    """Write all shards anew, each under a temporary name first; shards of an earlier, smaller set are removed."""
+    """Write all shards again, each under a temporary name first; shards of an earlier, smaller set are removed."""
     by_subset: dict[str, list[ItemKey]] = {}
     for key in settings.plan():
         by_subset.setdefault(key.subset, []).append(key)

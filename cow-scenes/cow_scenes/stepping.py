@@ -47,14 +47,14 @@ class ContactLog:
         return tuple(self.contact(*pair, record) for pair, record in self.found)
 
     def contact(self, a: str, b: str, record: dict) -> Contact:
-        """One touch as it is told."""
+        """One touch as it is recorded."""
         x, y, z = (float(c) for c in record["point"])
         step = record["step"]
         return Contact(a, b, step / self.rate, (x, y, z), float(record["impulse"]), -(-step // self.substeps))
 
 
 def carried(world: World, time: float) -> list[float] | None:
-    """Where the hand holds the mover at a time; None once it is let go."""
+    """Where the hand holds the mover at a time; None once it is released."""
     if world.carry_to is None or time > CARRY_SECONDS:
         return None
     s = time / CARRY_SECONDS

@@ -72,7 +72,7 @@ class Table:
 class World:
     """Everything Bullet needs. `velocity` (m/s) and `spin` (rad/s) are the mover's at t = 0.
 
-    `carry_to` is where the mover is carried by hand, in an arc of 0.6 s, before it is let go.
+    `carry_to` is where the mover is carried by hand, in an arc of 0.6 s, before it is released.
     """
 
     things: tuple[Thing, ...]

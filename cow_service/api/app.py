@@ -30,7 +30,7 @@ from cow_service.records import Problem
 from cow_service.requests import AnswerRequest, LookRequest, SimulateRequest
 from cow_service.settings import Settings
 
-SUMMARY = "Lets a multimodal LLM look before it answers: one image and one what-if question in, imagined frames out."
+SUMMARY = "Lets a multimodal LLM look before it answers: send an image and a what-if question, get imagined frames."
 FRAMEWORK_SCHEMAS = ("HTTPValidationError", "ValidationError")  # of errors that no operation returns
 # What web pages of COW_CORS_ORIGINS may send and read.
 CORS_METHODS = ("GET", "HEAD", "POST", "DELETE")
@@ -102,7 +102,7 @@ def create_app(
 
 
 class LayeredApp(FastAPI):
-    """FastAPI with layers around its own, which see also what its handler of unforeseen errors answers."""
+    """FastAPI with outer layers, which also see the responses of its handler of unforeseen errors."""
 
     surround: Callable[[ASGIApp], ASGIApp]
 
@@ -136,7 +136,7 @@ def install_layers(app: LayeredApp, settings: Settings, metrics: Metrics) -> Non
 def warn_if_open(settings: Settings) -> None:
     """Logs a warning where anybody who reaches the server can use it."""
     if not settings.api_keys and not is_loopback(settings.host):
-        log.warning("COW_API_KEYS is not set: whoever reaches %s can use this server.", settings.host)
+        log.warning("COW_API_KEYS is not set: anyone who can reach %s can use this server.", settings.host)
 
 
 def contract(app: FastAPI) -> dict[str, Any]:
@@ -148,7 +148,7 @@ def contract(app: FastAPI) -> dict[str, Any]:
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(schema.pop("$defs", {}))
             schemas[model.__name__] = schema
-        scheme = {"type": "http", "scheme": "bearer", "description": "Needed where the server has COW_API_KEYS."}
+        scheme = {"type": "http", "scheme": "bearer", "description": "Required if the server has COW_API_KEYS."}
         document["components"]["securitySchemes"] = {"key": scheme}
         for path, operations in document["paths"].items():
             refusals = (OriginNotAllowed,) if path in PROBES else (Unauthorized, OriginNotAllowed, RateLimited)

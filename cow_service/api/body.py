@@ -64,7 +64,7 @@ class RawBody:
     image: bytes | None = None
 
 
-MAX_PART_BYTES = 64 * 2**20  # of `request`, which may hold masks and a depth map; the whole body has a limit of its own
+MAX_PART_BYTES = 64 * 2**20  # of `request`, which may hold masks and a depth map; the body has a separate limit
 
 
 class _FormParser(MultiPartParser):
@@ -91,9 +91,7 @@ async def receive(request: Request) -> RawBody:
         )
     charset = parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
     if charset not in ("utf-8", "utf8", "us-ascii", "ascii"):
-        raise BodyTypeUnsupported(
-            f"The form has the character set '{charset[:SHOWN_CHARACTERS]}': send UTF-8, and name no other."
-        )
+        raise BodyTypeUnsupported(f"The form has the character set '{charset[:SHOWN_CHARACTERS]}': send UTF-8.")
     try:
         async with aclosing(request.stream()) as stream:
             parser = _FormParser(request.headers, stream, max_files=3, max_fields=8, max_part_size=MAX_PART_BYTES)
@@ -108,11 +106,11 @@ async def receive(request: Request) -> RawBody:
         if unknown:
             named = ", ".join(shortened(name, SHOWN_CHARACTERS) for name in unknown)
             raise InvalidRequest(
-                f"The form has fields that nothing reads: {named}. Put them into `request` as JSON.",
+                f"The form has unknown fields: {named}. Put request fields into `request` as JSON.",
                 errors=tuple(FieldError(f"/{pointer_part(name)}", "not a form field") for name in unknown),
             )
         twice = [name for name, times in Counter(name for name, _ in form.multi_items()).items() if times > 1]
-        _check_unique(twice, "stands in the form more than once; give it once")
+        _check_unique(twice, "appears more than once in the form; give it once")
         image = form.get("image")
         if image is not None and not isinstance(image, UploadFile):
             detail = "`image` must be a file part with a file name."
@@ -134,7 +132,7 @@ def parse(raw: RawBody, model: type[Body]) -> Body:
             return model.model_validate(read_object(raw.json, "The body"))
         given = read_object(raw.request, "The form field `request`")
         twice = [name for name in ("image", "question") if name in given and getattr(raw, name) is not None]
-        _check_unique(twice, "stands in the form and in its field `request`; give it once")
+        _check_unique(twice, "appears both in the form and in its field `request`; give it once")
         if raw.question is not None:
             given["question"] = raw.question
         if raw.image is not None:
@@ -145,7 +143,7 @@ def parse(raw: RawBody, model: type[Body]) -> Body:
 
 
 def _check_unique(twice: list[str], detail: str) -> None:
-    """Raises `InvalidRequest` where there are fields that were given twice."""
+    """Raises `InvalidRequest` if there are fields that were given twice."""
     if twice:
         names = " and ".join(f"`{name}`" for name in twice)
         raise InvalidRequest(f"{names} {detail}.", errors=tuple(FieldError(f"/{name}", detail) for name in twice))

@@ -37,10 +37,10 @@ def invalid(
     """A pydantic error as ours, with a JSON Pointer per field; `placed` says where that stands in the request."""
     found = error.errors()
     if any(item["type"] in ("json_invalid", "model_type") and not item["loc"] for item in found):
-        return errors.MalformedBody(f"The body is no JSON object: {found[0]['msg']}.")
+        return errors.MalformedBody(f"The body is not a JSON object: {found[0]['msg']}.")
     fields = field_errors(found, placed)
     summary = "; ".join(f"{field.pointer or 'the body'}: {field.detail}" for field in fields[:5])
-    return errors.InvalidRequest(f"{summary}. See /openapi.json for what the request may hold.", errors=fields)
+    return errors.InvalidRequest(f"{summary}. /openapi.json describes the request.", errors=fields)
 
 
 class ChatError(Record):
@@ -108,16 +108,16 @@ def install_problem_handlers(app: FastAPI) -> None:
     async def framework_error(request: Request, error: HTTPException) -> Response:
         path, status = errors.shortened(request.url.path, SHOWN_CHARACTERS), error.status_code
         if status == HTTPStatus.NOT_FOUND:
-            ours = errors.NotFound(f"Nothing is served at {path}. GET /openapi.json lists what is.")
+            ours = errors.NotFound(f"Nothing is served at {path}. GET /openapi.json lists the endpoints.")
         elif status == HTTPStatus.METHOD_NOT_ALLOWED:
-            ours = errors.MethodNotAllowed(f"{path} does not take {request.method}.")
+            ours = errors.MethodNotAllowed(f"{path} does not support {request.method}.")
         else:
             is_theirs = HTTPStatus.BAD_REQUEST <= status < HTTPStatus.INTERNAL_SERVER_ERROR
             ours = (errors.MalformedBody if is_theirs else errors.InternalError)(f"{error.detail}.")
         response = respond(ours, request.scope)
         response.headers.update(error.headers or {})
         if status == HTTPStatus.METHOD_NOT_ALLOWED:
-            # Several routes may have the address, of which the framework names the first one's methods.
+            # Several routes may share the address; the framework names only the methods of the first one.
             routers = (getattr(each, "original_router", None) for each in app.routes)
             routes = [*app.routes, *(route for router in routers if router is not None for route in router.routes)]
             fitting = (route for route in routes if route.matches(request.scope)[0] is not Match.NONE)
@@ -127,7 +127,7 @@ def install_problem_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(ClientDisconnect)
     async def gone(request: Request, error: ClientDisconnect) -> Response:
-        log.info("%s %s: the caller left before its body was in", request.method, request.url.path)
+        log.info("%s %s: the caller disconnected before its body was complete", request.method, request.url.path)
         return Response(status_code=HTTPStatus.BAD_REQUEST)
 
     @app.exception_handler(Exception)

@@ -48,7 +48,7 @@ Made = TypeVar("Made")
 
 
 def owner_of(request: Request) -> str | None:
-    """Whose key the request came with; None where the server has no keys."""
+    """Whose key the request came with; None if the server has no keys."""
     owner: str | None = request.scope.get("state", {}).get("owner")
     return owner
 
@@ -235,7 +235,7 @@ class Submitter:
         return await unless_disconnected(request, self._looks.run(owner, see))
 
     def submission(self, request: Request, kind: JobKind) -> Submission:
-        """What the request's headers say. Raises `QueueFull` and `ShuttingDown` where no job can be taken."""
+        """What the request's headers say. Raises `QueueFull` and `ShuttingDown` if no job can be taken."""
         prefer, owner = preferences_of(request.headers), owner_of(request)
         if prefer.key is None:
             self.engine.check_capacity(owner)  # before the body is read: a refusal comes at once
@@ -261,7 +261,7 @@ class Submitter:
         return created_at
 
     async def result(self, request: Request, submission: Submission, body: SimulateRequest) -> str | None:
-        """What the request comes to, as JSON; None where the caller wants the job instead."""
+        """The result of the request, as JSON; None if the caller wants the job instead."""
         received = submission.image is not None
         with self.engine.active.waiting(submission.job_id) as waiter:
             created_at = await self.submit(submission, body)
@@ -322,12 +322,12 @@ class Submitter:
             look = True
 
     async def leave(self, submission: Submission, created_at: str | None) -> None:
-        """The caller has disconnected: cancels a new job that nobody can ask for."""
+        """The caller has disconnected: cancels a new job whose id no caller knows."""
         if created_at is not None and not submission.may_return:
             await to_thread.run_sync(self.engine.cancel, submission.job_id, submission.owner)
 
     def _precheck(self, submission: Submission, body: SimulateRequest) -> tuple[str, str]:
-        """Raises what is wrong with a request before its image is looked at; returns its reader and generator."""
+        """Checks a request, except its image; raises what is wrong, and returns its reader and generator."""
         if isinstance(body.image, ImageArtifact) and submission.image is None:
             self.engine.may_read(body.image.artifact, submission.owner)
         for picture in body.attached:
@@ -368,16 +368,16 @@ class Submitter:
         try:
             found = self.engine.find(submission.job_id, submission.owner)
         except JobNotFound as error:
-            raise Canceled("The job was deleted before it was done.") from error
+            raise Canceled("The job was deleted before it was finished.") from error
         if created_at not in (None, found.job.created_at):
-            raise Canceled("The job was deleted before it was done.")
+            raise Canceled("The job was deleted before it was finished.")
         if found.job.status not in TERMINAL:
             self.engine.storage.check()
             return None
         if found.error is not None:
             raise found.error
         if found.result is None:
-            raise Canceled("The job was canceled before it was done.")
+            raise Canceled("The job was canceled before it was finished.")
         return found.result
 
 
@@ -409,7 +409,7 @@ async def unless_disconnected(
         if task.done():
             return task.result()
         await leave()
-        raise Canceled("The caller went away before the work was done.")
+        raise Canceled("The caller disconnected before the work was finished.")
     finally:
         for each in (task, gone):
             each.cancel()

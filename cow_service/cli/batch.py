@@ -24,37 +24,35 @@ EXIT_SOME_FAILED = 3
 EXIT_INTERRUPTED = 130
 MAX_FAILURES_SHOWN = 5
 MAX_FAULTS_SHOWN = 10
-RESUME_HINT = "The same command goes on with the batch."
+RESUME_HINT = "Run the same command again to resume."
 
 
 def batch(
     questions: Annotated[
         Path,
         argument(
-            'JSON Lines: {"image": FILE or URL, "question": TEXT}, maybe "id", "meta", and fields of the request.',
+            'JSON Lines of {"image": FILE or URL, "question": TEXT}; "id", "meta" and request fields are optional.',
             "QUESTIONS",
             readable=True,
             **EXISTING,
         ),
     ],
-    out: Annotated[Path, option("Folder for results.jsonl; a batch in it is gone on with.", "--out", "-o")],
+    out: Annotated[Path, option("Folder for results.jsonl; a batch in it is resumed.", "--out", "-o")],
     kind: Annotated[Literal["answer", "simulate"], option("Whether to answer, or only to simulate.")] = "answer",
     request: Annotated[
-        str | None, option('Fields for questions that lack them: {"votes": 5}.', metavar="JSON", shown="none")
+        str | None, option('Default request fields, such as {"votes": 5}.', metavar="JSON", shown="none")
     ] = None,
     concurrency: Annotated[int, option("Most questions at the same time.", min=1)] = CONCURRENCY,
     timeout: Annotated[float | None, option("Longest wait for one question, s.", min=0.001, shown="none")] = None,
-    save: Annotated[bool, option("Keep the pictures of each in OUT/items.", "--save")] = False,
-    fresh: Annotated[bool, option("Draw everything afresh: take no results of earlier requests.", "--fresh")] = False,
-    minimal: Annotated[bool, option("Leave out the long lists of trajectories.", "--minimal")] = False,
-    retry_failed: Annotated[bool, option("Ask those again that failed.", "--retry-failed")] = False,
+    save: Annotated[bool, option("Save the pictures of each question in OUT/items.", "--save")] = False,
+    fresh: Annotated[bool, option("Compute everything anew instead of using cached results.", "--fresh")] = False,
+    minimal: Annotated[bool, option("Leave the long lists out of trajectories.", "--minimal")] = False,
+    retry_failed: Annotated[bool, option("Ask failed questions again.", "--retry-failed")] = False,
     url: Url = None,
 ) -> None:
-    """Ask a server many questions, and resume where it stopped.
+    """Ask a server many questions; run it again to resume.
 
-    The same command resumes a batch that was interrupted.
-
-    Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch could not go on.
+    Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch had to stop.
     """
     given = locals()
     from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
@@ -68,14 +66,14 @@ def batch(
                 if result.unsaved is not None:
                     typer.echo(printable(f"{result.id}: not saved: {result.unsaved.detail}"), err=True)
     except KeyboardInterrupt:
-        typer.echo(f"Interrupted. The same command goes on with it; {out / 'results.jsonl'} is whole.", err=True)
+        typer.echo(f"Interrupted. {RESUME_HINT} {out / 'results.jsonl'} is complete so far.", err=True)
         sys.stderr.flush()
-        os._exit(EXIT_INTERRUPTED)  # threads that wait for jobs are not waited for
+        os._exit(EXIT_INTERRUPTED)  # do not wait for threads that wait for jobs
     except OSError as error:
         reason = error.strerror or str(error)
-        raise StorageUnavailable(f"'{out}' cannot be written: {reason}. {RESUME_HINT}") from error
+        raise StorageUnavailable(f"Cannot write to '{out}': {reason}. {RESUME_HINT}") from error
     except Unauthorized as error:
-        error.detail += " Here: set COW_API_KEY."
+        error.detail += " `cow batch` sends the key in COW_API_KEY."
         raise
     except TRANSIENT as error:
         error.detail += f" {RESUME_HINT}"
@@ -84,9 +82,9 @@ def batch(
 
 
 def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]:
-    """The questions of a file; images are looked for beside it.
+    """The questions of a file. Image paths are relative to the file's folder.
 
-    Raises `InvalidRequest` for whatever the server would refuse, before it is asked anything.
+    Raises `InvalidRequest` for anything that the server would refuse, before the first request.
     """
     from pydantic import ValidationError  # noqa: PLC0415
 
@@ -115,12 +113,12 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
         more = f"\n... and {len(faults) - MAX_FAULTS_SHOWN} more" if len(faults) > MAX_FAULTS_SHOWN else ""
         raise InvalidRequest("\n".join(faults[:MAX_FAULTS_SHOWN]) + more)
     if not items:
-        raise InvalidRequest(f"{path.name} holds no questions: give one JSON object a line.")
+        raise InvalidRequest(f"{path.name} holds no questions: write one JSON object per line.")
     return list(questions(items, defaults, path.parent))
 
 
 def print_summary(out: Path) -> int:
-    """Prints what the folder holds of the batch; returns the exit code."""
+    """Prints a summary of the batch in the folder; returns the exit code."""
     from cow_service.client.display import asked_words  # noqa: PLC0415
     from cow_service.records import Usage  # noqa: PLC0415
 
@@ -142,7 +140,7 @@ def print_summary(out: Path) -> int:
                 codes[code] += 1
                 failures.append(f"  {line['id']}: {code}: {line['problem']['detail']}")
     if total.calls:
-        typer.echo(f"asked of the MLLM: {asked_words(usage, total)}")
+        typer.echo(f"multimodal LLM: {asked_words(usage, total)}")
     without = f" ({without_simulation} without a simulation)" if without_simulation else ""
     typer.echo(f"{count - len(failures)} succeeded{without}, {len(failures)} failed: {results}")
     if not failures:

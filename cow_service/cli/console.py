@@ -1,4 +1,4 @@
-"""What `simulate`, `answer`, `models` and `doctor` show: progress, results in a folder, tables."""
+"""The output of `simulate`, `answer`, `models` and `doctor`: progress, results in a folder, tables."""
 
 import hashlib
 import platform
@@ -39,12 +39,12 @@ def run_request(
 ) -> Simulation | None:
     """Simulates or answers, shows the progress of each stage, prints a summary, and writes the results into a folder.
 
-    Returns the simulation. `formats` are names of `video.FORMATS`. Raises `InvalidRequest` that names the fields, and
-    where one of the formats is wanted and no video.
+    Returns the simulation. `formats` are names of `video.FORMATS`. Raises `InvalidRequest`, which names the wrong
+    fields, or says that a format needs the video.
     """
     if formats and not body["video"]:
-        raise InvalidRequest("--format makes its file of the video: leave --no-video out.")
-    # With JSON a silent one: standard output is for a program.
+        raise InvalidRequest("--format converts the video: leave --no-video out.")
+    # Silent with JSON: standard output is for a program.
     console = Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
     if out is not None:
         with writable(out):  # before the work, so that its results are not lost
@@ -56,7 +56,7 @@ def run_request(
     except ValidationError as error:
         fields, known = field_errors(error.errors()), ", ".join([*model.model_fields][2:])
         faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
-        remedy = f"--request takes these fields: {known}. A server's /docs says what each holds."
+        remedy = f"--request takes these fields: {known}. The page /docs of a server describes them."
         raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy * ("no such field" in faults)) from error
     result: Simulation | Answer
     with stages_shown(console) as show:
@@ -83,10 +83,10 @@ def run_request(
 
 @contextmanager
 def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], None]]:
-    """A progress bar with the stage beside it; yields the function that updates it."""
+    """A progress bar with the name of the stage; yields the function that updates it."""
     columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
     with Progress(*columns, console=console, transient=True) as bars:
-        bar = bars.add_task("loading", total=1.0)  # a model takes its time before the first stage
+        bar = bars.add_task("loading", total=1.0)  # loading a model takes a while before the first stage
         yield lambda stage, done: bars.update(bar, description=stage or "loading", completed=done)
 
 
@@ -131,7 +131,7 @@ def _result_in(folder: Path) -> Simulation | None:
 
 
 def default_folder(image: Path) -> Path:
-    """`<name of the image>-cow`, or the first with a number behind it, without the result of another picture."""
+    """`<name of the image>-cow`, with a number if that folder holds the result of another picture."""
     folder, number, sha256 = Path(f"{image.stem}-cow"), 1, hashlib.sha256(read_file(image)).hexdigest()
     while (found := _result_in(folder)) is not None and found.image.sha256 != sha256:
         number += 1
@@ -142,7 +142,7 @@ def default_folder(image: Path) -> Path:
 def save(service: Service, result: Simulation | Answer, out: Path, formats: Sequence[str]) -> list[str]:
     """Writes frames, video, overlay, the result as JSON and the clip in other formats; returns the names of files."""
     artifacts, documents, made = records.artifacts_of(result), records.documents_of(result), dict[str, Any]()
-    stale = ("simulation.json", "answer.json", "clip.gif", "clip.webp", "sheet.png")  # beside an earlier run's pictures
+    stale = ("simulation.json", "answer.json", "clip.gif", "clip.webp", "sheet.png")  # of an earlier run
     with writable(out):
         for name in () if (earlier := _result_in(out)) is None else (*records.artifacts_of(earlier), *stale):
             (out / name).unlink(missing_ok=True)
@@ -171,7 +171,7 @@ def print_models(models: records.Models, *, as_json: bool) -> None:
         table.add_row(backend.kind or "", name, _readiness(backend), backend.summary)
     console = Console()
     console.print(table)
-    console.print(f"\nCOW_MLLM takes one of these, or provider:model: {', '.join(models.mllms)}", highlight=False)
+    console.print(f"\nValues of COW_MLLM: provider:model, or one of: {', '.join(models.mllms)}", highlight=False)
 
 
 def _readiness(backend: records.BackendInfo) -> str:
@@ -180,7 +180,7 @@ def _readiness(backend: records.BackendInfo) -> str:
 
 
 def answer_table(answer: Answer) -> Table:
-    """What was answered, and what it rests on and cost."""
+    """The answer, its votes, and what it cost."""
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(style="bold")
     table.add_column()
@@ -224,7 +224,7 @@ class Report(BaseModel):
     problem: str | None
     backends: list[records.BackendInfo]
     unserved: list[Unserved]  # jobs that wait, and that no process takes
-    jobs_problem: str | None  # why the job database could not be read
+    jobs_problem: str | None  # why the job database cannot be read
 
     @property
     def healthy(self) -> bool:
@@ -284,7 +284,7 @@ def print_report(report: Report, *, as_json: bool) -> None:
     if report.problem:
         console.print(f"[red]{report.problem}[/]", highlight=False)
     else:
-        console.print("[green]The default request can be served.[/]")
+        console.print("[green]Everything that a default request needs is ready.[/]")
     if report.jobs_problem:
         console.print(f"[red]{escape(report.jobs_problem)}[/]", highlight=False, soft_wrap=True)
     for one in report.unserved:

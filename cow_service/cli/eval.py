@@ -1,4 +1,4 @@
-"""`cow eval`: does imagination help a multimodal LLM, by how much, and at what cost."""
+"""`cow eval`: measures whether imagination helps a multimodal LLM, by how much, and at what cost."""
 
 import sys
 from pathlib import Path
@@ -16,7 +16,7 @@ _OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair", "pyd
 
 
 class EvalsNotInstalled(CowError):
-    """The Python packages of the evaluation are not installed."""
+    """The Python packages for the evaluation are not installed."""
 
     code, status = "evals-not-installed", 0
 
@@ -25,7 +25,7 @@ class _RunByDefault(TyperGroup):
     """`cow eval DATA` is `cow eval run DATA`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Puts the name of the command in front where there is none."""
+        """Adds the command `run` if none is named."""
         if args and args[0] not in (*self.commands, "--help"):
             args = ["run", *args]
         return super().parse_args(ctx, args)
@@ -35,62 +35,61 @@ app = typer.Typer(
     cls=_RunByDefault,
     rich_markup_mode=None,
     no_args_is_help=True,
-    help="Measure whether imagination helps: cow eval DATA asks, cow eval report RUNS compares, cow eval plan DATA "
-    "fixes the analysis before.",
+    help="Measure whether imagination helps a multimodal LLM.\n\nEvery question is asked in several arms, ways to ask "
+    "it: with the image alone, with simulated frames, or with a placebo, frames that tell nothing about the future.",
+    epilog="Example: cow eval DATA --mllm openai/gpt-5 --out run",
 )
 
-Out = Annotated[Path, option("Folder of the run; a run that is in it is resumed.", "--out", "-o")]
+Out = Annotated[Path, option("Folder of the run; a run in it is resumed.", "--out", "-o")]
 Prices = Annotated[
-    Path | None, option("YAML or JSON: {MODEL: {input: 1.25, output: 10}}, per million tokens.", shown="none")
+    Path | None, option("YAML or JSON, per million tokens: {MODEL: {input: 1.25, output: 10}}.", shown="none")
 ]
 DATA = (
     "A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the name of a data "
-    "set of the Hugging Face hub, such as Mwxinnn/CausalSpatial."
+    "set on the Hugging Face hub, such as Mwxinnn/CausalSpatial."
 )
-# What a run and a plan share.
+# Options of both `run` and `plan`.
 Mllm = Annotated[
-    str | None, option("The multimodal LLM, as Inspect names it: openai/gpt-5.", shown="the embedded reader")
+    str | None, option("Multimodal LLM, as Inspect names it, such as openai/gpt-5.", shown="the embedded reader")
 ]
-Revision = Annotated[str | None, option("Commit or snapshot of its weights, for the record.", shown="none")]
+Revision = Annotated[str | None, option("Commit or snapshot of its weights, kept in the record.", shown="none")]
 Arms = Annotated[
     Texts,
     option(
-        "never, always, auto, placebo-still, placebo-direction, placebo-item, encounters, frames-only, gate, oracle, "
-        "each with suffixes such as :initial or :vote-3; or factors: content=simulated,frames=events,votes=1. May be "
-        "repeated, or several names with commas.",
+        "Ways to ask: never, always, auto, placebo-still, placebo-direction, placebo-item, encounters, frames-only, "
+        "gate, oracle, each with suffixes such as :initial or :vote-3; or factors: "
+        "content=simulated,frames=events,votes=1. May be repeated, or several names separated by commas.",
         shown="the preset's",
     ),
 ]
 PresetName = Annotated[
     Literal["default", "paper", "controls", "dose"] | None,
     option(
-        "default: with placebos; paper: its protocol; controls: votes, gate, frames, words; dose: frames degraded. "
-        "Arms of --arm come on top.",
-        shown="default, or the arms of --arm alone",
+        "Set of arms. default: with placebos; paper: the paper's protocol; controls: votes, gate, frames, words; dose: "
+        "degraded frames. Arms of --arm are added.",
+        shown="default, or only the arms of --arm",
     ),
 ]
 Repeats = Annotated[int | None, option("How often each question is asked in each arm.", min=1, shown="the preset's: 1")]
-Order = Annotated[Literal["shuffled", "data"] | None, option("Of the options.", shown="the preset's: shuffled")]
-Subsets = Annotated[Texts, option("Of CausalSpatial's layout only these; may be repeated.")]
-Limit = Annotated[int | None, option("Only the first so many questions.", min=1, shown="all")]
-Seed = Annotated[int | None, option("Of the order in which options are shown.", shown="0")]
-Reader = Annotated[str | None, option("Who grounds and reads motion for the imagination.", shown="the server's")]
-GeneratorName = Annotated[str | None, option("Who makes its frames.", shown="the server's")]
-BaseUrl = Annotated[str | None, option("Where the multimodal LLM is served.", shown="the provider's")]
-Temperature = Annotated[float | None, option("Of its replies.", shown="the provider's")]
-MaxTokens = Annotated[int | None, option("Of a reply.", min=1, shown="8192")]
-SkipFaulty = Annotated[
-    bool, option("Leave out rows that cannot be asked, and columns that mean nothing.", "--skip-faulty")
-]
+Order = Annotated[Literal["shuffled", "data"] | None, option("Order of the options.", shown="the preset's: shuffled")]
+Subsets = Annotated[Texts, option("Only this subset of CausalSpatial's layout; may be repeated.")]
+Limit = Annotated[int | None, option("Only this many questions, from the first.", min=1, shown="all")]
+Seed = Annotated[int | None, option("Random seed of the order of options.", shown="0")]
+Reader = Annotated[str | None, option("Reader of the simulations (`cow models`).", shown="the server's")]
+GeneratorName = Annotated[str | None, option("Generator of their frames.", shown="the server's")]
+BaseUrl = Annotated[str | None, option("URL of the server of the multimodal LLM.", shown="the provider's")]
+Temperature = Annotated[float | None, option("Sampling temperature of its replies.", shown="the provider's")]
+MaxTokens = Annotated[int | None, option("Most tokens in a reply.", min=1, shown="8192")]
+SkipFaulty = Annotated[bool, option("Skip rows that cannot be asked, and unknown columns.", "--skip-faulty")]
 
 
-@app.command()
+@app.command(epilog="Example: cow eval run questions.jsonl --mllm openai/gpt-5 --out run")
 def run(
     out: Out,
     data: Annotated[str | None, argument(DATA)] = None,
     plan: Annotated[
         Path | None,
-        option("What `cow eval plan` wrote: asks that, and reports whether it was followed.", shown="none"),
+        option("File of `cow eval plan`: ask what it says, and report whether it was followed.", shown="none"),
     ] = None,
     mllm: Mllm = None,
     mllm_revision: Revision = None,
@@ -100,7 +99,7 @@ def run(
     ask: Annotated[
         Literal["prompt", "answer"] | None,
         option(
-            "prompt: the paper's prompt, with frames of /simulate; answer: the service's own /answer.",
+            "prompt: the paper's prompt, with frames from /simulate; answer: the service's own /answer.",
             shown="prompt with --mllm, else answer",
         ),
     ] = None,
@@ -110,21 +109,21 @@ def run(
     seed: Seed = None,
     reader: Reader = None,
     generator: GeneratorName = None,
-    url: Annotated[str | None, option("The COW server.", shown="one is started in this process")] = None,
+    url: Annotated[str | None, option("URL of the COW server.", shown="a server in this process")] = None,
     base_url: BaseUrl = None,
     temperature: Temperature = None,
     max_tokens: MaxTokens = None,
     concurrency: Annotated[int, option("Most questions at the same time, in each arm.", min=1)] = CONCURRENCY,
     skip_faulty: SkipFaulty = False,
-    retry_failed: Annotated[bool, option("Ask those again that failed.", "--retry-failed")] = False,
-    log_images: Annotated[bool, option("Keep pictures in Inspect's logs, for inspect view.")] = False,
+    retry_failed: Annotated[bool, option("Ask failed questions again.", "--retry-failed")] = False,
+    log_images: Annotated[bool, option("Keep pictures in Inspect's logs, for `inspect view`.")] = False,
     prices: Prices = None,
 ) -> None:
-    """Ask every question in every arm, and report. `cow eval report RUNS` compares runs.
+    """Ask every question in every arm, and report.
 
-    The same command resumes a run that was interrupted; no reply that has come is asked for again.
+    Run the same command again to resume; replies that were received are kept.
 
-    Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not begin or go on.
+    Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not start or go on.
     """
     given = locals()
     _check_installed()
@@ -136,29 +135,29 @@ def run(
     try:
         done = evaluate(wanted, lambda told: typer.echo(printable(told), err=True))
     except KeyboardInterrupt:
-        typer.echo("Interrupted. The same command goes on with it.", err=True)
+        typer.echo("Interrupted. Run the same command again to resume.", err=True)
         sys.stderr.flush()
         raise typer.Exit(EXIT_INTERRUPTED) from None
     _report([done], out / REPORT, priced)
     failed = sum(each.failure is not None for each in done.observations)
     unasked = len(done.items) * len(done.info.arms) * done.info.repeats - len(done.observations)
     if failed:
-        typer.echo(f"{failed} questions failed; the report says why. --retry-failed asks them again.", err=True)
+        typer.echo(f"{failed} questions failed; the report says why. Ask them again with --retry-failed.", err=True)
     elif unasked:
-        typer.echo(f"{unasked} questions were not asked. The same command goes on with it.", err=True)
+        typer.echo(f"{unasked} questions were not asked. Run the same command again to resume.", err=True)
     if failed or unasked:
         raise typer.Exit(EXIT_SOME_FAILED)
 
 
-@app.command()
+@app.command(epilog="Example: cow eval plan questions.jsonl --mllm openai/gpt-5 --out plan.json")
 def plan(
     data: Annotated[str, argument(DATA)],
     out: Annotated[Path, option("The file to write.", "--out", "-o")],
-    mllm: Annotated[str, option("The multimodal LLM, as Inspect names it: openai/gpt-5.")],
-    effect: Annotated[float, option("The gain that you hope for, in percentage points.", min=0.01, max=100)] = 2.4,
+    mllm: Annotated[str, option("Multimodal LLM, as Inspect names it, such as openai/gpt-5.")],
+    effect: Annotated[float, option("Gain to detect, in percentage points.", min=0.01, max=100)] = 2.4,
     pilot: Annotated[
         Path | None,
-        option("Folder of a smaller run: says how much scenes differ, and what a reply costs.", shown="none"),
+        option("Folder of a smaller run, from which variance and costs are estimated.", shown="none"),
     ] = None,
     mllm_revision: Revision = None,
     arm: Arms = None,
@@ -176,21 +175,21 @@ def plan(
     skip_faulty: SkipFaulty = False,
     prices: Prices = None,
 ) -> None:
-    """Fix an analysis before the run: the primary question, its test, how many scenes it needs, and what it costs.
+    """Fix the analysis before the run, and estimate its cost.
 
-    Nothing is asked. `cow eval run --plan FILE --out DIR` asks what the file says; its report says whether the plan was
-    followed.
+    The file names the primary question, its test and the scenes it needs. Nothing is asked yet: run it with
+    `cow eval run --plan FILE --out DIR`. The report says whether the plan was followed.
     """
     given = {**locals(), "ask": "prompt", "plan": None}
     _check_installed()
     from cow_service.evals.run import write_plan  # noqa: PLC0415
 
     typer.echo(printable(write_plan(_request(given), out, effect / 100, pilot, _priced(prices))))
-    typer.echo(f"\nThe plan: {out}. Ask it with: cow eval run --plan {out} --out DIR")
+    typer.echo(f"\nThe plan: {out}. Run it with: cow eval run --plan {out} --out DIR")
 
 
 def _request(given: dict[str, Any]) -> Any:
-    """What the options ask for; what is not given is the plan's or the preset's. Raises `InvalidRequest`."""
+    """The request in the options, completed from the plan or the preset. Raises `InvalidRequest`."""
     from cow_service.evals.design import PRESETS  # noqa: PLC0415
     from cow_service.evals.plan import read_plan  # noqa: PLC0415
     from cow_service.evals.request import EvalRequest  # noqa: PLC0415
@@ -201,18 +200,18 @@ def _request(given: dict[str, Any]) -> Any:
         names = [name for name in (*plan.options, "arm", "preset", "repeats") if name in given]
         changed = [name for name in names if given[name] is not None and given[name] is not False]
         if changed:
-            raise InvalidRequest(f"--plan says what is asked: leave --{changed[0].replace('_', '-')} out.")
+            raise InvalidRequest(f"The plan already sets --{changed[0].replace('_', '-')}: leave that option out.")
         fields |= {name: plan.options[name] for name in fields.keys() & plan.options.keys()}
         subsets = tuple(plan.options["subset"])
         fields |= {"plan": plan, "arms": tuple(plan.arms), "repeats": plan.repeats, "subsets": subsets}
         return EvalRequest(**fields)
     if given["data"] is None:
-        raise InvalidRequest("Name the data to ask about, or a plan with --plan.")
+        raise InvalidRequest("Give the data to ask about, or a plan with --plan.")
     preset, ask = (
         PRESETS[given["preset"] or "default"],
         given["ask"] or ("answer" if given["mllm"] is None else "prompt"),
     )
-    # An arm of factors holds commas itself.
+    # An arm given by factors contains commas.
     named = [name for text in given["arm"] or () for name in ([text] if "=" in text else text.split(","))]
     own = preset.arms if given["preset"] or not named else ()
     if given["preset"] is None and ask == "answer" and not named:
@@ -228,13 +227,13 @@ def _request(given: dict[str, Any]) -> Any:
     return EvalRequest(**fields)
 
 
-@app.command()
+@app.command(epilog="Example: cow eval report run-a run-b --out comparison")
 def report(
-    runs: Annotated[list[Path], argument("Folders that `cow eval --out` wrote.", "RUNS")],
+    runs: Annotated[list[Path], argument("Folders of runs (--out of `cow eval`).", "RUNS")],
     out: Annotated[Path | None, option("Folder for the report.", "--out", "-o", shown="RUN/report")] = None,
     prices: Prices = None,
 ) -> None:
-    """Compare runs: tables, plots and a page that opens without a server."""
+    """Compare runs in tables, plots and a standalone page."""
     _check_installed()
     from cow_service.evals.runs import REPORT, read_run  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""The command line. Heavy imports stand inside the commands, so that `cow --help` is quick."""
+"""The command line. Heavy imports are inside the commands, so that `cow --help` is quick."""
 
 import sys
 from importlib.resources import as_file
@@ -9,7 +9,7 @@ import typer
 
 from cow_service import __version__
 from cow_service.cli import batch, eval, models, options, server
-from cow_service.cli.options import AsJson, Commands, Texts, option, with_request_options
+from cow_service.cli.options import AsJson, Commands, Grouped, Texts, option, with_request_options
 from cow_service.cli.server import open_service
 
 app = typer.Typer(
@@ -34,7 +34,7 @@ def main(
     """Look before you answer: imagine the future of an image."""
 
 
-@app.command()
+@app.command(cls=Grouped, epilog='Example: cow simulate photo.jpg "If the ball falls, what does it hit?"')
 @with_request_options
 def simulate(
     image: options.Image,
@@ -42,19 +42,19 @@ def simulate(
     out: Annotated[
         Path | None, option("Folder for the results.", "--out", "-o", shown="./<image>-cow, or -cow-2")
     ] = None,
-    video: Annotated[bool, option("Make the mp4.")] = True,
+    video: Annotated[bool, option("Make a video (mp4) of the whole clip.")] = True,
     formats: Annotated[
         list[options.Format] | None,
-        option("Also an animated gif or webp, or a contact sheet; may be repeated.", "--format"),
+        option("Also make an animated gif or webp, or a contact sheet; may be repeated.", "--format"),
     ] = None,
-    open_it: Annotated[bool, option("Open the video, or the overlay, when it is done.", "--open")] = False,
+    open_it: Annotated[bool, option("Open the video (or the overlay, without one) at the end.", "--open")] = False,
     as_json: Annotated[bool, option("Print the simulation as JSON, and nothing else.", "--json")] = False,
     *,
     request: dict[str, Any],
 ) -> None:
     """Imagine an image's future: frames, video and overlay.
 
-    They go into a folder, with simulation.json.
+    Writes them into a folder, together with simulation.json.
     """
     from cow_service.cli.console import default_folder, run_request  # noqa: PLC0415
 
@@ -66,12 +66,12 @@ def simulate(
         typer.launch(str(out / ("video.mp4" if video else simulation.overlay_name)))
 
 
-@app.command()
+@app.command(epilog="Example: cow demo --open")
 def demo(
     out: Annotated[Path, option("Folder for the results.", "--out", "-o")] = Path("cow-demo"),
     open_it: Annotated[bool, option("Open the video when it is done.", "--open")] = False,
 ) -> None:
-    """Imagine the future of an example: a ball is pushed towards a mug."""
+    """Run a built-in example: a ball moves towards a mug."""
     from cow_service.cli.console import run_request  # noqa: PLC0415
     from cow_service.weights.manifests import EXAMPLES  # noqa: PLC0415
 
@@ -82,7 +82,7 @@ def demo(
         typer.launch(str(out / "video.mp4"))
 
 
-@app.command()
+@app.command(cls=Grouped, epilog='Example: cow answer photo.jpg "If the red ball moves left, will it hit the vase?"')
 @with_request_options
 def answer(
     image: options.Image,
@@ -90,22 +90,22 @@ def answer(
     choice: Annotated[
         Texts,
         option(
-            "An answer to choose from, in order A, B, C...; may be repeated.",
+            "An answer to choose from; may be repeated, for A, B, C...",
             metavar="TEXT",
             shown="those in the question",
         ),
     ] = None,
     imagine: Annotated[
         Literal["always", "auto", "never"],
-        option("Simulate first; auto: only where answers from the image alone disagree or are not sure."),
+        option("Whether to simulate first; auto: only if answers from the image alone disagree."),
     ] = "always",
     no_imagine: Annotated[bool, option("The same as --imagine never.", "--no-imagine")] = False,
-    imagine_votes: Annotated[int, option("Of --imagine auto: votes before anything is imagined.")] = 3,
+    imagine_votes: Annotated[int, option("With --imagine auto: answers to ask for from the image alone.")] = 3,
     imagine_threshold: Annotated[
-        float, option("Of --imagine auto: share of them that agrees, for nothing to be imagined.")
+        float, option("With --imagine auto: share of them that must agree to skip the simulation.")
     ] = 1.0,
-    votes: Annotated[int, option("How often to ask; the most frequent answer is taken.")] = 1,
-    baseline: Annotated[bool, option("Answer without frames, too, for comparison.", "--baseline")] = False,
+    votes: Annotated[int, option("How often to ask; the most frequent answer wins.")] = 1,
+    baseline: Annotated[bool, option("Also answer without frames, for comparison.", "--baseline")] = False,
     out: Annotated[
         Path | None, option("Folder for the simulation and answer.json.", "--out", "-o", shown="none")
     ] = None,
@@ -115,7 +115,7 @@ def answer(
 ) -> None:
     """Answer a question after looking at the imagined future.
 
-    Shows the answer, the votes, the baseline, tokens and time.
+    Prints the answer, the votes, the answer without frames, tokens and time.
     """
     from cow_service.cli.console import run_request  # noqa: PLC0415
 
@@ -134,11 +134,11 @@ def answer(
         run_request(service, "answer", image, body, out, as_json=as_json)
 
 
-@app.command()
+@app.command(epilog="Example: cow doctor")
 def doctor(as_json: AsJson = False) -> None:
     """Show what is installed, and what each backend lacks.
 
-    Names the command that installs it.
+    Prints the command that installs what is missing. Exit code 1 if the default request cannot be served.
     """
     from cow_service.cli.console import examine, print_report  # noqa: PLC0415
 
@@ -151,7 +151,7 @@ def doctor(as_json: AsJson = False) -> None:
 
 @app.command(hidden=True)
 def openapi() -> None:
-    """Print the HTTP contract as YAML; `make openapi` keeps openapi.yaml with it."""
+    """Print the HTTP contract as YAML; `make openapi` writes it to openapi.yaml."""
     import yaml  # noqa: PLC0415
 
     from cow_service.api.app import create_app  # noqa: PLC0415
@@ -161,8 +161,15 @@ def openapi() -> None:
     typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 
-for command in (server.serve, server.worker, server.migrate, server.mcp, batch.batch, models.tracks):
-    app.command()(command)
+for command, example in {
+    server.serve: "cow serve --port 8000",
+    server.worker: "cow worker --queues light",
+    server.migrate: "cow migrate",
+    server.mcp: "cow mcp --transport http",
+    batch.batch: "cow batch questions.jsonl --out results",
+    models.tracks: "cow tracks photo-cow/simulation.json --out tracks.npy",
+}.items():
+    app.command(epilog=f"Example: {example}")(command)
 app.add_typer(eval.app, name="eval")
 app.add_typer(server.keys, name="keys")
 app.add_typer(models.app, name="models")

@@ -1,4 +1,4 @@
-"""`cow models`: lists backends, downloads weights and verifies them. Heavy imports stand inside the commands."""
+"""`cow models`: lists backends, downloads weights and verifies them. Heavy imports are inside the commands."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ if TYPE_CHECKING:
     from cow_service.weights.repositories import Download
 
 
-app = typer.Typer(rich_markup_mode=None, help="List readers, generators and models that see; pull and check weights.")
+app = typer.Typer(rich_markup_mode=None, epilog="Example: cow models pull ati")
 
-Name = Annotated[str, argument("As `cow models` lists it.", "NAME")]
+Name = Annotated[str, argument("Name of the model, as `cow models` lists it.", "NAME")]
 
 
 @app.callback(invoke_without_command=True)
 def models(context: typer.Context, as_json: AsJson = False) -> None:
-    """List readers and generators, and whether each is ready; pull and check weights."""
+    """List models and whether they are ready; pull and check weights.
+
+    Readers understand the question, generators make the frames, and vision models find objects and measure depth.
+    """
     if context.invoked_subcommand is not None:
         if as_json:
             raise typer.BadParameter("--json goes after the command.")
@@ -36,19 +39,22 @@ def models(context: typer.Context, as_json: AsJson = False) -> None:
     print_models(Service(load_settings()).models(), as_json=as_json)
 
 
-@app.command()
+@app.command(epilog="Example: cow models pull ati")
 def pull(
     name: Name,
     revision: Annotated[
         Texts,
         option(
-            "Branch, tag or commit, of all parts or of one; may be repeated.",
+            "Branch, tag or commit, for all parts or for one; may be repeated.",
             metavar="[PART=]REV",
-            shown="what was pulled before, else the newest",
+            shown="the revision pulled before, else the newest",
         ),
     ] = None,
 ) -> None:
-    """Download a model's weights, or those of COW_PERCEPTION=NAME, and check every file; what is here stays."""
+    """Download a model's weights and check every file.
+
+    NAME may also be a value of COW_PERCEPTION, such as cpu. Files that are already here are kept.
+    """
     from cow_service.perception.base import SETS  # noqa: PLC0415
 
     for each in SETS.get(name, (name,)):
@@ -81,9 +87,9 @@ def _pull(name: str, revision: list[str] | None) -> None:
     _fetch_kernels(manifest, console)
 
 
-@app.command()
+@app.command(epilog="Example: cow models check ati")
 def check(name: Name, as_json: AsJson = False) -> None:
-    """Say whether a model's weights are here and are those that were pulled; exit code 1 if not."""
+    """Check that a model's weights are complete; exit code 1 if not."""
     import json  # noqa: PLC0415
 
     from cow_service.weights import repositories as weights  # noqa: PLC0415
@@ -108,7 +114,7 @@ def check(name: Name, as_json: AsJson = False) -> None:
 
 
 def _fetch_kernels(manifest: Manifest, console: Console) -> None:
-    """Fetches the attention kernels that a video model may use on this machine's GPU; prints what became of each."""
+    """Fetches the attention kernels that a video model may use on this machine's GPU, and prints each outcome."""
     from importlib.util import find_spec  # noqa: PLC0415
 
     if not manifest.architecture or manifest.missing_modules() or find_spec("kernels") is None:
@@ -138,12 +144,12 @@ def _manifest(name: str) -> Manifest:
     manifests = load_manifests()
     if name not in manifests:
         known = ", ".join(sorted(each for each, manifest in manifests.items() if manifest.sources))
-        raise InvalidRequest(f"There is no model '{name}'. With weights to download there are: {known or 'none'}.")
+        raise InvalidRequest(f"There is no model '{name}'. Models with weights to download: {known or 'none'}.")
     return manifests[name]
 
 
 def _revisions(manifest: Manifest, wanted: list[str]) -> dict[str, str]:
-    """The revision of each part for which one was given. Raises `InvalidRequest` for a part that does not exist."""
+    """The given revisions by part. Raises `InvalidRequest` for a part that does not exist."""
     revisions: dict[str, str] = {}
     for each in wanted:
         part, _, revision = each.rpartition("=")
@@ -155,7 +161,7 @@ def _revisions(manifest: Manifest, wanted: list[str]) -> dict[str, str]:
 
 
 def _downloads(manifest: Manifest, weights_dir: Path, revisions: dict[str, str]) -> list[Download]:
-    """One download for each repository: parts that come from the same one share its folder and its revision."""
+    """One download per repository: parts from the same repository share its folder and revision."""
     from cow_service.weights.repositories import resolve  # noqa: PLC0415
 
     sources: dict[str, Source] = {}
@@ -165,7 +171,7 @@ def _downloads(manifest: Manifest, weights_dir: Path, revisions: dict[str, str])
         files = tuple(dict.fromkeys((*known.files, *source.files)))
         sources[source.repository] = known.model_copy(update={"files": files})
         if part in revisions and chosen.setdefault(source.repository, revisions[part]) != revisions[part]:
-            raise InvalidRequest(f"Parts of '{source.repository}' share its folder: give them one --revision.")
+            raise InvalidRequest(f"All parts from '{source.repository}' share a folder: give them one --revision.")
     return [resolve(source, weights_dir, chosen.get(name)) for name, source in sources.items()]
 
 
@@ -173,7 +179,10 @@ def tracks(
     simulation: Annotated[Path, argument("A simulation.json.", "SIMULATION", **EXISTING)],
     out: Annotated[Path, option("tracks.pth or .npz for ATI, tracks.npy for Wan-Move.", "--out", "-o")],
 ) -> None:
-    """Write a simulation's tracks as ATI and Wan-Move read them: of what moves, of what stays, then the anchors."""
+    """Write a simulation's point paths for ATI or Wan-Move.
+
+    Both video models take tracks, paths of points: first of moving objects, then of still ones, then of the background.
+    """
     from pydantic import ValidationError  # noqa: PLC0415
 
     from cow_service.generators.wan.tracks import CLIP_FPS, clip_length, tracks_of, write_tracks  # noqa: PLC0415
@@ -187,7 +196,7 @@ def tracks(
         place = ".".join(map(str, first["loc"])) or "the file"
         raise InvalidRequest(f"{simulation.name} is not a simulation: {place}: {first['msg']}.") from error
     if not record.trajectory.path.states:
-        raise InvalidRequest(f"{simulation.name} is a minimal result, without tracks: get it without `return=minimal`.")
+        raise InvalidRequest(f"{simulation.name} is a minimal result without tracks: ask without `return=minimal`.")
     length = clip_length(record.trajectory.num_frames, record.trajectory.fps, CLIP_FPS)
     trajectory = at_rate(record.trajectory, CLIP_FPS, length)
     found = tracks_of(trajectory, record.image.width, record.image.height)
@@ -197,6 +206,6 @@ def tracks(
     moving = found.points.shape[1] - still - anchors
     names = " and ".join(str(path) for path in written)
     typer.echo(
-        f"{moving} tracks of what moves, {still} of what stays and {anchors} anchors over {found.num_frames} frames at "
-        f"{CLIP_FPS:g} per second: {names}"
+        f"{moving} tracks of moving objects, {still} of still ones and {anchors} of the background over "
+        f"{found.num_frames} frames at {CLIP_FPS:g} per second: {names}"
     )

@@ -1,4 +1,4 @@
-"""The options that `simulate` and `answer` share, the request that they make, and how errors are shown."""
+"""The options that `simulate` and `answer` share, the request that they build, and how help and errors are shown."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from cow_service.errors import CowError, InvalidRequest
 
@@ -22,20 +22,21 @@ if TYPE_CHECKING:
     from cow_service.client import Client
 
 _GIVE_PLACE = (
-    "Here: --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME) for what moves, --other NAME=X0,Y0,X1,Y1 for the rest."
+    "Use --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME) for the moving object, and "
+    "--other NAME=X0,Y0,X1,Y1 for the other objects."
 )
-HINTS = {  # what an error's remedy asks for as options, by the error's code
+HINTS = {  # the remedy in terms of options, by the error's code
     "cannot-ground": _GIVE_PLACE,
     "object-not-found": _GIVE_PLACE,
-    "cannot-read-direction": "Here: --direction DX,DY.",
-    "generator-unavailable": "Or here: --generator cutout (or COW_GENERATOR=cutout), without GPU and weights.",
+    "cannot-read-direction": "Use --direction DX,DY (x right, y down).",
+    "generator-unavailable": "Or use --generator cutout (or COW_GENERATOR=cutout), which needs no GPU and no weights.",
 }
 
 
 class FileUnreadable(CowError):
-    """A file of the command line cannot be read."""
+    """A file named on the command line cannot be read."""
 
-    code, status = "file-unreadable", 0  # never on the wire
+    code, status = "file-unreadable", 0  # never in a response
 
 
 class FolderNotWritable(CowError):
@@ -47,9 +48,32 @@ class FolderNotWritable(CowError):
 COMMANDS = {
     "Ask": ("demo", "simulate", "answer", "batch"),
     "Serve": ("serve", "worker", "mcp", "keys", "migrate"),
-    "Look after it": ("doctor", "models"),
+    "Maintain": ("doctor", "models"),
     "Measure and convert": ("eval", "tracks"),
 }  # of `cow --help`
+GROUPS = {
+    "The moving object": ("point", "box", "name"),
+    "Its motion": ("direction", "kind", "speed", "distance", "duration", "until", "law", "trajectory"),
+    "The scene": ("other", "remove", "place", "depth", "depth_scale"),
+    "The simulation": ("ensemble", "reader", "language", "seed", "fields"),
+    "The frames": ("generator", "own", "num_frames", "fps", "frames", "count", "max_side"),
+}  # of the options that `simulate` and `answer` share
+
+
+class Grouped(TyperCommand):
+    """A command whose help lists its options in `GROUPS`, after its own."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Writes the arguments and the options."""
+        shared = {name: group for group, names in GROUPS.items() for name in names}
+        rows: dict[str, list[Any]] = {title: [] for title in ("Arguments", "Options", *GROUPS)}
+        for param in self.get_params(ctx):
+            own = "Arguments" if param.param_type_name == "argument" else "Options"
+            if (record := param.get_help_record(ctx)) is not None:
+                rows[shared.get(param.name or "", own)].append(record)
+        for title, records in rows.items():
+            with formatter.section(title):
+                formatter.write_dl(records)
 
 
 class Commands(TyperGroup):
@@ -59,7 +83,7 @@ class Commands(TyperGroup):
     """
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The commands in groups, by what one wants to do."""
+        """Writes the commands in groups by purpose."""
         for title, names in COMMANDS.items():
             found = [(name, self.commands[name]) for name in names if name in self.commands]
             rows = [(name, command.get_short_help_str(formatter.width - 14)) for name, command in found]
@@ -96,12 +120,12 @@ class Commands(TyperGroup):
 
 
 def printable(text: str) -> str:
-    """The text without characters that control a terminal: control codes, escapes, marks of writing direction."""
+    """The text without characters that could control a terminal: control codes, escapes, direction marks."""
     return "".join(character if character.isprintable() or character == "\n" else "\ufffd" for character in text)
 
 
 def option(help: str, *names: str, shown: str | None = None, **more: Any) -> Any:
-    """The declaration of an option; `shown` is what the help calls its default, where that has no value of its own."""
+    """The declaration of an option. `shown` is the default in the help, where the option itself has none."""
     return typer.Option(*names, help=help, show_default=shown or True, **more)
 
 
@@ -111,11 +135,11 @@ def argument(help: str, name: str | None = None, **more: Any) -> Any:
 
 
 EXISTING: dict[str, Any] = {"exists": True, "dir_okay": False}  # of a path: a file that is there
-Image = Annotated[Path, argument("PNG, JPEG or WebP.", "IMAGE", readable=True, **EXISTING)]
+Image = Annotated[Path, argument("PNG, JPEG or WebP file.", "IMAGE", readable=True, **EXISTING)]
 Question = Annotated[
-    str, argument('For example "If the red ball moves to the left, will it hit the vase?"', "QUESTION")
+    str, argument('A what-if question, such as "If the red ball moves left, will it hit the vase?"', "QUESTION")
 ]
-Url = Annotated[str | None, option("The server.", shown="COW_BASE_URL, http://127.0.0.1:8000")]
+Url = Annotated[str | None, option("URL of the server.", shown="COW_BASE_URL, http://127.0.0.1:8000")]
 AsJson = Annotated[bool, option("Print JSON.", "--json")]
 Texts = list[str] | None
 Policy = Literal["initial", "uniform", "events"]
@@ -126,15 +150,15 @@ Language = Literal["en", "de", "es", "fr", "zh", "ja"]
 
 
 class Format(StrEnum):
-    """What a clip can be made into, beside the mp4. Typer takes no list of a `Literal`."""
+    """Formats of a clip besides mp4. Typer does not accept a list of a `Literal`."""
 
     GIF = "gif"
     WEBP = "webp"
     SHEET = "sheet"
 
 
-# Where an option stands in the request. Typer needs their declarations below before pydantic could be imported: a test
-# checks that their defaults are those of the fields.
+# The request field of each option. The options below repeat the fields' defaults, because importing pydantic would
+# slow down `--help`; a test checks that they agree.
 FIELDS = {
     "point": "grounding/point",
     "box": "grounding/bbox",
@@ -150,30 +174,27 @@ FIELDS = {
     "count": "frames/count",
     "max_side": "frames/max_side",
 }
-_NUMBERS = {"point": 2, "box": 4, "direction": 2}  # how many an option takes, with commas between
+_NUMBERS = {"point": 2, "box": 4, "direction": 2}  # how many comma-separated numbers an option takes
 _SAME_NAME = ("language", "ensemble", "reader", "generator", "num_frames", "fps", "seed")
 
 
 def request_body(
-    point: Annotated[str | None, option("X,Y of a point on the object that moves, px.")] = None,
-    box: Annotated[str | None, option("X0,Y0,X1,Y1 of the object that moves, px.")] = None,
-    name: Annotated[
-        str | None, option("What the object is called, with --point, --box or --trajectory.", "--object")
-    ] = None,
-    direction: Annotated[str | None, option("DX,DY of the motion, px, x right, y down.")] = None,
-    kind: Annotated[
-        Kind | None, option("Kind of motion, with --direction (or alone for fall and static).", shown="linear")
-    ] = None,
-    speed: Annotated[float | None, option("px/s.", shown="0.26 widths/s")] = None,
-    distance: Annotated[float | None, option("px, after which it is stopped.")] = None,
-    duration: Annotated[float | None, option("Seconds, after which it is stopped.")] = None,
-    until: Annotated[Until | None, option("contact: stopped where it first meets something.")] = None,
-    remove: Annotated[Texts, option("Taken away before the motion; may be repeated.", metavar="NAME")] = None,
+    point: Annotated[str | None, option("X,Y of a point on the moving object, px.")] = None,
+    box: Annotated[str | None, option("X0,Y0,X1,Y1 of a box around the moving object, px.")] = None,
+    name: Annotated[str | None, option("Name of the object, with --point, --box or --trajectory.", "--object")] = None,
+    direction: Annotated[str | None, option("DX,DY of the motion in the image; x right, y down.")] = None,
+    kind: Annotated[Kind | None, option("Motion; linear and projectile need --direction.", shown="linear")] = None,
+    speed: Annotated[float | None, option("Speed, px/s.", shown="0.26 image widths/s")] = None,
+    distance: Annotated[float | None, option("Stop the object after this distance, px.")] = None,
+    duration: Annotated[float | None, option("Stop the object after this time, s.")] = None,
+    until: Annotated[Until | None, option("contact: stop the object at its first contact.")] = None,
+    remove: Annotated[Texts, option("Object to take away before the motion; may be repeated.", metavar="NAME")] = None,
     place: Annotated[
-        Texts, option('Such as "apple into bowl"; may be repeated.', metavar="THING RELATION THING")
+        Texts,
+        option('Put an object first: "apple into bowl"; may be repeated.', metavar="THING RELATION THING"),
     ] = None,
     law: Annotated[
-        Law | None, option("contact: floor, bounces, pushes; ballistic: through everything.", shown="contact")
+        Law | None, option("Physics. contact: bounces, pushes; ballistic: through everything.", shown="contact")
     ] = None,
     other: Annotated[
         Texts,
@@ -182,29 +203,29 @@ def request_body(
             metavar="NAME=X0,Y0,X1,Y1",
         ),
     ] = None,
-    ensemble: Annotated[int, option("How many worlds the probabilities are counted in, at most; 0: none.")] = 50,
-    depth: Annotated[Path | None, option("Depth map of the image: a grey PNG with 16 bits.", **EXISTING)] = None,
-    depth_scale: Annotated[float | None, option("Metres per unit of the depth map.", shown="not known")] = None,
-    trajectory: Annotated[Path | None, option("JSON with the `trajectory` of a request.", **EXISTING)] = None,
+    ensemble: Annotated[int, option("Most simulated versions, over which probabilities are counted; 0: none.")] = 50,
+    depth: Annotated[Path | None, option("Depth map of the image: a 16-bit grey PNG.", **EXISTING)] = None,
+    depth_scale: Annotated[float | None, option("Metres per unit of the depth map.", shown="unknown")] = None,
+    trajectory: Annotated[Path | None, option("JSON file: the `trajectory` of a request.", **EXISTING)] = None,
     language: Annotated[Language | None, option("Language of answer and story.", shown="en")] = None,
     fields: Annotated[
         str | None,
-        option('Other fields of the request: {"camera": {"pitch": 25}}.', "--request", metavar="JSON", shown="none"),
+        option('Other request fields, such as {"camera": {"pitch": 25}}.', "--request", metavar="JSON", shown="none"),
     ] = None,
-    reader: Annotated[str | None, option("Who looks at the image.", shown="COW_READER")] = None,
-    generator: Annotated[str | None, option("Who makes the frames.", shown="COW_GENERATOR")] = None,
+    reader: Annotated[str | None, option("Part that understands the question.", shown="COW_READER")] = None,
+    generator: Annotated[str | None, option("Part that makes the frames.", shown="COW_GENERATOR")] = None,
     own: Annotated[
         Texts,
         option("An option of the generator, such as steps=20; may be repeated.", "--option", metavar="NAME=VALUE"),
     ] = None,
-    num_frames: Annotated[int, option("Frames of the clip.")] = 81,
-    fps: Annotated[float, option("Frames per second.")] = 16,
-    seed: Annotated[int | None, option("For what draws random numbers.", shown="0, and none for an MLLM")] = None,
-    frames: Annotated[Policy, option("Which frames to keep as pictures.")] = "events",
-    count: Annotated[int, option("How many of them.")] = 4,
-    max_side: Annotated[int, option("Their longest side, px; 0 for the clip's own size.")] = 512,
+    num_frames: Annotated[int, option("Length of the clip, frames.")] = 81,
+    fps: Annotated[float, option("Frames per second of the clip.")] = 16,
+    seed: Annotated[int | None, option("Random seed.", shown="0, and none for a multimodal LLM")] = None,
+    frames: Annotated[Policy, option("Frames to save as pictures: around events, uniform, or initial.")] = "events",
+    count: Annotated[int, option("Number of these pictures.")] = 4,
+    max_side: Annotated[int, option("Their longest side, px; 0: the size of the clip.")] = 512,
 ) -> dict[str, Any]:
-    """The fields of the request that both commands have. Raises `InvalidRequest` naming the option that is wrong."""
+    """The request fields that both commands have. Raises `InvalidRequest`, naming the wrong option."""
     given = locals()
     body: dict[str, Any] = {name: given[name] for name in _SAME_NAME} | {"generator_options": {}}
     for text in own or []:
@@ -212,7 +233,7 @@ def request_body(
         if not own_name or not equals:
             raise InvalidRequest(f"--option takes NAME=VALUE, such as steps=20; got '{text}'.")
         body["generator_options"][own_name] = own_value
-        with suppress(ValueError):  # a value that is no JSON is text
+        with suppress(ValueError):  # a value that is not JSON is text
             body["generator_options"][own_name] = json.loads(own_value)
     body["objects"] = [_other_object(text) for text in other or []]
     removed = ({"kind": "remove", "object": thing} for thing in remove or [])
@@ -232,17 +253,17 @@ def request_body(
         points = body.get("trajectory", {}).get("points")
         if not points:
             raise InvalidRequest(
-                "--object goes with --point, --box or --trajectory; else the question names the object."
+                "--object needs --point, --box or --trajectory. Without them, name the object in the question."
             )
         body["grounding"]["point"] = points[0]
     more = object_in(fields or "{}", "--request")
-    if isinstance(more.get("depth"), dict):  # beside the file of the map, its focal length or deviation
+    if isinstance(more.get("depth"), dict):  # such as focal length or deviation, in addition to the map
         more["depth"] = body.get("depth", {}) | more["depth"]
     return body | more
 
 
 def with_request_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the options of `request_body` in place of its last parameter, `request`."""
+    """The command with its last parameter, `request`, replaced by the options of `request_body`."""
     shared = signature(request_body, eval_str=True).parameters
     own = [parameter for name, parameter in signature(command, eval_str=True).parameters.items() if name != "request"]
 
@@ -256,7 +277,7 @@ def with_request_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def open_client(url: str | None) -> Client:
-    """A client of the SDK. Raises `InvalidRequest` for what is no address."""
+    """A client of the SDK. Raises `InvalidRequest` if the URL is not valid."""
     from cow_service.client import Client  # noqa: PLC0415
 
     try:
@@ -266,11 +287,11 @@ def open_client(url: str | None) -> Client:
 
 
 def read_file(path: Path) -> bytes:
-    """The bytes of a file of the command line. Raises `FileUnreadable`."""
+    """The bytes of a file named on the command line. Raises `FileUnreadable`."""
     try:
         return path.read_bytes()
     except OSError as error:
-        raise FileUnreadable(f"'{path}' cannot be read: {error.strerror}. Choose another file.") from error
+        raise FileUnreadable(f"Cannot read '{path}': {error.strerror}. Choose another file.") from error
 
 
 @contextmanager
@@ -279,12 +300,12 @@ def writable(out: Path) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        detail = f"'{out}' cannot be written: {error.strerror}. Choose another place with --out."
+        detail = f"Cannot write to '{out}': {error.strerror}. Choose another place with --out."
         raise FolderNotWritable(detail) from error
 
 
 def object_in(text: str | bytes, name: str) -> dict[str, Any]:
-    """The JSON object that a text is. Raises `InvalidRequest` with the name of the text."""
+    """Parses a JSON object. Raises `InvalidRequest`, which calls the text by `name`."""
     try:
         given = json.loads(text)
     except ValueError as error:
@@ -301,19 +322,19 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
         values = []
     if len(values) != count:
         example = {"--direction": "-1,0 for to the left (x right, y down)"}.get(option, "10,20,90,140"[: 4 * count - 3])
-        raise InvalidRequest(f"{option} takes {count} numbers with commas between, such as {example}; got '{text}'.")
+        raise InvalidRequest(f"{option} takes {count} numbers separated by commas, such as {example}; got '{text}'.")
     return values
 
 
 def _depth_map(path: Path | None, scale: float | None) -> dict[str, object]:
-    """The `depth` of a request, by the file of a map."""
+    """The `depth` of a request, from the file of a map."""
     if path is None:
-        raise InvalidRequest("--depth-scale goes with --depth.")
+        raise InvalidRequest("--depth-scale needs --depth, the file of the depth map.")
     return {"map": f"data:image/png;base64,{base64.b64encode(read_file(path)).decode()}", "scale": scale}
 
 
 def _placement(text: str) -> dict[str, object]:
-    """What `--place` says, as an intervention."""
+    """The intervention that a `--place` option describes."""
     from cow_service.narration.words import PREPOSITIONS, RELATION_WORDS  # noqa: PLC0415 - it imports pydantic
 
     words = "|".join(sorted(RELATION_WORDS, key=len, reverse=True))  # "in front of" before "in"
@@ -321,8 +342,8 @@ def _placement(text: str) -> dict[str, object]:
     found = re.fullmatch(pattern, text, re.IGNORECASE)
     if found is None:
         raise InvalidRequest(
-            f"--place takes a thing, a relation ({', '.join(PREPOSITIONS)}) and what it is put to, such as "
-            f"'apple into bowl' or 'cube between mug and vase'; got '{text}'."
+            f"--place takes an object, a relation ({', '.join(PREPOSITIONS)}) and the object or place it refers to, "
+            f"such as 'apple into bowl' or 'cube between mug and vase'; got '{text}'."
         )
     relation = RELATION_WORDS[found["relation"].lower()]
     targets = re.split(r"\s+and\s+", found["targets"]) if relation == "between" else [found["targets"]]
@@ -330,7 +351,7 @@ def _placement(text: str) -> dict[str, object]:
 
 
 def _other_object(text: str) -> dict[str, object]:
-    """Another object of the image, by its box or by a point on it."""
+    """The object that an `--other` option gives, by its box or a point on it."""
     name, _, place = text.rpartition("=")
     if not name.strip():
         raise InvalidRequest(f"--other takes NAME=X0,Y0,X1,Y1 or NAME=X,Y; got '{text}'.")

@@ -1,4 +1,4 @@
-"""Commands of processes that go on: `serve`, `worker` and `mcp`, their job database, and the keys of their callers."""
+"""Commands that run servers: `serve`, `worker` and `mcp`; also their job database and API keys."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def serve(
     port: Annotated[int | None, option("Port to listen on; 0 takes a free one.", shown="COW_PORT, 8000")] = None,
     role: Annotated[
         Literal["all", "api"] | None,
-        option("api: take requests only, and leave the jobs to `cow worker`.", shown="COW_ROLE, all"),
+        option("api: only accept requests and leave the jobs to `cow worker`.", shown="COW_ROLE, all"),
     ] = None,
 ) -> None:
     """Start the server."""
@@ -44,7 +44,7 @@ def serve(
         settings = service.settings
         pool = WorkerPool(settings, service.metrics) if settings.workers and settings.role == "all" else None
         if pool is not None:
-            pool.start()  # its processes start while the server is imported
+            pool.start()  # its processes start while the server's modules are imported
         from cow_service.api.app import warn_if_open  # noqa: PLC0415
         from cow_service.server import run_server  # noqa: PLC0415
 
@@ -54,10 +54,11 @@ def serve(
 
 def worker(
     queues: Annotated[
-        str | None, option("Queues to take jobs from: light, and ati or another name.", shown="COW_QUEUES, all")
+        str | None,
+        option("Queues to take jobs from, with commas: light, or a backend such as ati.", shown="COW_QUEUES, all"),
     ] = None,
 ) -> None:
-    """Compute the jobs of servers on the same job database."""
+    """Compute jobs for the servers on the same job database."""
     named = None if queues is None else tuple(name.strip() for name in queues.split(",") if name.strip())
     with quick_imports():
         service = _served(queues=named)
@@ -70,13 +71,13 @@ def worker(
 
     run_worker(service, pool)
     tracing.stop()
-    os._exit(0)  # while the database is away, DBOS retries in threads for which Python would wait
+    os._exit(0)  # Python would wait for the threads in which DBOS retries while the database is down
 
 
 def migrate() -> None:
     """Create or update the tables of the job database.
 
-    Servers and workers do so themselves when they start, unless COW_MIGRATE is false.
+    Servers and workers do this when they start, unless COW_MIGRATE is false.
     """
     from cow_service.jobs.webhooks import migrate as run  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
@@ -94,26 +95,26 @@ class McpNotInstalled(CowError):
 def mcp(
     transport: Annotated[
         Literal["stdio", "http"],
-        option("stdio: with the program that starts this one; http: at --host and --port, /mcp."),
+        option("stdio: talk to the program that starts it; http: listen at --host and --port, under /mcp."),
     ] = "stdio",
     host: Annotated[str, option("Address to listen on, with --transport http.")] = "127.0.0.1",
     port: Annotated[int, option("Port to listen on; 0 takes a free one.", min=0, max=65535)] = 8001,
     url: Annotated[
         str | None,
         option(
-            "COW server that does the work; its key is COW_API_KEY, or that of the caller over HTTP.",
+            "COW server that does the work; the key is COW_API_KEY, or over HTTP the caller's.",
             envvar="COW_BASE_URL",
-            shown="none: this process does it",
+            shown="none: this process does the work",
         ),
     ] = None,
     allow_host: Annotated[
         Texts,
-        option("Another name by which it may be asked, such as that of a proxy; may be repeated.", metavar="NAME"),
+        option("Another host name that callers use, such as a proxy's; may be repeated.", metavar="NAME"),
     ] = None,
 ) -> None:
-    """Serve `simulate` and `answer` as tools over MCP.
+    """Serve `simulate` and `answer` as tools for agents (MCP).
 
-    MCP is the Model Context Protocol, by which agents call tools.
+    MCP is the Model Context Protocol, which agents use to call tools.
     """
 
     from cow_service.observability import logging as logs  # noqa: PLC0415
@@ -143,7 +144,7 @@ def mcp(
         warn_if_open(settings)
     elif not is_loopback(host):
         logging.getLogger("cow_service").warning(
-            "Whoever reaches %s can use the COW server behind it, unless that asks for keys.", host
+            "Anyone who can reach %s can use the COW server behind it, unless that server asks for keys.", host
         )
     run_http(backend_for(settings, url), settings, names=allow_host or ())
 
@@ -153,28 +154,28 @@ def _keys() -> None:
     """Create API keys."""
 
 
-@keys.command()
-def new(name: Annotated[str, argument("Whose key it is; logs and limits go by it.", "NAME")]) -> None:
-    """Create a key for NAME, and print the setting with which the server accepts it. Nothing is stored."""
+@keys.command(epilog="Example: cow keys new alice")
+def new(name: Annotated[str, argument("Owner of the key, as logs and rate limits name it.", "NAME")]) -> None:
+    """Create a key for NAME, and print it and the server's setting."""
     from cow_service.api.middleware.access import hash_of, new_key  # noqa: PLC0415
     from cow_service.settings import KEY_NAME, load_settings  # noqa: PLC0415
 
     if not re.fullmatch(KEY_NAME, name):
-        raise InvalidRequest(f"{name!r} is no name for a key: 1 to 64 letters, digits, dots, hyphens, underscores.")
+        raise InvalidRequest(f"{name!r} cannot be the name of a key: use 1 to 64 letters, digits, '.', '-' or '_'.")
     known = load_settings().api_keys
     if name in known:
         raise InvalidRequest(
-            f"COW_API_KEYS has a key of '{name}' already. Take another name, or remove that one first."
+            f"COW_API_KEYS already has a key named '{name}'. Choose another name, or remove that key first."
         )
     key = new_key()
-    typer.echo(f"The key of {name}, shown only now; it goes into the header `Authorization: Bearer <key>`:")
+    typer.echo(f"The key of {name}, shown only once; send it in the header `Authorization: Bearer <key>`:")
     typer.echo(f"\n    {key}\n")
-    typer.echo("The setting of the server, which holds hashes only" + (", with those set here:" if known else ":"))
+    typer.echo("The server's setting, which holds only hashes" + (", including the keys set here:" if known else ":"))
     typer.echo(f"\n    COW_API_KEYS='{json.dumps(known | {name: hash_of(key)})}'\n")
 
 
 def open_service(*, ahead: bool = False, **overrides: Any) -> Service:
-    """`ahead`: its first worker process, where there will be one, is started before all that it needs is imported."""
+    """The service. With `ahead`, its first worker process, if any, starts before the service's imports."""
     from cow_service.settings import load_settings  # noqa: PLC0415
 
     for name, level in QUIET.items():
@@ -190,7 +191,7 @@ def open_service(*, ahead: bool = False, **overrides: Any) -> Service:
 
 
 def _served(**overrides: Any) -> Service:
-    """The service of a process that goes on, with its logs and traces."""
+    """The service of a long-running process, with its logs and traces."""
     service = open_service(ahead=True, **overrides)
     from cow_service.jobs.queues import check_queues  # noqa: PLC0415
     from cow_service.observability import logging as logs  # noqa: PLC0415
@@ -204,7 +205,7 @@ def _served(**overrides: Any) -> Service:
 
 @contextmanager
 def quick_imports() -> Generator[None]:
-    """Without garbage collection: nothing of imports is garbage, and looking for it takes a fifth of the time."""
+    """Turns garbage collection off: imports leave no garbage, and looking for it takes a fifth of their time."""
     gc.disable()
     try:
         yield
@@ -214,7 +215,7 @@ def quick_imports() -> Generator[None]:
 
 
 def check_port(settings: Settings) -> None:
-    """Raises `SettingsError` where nobody can listen at the server's address and port."""
+    """Raises `SettingsError` if the server cannot listen at its address and port."""
     from cow_service.settings import SettingsError  # noqa: PLC0415
 
     host, port = settings.host, settings.port

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from cow_service.client.sync_results import JobHandle as JobHandle
     from cow_service.client.sync_results import Simulation as Simulation
 
-# Each is imported when it is first asked for: whoever uses one client need not wait for the rest.
+# Each is imported on first use, so that a program with one client does not wait for the rest.
 _MODULES = {
     "async_client": ("AsyncClient",),
     "async_results": ("AsyncAnswer", "AsyncJobHandle", "AsyncSimulation"),

@@ -27,7 +27,7 @@ def iterate(values: AsyncGenerator[R]) -> AsyncGenerator[R]:
 
 
 def picture_bytes(files: Any, sha256: str) -> bytes | None:
-    """An artifact for a notebook, where it has been downloaded: nobody can await while a notebook shows a result."""
+    """An artifact for a notebook, if it has been downloaded: a notebook cannot await while it shows a result."""
     return files.held.get(sha256)
 
 
@@ -68,7 +68,7 @@ class AsyncIO:
         return await asyncio.to_thread(function)
 
     async def shield(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Does work in a task of its own: whoever is canceled may be canceled again before it is done."""
+        """Does work in a separate task: a canceled caller may be canceled again before the work is done."""
         task = asyncio.create_task(work())
         self._shielded.add(task)
         task.add_done_callback(self._shielded.discard)

@@ -64,7 +64,7 @@ class AsyncSimulation(SimulationView):
         return picture_of(await run(self._files.fetch(self.overlay.sha256)))
 
     async def video_bytes(self) -> bytes:
-        """The clip as mp4 (H.264). Raises `ValueError` where the request said `video=False`."""
+        """The clip as mp4 (H.264). Raises `ValueError` if the request said `video=False`."""
         if self.video is None:
             raise ValueError("This simulation has no video: ask for one with video=True.")
         return await run(self._files.fetch(self.video.sha256))
@@ -93,7 +93,7 @@ class AsyncAnswer(AnswerView):
     0.0
     """
 
-    simulation: AsyncSimulation | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: nobody assigns it
+    simulation: AsyncSimulation | None  # pyright: ignore[reportIncompatibleVariableOverride] - frozen: never assigned
 
     @property
     def files(self) -> Files:
@@ -132,14 +132,14 @@ class AsyncJobHandle(Generic[R_co]):
         return self.job.id
 
     async def refresh(self) -> Job:
-        """Gets the state of the job. Raises `JobNotFound` where it was deleted."""
+        """Gets the state of the job. Raises `JobNotFound` if it was deleted."""
         self.job = await run(self._connection.refresh(self.id))
         return self.job
 
     async def request(self) -> AcceptedRequest:
         """Gets the request that became the job: `client.submit(**request.request, kind=request.kind)` sends it again.
 
-        Raises `JobNotFound` where the job was deleted.
+        Raises `JobNotFound` if the job was deleted.
         """
         return await run(self._connection.get(AcceptedRequest, f"{protocol.job_path(self.id)}/request"))
 

@@ -1,4 +1,4 @@
-"""Batches: what becomes of each question, and which errors are about the question and which about the server."""
+"""Batches: the outcome of each question, and whether an error is about the question or about the server."""
 
 import threading
 import time
@@ -87,7 +87,7 @@ class OutageTimer:
                 self._on_change(None)
 
     def pause_after(self, error: errors.CowError) -> float | None:
-        """Seconds before the question is sent again; None where the error is about the question.
+        """Seconds before the question is sent again; None if the error is about the question.
 
         Raises an error that all questions would meet, or that has lasted for too long.
         """
@@ -170,7 +170,7 @@ class Batch:
     def request(self, question: Question) -> JobRequest:
         """The request of a question, with a key that a batch which resumes after a kill uses again.
 
-        Raises `ImageUnreadable` where its file cannot be read, and `InvalidRequest` where its image is none.
+        Raises `ImageUnreadable` if its file cannot be read, and `InvalidRequest` where its image is none.
         """
         fresh, minimal = self.options.fresh, self.options.minimal
         try:
@@ -182,7 +182,7 @@ class Batch:
         return replace(request, key=self.journal.key(question, request.content, fresh=fresh))
 
     def folder_of(self, question: Question) -> Path | None:
-        """Where the pictures of a question are saved; None where they are not."""
+        """Where the pictures of a question are saved; None if they are not."""
         if self.journal is None or not self.options.save:
             return None
         return self.journal.folder / "items" / question.folder

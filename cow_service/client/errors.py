@@ -121,7 +121,7 @@ def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) ->
 
 
 def code_of(response: httpx.Response) -> str | None:
-    """The problem code of a response; None where it has none."""
+    """The problem code of a response; None if it has none."""
     problem = _problem(response)
     return None if problem is None else _code(problem)
 

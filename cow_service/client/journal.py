@@ -36,7 +36,7 @@ _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 @dataclass(frozen=True)
 class Question:
-    """One question of a batch. `meta` is whatever should stand beside its outcome, such as the true answer.
+    """One question of a batch. `meta` is anything to keep with its outcome, such as the true answer.
 
     `named` is what tells its image from others; by default its path, its URL, or the digest of its bytes. No file is
     read for it.
@@ -51,7 +51,7 @@ class Question:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of what is asked; of an image in a file its path counts, not its bytes."""
+        """SHA-256 of the question; for an image in a file its path counts, not its bytes."""
         image, named = self.image, self.named
         if named is None:
             if isinstance(image, Path) or (isinstance(image, str) and not image.lower().startswith("data:")):
@@ -73,7 +73,7 @@ class Question:
 def questions(
     items: Iterable[QuestionLike], defaults: Mapping[str, Any] | None = None, folder: Path | None = None
 ) -> Iterator[Question]:
-    """The questions of these items, each with an id: its own, else one made of what it asks.
+    """The questions of these items, each with an id: its own, else one derived from its content.
 
     `defaults` are fields of the request for those that do not have them. Files are looked for in `folder`. Raises
     `InvalidRequest` for an item without image or question, for what no JSON can hold, and for an id that comes twice.
@@ -102,7 +102,7 @@ def questions(
 
 
 def _read_item(item: Any, place: int, defaults: Mapping[str, Any], folder: Path | None) -> Question:
-    """A question, without an id where it has none of its own. Raises `InvalidRequest` for what is no `QuestionLike`."""
+    """A question; without an id unless it has one. Raises `InvalidRequest` if it is not a `QuestionLike`."""
     if isinstance(item, Question):
         question = replace(item, options={**defaults, **item.options}) if defaults else item
     else:
@@ -145,9 +145,9 @@ class Journal:
     def __init__(self, folder: Path, kind: JobKind, *, retry_failed: bool = False) -> None:
         """Opens the folder, which is made if missing.
 
-        Raises `InvalidRequest` where another process holds it, or where it is that of another kind of batch.
+        Raises `InvalidRequest` if another process holds it, or where it is that of another kind of batch.
         """
-        from filelock import FileLock, Timeout  # noqa: PLC0415 - whoever only calls a server need not have it
+        from filelock import FileLock, Timeout  # noqa: PLC0415 - not needed to call a server
 
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
@@ -186,7 +186,7 @@ class Journal:
         self._lock.release()
 
     def has(self, question: Question) -> bool:
-        """Whether its outcome is here. Raises `InvalidRequest` where that is one of another question of the same id."""
+        """Whether its outcome is here. Raises `InvalidRequest` if that is one of another question of the same id."""
         known = self.done.get(question.id)
         if known is not None and known[0] != question.fingerprint:
             raise InvalidRequest(
@@ -273,7 +273,7 @@ def _flush(file: BinaryIO) -> None:
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The lines that were written whole. Raises `InvalidRequest` for one that is none of a batch."""
+    """The completely written lines. Raises `InvalidRequest` for one that does not belong to a batch."""
     with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
         for number, text in enumerate(file, 1):
             if not text.endswith(b"\n"):

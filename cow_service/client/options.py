@@ -1,4 +1,4 @@
-"""What calls take beside image and question: the fields of `SimulateRequest` and `AnswerRequest`; and defaults."""
+"""Arguments of calls besides image and question: the fields of `SimulateRequest` and `AnswerRequest`, and defaults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress of a job and of a batch, on the terminal or in a notebook: as a bar, or told to a function of one's own."""
+"""Progress of a job and of a batch, on the terminal or in a notebook: as a bar, or passed to your own function."""
 
 import sys
 import time
@@ -44,7 +44,7 @@ LOOK_SECONDS = 10.0  # between two looks at what the server's jobs wait for
 
 
 def describe_load(workers: Workers) -> str:
-    """What most of the server's jobs wait for, whoever asked; empty where nothing waits or the server does not say."""
+    """What most of the server's jobs wait for; empty if nothing waits or the server does not say."""
     loads = [one.load for process in workers.processes for one in process.workers if one.load is not None]
     cpu, calls = sum(one.cpu_waiting for one in loads), sum(one.mllm_calls for one in loads)
     at_mllm, queued = calls + sum(one.mllm_waiting for one in loads), sum(queue.queued for queue in workers.queues)

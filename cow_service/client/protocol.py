@@ -54,7 +54,7 @@ class Endpoint:
         return httpx.Timeout(**{**self.timeout.as_dict(), "read": STREAM_TIMEOUT_SECONDS})
 
     def limited(self, seconds: float | None) -> httpx.Timeout:
-        """Timeouts of a request, none of them longer than so many seconds."""
+        """Timeouts of a request, each limited to a number of seconds."""
         if seconds is None:
             return self.timeout
         limits = self.timeout.as_dict().items()
@@ -98,7 +98,7 @@ _BROKEN_CONNECTION = (httpx.NetworkError, httpx.TimeoutException, httpx.RemotePr
 
 
 def pause_before_retry(outcome: httpx.Response | httpx.HTTPError, attempts: int) -> float | None:
-    """Seconds to wait after so many attempts; None where another would have the same outcome."""
+    """Seconds to wait after a number of attempts; None if another would have the same outcome."""
     if not is_refusal(outcome):
         return None
     if isinstance(outcome, httpx.Response) and (seconds := retry_after(outcome)) is not None:
@@ -137,7 +137,7 @@ class Event:
     """One thing that happened to a job.
 
     `number` is the same however often events are read, and None for `progress`, which is not repeated. `job` is the
-    job as it then was, without its result; None where it was deleted.
+    job as it then was, without its result; None if it was deleted.
     """
 
     name: EventName

@@ -27,7 +27,7 @@ def to_json(value: Any) -> bytes:
 
 
 def plain(value: Any) -> Any:
-    """What JSON can hold of a record, of a NumPy array or number, or of a time; tuples and lists stay."""
+    """A JSON value for a record, a NumPy array or number, or a time; tuples and lists stay."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True)
     if hasattr(value, "tolist"):
@@ -79,7 +79,7 @@ def is_url(text: str) -> bool:
 def image_input(image: ImageLike) -> bytes | str | dict[str, str]:
     """How an image is sent: as a file with these bytes, or named in the request: a URL, a data URL, an artifact.
 
-    Raises `OSError` where a file cannot be read, and `InvalidRequest` for anything that is no image.
+    Raises `OSError` if a file cannot be read, and `InvalidRequest` for anything that is no image.
     """
     sent: bytes | str | dict[str, str] | None = None
     if isinstance(image, str) and is_url(image):
@@ -96,7 +96,7 @@ def image_input(image: ImageLike) -> bytes | str | dict[str, str]:
         from cow_service.requests import ImageArtifact, ImageUrl  # noqa: PLC0415 - most calls do not need it
 
         sent = image.model_dump() if type(image) in (ImageArtifact, ImageUrl) else None
-    # Neither library is loaded for this: whoever has such an image has loaded it.
+    # Neither library is loaded for this: a program with such an image has loaded it.
     elif hasattr(image, "__array_interface__") and hasattr(image, "dtype"):
         sent = encoded_array(cast("NDArray[np.uint8]", image))
     elif hasattr(image, "save") and hasattr(image, "mode"):

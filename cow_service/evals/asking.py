@@ -1,4 +1,4 @@
-"""One question, asked once: the order of its options, who is asked, what is replied, and what is observed of it.
+"""One question, asked once: the order of its options, the model asked, its reply, and the observation made of it.
 
 There are two ways to ask: a multimodal LLM itself through Inspect, or the service's own `/answer`.
 """
@@ -35,7 +35,7 @@ from cow_service.stages.keys import FirstAnswers
 
 GATE_THRESHOLD = 1.0
 PROMPT = "eval-question"
-OVERLAY = "Not sent to the model: the overlay of the simulation that the frames are of."
+OVERLAY = "Not sent to the model: the overlay of the simulation behind the frames."
 # Where the public rules and ours differ, for readers of a report.
 DIFFERENCES = (
     "A reply that gives an option's text instead of its letter is read here; the paper's rules take the text's first "
@@ -48,7 +48,7 @@ DIFFERENCES = (
 # What stands behind the word "answer" and a colon, up to the next quotation mark.
 _ANNOUNCED = re.compile(r"""["']?[Aa]nswer["']?\s*:\s*["']?([^"']+)""")
 BETWEEN_REPLIES = "\n\n"
-MOST_LISTED = 5  # options, of which all orders are listed
+MOST_LISTED = 5  # options; up to so many, all orders are listed
 _PAPER_FORMS = tuple(map(re.compile, (r"\(([a-j])\)", r"^([a-j])$", r"([a-j])\.", r"^([a-j])\)")))
 
 
@@ -74,7 +74,7 @@ def _draws(*parts: object) -> random.Random:
 
 
 def read_reply(reply: str, options: Sequence[AnswerOption]) -> str | None:
-    """The letter of the shown option that a reply chooses; None where it chooses none, or several."""
+    """The letter of the shown option that a reply chooses; None if it chooses none, or several."""
     try:
         return read_answer(reply, options).answer
     except ReplyError:
@@ -82,7 +82,7 @@ def read_reply(reply: str, options: Sequence[AnswerOption]) -> str | None:
 
 
 def read_as_paper(reply: str) -> str | None:
-    """The letter that the rules of the paper's public scoring script read in a reply; None where they find none.
+    """The letter that the rules of the paper's public scoring script read in a reply; None if they find none.
 
     The last announced answer counts: a letter in brackets anywhere in it, else a lone letter, else a letter before a
     full stop, else its first character where that is a letter.
@@ -111,7 +111,7 @@ class Case:
 
     @property
     def question(self) -> str:
-        """As it is asked."""
+        """The text of the question."""
         return question_text(self.item, self.order)
 
     @property
@@ -123,7 +123,7 @@ class Case:
         )
 
     def read(self, reply: str) -> str | None:
-        """The letter, in the data's order, that a reply chooses; None where it chooses none, or several."""
+        """The letter, in the data's order, that a reply chooses; None if it chooses none, or several."""
         return self._in_data_order(read_reply(reply, self.options))
 
     def read_as_paper(self, reply: str) -> str | None:
@@ -200,13 +200,13 @@ def place_of(case: Case) -> dict[str, Any]:
 
 
 def leading(letters: Sequence[str | None]) -> str | None:
-    """The most frequent of the letters, of equals the first; None where none could be read."""
+    """The most frequent of the letters, of equals the first; None if none could be read."""
     counts = Counter(letter for letter in letters if letter is not None)
     return counts.most_common(1)[0][0] if counts else None
 
 
 def happens(item: Item) -> bool | None:
-    """Whether what is asked happens, by the truth; None where the right option is neither yes nor no."""
+    """Whether the event happens, by the truth; None if the right option is neither yes nor no."""
     said = plain(next(option.text for option in item.options if option.letter == item.answer))
     return {"yes": True, "true": True, "no": False, "false": False}.get(said.partition(" ")[0])
 
@@ -323,9 +323,9 @@ def message(digests: Iterable[str], text: str, pictures: Pictures) -> inspect_mo
 
 
 def conversation(case: Case, asked: CaseReplies, pictures: Pictures) -> list[inspect_model.ChatMessage]:
-    """What a viewer shows: what was asked last, every reply, and in the first repeat the overlay.
+    """The content for a viewer: the last question, every reply, and in the first repeat the overlay.
 
-    What `/answer` sends by itself is not known here: in its place stand the image, the frames and the question.
+    What `/answer` sends is not known here; the image, the frames and the question stand for it.
     """
     frames = [digest for found in asked.evidence for digest in found.frames]
     shown = list(asked.messages) or [message((case.item.image, *frames), case.question, pictures)]

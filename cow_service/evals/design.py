@@ -25,7 +25,7 @@ Order = Literal["shuffled", "data"]
 
 
 class Arm(Record):
-    """What is shown beside the image, and how often the question is asked."""
+    """What is shown with the image, and how often the question is asked."""
 
     content: Content = "none"
     frames: FramePolicy = Field(default="events", description="Which frames.")
@@ -155,7 +155,7 @@ def arm_of(text: str) -> Arm:
         given = NAMED[base].model_dump(exclude_defaults=True)
     else:
         raise InvalidRequest(
-            f"There is no arm '{text}': there are {', '.join(NAMED)}, each with suffixes such as :initial or :vote-3, "
+            f"There is no arm '{text}': arms are {', '.join(NAMED)}, each with suffixes such as :initial or :vote-3, "
             "or factors, such as content=simulated,frames=events,votes=1."
         )
     for suffix in suffixes if "=" not in base else ():
@@ -186,7 +186,7 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
         if ask not in arm.asks:
             raise InvalidRequest(
                 f"The service's own /answer has no arm '{arm.name}', only never, always and auto, each also with "
-                "votes: name a multimodal LLM with --mllm, and leave --ask out."
+                "votes: name a multimodal LLM with --mllm and leave --ask out."
             )
         without = [item for item in items if item.truth is None or not item.truth.shows(drawn=arm.error is not None)]
         if arm.content == "true" and without:
@@ -201,7 +201,7 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
 
 
 def references(arm: Arm, asked: Sequence[Arm]) -> tuple[Arm, ...]:
-    """What an arm is compared with, of the arms that were asked: all contrasts that a report shows.
+    """The arms that an arm is compared with, among those asked: all contrasts of a report.
 
     The image alone; the image alone with as many calls; and of frames that are meant to tell something, each placebo
     with the same frames and votes.

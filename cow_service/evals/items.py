@@ -1,4 +1,4 @@
-"""What is asked and what comes of it: an item is one question on one image, with its options and its truth."""
+"""Items and replies. An item is one question about one image, with its options and its truth."""
 
 import hashlib
 from collections.abc import Sequence
@@ -66,7 +66,7 @@ Wording = tuple[tuple[str, ...], tuple[AnswerOption, ...]]
 
 
 def listed_wording(question: str) -> Wording | None:
-    """The parts of a question around the options that it lists, and these; None where it lists none.
+    """The parts of a question around the options that it lists, and these; None if it lists none.
 
     The letters and all words between the options stay where they are.
     """
@@ -84,7 +84,7 @@ def listed_wording(question: str) -> Wording | None:
 
 
 def appended_wording(question: str, options: Sequence[str]) -> Wording:
-    """The same for a question whose options stand beside it: they are put below it, a line each, with letters."""
+    """The same for a question with separate options: they are put below it, a line each, with letters."""
     letters = LETTERS[: len(options)]
     heads = [f"\n({letter}) " for letter in letters]
     parts = (f"{question}\n{heads[0]}", *heads[1:], "")
@@ -95,7 +95,7 @@ class Pictures(DiskArtifacts):
     """A folder of pictures, by their digests. The same bytes are kept once."""
 
     def add(self, data: bytes) -> str:
-        """Keeps a picture; returns its digest. Raises what `decode` raises for what is none."""
+        """Keeps a picture; returns its digest. Raises the errors of `decode`."""
         if not self.has(hashlib.sha256(data).hexdigest()):
             decode(data)
         return self.add_made(data)
@@ -139,7 +139,7 @@ class Observation(Record):
     calls: int = Field(default=0, description="Of the multimodal LLM, those of the imagination included.")
     input_tokens: int = 0
     output_tokens: int = 0
-    seconds: float = Field(default=0.0, description="For simulations and replies; what is found again takes less.")
+    seconds: float = Field(default=0.0, description="For simulations and replies; cached results take less.")
     imaginations: int = Field(default=0, description="Simulations that the reply rests on.")
     refusal: str | None = Field(default=None, description="Code of the problem for which nothing was imagined.")
     frames: tuple[Sha256, ...] = Field(default=(), description="Pictures shown beside the image, in their order.")
@@ -172,7 +172,7 @@ class Observation(Record):
 
     @property
     def simulation_right(self) -> bool | None:
-        """Whether what the simulation finds likelier is what happens; None where one of the two is not known."""
+        """Whether what the simulation finds likelier is what happens; None if one of the two is not known."""
         if self.probability is None or self.happens is None:
             return None
         return (self.probability >= 0.5) == self.happens

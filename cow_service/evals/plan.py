@@ -17,7 +17,7 @@ from cow_service.records import Record
 from cow_service.records.world import Sha256
 
 FORMAT: Literal[2] = 2
-DISCORDANT = 0.2  # share of pairs of replies of which one alone is right, where no pilot tells
+DISCORDANT = 0.2  # share of pairs of replies with exactly one right, without a pilot
 METHOD = (
     "The difference in the share of right replies between the primary arm and each placebo with the same frames and "
     "votes, paired by question and repeat. Two-sided permutation test of the signs of whole scenes; p is the largest "
@@ -66,7 +66,7 @@ class AnalysisPlan(RunRecord):
 
     format: Literal[2] = FORMAT
     primary: str = Field(description="The arm whose gain is the primary question.")
-    placebos: tuple[str, ...] = Field(description="The arms of which it is to beat each.")
+    placebos: tuple[str, ...] = Field(description="The arms that it must beat, each of them.")
     method: str = METHOD
     alpha: float = ALPHA
     effect: float = Field(description="The gain that is hoped for, as a share of questions.")
@@ -121,7 +121,7 @@ def differences(before: RunRecord, now: RunRecord) -> list[str]:
 
 
 def departures(run: RunInfo, failed: int, unasked: int) -> list[str]:
-    """Where a run does not follow its plan, in words; so many questions failed, and so many were not asked yet."""
+    """Departures of a run from its plan, in words, given the numbers of failed questions and of those not asked yet."""
     plan = run.plan
     if plan is None:
         return []
@@ -167,12 +167,12 @@ def read_plan(path: Path) -> AnalysisPlan:
         raise InvalidRequest(f"The plan '{path}' cannot be read: {error.strerror or error}.") from error
     except ValidationError as error:
         raise InvalidRequest(
-            f"'{path}' is no plan that `cow eval plan` of this version wrote: {str(error).splitlines()[-2].strip()}"
+            f"'{path}' is not a plan of this version's `cow eval plan`: {str(error).splitlines()[-2].strip()}"
         ) from error
 
 
 def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
-    """The plan in words: the primary question, how many scenes it needs, and what it takes.
+    """The plan in words: the primary question, the scenes it needs, and its cost.
 
     `costs` are those of a pilot's arms by name, where there was one.
     """

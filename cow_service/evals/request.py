@@ -32,7 +32,7 @@ MAX_TOKENS = 8192  # of a reply, as in the paper
 
 @dataclass(frozen=True)
 class EvalRequest:
-    """What the caller wants. Options that decide what is asked are those that `options` lists."""
+    """What the caller wants. `options` lists the options that decide what is asked."""
 
     data: str
     out: Path
@@ -83,7 +83,7 @@ def check_request(wanted: EvalRequest) -> None:
     if wanted.ask == "prompt" and wanted.mllm is None:
         raise InvalidRequest("--ask prompt asks a multimodal LLM: name it with --mllm, such as openai/gpt-5.")
     if wanted.ask == "answer" and wanted.mllm is not None and wanted.url is not None:
-        raise InvalidRequest("The server at --url answers with its own multimodal LLM: leave --mllm out.")
+        raise InvalidRequest("The server at --url uses its own multimodal LLM: leave --mllm out.")
     if wanted.ask == "answer" and (wanted.temperature is not None or wanted.max_tokens is not None):
         raise InvalidRequest("--temperature and --max-tokens are for --ask prompt: /answer has its own.")
 
@@ -144,7 +144,7 @@ def info_of(wanted: EvalRequest, found: Collected, items: Sequence[Item], arms: 
 
 
 def merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
-    """A run that goes on, with more arms or repeats perhaps. Raises `InvalidRequest` where the rest is not the same."""
+    """A resumed run, possibly with more arms or repeats. Raises `InvalidRequest` if anything else has changed."""
     if before is None:
         return wanted
     changed = differences(before, wanted)
@@ -156,7 +156,7 @@ def merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
             "options as before."
         )
     newer = [f"{name} {version}" for name, version in wanted.versions.items() if before.versions.get(name) != version]
-    notes = (f"Gone on with {', '.join(newer)}.",) if newer else ()
+    notes = (f"Continued with {', '.join(newer)}.",) if newer else ()
     changes = {
         "arms": {**before.arms, **wanted.arms},
         "repeats": max(before.repeats, wanted.repeats),
@@ -166,7 +166,7 @@ def merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
 
 
 def versions() -> dict[str, str]:
-    """Of this service and its commit, of Python, of the packages that are installed, and of the prompts."""
+    """Versions of this service and its commit, of Python, of the installed packages, and of the prompts."""
     found = {"cow-service": __version__, "commit": _commit(), "python": platform.python_version()}
     for name in PACKAGES:
         try:

@@ -142,7 +142,7 @@ def chosen_option() -> Scorer:
 def prepare(wanted: request.EvalRequest, folder: Path, tell: Callable[[str], None]) -> tuple[RunInfo, list[Item]]:
     """What is to be asked, checked, as the record of a run; its pictures are kept in the folder.
 
-    `tell` is told what was found in the data. Raises as `evaluate` does.
+    `tell` receives findings about the data. Raises as `evaluate` does.
     """
     request.check_request(wanted)
     try:
@@ -160,7 +160,7 @@ def prepare(wanted: request.EvalRequest, folder: Path, tell: Callable[[str], Non
 def write_plan(
     wanted: request.EvalRequest, file: Path, effect: float, pilot: Path | None, prices: Mapping[str, Price]
 ) -> str:
-    """Writes the plan of a run that hopes for a gain of `effect` (a share of questions); returns what it says.
+    """Writes the plan of a run to detect a gain of `effect` (a share of questions); returns its text.
 
     A pilot run tells how much scenes differ, and what a reply costs. Raises as `evaluate` does.
     """
@@ -190,7 +190,7 @@ def write_plan(
 def evaluate(wanted: request.EvalRequest, tell: Callable[[str], None]) -> runs.EvalRun:
     """Asks everything that the folder has no reply to yet; returns all of it.
 
-    All is checked before the first question is asked; `tell` is told what was found in the data. Raises
+    All is checked before the first question is asked; `tell` receives findings about the data. Raises
     `InvalidRequest` for data, arms and settings that cannot be asked, `StorageUnavailable` for a folder that cannot be
     written, and the `CowError` for which no server can be used.
     """
@@ -207,7 +207,7 @@ def evaluate(wanted: request.EvalRequest, tell: Callable[[str], None]) -> runs.E
     logs = wanted.out / runs.LOGS
     info = request.merged(runs.read_info(wanted.out), begun)
     if wanted.retry_failed and logs.is_dir() and runs.forget_failures(logs) > 0:
-        # Under the key of an earlier round a failed job would only be found again.
+        # With the key of an earlier round, the failed job would be returned again.
         info = info.model_copy(update={"rounds": info.rounds + 1})
     _ask(wanted, info, items, model, settings)
     done = runs.read_run(wanted.out)

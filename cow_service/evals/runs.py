@@ -1,4 +1,4 @@
-"""A folder of results: what was asked, and what came of it, which stands in Inspect's logs alone."""
+"""A folder of results: the questions, and their outcomes, which are kept only in Inspect's logs."""
 
 import json
 from collections.abc import Iterable
@@ -43,7 +43,7 @@ class EvalRun:
 
 
 def write_run(folder: Path, info: RunInfo, items: Iterable[Item]) -> None:
-    """Writes what is asked, before anything is."""
+    """Writes the design of the run, before anything is asked."""
     lines = "".join(item.model_dump_json() + "\n" for item in items)
     for name, text in ((ITEMS, lines), (RUN, info.model_dump_json(indent=2) + "\n")):
         partial = folder / f".{name}.partial"
@@ -52,14 +52,14 @@ def write_run(folder: Path, info: RunInfo, items: Iterable[Item]) -> None:
 
 
 def read_info(folder: Path) -> RunInfo | None:
-    """What a folder was asked; None where no run was begun in it. Raises `InvalidRequest` for one that is damaged."""
+    """What a folder was asked; None if no run was begun in it. Raises `InvalidRequest` for one that is damaged."""
     path = folder / RUN
     try:
         found: Any = json.loads(path.read_bytes()) if path.is_file() else None
         if isinstance(found, dict) and found.get("format") != FORMAT:
             raise InvalidRequest(
                 f"'{folder}' holds a run that another version of COW wrote (format {found.get('format')}, not "
-                f"{FORMAT}), whose arms showed other frames: ask into another folder."
+                f"{FORMAT}), whose arms showed other frames: choose another folder with --out."
             )
         return None if found is None else RunInfo.model_validate(found)
     except (ValueError, OSError) as error:
@@ -67,7 +67,7 @@ def read_info(folder: Path) -> RunInfo | None:
 
 
 def read_run(folder: Path) -> EvalRun:
-    """A run and what came of it so far. Raises `InvalidRequest` for a folder that holds none."""
+    """A run and its outcomes so far. Raises `InvalidRequest` for a folder without a run."""
     info = read_info(folder)
     if info is None:
         raise InvalidRequest(f"'{folder}' holds no {RUN}: name the folder that `cow eval --out` wrote.")
@@ -81,7 +81,7 @@ def read_run(folder: Path) -> EvalRun:
 
 def _unreadable(folder: Path, name: str, error: Exception) -> InvalidRequest:
     reason = str(error).splitlines()[0]
-    return InvalidRequest(f"'{folder}' holds no whole run: {name} cannot be read ({reason}). Run `cow eval` again.")
+    return InvalidRequest(f"'{folder}' holds no complete run: {name} cannot be read ({reason}). Run `cow eval` again.")
 
 
 def read_observations(folder: Path) -> list[Observation]:
@@ -100,7 +100,7 @@ def read_observations(folder: Path) -> list[Observation]:
 
 
 def _observation(log: inspect_log.EvalLog, sample: inspect_log.EvalSample) -> Observation | None:
-    """What came of a sample; None where it was canceled."""
+    """What came of a sample; None if it was canceled."""
     for score in (sample.scores or {}).values():
         if score.metadata and OBSERVATION in score.metadata:
             return Observation.model_validate(score.metadata[OBSERVATION])
@@ -114,7 +114,7 @@ def _observation(log: inspect_log.EvalLog, sample: inspect_log.EvalSample) -> Ob
 
 
 def forget_failures(folder: Path) -> int:
-    """Marks what failed, so that it is asked again; returns how many there were."""
+    """Marks failed questions to be asked again; returns their number."""
     count = 0
     for info in inspect_log.list_eval_logs(str(folder)):
         log = inspect_log.read_eval_log(info)

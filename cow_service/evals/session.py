@@ -70,7 +70,7 @@ class Session:
 
 
 def _observed(limit: AdaptiveLimit) -> httpx.AsyncClient:
-    """An HTTP client that tells a limit of every refusal, also of those after which `AsyncClient` asks again."""
+    """An HTTP client that reports every refusal to a limit, even those that `AsyncClient` retries."""
 
     async def note_begin(request: httpx.Request) -> None:
         request.extensions["begun"] = time.monotonic()
@@ -105,7 +105,7 @@ def session(
 
 
 def active_session() -> Session | None:
-    """The session in which tasks run; None where they were started by Inspect's own command."""
+    """The session in which tasks run; None if they were started by Inspect's own command."""
     return _active[-1] if _active else None
 
 
@@ -141,7 +141,7 @@ def _share_files(pictures: Path, artifacts: Path) -> None:
 
 @dataclass
 class EvalProgress(BatchProgress):
-    """Rate, time left and accuracy so far. What an earlier process has asked counts as done, and not for the rate."""
+    """Rate, time left and accuracy so far. Questions of an earlier process count as done, but not for the rate."""
 
     arms: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter[str]))
 

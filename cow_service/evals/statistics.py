@@ -62,7 +62,7 @@ class PrimaryGain(Record):
 
 
 class Bin(Record):
-    """Told probabilities between two bounds, and how often what they tell of happened."""
+    """Predicted probabilities between two bounds, and how often the event happened."""
 
     count: int
     told: float = Field(description="Mean of the probabilities.")
@@ -70,7 +70,7 @@ class Bin(Record):
 
 
 class Calibration(Record):
-    """How good the told probabilities are."""
+    """How good the predicted probabilities are."""
 
     count: int
     brier: float
@@ -91,7 +91,7 @@ class Cost(Record):
 
 
 def rates(observations: Sequence[Observation]) -> Rates | None:
-    """Of one arm; None where nothing was replied to."""
+    """Of one arm; None if nothing was replied to."""
     replied = [each for each in observations if each.failure is None]
     if not replied:
         return None
@@ -137,7 +137,7 @@ def pairs_of(arm: Sequence[Observation], baseline: Sequence[Observation]) -> tup
 
 
 def gain(arm: Sequence[Observation], baseline: Sequence[Observation]) -> Gain | None:
-    """Of an arm over a baseline; None where no question was replied to in both."""
+    """Of an arm over a baseline; None if no question was replied to in both."""
     pairs, questions = pairs_of(arm, baseline)
     return gain_of(pairs, questions) if len(pairs) else None
 
@@ -181,7 +181,7 @@ def sign_flip_p(differences: NDArray[np.float64]) -> float:
 def primary_gain(placebos: Mapping[str, tuple[Pairs, int]]) -> PrimaryGain | None:
     """Of an arm over the strongest of its placebos, by their names: pairs of replies and questions as of `pairs_of`.
 
-    None where there is no placebo, or one without replies. Which placebo is the strongest is found out from the same
+    None if there is no placebo, or one without replies. Which placebo is the strongest is found out from the same
     replies, so one must not only test against that: the gain is one where each placebo is beaten (an intersection-union
     test, Berger 1982). The lower end of the interval is the lowest of all, the upper one the lowest of those with their
     error shared among the placebos.
@@ -206,7 +206,7 @@ def _quantiles(placebos: int) -> float:
 
 
 def scenes_needed(effect: float, variance: float, placebos: int) -> int:
-    """How many scenes show such a gain (a share) over each of so many placebos with a power of 80% at 5%, two-sided.
+    """How many scenes show a gain (a share) over each of several placebos with a power of 80% at 5%, two-sided.
 
     At most: if all placebos are equally strong, and their replies independent. `variance` is that of the scenes' mean
     differences: of one question and reply each, at most the share of discordant pairs.
@@ -215,18 +215,18 @@ def scenes_needed(effect: float, variance: float, placebos: int) -> int:
 
 
 def effect_shown(scenes: int, variance: float, placebos: int) -> float:
-    """The gain that so many scenes show; the inverse of `scenes_needed`."""
+    """The gain that a number of scenes shows; the inverse of `scenes_needed`."""
     return _quantiles(placebos) * math.sqrt(variance / scenes)
 
 
 def power_of(effect: float, variance: float, scenes: int, placebos: int) -> float:
-    """How probable it is, at least, that so many scenes show such a gain; see `scenes_needed`."""
+    """A lower bound of the probability that a number of scenes shows a gain; see `scenes_needed`."""
     missed = norm.sf(effect * math.sqrt(scenes / variance) - norm.ppf(1 - ALPHA / 2))
     return max(0.0, float(1 - placebos * missed))
 
 
 def upper_variance(sd: float, scenes: int) -> float:
-    """A variance that is exceeded in one of five cases, of a standard deviation that so many scenes had."""
+    """A variance that is exceeded in one of five cases, from the standard deviation of a number of scenes."""
     return sd**2 * (scenes - 1) / float(chi2.ppf(0.2, scenes - 1))
 
 
@@ -270,7 +270,7 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibration | None:
-    """Of the told probabilities, each item once; None where none was told."""
+    """Calibration of the predicted probabilities, each item once; None if there are none."""
     told = {
         each.item: (each.probability, each.happens)
         for each in observations
@@ -280,7 +280,7 @@ def calibration(observations: Iterable[Observation], bins: int = 10) -> Calibrat
 
 
 def calibration_of(told: Sequence[tuple[float, bool]], bins: int = 10) -> Calibration:
-    """Of probabilities and whether what they are about happened: one or more."""
+    """Calibration of one or more probabilities and whether their events happened."""
     table = np.array(told, dtype=np.float64)
     base = table[:, 1].mean()
     places = np.minimum((table[:, 0] * bins).astype(int), bins - 1)

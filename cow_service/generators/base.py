@@ -50,9 +50,9 @@ class Limits(Protocol):
 class Generator(Limits, Protocol):
     """Makes the frames of a clip."""
 
-    concurrency: int | None  # clips at the same time on a device of its own; None where it computes on the CPU
+    concurrency: int | None  # clips at the same time on a device of its own; None if it computes on the CPU
     fingerprint: str
-    """All that decides a clip, besides what it is given: model, revision, weights, profile."""
+    """Everything that determines a clip besides its inputs: model, revision, weights, profile."""
 
     def describe(self, given: GeneratorInput) -> GeneratorInfo:
         """Who would make this clip, and what would have to be the same to make it again."""

@@ -32,7 +32,7 @@ class ActiveJob:
     begun: float | None = None  # when its first stage began (`time.monotonic`)
 
     def check(self) -> None:
-        """Raises `Canceled` where its end was requested."""
+        """Raises `Canceled` if its end was requested."""
         if self.cancel_requested.is_set():
             raise Canceled("The job was canceled.")
 
@@ -44,7 +44,7 @@ class Waiter:
     loop: asyncio.AbstractEventLoop
     changed: asyncio.Event = field(default_factory=asyncio.Event)  # progress, or the end
     ended: asyncio.Event = field(default_factory=asyncio.Event)  # the database has the answer
-    refusal: CowError | None = None  # why nobody may wait here any longer
+    refusal: CowError | None = None  # why callers may not wait here any longer
 
     def notify(self, refusal: CowError | None) -> None:
         """The job has ended, or is not waited for any more."""
@@ -56,7 +56,7 @@ class Waiter:
 class ActiveJobs:
     """The jobs that this process runs or waits for. Safe to use from every thread.
 
-    An idempotency key that is used again after its job was deleted comes to the same id: a message about an id may be
+    An idempotency key that is used again after its job was deleted gives the same id: a message about an id may be
     about the earlier job. What became of a job is therefore read from the database alone.
     """
 
@@ -80,7 +80,7 @@ class ActiveJobs:
             self._stirred.notify_all()
 
     def rest(self, stop: threading.Event, seconds: float, quiet_seconds: float) -> None:
-        """Waits so long, or for the other time as long as it is quiet. `stop`, with `stir`, ends it."""
+        """Waits for a time, or for the other one while it is quiet. `stop`, with `stir`, ends it."""
         with self._stirred:
             if self.is_quiet and not stop.is_set():
                 self._stirred.wait(quiet_seconds)
@@ -129,12 +129,12 @@ class ActiveJobs:
         return tuple(found)
 
     def at(self, job: str) -> At | None:
-        """The stage and the share of it that is done, of a job that any process runs; None where that is not known."""
+        """The stage of a job in any process, and the share of that stage that is done; None if that is not known."""
         active = self.get(job)
         return self._elsewhere.get(job) if active is None else active.at
 
     def all_at(self) -> dict[str, At]:
-        """As `at`, of all jobs of which it is known.
+        """As `at`, for all known jobs.
 
         To be asked before the database is: a job may end in between, and would seem not to have begun.
         """
@@ -149,7 +149,7 @@ class ActiveJobs:
             self._wake(job)
 
     def awaited_elsewhere(self) -> list[str]:
-        """The jobs that somebody waits for in this process, and that it does not run."""
+        """The jobs that callers of this process wait for, but that it does not run."""
         with self._lock:
             return [job for job in self._waiters if job not in self._running]
 
@@ -179,7 +179,7 @@ class ActiveJobs:
                     del self._waiters[job]
 
     def awaited(self) -> list[str]:
-        """The jobs that somebody waits for in this process."""
+        """The jobs that callers of this process wait for."""
         with self._lock:
             return list(self._waiters)
 
@@ -206,7 +206,7 @@ class RestingThread(BackgroundThread):
         self._active = active
 
     def rest(self, seconds: float, quiet_seconds: float) -> bool:
-        """Waits so long, or for the other time as long as it is quiet; returns whether to go on."""
+        """Waits for a time, or for the other one while it is quiet; returns whether to go on."""
         self._active.rest(self._stop, seconds, quiet_seconds)
         return not self._stop.is_set()
 

@@ -55,7 +55,7 @@ class Runner:
             thread.start()
         except RuntimeError as error:  # the system gives no more threads
             log.warning("job %s could not be started: %s", job.id, error)
-            self._on_end(job, False)  # maintenance will find that nobody works on it, and give it back
+            self._on_end(job, False)  # maintenance will find it without a worker and requeue it
         else:
             self._threads = [*(each for each in self._threads if each.is_alive()), thread]
 
@@ -122,7 +122,7 @@ class Runner:
                 given = job, computed.result, computed.trajectory_key, computed.stages, computed.answer, tell
                 status, stored = "succeeded", patient.wait_through(lambda: self._jobs.succeed(*given))
             if not stored:
-                raise Canceled("The job is another process's, or has lost a stage.")
+                raise Canceled("Another process has the job, or a stored stage of it is missing.")
         except Canceled:
             with suppress(StorageUnavailable):  # else when this process has ended, or maintenance notices
                 if self._jobs.release(job.id, job.run):  # it was interrupted; one that was canceled stays so
@@ -142,7 +142,7 @@ class Dispatcher(BackgroundThread):
         start: Callable[[TakenJob], None],
         tell_others: Callable[[], None],
     ) -> None:
-        """`capacity`: of a queue by its name; `start` begins the work on a job that was taken, and `tell_others` tells
+        """`capacity`: of a queue by its name; `start` begins the work on a taken job, and `tell_others` tells
         other processes that there are jobs for which this one has no place.
         """
         super().__init__("cow-dispatcher", STOP_SECONDS)
@@ -178,7 +178,7 @@ class Dispatcher(BackgroundThread):
         return 0 if self._stop.is_set() else self._capacity(queue) - self._held[queue]
 
     def give_place_back(self, queue: str) -> None:
-        """The holder of a place needs it no more."""
+        """The holder of a place no longer needs it."""
         with self._places:
             self._held[queue] -= 1
         self.wake()

@@ -21,7 +21,7 @@ class Calls:
 
     def check(self, url: str) -> None:
         """Raises `WebhookNotAllowed` for a URL that would not be called."""
-        raise WebhookNotAllowed("This server calls no webhooks: COW_WEBHOOK_SECRET is not set. Ask for the job.")
+        raise WebhookNotAllowed("This server calls no webhooks: COW_WEBHOOK_SECRET is not set. Poll the job instead.")
 
     def start(self, jobs: JobTable, executor: str, *, migrate: bool) -> None:
         """Makes the tables that it needs, or looks whether they are there, and begins. Raises `StorageUnavailable`."""
@@ -42,7 +42,7 @@ class Calls:
         """Has the calls of processes that have ended made by others."""
 
     def forget(self, jobs: list[str]) -> None:
-        """Deletes what is kept of the calls for some jobs. Raises `StorageUnavailable`."""
+        """Deletes the records of calls for some jobs. Raises `StorageUnavailable`."""
 
     def clean_up(self, before: float, stop: Callable[[], bool]) -> None:
-        """Deletes what is kept of calls that ended before a time (Unix time, s), until `stop` says so."""
+        """Deletes the records of calls that ended before a time (Unix time, s), until `stop` says so."""

@@ -1,4 +1,4 @@
-"""The computation of one job: its stages, each result stored as soon as it is there. In any process that has a service.
+"""The computation of one job: its stages, each result stored at once. Runs in any process with a service.
 
 A job engine gives its jobs to a `Computer`: its own process, or others (`cow_service.workers`).
 """
@@ -49,7 +49,7 @@ log = logging.getLogger("cow_service")
 
 @dataclass(frozen=True)
 class Outages:
-    """How long a job waits for storage, and who tells that nobody wants its result any more."""
+    """How long a job waits for storage, and how it learns that its result is no longer wanted."""
 
     budget: float  # seconds, of each outage
     check_canceled: Callable[[], None]
@@ -57,7 +57,7 @@ class Outages:
     def wait_through(self, work: Callable[[], Value]) -> Value:
         """What `work` returns, tried again while storage is away.
 
-        Raises `StorageUnavailable` where it is away for longer than the budget, and what `check_canceled` raises.
+        Raises `StorageUnavailable` if it is away for longer than the budget, and what `check_canceled` raises.
         """
         began, wait = time.monotonic(), FIRST_WAIT
         while True:
@@ -80,7 +80,7 @@ class KeyLocks:
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
-        self._locks: WeakValueDictionary[str, threading.Lock] = WeakValueDictionary()  # whoever waits keeps the lock
+        self._locks: WeakValueDictionary[str, threading.Lock] = WeakValueDictionary()  # waiters keep their lock alive
 
     @contextmanager
     def held(self, key: str, check_canceled: Callable[[], None]) -> Generator[None]:
@@ -97,7 +97,7 @@ class KeyLocks:
 
 @dataclass
 class StoredStep:
-    """The `Step` of one job: what is stored is not computed again.
+    """The `Step` of one job: stored results are not computed again.
 
     Results of quick stages are stored together, before the next one that may take long, or by `flush`: a transaction
     costs more than they do. One that waits for that is computed again by a job that wants the same at this moment. What
@@ -105,7 +105,7 @@ class StoredStep:
     """
 
     job_id: str
-    owner: str | None  # whose results of other jobs may be taken: nobody learns what another key asked
+    owner: str | None  # only results of this owner may be reused, so that keys cannot learn about each other
     fresh: bool  # results of other jobs are not taken
     database: Database
     artifacts: ArtifactStore
@@ -148,7 +148,7 @@ class StoredStep:
             return found
 
     def flush(self) -> None:
-        """Stores what waits for it. Raises `Canceled` where the job was deleted or canceled."""
+        """Stores what waits for it. Raises `Canceled` if the job was deleted or canceled."""
         self.outages.check_canceled()  # nothing may be stored for a job that was deleted
         if self.waiting:
             self.outages.wait_through(lambda: self.database.store_results(self.job_id, self.waiting))
@@ -163,7 +163,7 @@ class StoredStep:
         job_id, values = row
         try:
             result = RESULT_TYPES[stage].model_validate_json(to_json(values))
-            if job_id != self.job_id:  # before its artifacts are looked for: nobody removes them meanwhile
+            if job_id != self.job_id:  # before looking for its artifacts, so that they are not removed meanwhile
                 self.database.reuse_result(self.job_id, stage, result.artifacts)
             self.artifacts.touch(*result.artifacts)
         except (ArtifactNotFound, ValidationError):  # lost, or of another version
@@ -187,7 +187,7 @@ class Work:
     """One job to be computed, and who hears of it."""
 
     job: TakenJob
-    progress: Progress  # raises `Canceled` where nobody wants the result any more
+    progress: Progress  # raises `Canceled` if the result is no longer wanted
     check: Callable[[], None]  # raises `Canceled` as well, and says nothing
     looked_for: Callable[[Stage, bool], None]  # a stage was looked for among stored results, and whether it was there
 
@@ -199,8 +199,8 @@ class JobOutcome:
     result: str  # JSON, without the trajectory where that is stored under `trajectory_key`
     trajectory_key: str | None
     timings: dict[str, float]
-    stages: set[str]  # those of the job, each of which is stored
-    answer: str  # what it comes to, in words
+    stages: set[str]  # of the job; all are stored
+    answer: str  # in words
 
 
 def waiting_jobs(settings: Settings) -> int:
@@ -221,7 +221,7 @@ class Computer:
         """Makes ready for jobs. Returns at once."""
 
     def close(self) -> None:
-        """Lets go of what it holds. No job is at work any more."""
+        """Releases what it holds. No job is running any more."""
 
     def capacity(self, queue: str) -> int:
         """How many jobs of a queue are taken at the same time; 0 where none is."""
@@ -232,7 +232,7 @@ class Computer:
         raise NotImplementedError
 
     def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
-        """What computes the jobs, of which `active` says how far they are."""
+        """Computes the jobs and reports their progress to `active`."""
         return ()
 
 

@@ -1,4 +1,4 @@
-"""The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS keeps its tables beside ours."""
+"""The job database: SQLite in the data folder, or PostgreSQL by COW_DATABASE_URL. DBOS has its tables there, too."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 BUSY_TIMEOUT_MS = 30_000  # how long SQLite waits for another writer
 MAX_IDS = 500  # in one statement
 CONNECT_SECONDS = 4  # for a connection to PostgreSQL
-STALLED_SECONDS = 5.0  # that one may be in use at a time, of which a transaction needs milliseconds
+STALLED_SECONDS = 5.0  # longest use of a connection; a transaction needs milliseconds
 IDLE_SECONDS = 1.0  # after which it is asked for a sign of life before it is used again
-MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log, beyond which it is cut when it begins anew
+MAX_LOG_BYTES = 16_000_000  # of SQLite's write-ahead log; beyond, it is truncated when it restarts
 TABLES_LOCK = 0x434F5701  # of PostgreSQL, held while tables are created
 INCREMENTAL = 2  # SQLite's number of that mode
 VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
@@ -102,7 +102,7 @@ class Database:
     def create_tables(self) -> None:
         """Makes our tables, or adds what those of an earlier version lack, and makes the folder of a file.
 
-        Those of a later version stay as they are. Raises `StorageUnavailable` where this one cannot serve on them, or
+        Those of a later version stay as they are. Raises `StorageUnavailable` if this one cannot serve on them, or
         would change them in a way that processes which run do not bear.
         """
         if self.file is not None:
@@ -116,12 +116,12 @@ class Database:
             schema.add_indexes(connection)
 
     def schema(self) -> int:
-        """That of the tables; 0 where there are none. Raises `StorageUnavailable` where this version cannot use it."""
+        """That of the tables; 0 where there are none. Raises `StorageUnavailable` if this version cannot use it."""
         with database_errors(), self.engine.connect() as connection:
             return schema.schema_of(connection)
 
     def claim(self, address: str) -> None:
-        """Notes where the artifacts of all jobs are. Raises `StorageUnavailable` where they are elsewhere.
+        """Notes where the artifacts of all jobs are. Raises `StorageUnavailable` if they are elsewhere.
 
         A server with a store of its own would take jobs whose images it does not have, and fail them.
         """
@@ -132,7 +132,7 @@ class Database:
             raise StorageUnavailable(
                 f"The jobs of this database have their images in {known}, and this server in {address}. Give all "
                 "servers on a database the same COW_ARTIFACTS: an object store, or a folder on a disk that they share, "
-                "by default that of COW_DATA_DIR. Or give this one another COW_DATABASE_URL. Where that place is lost "
+                "by default that of COW_DATA_DIR. Or give this one another COW_DATABASE_URL. If that place is lost "
                 "for good, delete the row of the table cow_artifact_store."
             )
 
@@ -141,7 +141,7 @@ class Database:
         self.read(sa.text("SELECT 1"))
 
     def is_away(self) -> bool:
-        """Whether PostgreSQL cannot be reached, or lets nobody in: it may be starting. A file is never away."""
+        """Whether PostgreSQL is unreachable or refuses connections, as at its start. A file never is."""
         if self.file is not None:
             return False
         try:
@@ -193,7 +193,7 @@ class Database:
                 rows = cursor.fetchall()  # all of them: SQLite gives a page back for each
                 return rows[0][0] if rows and rows[0] else 0
 
-            if pragma("auto_vacuum") != INCREMENTAL:  # the file of an earlier version: it is written anew once
+            if pragma("auto_vacuum") != INCREMENTAL:  # the file of an earlier version: it is rewritten once
                 if pragma("freelist_count") > pragma("page_count") / 2:
                     pragma("auto_vacuum=INCREMENTAL")
                     cursor.execute("VACUUM")
@@ -203,7 +203,7 @@ class Database:
             pragma("wal_checkpoint(PASSIVE)")  # the file is cut by it
 
     def close_idle(self) -> None:
-        """Closes the connections that nobody uses; they are opened again as they are needed."""
+        """Closes the unused connections; they are opened again when needed."""
         self.engine.dispose()
 
     def close(self) -> None:
@@ -265,7 +265,7 @@ class Database:
     def store_results(self, job: str, results: Sequence[StoredResult]) -> None:
         """Adds references to the artifacts of a job's stages, and saves their results together.
 
-        Raises `Canceled` where the job was deleted.
+        Raises `Canceled` if the job was deleted.
         """
         with self._cursor(writes=True) as cursor:
             self._store(cursor, job, results)
@@ -309,7 +309,7 @@ class Database:
             return connection.execute(sa.update(MAINTENANCE).where(*due).values(begun=now)).rowcount > 0
 
     def give_turn_back(self, task: str) -> None:
-        """The task was not done: whoever asks next may take it."""
+        """The task was not done: the next process that asks may take it."""
         with self.transaction() as connection:
             connection.execute(sa.update(MAINTENANCE).where(MAINTENANCE.c.task == task).values(begun=0))
 
@@ -355,7 +355,7 @@ class Database:
 class StalledConnections(BackgroundThread):
     """Ends connections to PostgreSQL that are in use for too long: a network may lose answers without a sign.
 
-    Whoever waits for such an answer has an error then. A pooled connection that was idle is tried before it is used.
+    A caller that waits for such an answer gets an error. A pooled connection that was idle is tried before it is used.
     """
 
     def __init__(self, engine: sa.Engine) -> None:
@@ -410,7 +410,7 @@ class StalledConnections(BackgroundThread):
         super().stop()
 
     def run(self) -> None:
-        """Looks at what is in use."""
+        """Checks the connections in use."""
         while not self._stop.wait(STALLED_SECONDS / 10):
             if not self._in_use:
                 self._is_used.clear()
@@ -420,7 +420,7 @@ class StalledConnections(BackgroundThread):
             with self._guard:  # its socket is not closed meanwhile, nor the number of that given to another one
                 for connection in [one for one, since in self._in_use.items() if since < late]:
                     del self._in_use[connection]
-                    log.warning("a connection to the job database gives no answer, and is ended")
+                    log.warning("a connection to the job database does not answer and is closed")
                     with (
                         suppress(OSError, self._driver_error),
                         socket.socket(fileno=os.dup(connection.fileno())) as stalled,
@@ -439,9 +439,9 @@ def database_errors() -> Generator[None]:
         yield
     except (SQLAlchemyError, sqlite3.Error, getattr(sys.modules.get("psycopg"), "Error", sqlite3.Error)) as error:
         if "IntegrityError" in (kind.__name__ for kind in type(error).__mro__):
-            raise Canceled("The job was deleted before it was done.") from error
+            raise Canceled("The job was deleted before it was finished.") from error
         raise StorageUnavailable(
-            f"The job database cannot be used ({type(error).__name__}): see COW_DATABASE_URL, and the disk it is on."
+            f"The job database cannot be used ({type(error).__name__}): check COW_DATABASE_URL and its disk."
         ) from error
 
 
@@ -454,7 +454,7 @@ def _address(settings: Settings) -> tuple[str, Path | None]:
     try:
         url = sa.make_url(given)
     except SQLAlchemyError as error:
-        raise SettingsError("Bad settings: COW_DATABASE_URL is no database URL.") from error
+        raise SettingsError("Bad settings: COW_DATABASE_URL is not a database URL.") from error
     if url.get_backend_name() == "sqlite" and url.database:
         return given, Path(url.database)
     if url.get_backend_name() in ("postgresql", "postgres"):

@@ -35,7 +35,7 @@ from cow_service.records import TERMINAL, AcceptedRequest, JobPage, ProcessRole
 from cow_service.service import Service
 
 FIRST_WAIT, LONGEST_WAIT = 1.0, 5.0  # seconds between two tries to reach the database
-NOT_STARTED = "The server waits for its job database. Ask again in a while."
+NOT_STARTED = "The server is waiting for its job database. Ask again later."
 HANDOVER_SECONDS = 3.0  # for interrupted jobs to end, after the grace period
 
 log = logging.getLogger("cow_service")
@@ -48,7 +48,7 @@ class JobEngine:
     """
 
     def __init__(self, service: Service, computer: Computer | None = None, role: ProcessRole | None = None) -> None:
-        """`computer`: who computes the jobs; by default this process. `role`: by default that of the settings."""
+        """`computer`: computes the jobs; by default in this process. `role`: by default that of the settings."""
         self.database, self.active = Database(service.settings), ActiveJobs()
         self.calls = Calls()
         if service.settings.webhook_secret is not None:
@@ -85,7 +85,7 @@ class JobEngine:
         """Waits until the database can be reached, or until `stop` is set, and logs that it waits."""
         pause = FIRST_WAIT
         while self.database.is_away():
-            log.warning("the job database cannot be reached: see COW_DATABASE_URL. Tried again in %g s.", pause)
+            log.warning("the job database cannot be reached: check COW_DATABASE_URL. Next try in %g s.", pause)
             if stop.wait(pause):
                 return
             pause = min(2 * pause, LONGEST_WAIT)
@@ -109,7 +109,7 @@ class JobEngine:
             part.start()
 
     def drain(self) -> None:
-        """Accepts no more jobs, and answers callers who wait for a job that does not run.
+        """Stops accepting jobs, and answers callers who wait for a job that does not run.
 
         Running jobs have the grace period of the settings; after it their callers are answered, too.
         """
@@ -140,23 +140,23 @@ class JobEngine:
         self.is_running = False
 
     def check(self) -> None:
-        """Raises `StorageUnavailable` where the database does not answer, `ShuttingDown` where the engine stops,
+        """Raises `StorageUnavailable` if the database does not answer, `ShuttingDown` where the engine stops,
         `NotReady` where jobs wait that no process takes."""
         if self._stopping:
-            raise ShuttingDown("The server is stopping. Ask another one, or this one again in a while.")
+            raise ShuttingDown("The server is stopping. Ask another one, or ask again later.")
         self.database.check()
         if not self.is_running:
             raise NotReady(NOT_STARTED)
         self.processes.overview.check_served()
 
     def check_capacity(self, owner: str | None) -> None:
-        """Raises `QueueFull` where another job would be too many, `ShuttingDown` where none is accepted."""
+        """Raises `QueueFull` if another job would be too many, `ShuttingDown` where none is accepted."""
         if self._stopping:
-            raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again in a while.")
+            raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again later.")
         self._check_open(owner, *self.jobs.count_open(owner))
 
     def _check_open(self, owner: str | None, jobs: int, own: int) -> None:
-        """Raises `QueueFull` where so many open jobs, and so many of the owner, leave no room for another one."""
+        """Raises `QueueFull` if so many open jobs, and so many of the owner, leave no room for another one."""
         limit, own_limit = self.service.settings.queue_limit, self.service.settings.own_queue_limit
         if jobs >= limit:
             raise QueueFull(f"{jobs} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later.")
@@ -186,7 +186,7 @@ class JobEngine:
                 continue  # another request with the same key was faster
             if known.digest != spec.digest:
                 raise IdempotencyKeyReused(
-                    "This Idempotency-Key came with another request before. Give every request a key of its own."
+                    "This Idempotency-Key was used for another request before. Give every request its own key."
                 )
             found = self.jobs.find(job_id, None, full=False)
             if found is None:
@@ -256,7 +256,7 @@ class JobEngine:
             raise ArtifactNotFound(f"No artifact of yours has the SHA-256 {sha256[:64]}.")
 
     def _attempt_ended(self, job: TakenJob, has_ended: bool) -> None:
-        """This process works no more on a job. Where that has ended, callers are told."""
+        """This process stopped working on a job. Callers are notified if the job has ended."""
         self._dispatcher.give_place_back(job.queue)
         if has_ended:
             self.active.notify_ended(job.id)
@@ -270,7 +270,7 @@ class JobEngine:
         self._notifications.send(Notification("queued"))
 
     def _receive(self, notification: Notification) -> None:
-        """What another process has told of a job."""
+        """Handles a message of another process about a job."""
         match notification:
             case Notification("queued"):
                 self._dispatcher.wake()
@@ -292,7 +292,7 @@ class JobEngine:
     def _notify_stopping(self, jobs: Iterable[str]) -> None:
         for job_id in jobs:
             error = ShuttingDown(
-                f"The server is stopping. The job {job_id} goes on when it is back: GET /jobs/{job_id}.",
+                f"The server is stopping. The job {job_id} continues when it is back: GET /jobs/{job_id}.",
                 headers={"Location": f"/jobs/{job_id}"},
             )
             self.active.notify_ended(job_id, error)
@@ -306,4 +306,4 @@ def new_job_id(owner: str | None, key: str | None) -> str:
 
 
 def _no_job(job_id: str) -> JobNotFound:
-    return JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or never was one of yours.")
+    return JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or is not one of yours.")

@@ -92,7 +92,7 @@ class JobSpec(Record):
         return AcceptedRequest(kind=self.kind, request=self.request | priority)
 
     def parsed(self) -> SimulateRequest | AnswerRequest:
-        """The request, as it was validated when it came."""
+        """The request as it was validated on arrival."""
         model = AnswerRequest if self.kind == "answer" else SimulateRequest
         return model.model_validate({**self.request, "reader": self.reader, "generator": self.generator})
 
@@ -178,7 +178,7 @@ class JobTable:
         step: int,
         check: Callable[[int, int], None] = lambda jobs, own: None,
     ) -> bool:
-        """Adds a job and what it needs; False where there is one of that id.
+        """Adds a job and what it needs; False if there is one of that id.
 
         Its turn comes `step` after that of its owner's last job. `check` is given how many jobs are open, all and those
         of the owner; what it raises passes through, and nothing is added.
@@ -234,7 +234,7 @@ class JobTable:
         ]
 
     def begin(self, job: TakenJob, tell: Tell = _tell_nobody) -> bool:
-        """Work on a job begins. False where it is no longer this process's: it was canceled, for example."""
+        """Marks a job as running. False if it is no longer this process's: it was canceled, for example."""
         mine = JOBS.c.id == job.id, JOBS.c.run == job.run, JOBS.c.status.in_(OPEN)
         with self._database.transaction() as connection:
             is_mine = connection.execute(sa.update(JOBS).where(*mine).values(status="running")).rowcount > 0
@@ -243,7 +243,7 @@ class JobTable:
         return is_mine
 
     def release(self, job_id: str, run: str) -> bool:
-        """Puts a job back into its queue. False where it is no longer this process's, or has ended."""
+        """Puts a job back into its queue. False if it is no longer this process's, or has ended."""
         mine = JOBS.c.id == job_id, JOBS.c.run == run, JOBS.c.status.in_(OPEN)
         with self._database.transaction() as connection:
             return connection.execute(sa.update(JOBS).where(*mine).values(_RELEASED)).rowcount > 0
@@ -257,7 +257,7 @@ class JobTable:
         answer: str = "",
         tell: Tell = _tell_nobody,
     ) -> bool:
-        """Stores the result of a job, and what it comes to in words.
+        """Stores the result of a job, and its answer in words.
 
         False where the job is no longer this process's, and where one of its stages is not stored: PostgreSQL loses the
         latest ones in a crash, with what refers to their artifacts.
@@ -272,7 +272,7 @@ class JobTable:
         return self._end(job.id, "failed", job.run, tell=tell, error=json.dumps(error_as_json(error)))
 
     def cancel(self, job_id: str) -> bool:
-        """Ends a job; False where it had ended."""
+        """Ends a job; False if it had ended."""
         return self._end(job_id, "canceled")
 
     def executors(self) -> set[str]:
@@ -292,7 +292,7 @@ class JobTable:
         """
         theirs = JOBS.c.executor.in_(list(executors)), JOBS.c.status.in_(OPEN)
         worn_out = sa.select(JOBS.c.id, JOBS.c.run).where(*theirs, JOBS.c.starts >= MAX_STARTS)
-        detail = "The server ended while it worked on this job, again and again; it is not tried again."
+        detail = "The server ended repeatedly while it worked on this job, so the job is not tried again."
         error = json.dumps(error_as_json(InternalError(detail)))
         for row in self._database.read(worn_out):
             self._end(row.id, "failed", row.run, error=error)
@@ -321,7 +321,7 @@ class JobTable:
         content: dict[str, Any] = unpacked(rows[0].result)
         if rows[0].trajectory is not None:
             (content.get("simulation") or content)["trajectory"] = unpacked(rows[0].trajectory)  # null until now
-        if rows[0].format < FORMAT:  # as it is written today; what a later version wrote goes out as it is
+        if rows[0].format < FORMAT:  # as this version writes it; results of later versions are returned unchanged
             model = Answer if found.job.kind == "answer" else Simulation
             content = model.model_validate(content).model_dump(mode="json")
         return replace(found, content=content)
@@ -339,7 +339,7 @@ class JobTable:
             last = sa.tuple_(*(sa.literal(part) for part in _read_cursor(filters.cursor)))
             query = query.where(sa.tuple_(JOBS.c.created_at, JOBS.c.id) < last)
         if filters.kind is not None or filters.status:
-            # A range of an index for each kind and status, of which no more is read than a page has.
+            # Reads one index range per kind and status, and from each no more than one page.
             kinds = [filters.kind] if filters.kind else get_args(JobKind)
             pairs = product(kinds, sorted({*(filters.status or get_args(JobStatus))}))
             ranges = (query.where(JOBS.c.kind == kind, JOBS.c.status == status) for kind, status in pairs)
@@ -482,7 +482,7 @@ def error_from_json(kept: Mapping[str, Any]) -> CowError:
 
 
 def _within_limit(queue: str, limit: int) -> sa.Select[Any]:
-    """The waiting jobs of a queue that their owners may have beside those that are taken."""
+    """The waiting jobs of a queue that their owners' limits still allow to run."""
     taken = (
         sa.select(JOBS.c.owner, sa.func.count().label("number"))
         .where(JOBS.c.executor.is_not(None), JOBS.c.status.in_(OPEN))
@@ -537,5 +537,5 @@ def _read_cursor(cursor: str) -> tuple[str, str]:
         datetime.fromisoformat(created_at)
         return created_at, str(job_id)
     except (ValueError, TypeError, binascii.Error, RecursionError) as error:
-        detail = "is none that this server gave out"
+        detail = "was not issued by this server"
         raise InvalidRequest(f"`cursor` {detail}.", errors=(FieldError("/cursor", detail),)) from error

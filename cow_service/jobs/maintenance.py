@@ -1,4 +1,4 @@
-"""Background work of a job engine: recovers jobs, notices cancellations, and cleans up what nobody needs any more."""
+"""Background work of a job engine: recovers jobs, notices cancellations, and cleans up."""
 
 import logging
 import math
@@ -51,7 +51,7 @@ class Lease(Protocol):
         ...
 
     def ended(self, executors: Iterable[str]) -> AbstractContextManager[list[str]]:
-        """Those of some executors whose processes have ended. Nobody else finds them inside the block."""
+        """The executors whose processes have ended. Inside the block no other process can claim them."""
         ...
 
     def release(self) -> None:
@@ -75,7 +75,7 @@ class FolderLease:
             self._lock = FileLock(self._folder / f"{self._executor}.lock")
             self._lock.acquire(timeout=0)
         except OSError as error:
-            raise StorageUnavailable("The data folder cannot be written: no place for this process.") from error
+            raise StorageUnavailable("Cannot write to the data folder: check its permissions.") from error
         return self._executor
 
     @contextmanager
@@ -103,7 +103,7 @@ class FolderLease:
 
 
 class Maintenance(RestingThread):
-    """A thread beside an engine's own. `remove` removes jobs, and those of their artifacts not used since a time;
+    """A background thread of an engine. `remove` removes jobs, and those of their artifacts not used since a time;
     `offer` tells that jobs are back in their queues.
     """
 
@@ -187,7 +187,7 @@ class Maintenance(RestingThread):
         taken = self._parts.jobs.taken_by(self._parts.executor)
         idle = taken.keys() - self._parts.active.runs().keys()
         for job_id in idle & self._idle:  # idle at the last check, too: it is not just being started
-            log.warning("job %s was stalled, and goes back to its queue", job_id)
+            log.warning("job %s stalled and goes back to its queue", job_id)
             if self._parts.jobs.release(job_id, taken[job_id]):
                 self._offer()
         self._idle = idle
@@ -214,7 +214,7 @@ class Maintenance(RestingThread):
                 database.give_turn_back("artifacts")  # an hour is long
 
     def clean_up_jobs(self) -> None:
-        """Removes jobs past their retention, and what is kept of calls from before that."""
+        """Removes jobs past their retention, and older records of webhook calls."""
         before = time.time() - 3600.0 * self._parts.service.settings.job_retention_hours
         while not self._stop.is_set() and (jobs := self._parts.jobs.ended_before(before, MAX_REMOVED_JOBS)):
             self._remove(jobs, before)
@@ -224,9 +224,9 @@ class Maintenance(RestingThread):
 
 
 def collect_artifacts(service: Service, database: Database, stop: Callable[[], bool], now: float | None = None) -> None:
-    """Removes what is not needed any more, as of `now` (Unix time, s; by default the clock's), until `stop` says so.
+    """Removes what is no longer needed, as of `now` (Unix time, s; by default the clock's), until `stop` says so.
 
-    The store is listed in chunks, of which one is in memory at a time; the longest unused go by a second listing.
+    The store is listed in chunks, one in memory at a time; a second listing finds the least recently used.
 
     What is used meanwhile stays, however long this takes: whoever refers to an artifact has used it within the grace
     before that. One without a reference in the database, whose last use, looked up again right before it is deleted,
@@ -255,7 +255,7 @@ def collect_artifacts(service: Service, database: Database, stop: Callable[[], b
         total -= _remove_longest_unused(store, stop, now, in_use, removable, total - max_bytes)
         if total > max_bytes:
             shown = total / 1e9, max_gb
-            log.warning("artifacts have %.1f GB, more than COW_ARTIFACTS_MAX_GB=%g: what is left is in use", *shown)
+            log.warning("artifacts have %.1f GB, more than COW_ARTIFACTS_MAX_GB=%g: the rest is in use", *shown)
 
 
 def _remove_longest_unused(

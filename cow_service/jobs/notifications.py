@@ -20,8 +20,8 @@ from cow_service.requests import Stage
 if TYPE_CHECKING:
     import sqlalchemy as sa
 
-POLL_SECONDS = 0.05  # between two looks at SQLite, where somebody waits
-QUIET_POLL_SECONDS = 20.0  # where nobody does: who begins to ends that
+POLL_SECONDS = 0.05  # between two looks at SQLite, while a caller waits
+QUIET_POLL_SECONDS = 20.0  # while no caller waits; a new one ends this pause
 POLL_SHARE = 20  # and so many times as long as one took
 
 
@@ -30,7 +30,7 @@ class Notification:
     """What happened to a job. `stage` and `done` are those of its progress."""
 
     what: Literal["queued", "progress", "ended", "canceled"]
-    job_id: str = ""  # of those that are queued, nobody asks
+    job_id: str = ""  # empty for queued jobs
     stage: Stage | None = None
     done: float = 0.0
 
@@ -48,7 +48,7 @@ class Notifications(RestingThread):
 
     @abstractmethod
     def send(self, notification: Notification) -> None:
-        """Tells all processes. What cannot be told is found in the database later."""
+        """Notifies all processes. A lost message is found in the database later."""
 
     @abstractmethod
     def send_within(self, connection: sa.Connection, notification: Notification) -> None:
@@ -56,7 +56,7 @@ class Notifications(RestingThread):
 
 
 class PolledNotifications(Notifications):
-    """On SQLite, whose processes are on one machine: asks for the end of jobs that somebody waits for."""
+    """On SQLite, whose processes are on one machine: polls for the end of jobs that callers wait for."""
 
     def send(self, notification: Notification) -> None:
         """Does nothing."""

@@ -1,4 +1,4 @@
-"""What processes on PostgreSQL have beside its tables: leases that sessions hold, and LISTEN and NOTIFY.
+"""What processes use of PostgreSQL besides tables: leases held by sessions, and LISTEN and NOTIFY.
 
 Both need a session of their own: behind pgbouncer in transaction mode, one that does not go through it.
 """
@@ -62,7 +62,7 @@ class SessionLease(BackgroundThread):
         """As `Lease` says. One counts as ended when its lease was free before, too."""
         with self._guard:
             session = self._session
-            if session is None:  # an outage: nobody can be told from those that have ended
+            if session is None:  # an outage: live and ended processes cannot be told apart
                 yield []
                 return
             free = set[str]()
@@ -93,14 +93,14 @@ class SessionLease(BackgroundThread):
                     else:
                         self._ask(self._session, "SELECT 1")
                 except psycopg.Error:
-                    log.warning("the lease of this process was lost: it is taken again when the database is back")
+                    log.warning("this process lost its lease and takes it again when the database is back")
                     self._close()
                     self._free_since = {}
 
     def _open(self) -> None:
         session = self._database.session()
         self._ask(session, "SELECT set_config('idle_session_timeout', %s, false)", f"{SILENCE_SECONDS:g}s")
-        self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held by who looks at it, for a moment
+        self._ask(session, "SELECT pg_advisory_lock(%s)", _key(self._executor))  # held briefly by whoever checks it
         self._session = session
 
     def _close(self) -> None:

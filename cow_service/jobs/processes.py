@@ -1,4 +1,4 @@
-"""The processes on a job database: what each tells of itself, and what they and the queues are doing together."""
+"""The processes on a job database: what each reports about itself, and the state of all of them and the queues."""
 
 import logging
 import os
@@ -49,7 +49,7 @@ class ProcessTable:
         self._database, self._now = database, database.now
 
     def write(self, info: ProcessInfo) -> None:
-        """Notes that a process is alive, and what it does; deletes rows of those long gone."""
+        """Records that a process is alive, and what it does; deletes rows of processes long gone."""
         row = self._database.insert(PROCESSES)
         row = row.values(executor=info.executor_id, seen=self._now, info=info.model_dump_json())
         kept = {"seen": row.excluded.seen, "info": row.excluded.info}
@@ -70,7 +70,7 @@ class ProcessTable:
             try:
                 found.append(ProcessInfo.model_validate_json(info, extra="ignore"))  # a later version has more fields
             except ValueError:
-                log.warning("the process %s is of a version that this one does not understand", executor)
+                log.warning("the process %s runs a version that this one does not understand", executor)
         return tuple(sorted(found, key=lambda one: (one.role, one.host or "", one.pid or 0)))
 
 
@@ -105,7 +105,7 @@ class Processes(RestingThread):
         super().start()
 
     def drain(self) -> None:
-        """The process takes no more jobs, and goes on with those that it has."""
+        """The process takes no more jobs, and finishes those that it has."""
         self._draining = True
 
     def stop(self) -> None:
@@ -138,11 +138,11 @@ class Processes(RestingThread):
             self.rest(TELL_SECONDS, QUIET_TELL_SECONDS)
 
     def _try(self, work: Callable[[], None]) -> None:
-        """Does it, and goes on where it fails: what is told is for people, and no job depends on it."""
+        """Reports the process, and ignores failures: the report is for people, and no job depends on it."""
         try:
             work()
         except CowError as error:
-            log.warning("what this process does could not be told: %s", error.detail)
+            log.warning("the state of this process could not be reported: %s", error.detail)
 
 
 class Overview:
@@ -165,7 +165,7 @@ class Overview:
         return self._latest()[1]
 
     def check_served(self) -> None:
-        """Raises `NotReady` where nobody takes the jobs of the default request, or those of another version."""
+        """Raises `NotReady` if no process takes the jobs of the default request, or those of another version."""
         found, settings = self.workers(), self._settings
         queue = queue_of(settings.reader, settings.generator, settings)
         if settings.role == "api" and not _serving(found.processes, queue, VERSION):
@@ -216,7 +216,7 @@ def remedy(one: Unserved) -> str:
     if one.reason == "version":
         return (
             f"Start a server or worker of a COW with workflow version {one.workflow_version} on this job database "
-            "until they are done, or cancel them."
+            "until they are finished, or cancel them."
         )
     return (
         f"No process takes jobs of the queue {one.queue!r}: start `cow worker --queues {one.queue}` or a server on "

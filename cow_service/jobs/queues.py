@@ -28,7 +28,7 @@ def queue_of(reader: str, generator: str, settings: Settings) -> str:
 
 
 def clips(generator: str, settings: Settings) -> int | None:
-    """Clips at the same time of a generator that has a device or a limit of its own; None where it has none."""
+    """Clips at the same time of a generator that has a device or a limit of its own; None if it has none."""
     return settings.generator_concurrency.get(generator, places(generator))
 
 
@@ -46,7 +46,7 @@ def known_queues(settings: Settings) -> tuple[str, ...]:
 
 
 def check_queues(settings: Settings) -> None:
-    """Raises `SettingsError` where COW_QUEUES names what is no queue here."""
+    """Raises `SettingsError` if COW_QUEUES names an unknown queue."""
     known = known_queues(settings)
     for name in settings.queues:
         if name in known:

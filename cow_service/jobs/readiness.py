@@ -61,7 +61,7 @@ class Readiness:
         """Raises `NotReady` while loading, `StorageUnavailable`, `ReaderUnavailable`, `GeneratorUnavailable`."""
         fault = self._fault()
         if fault is not None or (self._started and not self._done.is_set()):
-            raise NotReady(fault or "The default reader and generator are being loaded. Ask again in a while.")
+            raise NotReady(fault or "The default reader and generator are being loaded. Ask again later.")
         self._service.artifacts.check()
         self._load_backends()
         free = shutil.disk_usage(self._service.settings.data_dir).free
@@ -94,7 +94,7 @@ class StorageCheck:
         self._fault: str | None = None
 
     def check(self) -> None:
-        """Raises `StorageUnavailable` where they cannot."""
+        """Raises `StorageUnavailable` if they cannot."""
         with self._lock:
             if time.monotonic() - self._looked > MAX_AGE_SECONDS:
                 self._fault = None
@@ -104,7 +104,7 @@ class StorageCheck:
                     self._fault = error.detail
                 self._looked = time.monotonic()
             if self._fault is not None:
-                raise StorageUnavailable(f"{self._fault} The job goes on when that is over.")
+                raise StorageUnavailable(f"{self._fault} The job continues when that is fixed.")
 
 
 QUESTION = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
@@ -123,4 +123,4 @@ def warm_up(settings: Settings) -> None:
             service.simulate(request).model_dump_json()
             service.close()
     except (CowError, OSError) as error:
-        log.warning("the warm-up failed, the first request will take longer: %s", error)
+        log.warning("the warm-up failed, so the first request will take longer: %s", error)

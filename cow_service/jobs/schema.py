@@ -29,7 +29,7 @@ JOBS = sa.Table(
     METADATA,
     sa.Column("id", sa.String(64), primary_key=True),
     sa.Column("kind", sa.String(16), nullable=False),
-    sa.Column("owner", sa.Text),  # the name of a key; null where the server has none
+    sa.Column("owner", sa.Text),  # the name of a key; null if the server has none
     sa.Column("status", sa.String(16), nullable=False),  # a `JobStatus`: queued until work on it begins
     sa.Column("created_at", sa.String(32), nullable=False),  # RFC 3339 in UTC, to the millisecond: sorts as text
     sa.Column("ended", sa.Float),  # Unix time, s
@@ -90,7 +90,7 @@ REFERENCES = sa.Table(
     sa.Column("sha256", sa.String(64), primary_key=True),
     _of_job(primary_key=True, index=True),
 )
-# The stages of each job that are done, whoever computed their results.
+# The finished stages of each job, even if another job computed their results.
 STAGES = sa.Table(
     "cow_stages_of_jobs",
     METADATA,
@@ -104,7 +104,7 @@ STORES = sa.Table(
     sa.Column("id", sa.Integer, primary_key=True),  # always 1
     sa.Column("address", sa.Text, nullable=False),
 )
-# When a process last began a kind of maintenance, of which each is one process's work at a time.
+# When each kind of maintenance last began; only one process does each kind at a time.
 MAINTENANCE = sa.Table(
     "cow_maintenance",
     METADATA,
@@ -130,7 +130,7 @@ PROCESSES = sa.Table(
 
 
 def schema_of(connection: sa.Connection) -> int:
-    """That of the tables; 0 where there are none. Raises `StorageUnavailable` where this version cannot use it."""
+    """That of the tables; 0 where there are none. Raises `StorageUnavailable` if this version cannot use it."""
     there = set(sa.inspect(connection).get_table_names())
     if SCHEMAS.name in there:
         found = connection.execute(sa.select(SCHEMAS)).one_or_none()
@@ -139,7 +139,7 @@ def schema_of(connection: sa.Connection) -> int:
                 f"The job database is of a later version of COW (schema {found.version}), on whose tables this one "
                 f"(schema {SCHEMA}) cannot serve: update it."
             )
-        if found is not None:  # else a restore has left the row out, and it is written anew
+        if found is not None:  # otherwise a restore has lost the row, and it is written again
             return found.version
     if BEFORE_SCHEMA_1 in there and JOBS.name not in there:
         raise StorageUnavailable(
@@ -152,7 +152,7 @@ def schema_of(connection: sa.Connection) -> int:
 def update_tables(connection: sa.Connection, now: sa.ColumnElement[float]) -> None:
     """Makes our tables, or adds what those of an earlier version lack; those of a later one stay as they are.
 
-    Raises `StorageUnavailable` where this version cannot use them, or would change them in a way that processes which
+    Raises `StorageUnavailable` if this version cannot use them, or would change them in a way that processes which
     run do not bear.
     """
     found = schema_of(connection)
@@ -162,8 +162,8 @@ def update_tables(connection: sa.Connection, now: sa.ColumnElement[float]) -> No
         alive = sa.select(PROCESSES.c.executor).where(PROCESSES.c.seen > now - ALIVE_SECONDS)
         if connection.execute(alive).first() is not None:
             raise StorageUnavailable(
-                f"The tables of the job database change (schema {found} to {SCHEMA}) in a way that the servers and "
-                "workers on it do not bear: stop all of them first."
+                f"The tables of the job database change (schema {found} to {SCHEMA}) in a way that running servers "
+                "and workers cannot handle: stop all of them first."
             )
     METADATA.create_all(connection)
     for table in METADATA.sorted_tables:
@@ -200,5 +200,5 @@ def add_indexes(connection: sa.Connection) -> None:
                 made = f"CREATE INDEX CONCURRENTLY {index.name} ON {table.name} ({columns})"
                 connection.execute(sa.text(made))
         except SQLAlchemyError as error:
-            log.warning("an index could not be added: lists of jobs are slow (%s)", type(error).__name__)
+            log.warning("an index could not be added, so lists of jobs are slow (%s)", type(error).__name__)
         connection.invalidate()  # with its session the lock and the setting end

@@ -58,7 +58,7 @@ class Subscription:
     def __init__(self, active: ActiveJobs, job_id: str, read: Callable[[], JobView]) -> None:
         """`read` blocks."""
         self.followers = 0
-        self.is_over = False  # nothing more is read: who comes now needs a subscription of their own
+        self.is_over = False  # reading has ended: new followers need another subscription
         self._read = read
         self._view: JobView | None = None
         self._number = 0  # of the view
@@ -75,7 +75,7 @@ class Subscription:
         return self._view, self._number
 
     def stop(self) -> None:
-        """Ends reading: nobody follows any more."""
+        """Stops reading: there are no followers left."""
         self._reading.cancel()
 
     async def _read_on(self, active: ActiveJobs, job_id: str) -> None:
@@ -84,7 +84,7 @@ class Subscription:
                 waiter.changed.clear()
                 try:
                     view = await asyncio.to_thread(self._read)
-                except Exception as error:  # noqa: BLE001 # whoever follows raises it
+                except Exception as error:  # noqa: BLE001 # the followers raise it
                     self._error, self.is_over = error, True
                     self._wake()
                     return

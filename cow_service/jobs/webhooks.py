@@ -34,7 +34,7 @@ from cow_service.records import Job
 from cow_service.settings import Settings
 
 APPLICATION = "cow"  # as DBOS knows it
-QUEUE = "cow-webhook-receivers"  # in which every receiver has a share of its own
+QUEUE = "cow-webhook-receivers"  # shared equally by the receivers
 WORKFLOW = "webhook"  # the name of an attempt's workflow
 MAX_CONCURRENT_DELIVERIES = 100
 MAX_CONCURRENT_DELIVERIES_TO_ONE = 2  # receiver: one that is silent holds up its own calls alone
@@ -43,7 +43,7 @@ RETRY_SECONDS = (5, 30, 120, 600, 3600, 6 * 3600)  # before each further attempt
 JITTER = 0.2  # share
 SUCCESS = range(200, 300)
 MAX_REMOVED = 200  # records of calls, at a time
-GONE = 410  # the receiver wants no more
+GONE = 410  # the receiver wants no more calls
 
 log = logging.getLogger("cow_service")
 
@@ -112,10 +112,10 @@ class Webhooks(Calls):
         try:
             self.client.enqueue_in_transaction(connection, options, job_id, url, attempt)
         except dbos_error.DBOSException as error:
-            raise StorageUnavailable(f"A webhook was not taken ({type(error).__name__}).") from error
+            raise StorageUnavailable(f"A webhook could not be scheduled ({type(error).__name__}).") from error
 
     def call(self, job_id: str, url: str, attempt: int) -> None:
-        """Makes an attempt to call a webhook, and sees to another one where that failed."""
+        """Makes an attempt to call a webhook, and schedules another one if it failed."""
 
         def check() -> None:
             if _webhooks is not self:
@@ -166,7 +166,7 @@ class Webhooks(Calls):
                 self.client.delete_workflows([record.workflow_id for record in records])
 
     def send(self, job: Job, url: str, attempt: int) -> float | None:
-        """Makes one attempt; returns the seconds until the next one, or None where none follows."""
+        """Makes one attempt; returns the seconds until the next one, or None if none follows."""
         event = {"type": f"job.{job.status}", "timestamp": job.finished_at, "data": job.model_dump(mode="json")}
         body = json.dumps(event, separators=(",", ":")).encode()
         message, moment, secrets = f"msg_{job.id}", str(int(time.time())), self._secret.get_secret_value().split(" ")
@@ -209,7 +209,7 @@ def call_webhook(job_id: str, url: str, attempt: int) -> None:
 
 
 def launch(database: Database, executor: str, *, migrate: bool, queues: tuple[str, ...] = (QUEUE,)) -> None:
-    """Has DBOS run on a database, in which it makes its tables or looks whether they are there.
+    """Starts DBOS on a database, and creates its tables or checks that they exist.
 
     `queues`: those from which this process takes work. Raises `StorageUnavailable`.
     """
@@ -230,7 +230,7 @@ def launch(database: Database, executor: str, *, migrate: bool, queues: tuple[st
         DBOS.launch()
     except (SQLAlchemyError, dbos_error.DBOSException) as error:
         DBOS.destroy()
-        remedy = "see COW_DATABASE_URL" if migrate else "run `cow migrate` first, and see COW_DATABASE_URL"
+        remedy = "see COW_DATABASE_URL" if migrate else "run `cow migrate` first, and check COW_DATABASE_URL"
         raise StorageUnavailable(f"The job database cannot be used ({type(error).__name__}): {remedy}.") from error
 
 
@@ -251,7 +251,7 @@ def _dbos_errors() -> Generator[None]:
         with database_errors():
             yield
     except dbos_error.DBOSException as error:
-        raise StorageUnavailable(f"Calls of webhooks cannot be looked after ({type(error).__name__}).") from error
+        raise StorageUnavailable(f"Calls of webhooks cannot be managed ({type(error).__name__}).") from error
 
 
 def attempt_ids(job_id: str) -> list[str]:

@@ -57,12 +57,12 @@ def input_schema(tool: ToolName, image: str) -> dict[str, Any]:
     properties["remove"] = {
         "type": "array",
         "items": {"type": "string"},
-        "description": "Things that are taken away before anything moves, in words.",
+        "description": "Objects to take away before anything moves, in words.",
     }
     properties["place"] = {
         "type": "array",
         "items": _record_of(intervention, _OF_PLACE),
-        "description": "Things that are put somewhere: before anything else moves, or as all that happens.",
+        "description": "Objects to put somewhere: before anything else moves, or as the whole motion.",
     }
     properties |= {name: field for name, field in fields.items() if name not in _LEFT_OUT | _LEFT_OUT_OF[tool]}
     properties["objects"] |= {"items": _record_of(fields["objects"]["items"]["properties"], _OF_OBJECTS)}
@@ -74,15 +74,15 @@ def input_schema(tool: ToolName, image: str) -> dict[str, Any]:
 
 
 def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The request that the arguments of a call make. Null is as good as leaving one out.
+    """The request for the arguments of a call. Null is the same as leaving an argument out.
 
     Raises `InvalidRequest` for an unknown argument, and where `image` or `question` is missing.
     """
     known = input_schema(tool, "")["properties"]
-    others = f"there is no such argument; there are: {', '.join(known)}"
+    others = f"is not an argument of this tool; it takes: {', '.join(known)}"
     faults = [FieldError(f"/{name}", others) for name in arguments if name not in known]
     missing = [name for name in ("image", "question") if not isinstance(arguments.get(name), str)]
-    faults += [FieldError(f"/{name}", "is needed, as text") for name in missing]
+    faults += [FieldError(f"/{name}", "is required, as text") for name in missing]
     if faults:
         raise InvalidRequest("The arguments of the tool are not valid.", errors=tuple(faults))
     request: dict[str, Any] = {}
@@ -106,10 +106,10 @@ def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, An
 
 
 def inlined(schema: dict[str, Any], exclude: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """A JSON schema with each reference replaced, and without what costs a model's attention and says nothing.
+    """A JSON schema with each reference replaced, and without parts that tell a model nothing.
 
-    That is titles and defaults of null; in arguments also null itself, which may always be given. Of results, `exclude`
-    has the fields that are left out, in the form that `BaseModel.model_dump` takes.
+    Those are titles and defaults of null; in arguments also null itself, which is always allowed. `exclude` names the
+    fields of results to leave out, as `BaseModel.model_dump` takes it.
     """
     records = schema.get("$defs", {})
 
@@ -140,13 +140,11 @@ def _record_of(properties: Mapping[str, Any], names: tuple[str, ...]) -> dict[st
 
 
 ARTIFACTS = "cow://artifacts/"
-_KEPT = (
-    "the 64-digit sha256 of the `image` in an earlier result, which asks about the same image again without sending it"
-)
+_KEPT = "the 64-digit sha256 of the `image` in an earlier result, to ask about that image again without sending it"
 HELP_WITH_PATHS = f"The image: the absolute path of a PNG, JPEG or WebP file, a data URL, an http(s) URL, or {_KEPT}."
 HELP_WITHOUT_PATHS = (
-    f"The image (PNG, JPEG or WebP): a data URL (data:image/png;base64,...), an http(s) URL, or {_KEPT}. No path: this "
-    "server does not read files."
+    f"The image (PNG, JPEG or WebP): a data URL (data:image/png;base64,...), an http(s) URL, or {_KEPT}. A path is not "
+    "accepted: this server does not read files."
 )
 _DIGEST = re.compile(rf"(?:{ARTIFACTS})?([0-9a-f]{{64}})", re.IGNORECASE | re.ASCII)
 _SCHEME = re.compile(r"(data:|[a-z][a-z0-9+.-]*://)", re.IGNORECASE | re.ASCII)
@@ -157,9 +155,9 @@ _MAX_SHOWN = 200  # characters of the caller's text in an error
 
 
 def image_of(text: str, *, paths: bool) -> ImageLike:
-    """What the SDK takes for an image; reads a file where it is one. `paths` says whether files may be named.
+    """The image as the SDK takes it. A path is read, if `paths` allows it.
 
-    Raises `InvalidRequest`, also for a file that is no image: nothing else leaves the machine.
+    Raises `InvalidRequest`, also for a file that is not an image: no other file leaves the machine.
     """
     text = text.strip()
     if digest := digest_of(text):
@@ -169,7 +167,7 @@ def image_of(text: str, *, paths: bool) -> ImageLike:
         return scheme + text[len(scheme) :]
     if not paths:
         raise _wrong(
-            f"{_shown(text)} is no data URL, http(s) URL or SHA-256 digest; files of the server's machine are not read"
+            f"{_shown(text)} is not a data URL, http(s) URL or SHA-256 digest; this server reads no local files"
         )
     if scheme not in (None, "file://"):
         raise _wrong(f"{_shown(text)} cannot be opened: give a path, a data URL, an http(s) URL or a digest")
@@ -181,7 +179,7 @@ def image_of(text: str, *, paths: bool) -> ImageLike:
         with path.open("rb") as file:
             head = file.read(_SIGNATURE_BYTES)
             if media_type_of(head) not in ("image/png", "image/jpeg", "image/webp"):
-                raise _wrong(f"{_shown(str(path))} is no PNG, JPEG or WebP")
+                raise _wrong(f"{_shown(str(path))} is not a PNG, JPEG or WebP file")
             rest = file.read(MAX_FILE_BYTES)
     except (OSError, RuntimeError, ValueError) as error:  # no home folder; NUL in the name
         why = error.strerror if isinstance(error, OSError) else str(error)
@@ -192,7 +190,7 @@ def image_of(text: str, *, paths: bool) -> ImageLike:
 
 
 def digest_of(text: str) -> str | None:
-    """The SHA-256 that a text names, as such or as a resource; None where it names none."""
+    """The SHA-256 digest in a text, by itself or in the URI of a resource; None if there is none."""
     found = _DIGEST.fullmatch(text)
     return found and found[1].lower()
 
@@ -206,36 +204,37 @@ def _wrong(detail: str) -> InvalidRequest:
 
 
 _GIVE_PLACE = (
-    "Look at the image and call again with `bbox` [x0, y0, x1, y1] or `point` [x, y] of the thing that moves, in "
-    "pixels of the image, and `object`, its name; give other things that the question names in `objects`, each with "
-    "`object` and `bbox`."
+    "Look at the image and call again with `bbox` [x0, y0, x1, y1] or `point` [x, y] of the moving object, in pixels "
+    "of the image, and its name as `object`. List the other objects of the question in `objects`, each with `object` "
+    "and `bbox`."
 )
 _RETRY_LATER = "Call again in a while, with the same arguments."
 REMEDIES = {
     "cannot-ground": _GIVE_PLACE,
     "object-not-found": _GIVE_PLACE,
     "cannot-read-direction": "Call again with `direction` [dx, dy] (x right, y down; [-1, 0] is to the left), or with "
-    '`motion_kind` "fall" where it is dropped.',
-    "artifact-not-found": "Send the image itself: the server keeps none of that digest for you.",
-    "image-url-not-allowed": "Give the image itself instead of its address. Which addresses are fetched is set by "
-    "COW_ALLOW_IMAGE_URLS of the server.",
-    "image-url-unreachable": "Check the address, or give the image itself.",
-    "unauthorized": "The person who set up this tool has to give it a valid key: COW_API_KEY in the environment of "
-    "`cow mcp`, or the header `Authorization: Bearer <key>` where it is reached over HTTP.",
+    '`motion_kind` "fall" if the object is dropped.',
+    "artifact-not-found": "Send the image itself: the server has no image with that digest for you.",
+    "image-url-not-allowed": "Give the image itself instead of its URL. COW_ALLOW_IMAGE_URLS on the server sets which "
+    "hosts it fetches images from.",
+    "image-url-unreachable": "Check the URL, or give the image itself.",
+    "unauthorized": "Whoever set up this tool must give it a valid key: COW_API_KEY in the environment of `cow mcp`, "
+    "or the header `Authorization: Bearer <key>` for MCP over HTTP.",
     "queue-full": _RETRY_LATER,
     "rate-limited": _RETRY_LATER,
     "shutting-down": _RETRY_LATER,
     "not-ready": _RETRY_LATER,
     "mllm-unavailable": "Call again in a while, or with another `reader` ('embedded' needs no model).",
-    "mllm-refused": "The same call would be rejected again: change image or question, or name another `reader`.",
-    "canceled": "Somebody canceled the job. Call again if it is still wanted.",
+    "mllm-refused": "The same call would be rejected again: change the image or the question, or name another "
+    "`reader`.",
+    "canceled": "The job was canceled. Call again if you still want it.",
 }
 
 
 def error_text(error: CowError) -> str:
-    """An error as text from which a model can do better: the code, what was wrong, and what to do with these tools."""
+    """An error as text that helps a model to correct its call: the code, what was wrong, and what to do."""
     lines = [f"{error.code}: {error.title}"]
-    # The detail says the same as the fields do, in words of the service's requests.
+    # The detail repeats the fields under the names of HTTP requests, so it is shown only without fields.
     lines += [f"- {_argument_at(field.pointer)}: {field.detail}" for field in error.errors] or [error.detail]
     if error.code in REMEDIES:
         lines.append(f"What to do: {REMEDIES[error.code]}")
@@ -245,7 +244,7 @@ def error_text(error: CowError) -> str:
 
 
 def _argument_at(pointer: str) -> str:
-    """The argument of a tool that a JSON Pointer into the service's request means."""
+    """The argument of a tool for a JSON Pointer into the service's request."""
     path = pointer.lstrip("/")
     for name, known in NESTED.items():
         if path == known or path.startswith(f"{known}/"):

@@ -64,7 +64,7 @@ async def tool_result(result: Simulation | Answer, client: AsyncClient, base_url
     shown = data["simulation"] if isinstance(result, Answer) else data
     video = ""
     if simulation is not None:
-        # A thing that comes to rest touches the floor many times.
+        # An object that settles touches the floor many times.
         contacts = shown["trajectory"]["contacts"]
         shown["trajectory"]["contacts"] = [each for each in contacts if each["time"] > 0][: display.MAX_CONTACTS]
     if simulation is not None and simulation.video is not None:
@@ -98,7 +98,7 @@ def answer_text(answer: Answer, video: str) -> str:
     if answer.simulation is not None:
         lines += ["", "Imagined:", *_simulation_lines(answer.simulation, video)]
     else:
-        lines.append("Nothing was imagined: the answer is from the image alone.")
+        lines.append("Nothing was simulated: the answer is from the image alone.")
     return _text(lines, answer.warnings, answer.image.sha256)
 
 

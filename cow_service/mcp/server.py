@@ -31,8 +31,8 @@ from cow_service.records import Job
 from cow_service.weights.manifests import TOOL_PROMPTS
 
 TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
-# It only looks; asking again changes nothing, though a model that samples may answer otherwise; images may be fetched,
-# and shown to a provider's model.
+# The tools only read. Repeating a call changes nothing, though a model that samples may answer differently. The world
+# is open: images may be fetched, and shown to a provider's model.
 HINTS = {"read_only_hint": True, "destructive_hint": False, "idempotent_hint": True, "open_world_hint": True}
 MIN_STEP = 1e-4  # the protocol wants progress that grows, and a stage may begin without any
 
@@ -41,11 +41,11 @@ log = logging.getLogger("cow_service")
 
 @dataclass(frozen=True)
 class Caller:
-    """Who calls a tool: by key and address where the call came over HTTP, else nothing is known."""
+    """Who calls a tool. Key and address are known only for calls over HTTP."""
 
     key: str | None = None
     address: tuple[str, int] | None = None
-    forwarded: bool = False  # by a proxy, which may stand before anybody
+    forwarded: bool = False  # by a proxy, which may serve any client
 
 
 Connect: TypeAlias = Callable[[Caller], AbstractAsyncContextManager[AsyncClient]]
@@ -97,7 +97,7 @@ class _Tools:
     async def call(
         self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
     ) -> types.CallToolResult:
-        """What a tool returns; an error is text in it, since that is where a model looks."""
+        """What a tool returns. An error is returned as text, since that is where a model looks."""
         tool = params.name
         if tool not in TITLES:
             raise MCPError(code=types.INVALID_PARAMS, message=f"Unknown tool: {tool[:80]!r}")
@@ -116,7 +116,7 @@ class _Tools:
             failure = error
         except Exception:
             log.exception("%s failed", tool)
-            failure = InternalError("The tool met an error that it did not foresee; its log has the trace.")
+            failure = InternalError("An unexpected error happened in the tool. Its log has the trace.")
         return types.CallToolResult(content=[types.TextContent(text=arguments.error_text(failure))], is_error=True)
 
     async def resources(self, *_: Any) -> types.ListResourcesResult:
@@ -127,7 +127,7 @@ class _Tools:
             uri_template=arguments.ARTIFACTS + "{sha256}",
             name="artifact",
             title="Pictures and videos of results",
-            description="The bytes of a picture or video, by the SHA-256 that a result names it with.",
+            description="The bytes of a picture or video, by the SHA-256 digest in a result.",
         )
         return types.ListResourceTemplatesResult(resource_templates=[artifact])
 

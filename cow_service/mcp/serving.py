@@ -153,7 +153,7 @@ def backend_for(settings: Settings, url: str | None) -> Backend:
 def for_its_owner(settings: Settings) -> Settings:
     """Settings of a service that one person starts for themselves, as a child of their own program.
 
-    Whoever started it owns the process and the data folder: keys and limits for others make no sense. It has to end
+    Its user owns the process and the data folder, so keys and limits for others make no sense. It has to end
     soon after its standard input, before it is killed: unfinished jobs go on at the next start.
     """
     return settings.model_copy(
@@ -168,7 +168,7 @@ async def _client(url: str, caller: Caller, http: httpx.AsyncClient) -> AsyncGen
     try:
         client = AsyncClient(url, api_key=caller.key, http_client=http)
     except ValueError as error:
-        raise Unauthorized("The key holds characters that no key has.") from error
+        raise Unauthorized("The key contains characters that are not allowed in keys.") from error
     try:
         yield client
     finally:

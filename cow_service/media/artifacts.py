@@ -67,7 +67,7 @@ class ArtifactStore(ABC):
     """
 
     def __init__(self, scratch_folder: Path) -> None:
-        self.scratch_folder = scratch_folder  # that of the store, or beside the jobs where the store has no folder
+        self.scratch_folder = scratch_folder  # the store's folder, or one next to the jobs if the store has none
         self._verified: dict[str, object] = {}  # by digest, the version whose bytes were compared with it
 
     @abstractmethod
@@ -110,7 +110,7 @@ class ArtifactStore(ABC):
         """A file with the bytes of an artifact, which is there inside the block. Raises as `get` does."""
 
     def signed_url(self, sha256: str, seconds: float) -> str | None:
-        """A URL under which anybody can get an artifact for so long; None where the store has none."""
+        """A URL under which anybody can get an artifact for so long; None if the store has none."""
         return None
 
     @abstractmethod
@@ -328,7 +328,7 @@ def disk_errors(sha256: str | None = None) -> Generator[None]:
             raise StorageUnavailable("The disk of the data folder is full: free some space and try again.") from error
         reason = os.strerror(error.errno) if error.errno else type(error).__name__
         raise StorageUnavailable(
-            f"The data folder cannot be used ({reason}): make it a folder that the server may read and write."
+            f"The data folder cannot be used ({reason}): give a folder that the server can read and write."
         ) from error
 
 
@@ -351,7 +351,7 @@ def media_type_of(data: bytes) -> str | None:
 def extension_of(media_type: str) -> str:
     """The extension of files of a media type. Raises `ValueError` if it is not in `MEDIA_TYPES`."""
     if media_type not in MEDIA_TYPES:
-        raise ValueError(f"The media type {media_type!r} is not kept: use one of {', '.join(MEDIA_TYPES)}.")
+        raise ValueError(f"The media type {media_type!r} is not supported: use one of {', '.join(MEDIA_TYPES)}.")
     return MEDIA_TYPES[media_type]
 
 

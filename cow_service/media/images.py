@@ -160,7 +160,7 @@ def _damage_named(kind: str, data: bytes) -> Generator[None]:
         raise
     except Exception as error:  # a dozen kinds
         raise errors.ImageUnreadable(
-            f"The {kind} file of {len(data)} bytes could not be decoded, it is damaged or incomplete: send it whole."
+            f"The {kind} file of {len(data)} bytes could not be decoded: it is damaged or incomplete. Send it whole."
         ) from error
 
 
@@ -170,10 +170,10 @@ def _check_frames(kind: str, frames: int) -> None:
 
 
 def decode_own(data: bytes) -> NDArray[np.uint8]:
-    """Upright RGB pixels [H, W, 3] of a PNG that this service wrote. Raises `InternalError` where it is damaged."""
+    """Upright RGB pixels [H, W, 3] of a PNG that this service wrote. Raises `InternalError` if it is damaged."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if pixels is None:
-        raise errors.InternalError("A picture that was written before can no longer be read.")
+        raise errors.InternalError("A stored picture can no longer be read.")
     return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
 
 
@@ -183,7 +183,7 @@ def decode_depth(data: bytes, *, max_megapixels: float) -> NDArray[np.uint16]:
     kind, opener = _OPENERS[media_type]
     with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
         if not image.mode.startswith("I"):
-            detail = "It has colours, or 8 bits per pixel, not grey with 16 bits: save it as such."
+            detail = "It has colours or 8 bits per pixel: save it as 16-bit grey."
             raise errors.ImageTypeUnsupported(detail)
         return np.asarray(image).astype(np.uint16)
 
@@ -374,7 +374,7 @@ def _strip_jpeg(data: bytes) -> tuple[bytes, dict[int, int]]:
 
 def _overfull(what: str) -> errors.ImageUnreadable:
     """For a file of more parts than any camera or program writes."""
-    return errors.ImageUnreadable(f"The image is {what}: save it anew with another program and send that.")
+    return errors.ImageUnreadable(f"The image is {what}: save it again with another program and send that.")
 
 
 def _read_exif(exif: bytes) -> dict[int, int]:
@@ -414,7 +414,7 @@ def decode_data_url(url: str, pointer: str = "/image") -> bytes:
         raise _bad_image(f"`{field}` must be a data URL with base64: data:image/png;base64,...", pointer)
     declared = head["type"].lower()
     if not declared.startswith("image/") and declared not in ("", "application/octet-stream"):
-        # Of the image types, what the bytes are counts, and not what they are declared to be.
+        # The image type is detected from the bytes; the declared type is ignored.
         raise errors.ImageTypeUnsupported(
             f"The data URL of `{field}` declares {declared[:80]}: send image/png, image/jpeg or image/webp."
         )

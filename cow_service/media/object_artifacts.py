@@ -1,4 +1,4 @@
-"""Artifacts as objects of S3, Google Cloud Storage, Azure or what speaks like them, through obstore.
+"""Artifacts as objects of S3, Google Cloud Storage, Azure or compatible stores, through obstore.
 
 An object is `<prefix>/<digest>`; its content type is the media type. The time of an object is that of its last use, but
 for `RENEWED_AFTER_SECONDS`: an object store sets it only when the bytes are sent, so that an object that is used again
@@ -88,7 +88,7 @@ class ObjectArtifacts(artifacts.ArtifactStore):
         return artifacts.artifact_of(sha256, media_type, len(data))
 
     def get(self, sha256: str) -> Artifact:
-        """Finds an object. Its bytes are not compared: whoever gets them from a signed URL can."""
+        """Finds an object. Its bytes are not compared; a caller with a signed URL can do that."""
         return self._head(sha256).artifact
 
     def read(self, sha256: str) -> bytes:
@@ -119,11 +119,11 @@ class ObjectArtifacts(artifacts.ArtifactStore):
             yield path
 
     def signed_url(self, sha256: str, seconds: float) -> str | None:
-        """A URL of the store itself; None where its credentials cannot sign."""
+        """A URL of the store itself; None if its credentials cannot sign."""
         try:
             return obstore.sign(self._store, "GET", sha256, timedelta(seconds=seconds))
         except exceptions.BaseError as error:
-            log.warning("artifacts are streamed: the object store signs no URL (%s)", type(error).__name__)
+            log.warning("artifacts are streamed, because the object store cannot sign URLs (%s)", type(error).__name__)
             return None
 
     def delete(self, artifacts: Collection[str], untouched_since: float) -> set[str]:
@@ -218,7 +218,7 @@ class ObjectArtifacts(artifacts.ArtifactStore):
 
 def _object(sha256: str, result: "obstore.GetResult") -> _Object:
     meta, media_type = result.meta, result.attributes.get("Content-Type", "")
-    if media_type not in artifacts.MEDIA_TYPES:  # an object that somebody else has put there
+    if media_type not in artifacts.MEDIA_TYPES:  # an object from another program
         raise artifacts.not_found(sha256)
     artifact = artifacts.artifact_of(sha256, media_type, meta["size"])
     return _Object(artifact, meta["e_tag"], meta["last_modified"].timestamp())
@@ -238,8 +238,8 @@ def _store_errors(sha256: str | None = None) -> Generator[None]:
                 raise artifacts.not_found(sha256) from error
             reason = "there is no such bucket"
         elif isinstance(error, exceptions.PermissionDeniedError | exceptions.UnauthenticatedError):
-            reason = "it refuses the credentials; see those of its provider, such as AWS_*"
+            reason = "it refuses the credentials; check the provider's variables, such as AWS_*"
         else:
-            reason = f"no answer, or no credentials ({type(error).__name__}): the log says more"
+            reason = f"no answer, or no credentials ({type(error).__name__}): see the log"
         log.warning("object store: %s", str(error).partition("\n")[0])
         raise StorageUnavailable(f"The object store of COW_ARTIFACTS cannot be used: {reason}.") from error

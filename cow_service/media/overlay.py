@@ -36,7 +36,7 @@ class Label:
     below: bool  # rather than above the box
 
 
-# OpenCV loads its font anew in each thread that writes, which takes longer than all else that is drawn.
+# OpenCV loads its font again in each thread that writes, which takes longer than the rest of the drawing.
 _letters = ThreadPoolExecutor(1, "cow-letters")
 
 
@@ -109,7 +109,7 @@ ENCOUNTERS = {"touches": (255, 82, 82), "occludes": (190, 120, 255), "occluded-b
 REMOVED = (255, 120, 120)  # what is taken away
 PLACED = (130, 255, 130)  # what is put somewhere before the motion
 HATCH, DASH = 9, 6  # line widths from one line of a hatching to the next, and of a dash
-BAND_OPACITY, WIDE_BAND_OPACITY = 0.3, 0.06  # of a narrow band, and the least that a wide one comes to
+BAND_OPACITY, WIDE_BAND_OPACITY = 0.3, 0.06  # of a narrow band, and the minimum for a wide one
 NARROW_BAND = 0.015  # share of the image up to which a box of a band is narrow
 BAND_EDGE_OPACITY = 0.6  # of the line around a band
 AT_REST = 0.25  # px per frame: what moves less rests

@@ -1,4 +1,4 @@
-"""What people pass on of a result: its film with question, futures and verdict, and a still of the same for a link."""
+"""Results to share: a film with question, futures and verdict, and a still picture of it for a link."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Told:
 
 
 def film(video: bytes, told: Told) -> bytes:
-    """An mp4: the futures fade over the first frame, the film plays, and the verdict is told.
+    """An mp4: the futures fade over the first frame, the film plays, and the verdict is shown.
 
     It is made smaller where it would not fit into a chat (`SMALL_ENOUGH`). Its frames are read as they are needed.
     """
@@ -150,7 +150,7 @@ class _Sheet:
             yield told
 
     def around(self, frame: Image, is_told: bool) -> Image:
-        """A frame with its words, the verdict among them where it is told."""
+        """A frame with its words, including the verdict if it is shown."""
         canvas = np.full((*self.shape, 3), DARK[0], np.uint8)
         canvas[self.above : self.above + self.frame[0]] = frame
         in_letters_thread(self._write, canvas, is_told)
@@ -196,7 +196,7 @@ WEB = Path(__file__).parents[1] / "web"
 
 
 def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
-    """HTML that needs no network: the picture [H, W, 3], and its worlds, computed anew while somebody drags the arrow.
+    """HTML that needs no network: the picture [H, W, 3], and its worlds, computed anew while you drag the arrow.
 
     `world` is the JSON of `trajectory.live`.
     """

@@ -48,7 +48,7 @@ def ids() -> dict[str, str]:
 
 
 def traceparent() -> str | None:
-    """The header that names the current span as the parent; None where there is none."""
+    """The header that names the current span as the parent; None if there is none."""
     span = get_current_span().get_span_context()
     if not span.is_valid:
         return None
@@ -126,7 +126,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None = None) -> None:
-    """Sends all logs of the process through one format. Setting up once more replaces what was set up before."""
+    """Sends all logs of the process through one format. A second call replaces the first."""
     formatter = JsonFormatter() if settings.log_format == "json" else TextFormatter()
     level = settings.log_level.upper()
     problems, requests = logging.StreamHandler(err or sys.stderr), logging.StreamHandler(out or sys.stdout)

@@ -1,4 +1,4 @@
-"""What the service counts, for Prometheus. Each instance has a registry of its own: none knows of another."""
+"""What the service counts, for Prometheus. Each instance has its own registry."""
 
 import logging
 import sys
@@ -35,10 +35,10 @@ _STAGE_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120,
 
 # By name: description, labels.
 GAUGES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "cow_queue_depth": ("Jobs on the job database that wait or run.", ("queue", "generator", "state")),
-    "cow_queue_oldest_seconds": ("How long the oldest job has waited in a queue, s; 0 where none waits.", ("queue",)),
+    "cow_queue_depth": ("Jobs in the job database that wait or run.", ("queue", "generator", "state")),
+    "cow_queue_oldest_seconds": ("Waiting time of the oldest job in a queue, s; 0 if none waits.", ("queue",)),
     "cow_queue_unserved": (
-        "Jobs that wait, and that no process takes: none has their queue, or their workflow version.",
+        "Waiting jobs that no process takes, because of their queue or workflow version.",
         ("queue", "reason"),
     ),
     "cow_workers": ("Workers of this process.", ("queue", "state")),
@@ -74,18 +74,16 @@ class Metrics(Collector):
         self._requests = counter("cow_http_requests", "Requests answered.", ("method", "route", "status"))
         self._request_seconds = histogram(
             "cow_http_request_seconds",
-            "From a request's head to the last byte of its answer, s.",
+            "Time from a request's head to the last byte of its response, s.",
             ("route",),
             buckets=_REQUEST_BUCKETS,
         )
         self.stage_seconds = histogram("cow_stage_seconds", "Time in a stage, s.", ("stage",), buckets=_STAGE_BUCKETS)
         # The outcome of a job is `succeeded`, `failed` or `canceled`.
         self.jobs = counter("cow_jobs", "Jobs that ended.", ("kind", "outcome"))
-        self._stage_cache = counter("cow_stage_cache", "Stages looked for among earlier results.", ("stage", "result"))
-        self.worker_ends = counter("cow_worker_ends", "Worker processes that ended, and why.", ("reason",))
-        self.webhooks = counter(
-            "cow_webhook_attempts", "Attempts to call a webhook, and what came of them.", ("outcome",)
-        )
+        self._stage_cache = counter("cow_stage_cache", "Cache lookups of stages, by result.", ("stage", "result"))
+        self.worker_ends = counter("cow_worker_ends", "Worker processes that ended, by reason.", ("reason",))
+        self.webhooks = counter("cow_webhook_attempts", "Attempts to call a webhook, by outcome.", ("outcome",))
         self.webhooks_given_up = counter(
             "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt."
         )

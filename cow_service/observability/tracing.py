@@ -35,7 +35,7 @@ _provider: TracerProvider | None = None
 def start(environment: Mapping[str, str] = os.environ) -> bool:
     """Starts recording and exporting where the environment asks for it; returns whether it does.
 
-    Raises `SettingsError` where it asks for what cannot be done.
+    Raises `SettingsError` if it asks for what cannot be done.
     """
     global _provider  # noqa: PLW0603  one process, one exporter
     named = next((name for name in ENDPOINTS if environment.get(name)), None)
@@ -67,7 +67,7 @@ def start(environment: Mapping[str, str] = os.environ) -> bool:
 
 
 def stop() -> None:
-    """Exports what is left, within OTEL_EXPORTER_OTLP_TIMEOUT (10 s), and records no more."""
+    """Exports what is left, within OTEL_EXPORTER_OTLP_TIMEOUT (10 s), and stops recording."""
     global _provider
     provider, _provider = _provider, None
     if provider is not None:

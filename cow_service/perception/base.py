@@ -1,4 +1,4 @@
-"""The Protocols of what sees with models, and the choice of a server. Stages know this file, never an implementation.
+"""The Protocols of vision models, and the choice of a server. Stages know this file, never an implementation.
 
 Images are RGB [H, W, 3], uint8; boxes and points are pixels of them.
 """
@@ -66,7 +66,7 @@ class Segmenter(Protocol):
     """Cuts things out. Safe to use from several threads, as all of these are."""
 
     fingerprint: str
-    """All that decides what it finds: model, revision, options. So of all of these."""
+    """Everything that determines what it finds: model, revision, options. The same holds for all protocols here."""
 
     def embed(self, image: Image) -> Any:
         """What it knows of an image before it is asked for a thing: computed once, used for every prompt."""
@@ -102,7 +102,7 @@ class DepthReading:
 
     depth: Floats  # [h, w] over the whole image, along the optical axis; nan where nothing is known
     scale: float | None  # metres per unit; None: relative, proportional to distances
-    focal: float | None  # px of the image; None where the model does not tell
+    focal: float | None  # px of the image; None if the model does not tell
     deviation: float  # relative, one standard deviation
 
 
@@ -147,7 +147,7 @@ class Perception:
     """The models that a server sees with, loaded when they are first needed. Safe to use from several threads."""
 
     def __init__(self, settings: Settings) -> None:
-        """Raises `SettingsError` for names that nobody has, and for two of one kind."""
+        """Raises `SettingsError` for unknown names, and for two of one kind."""
         self._registries: dict[PerceptionKind, Registry[Any]] = {
             kind: Registry(group, PerceptionUnavailable, settings) for kind, group in GROUPS.items()
         }
@@ -175,7 +175,7 @@ class Perception:
         return [(kind, name) for kind, registry in self._registries.items() for name in registry.names()]
 
     def load(self, kind: PerceptionKind) -> Any | None:
-        """The model of a kind, None where the server has none. Raises `PerceptionUnavailable`."""
+        """The model of a kind, None if the server has none. Raises `PerceptionUnavailable`."""
         if kind not in self.names:
             return None
         check_modules(self.names[kind], PerceptionUnavailable)
@@ -183,7 +183,7 @@ class Perception:
 
     @property
     def segmenter(self) -> Segmenter | None:
-        """None where the server has none; so of the others. Raises `PerceptionUnavailable`."""
+        """None if the server has none; so of the others. Raises `PerceptionUnavailable`."""
         return cast(Segmenter | None, self.load("segmenter"))
 
     @property
@@ -214,8 +214,8 @@ class Perception:
     def embed(self, key: ImageKey, image: Callable[[], Image], source: bytes | None = None) -> Embedded:
         """What the segmenter knows of an image, which is asked for only where it is new. There must be a segmenter."""
         segmenter = self.segmenter
-        assert segmenter is not None, "asked for only where there is a segmenter"
-        with self._lock:  # also while it looks: who asks for the same image waits, and the model takes one at a time
+        assert segmenter is not None, "called only if there is a segmenter"
+        with self._lock:  # also during a look: callers with the same image wait, and the model takes one at a time
             found = self._embeddings.get(key)
             if found is None:
                 pixels = image()

@@ -165,7 +165,7 @@ class LamaInpainter:
         self._model, self.fingerprint = model, model.fingerprint
 
     def fill(self, image: Image, hole: Mask, progress: Callable[[float], None]) -> Image:
-        """See `Inpainter`. Raises `PerceptionUnavailable` where memory runs out."""
+        """See `Inpainter`. Raises `PerceptionUnavailable` if memory runs out."""
         tight = window_of(hole)
         if tight is None:
             return image

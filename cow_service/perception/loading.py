@@ -1,4 +1,4 @@
-"""What all models that see have in common: finding their weights, loading them, running them, translating errors."""
+"""What all vision models have in common: finding their weights, loading them, running them, translating errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LoadedModel:
     network: Any
     device: torch.device
     fingerprint: str
-    half: torch.dtype | None = None  # what it may compute in on a GPU; None: float32 only
+    half: torch.dtype | None = None  # precision that it may use on a GPU; None: float32 only
     _lock: Lock = field(default_factory=Lock)
 
     @contextmanager
@@ -101,8 +101,8 @@ def check_keys(name: str, missing: Sequence[str], unknown: Sequence[str]) -> Non
     for keys, what in ((missing, "lack"), (unknown, "have, beyond its model,")):
         if keys:
             raise PerceptionUnavailable(
-                f"The weights of '{name}' {what} {listed(keys)}. Run `cow models pull {name}`, or take a checkpoint of "
-                f"this model where COW_CHECKPOINTS names one."
+                f"The weights of '{name}' {what} {listed(keys)}. Run `cow models pull {name}`, or name a checkpoint of "
+                f"this model in COW_CHECKPOINTS."
             )
 
 

@@ -1,4 +1,4 @@
-"""Outlines that can be trusted: those on which two prompts agree. One alone may be a scrap of a thing."""
+"""Trustworthy outlines: those on which two prompts agree. A single one may be a fragment of an object."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Outline:
 
 
 def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
-    """What is in each box; None where nothing fills it.
+    """What is in each box; None if nothing fills it.
 
     It is sure where it fills the box well, and the point deepest inside of its mask gives the same mask again.
     """
@@ -57,7 +57,7 @@ def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
 
 
 def outlines_at(image: Embedded, point: Point) -> list[Outline]:
-    """The things that a point may mean, best first; empty where no two prompts agree.
+    """The things that a point may mean, best first; empty if no two prompts agree.
 
     More than one are things within each other that are about as good; else the first alone is meant.
     """

@@ -113,7 +113,7 @@ class Course:
 
 
 def course_of(motion: Motion, velocities: Sequence[Floats], speed: float) -> Course | None:
-    """The course with the velocity [3] (m/s) of each leg, at a speed in px/s; None where it just goes on.
+    """The course with the velocity [3] (m/s) of each leg, at a speed in px/s; None if it just goes on.
 
     Legs before the last that have no length of their own share what is left of `COURSE_TIME`.
     """

@@ -1,4 +1,4 @@
-"""What is known of the bodies of a scene before they are placed: boxes, shapes, and what stands on what."""
+"""What is known about the bodies of a scene before they are placed: boxes, shapes, and which stands on which."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats
 
 ON_TOP = 0.72  # of a support's height in the image, from its upper edge: a foot below that stands before it
-SHOWN = 0.1  # of a body's width: so much of its support's top is seen beside it, above its foot
-BESIDE = 3.0  # px beside a body's box where the support's upper edge is looked for
+SHOWN = 0.1  # of a body's width: how much of its support's top is visible next to it, above its foot
+BESIDE = 3.0  # px next to a body's box where the support's upper edge is searched
 ENDS = 0.2  # of the height, at the upper and at the lower end, where a vessel has no handle
 HANDLE, BARE = 0.12, 0.05  # of the width: so far a handle reaches at least, and the other side at most
 WIDER = 1.15  # a support is so much wider than what stands on it
 RIM = 0.9  # of half the width of its upper edge: what lies further out rises too steeply to be measured
 LEAST_RIM = 12  # px across
 RIM_SIGMA, RIM_OFF = 0.08, 0.08  # of half its width: its deviation at best, and that of what is no ellipse
-LEAST_OVERLAP = 0.1  # of the narrower box: with less of it above the other, it is seen beside that
+LEAST_OVERLAP = 0.1  # of the narrower box: with less of it above the other, it is next to that
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class SeenBody:
     elongated: bool = False  # a vehicle: longer along its heading than across
     equal_sided: bool = False  # a cube: as wide as high
     is_form_known: bool = True  # its shape was seen or said; else how deep it is, is not known
-    stands_out: bool = True  # it was told from its surroundings: nothing else is seen to carry it
+    stands_out: bool = True  # it is separate from its surroundings: nothing else is seen to carry it
     taper: float = 1.0  # its width at its lower end, of that at its upper end
     point: Point | None = None  # px: of the mover, the one it was grounded at
 
     @property
     def is_depth_known(self) -> bool:
-        """Whether its shape tells how deep it is along the line of sight: bricks and boxes have any depth."""
+        """Whether its shape determines its depth along the line of sight: that of bricks and boxes is unknown."""
         said = self.prior
         is_any_box = said is not None and said.shape == "box" and not (said.equal_sided or said.elongated)
         return self.is_form_known and not is_any_box
@@ -88,7 +88,7 @@ class SeenBody:
     def rim(self) -> tuple[float, float] | None:
         """Minor to major axis of its round top as the upper edge of its outline shows it, and its deviation.
 
-        None where that edge is no half of an ellipse.
+        None if that edge is no half of an ellipse.
         """
         patch = self.mask.patch
         top = patch[: max(3, len(patch) // 6)]
@@ -107,7 +107,7 @@ class SeenBody:
 
     @cached_property
     def widths(self) -> Floats:
-        """Of its outline per row [R] from the top, of the widest; a cylinder's where there is none."""
+        """Widths of its outline per row [R] from the top, relative to the widest; a cylinder's if it has no outline."""
         widths = self.mask.patch.sum(axis=1)
         return widths / widths.max() if self.mask.area else np.ones(1)
 
@@ -149,7 +149,7 @@ class SeenBody:
             return False
         if not (x0 < x < x1 and y0 < y < y0 + ON_TOP * (y1 - y0)):
             return False
-        above, below, mask = math.inf, math.inf, self.mask  # px of it beside the other one, over and under its foot
+        above, below, mask = math.inf, math.inf, self.mask  # px of it next to the other one, above and below its foot
         for column in (left - BESIDE, right + BESIDE):
             at = int(column) - mask.columns.start
             rows = np.nonzero(mask.patch[:, at])[0] if 0 <= at < mask.patch.shape[1] else np.zeros(0)
@@ -186,7 +186,7 @@ def _drawn_supports(bodies: Sequence[SeenBody], level: float) -> list[int | None
 
 
 def supports_of(bodies: Sequence[SeenBody], level: float | None = None) -> list[int | None]:
-    """For each body the one that it stands on, by what is said of it or by where its foot is; None: the floor.
+    """For each body its support, as stated or by the place of its foot; None: the floor.
 
     `level` is the height in the image (px) of the floor of a drawing that is seen from the side.
     """

@@ -1,4 +1,4 @@
-"""The pinhole camera that turns pixels into metres and back, with the stated guesses where an image tells nothing."""
+"""The pinhole camera that turns pixels into metres and back, with stated defaults where the image shows nothing."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ SEEN_RIM = 0.8  # of the tops that look round: the others were seen amiss
 CUBE_SIGMA = 0.1  # of a cube's height in the image against its width
 CUBE_AMISS = 0.02  # likelihood of any height, where a cube was seen amiss
 TURNED = np.linspace(1.0, math.sqrt(2), 6)  # widths, in its side, of a cube whose yaw is not known
-OUT_OF_SIGHT = 50.0  # what a foot above the horizon costs: no such camera is left beside one without any
+OUT_OF_SIGHT = 50.0  # penalty of a foot above the horizon: such a camera loses against any without one
 FAR_END = 0.3  # of the image's width: a level line so long above all things is the far end of the floor, as a rule
 FAR_END_SLOPE = 0.35
 FAR_END_SIGMA, FAR_END_SEEN = 0.2, 0.75  # of the sine of the angle below the horizon; share of such lines that are it
@@ -229,7 +229,7 @@ def camera_of(
     metres_per_pixel: float,
     shadow: Shadow | None,
 ) -> CameraFit:
-    """The camera by what stands on the floor and, of a mover that is in the air, by its height as said and its shadow.
+    """The camera from objects on the floor and, for a mover in the air, from its stated height and its shadow.
 
     `lines` are segments [N, 4] (px) that lie between things; `metres_per_pixel` holds at the mover.
     """
@@ -247,7 +247,7 @@ def camera_of(
 def narrowed(
     fit: CameraFit, things: Sequence[Standing], size: tuple[int, int], floor: Floats | None = None
 ) -> CameraFit:
-    """The camera by what stands on the floor of an image of a size (width, height; px), and by lines of the floor.
+    """The camera from objects on the floor of an image of a size (width, height; px), and from lines of the floor.
 
     All feet lie below the horizon. A circle is seen as an ellipse whose axes have the ratio of the sine of the angle at
     which it is looked down on; a cube shows the more of its top the larger that angle is. Upright edges meet in one
@@ -310,7 +310,7 @@ def _far_end(floor: Floats, above: float, width: int) -> Floats | None:
 def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, int]) -> CameraFit | None:
     """The camera by the shadow of a ball in a box of an image of a size (width, height), px.
 
-    None where no likely camera and light would make that shadow of a ball in the air.
+    None if no likely camera and light would make that shadow of a ball in the air.
     """
     radius, middle = (ball[2] - ball[0] + ball[3] - ball[1]) / 4, np.array(size) / 2
     across = (np.array([ball[0] + ball[2], ball[1] + ball[3]]) / 2 - middle) / radius

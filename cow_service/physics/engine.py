@@ -53,10 +53,10 @@ class RigidShape:
     density: float = 1.0  # against that of the others
     friction: float = 0.5
     restitution: float = 0.5
-    starts: bool = False  # it is set in motion or let go; what is not sleeps until it is touched
+    starts: bool = False  # it is set in motion or released; others sleep until they are touched
     glides: bool = False  # keeps its velocity, without friction, until it meets another body
     falls: bool = True  # gravity acts on it
-    ghost: bool = False  # passes through everything; what it meets is told all the same
+    ghost: bool = False  # passes through everything, but its meetings are recorded
     course: Course | None = None  # of what glides: its legs, and where it stops
     hollow: Hollow | None = None  # it is an open container
     middle: float | None = None  # height of a solid body's centre of mass, of its height; None: as of one stuff
@@ -89,14 +89,14 @@ class RigidShape:
 
 ENGINE_SIZE = 0.15  # m inside the engine: half the width of the first body of the first world
 SPACING = 24.0  # m inside the engine, between worlds
-COLOURS = 5  # worlds so many places apart, along and across, share a collision group
+COLOURS = 5  # worlds this many places apart, along and across, share a collision group
 REACH = 0.9 * COLOURS * SPACING / 2  # m inside the engine: what would get further away is taken out
 CHECKED = 4  # recorded frames after which it is asked what is far away, finished, or at rest
 LEAST_STEPS, LEAST_STEPS_OF_MANY = 60.0, 30.0  # steps per second, at least, of a world alone and of many
 FLOOR_RESTITUTION, FLOOR_FRICTION = 0.5, 0.5
 MOST_GRAVITY = 500.0  # m/s^2 inside the engine: what is smaller than 3 mm would sink into the floor between two steps
 FORESEEN = 10.0  # m inside the engine, at most: contacts are found that far ahead of what is fast
-GAP = 1e-3  # m inside the engine: how far above what it stands on a body starts
+GAP = 1e-3  # m inside the engine: height above its support at which a body starts
 FLOOR = (-1, -1)  # its owner
 LEAST_WAIST = 0.05  # of the height: a thinner foot would let its edge through the floor
 AT_REST = 0.05  # of a body's half width, per second: what moves more slowly is at rest
@@ -131,7 +131,7 @@ class WorldRun:
 
 
 Finished = Callable[[Floats, Floats], Mask]
-"""Of which worlds [K] the rest does not matter, by positions and velocities [K, 3] (m, m/s) of their first bodies."""
+"""Which worlds [K] may stop now, by positions and velocities [K, 3] (m, m/s) of their first bodies."""
 
 
 def run_worlds(
@@ -144,7 +144,7 @@ def run_worlds(
     until_rest: bool = False,
     path_fps: float | None = None,
 ) -> list[WorldRun]:
-    """Runs worlds for the time of so many frames, recording every `every`-th. They have equally many bodies each.
+    """Runs worlds for a number of frames, recording every `every`-th. All have the same number of bodies.
 
     With more than one world, impulses are not recorded, nor turns where they are not wanted, and worlds that are
     finished go on in a straight line. `until_rest`: fewer frames are recorded where from some frame on nothing moves
@@ -290,7 +290,7 @@ class _Engine:
         for number in range(frame * self.substeps, (frame + self.every) * self.substeps):
             time = number * step
             self.steer(number, step)
-            # Velocities before the step, of which meetings tell the change.
+            # Velocities before the step, from which the change at a meeting is computed.
             before = {(0, i): self.bodies[0][i].linvel for i in self.awake[0]} if self.is_alone else {}
             world.step()
             for event in drain():
@@ -323,7 +323,7 @@ class _Engine:
                 self.release(k, i)
 
     def release(self, k: int, i: int) -> None:
-        """A body glides no more: from now on it is subject to friction."""
+        """A body stops gliding: from now on it is subject to friction."""
         self.courses.pop((k, i), None)
         for collider in self.bodies[k][i].colliders:
             self.world.colliders[collider].friction = self.worlds[k][i].friction

@@ -1,4 +1,4 @@
-"""The likeliest world, and the ensemble of worlds around it: what is shown, what is answered, and how sure that is.
+"""The likeliest world, and the ensemble of worlds around it, which give the frames, the answer and its certainty.
 
 The rule, the same for every form of question: an answer is sure where it has at least `SURE` of the worlds, or
 `SURE_OF_MISS` where a throw meets nothing, or `SURE_OF_FIT` of what is put into something, and robust where it has at
@@ -26,15 +26,15 @@ BATCHES = (15, 30)  # worlds after which it is asked whether all that are wanted
 EVERY = 2  # frames of its clock between those that are recorded of the ensemble
 TRIES = 4  # worlds that are tried for one that shows what most of the ensemble does
 SURE = 0.7  # share of the worlds from which an answer is given
-# The same of a throw whose heading out of the plane of the image nobody tells, where it meets nothing: a wrong guess of
+# The same for a throw with an unknown heading out of the image plane that meets nothing: a wrong guess of
 # the heading makes worlds miss, and hardly ever hit.
 SURE_OF_MISS = 0.85
-SURE_OF_FIT = 0.85  # the same of whether something fits where it is put: widths are told by two outlines at two depths
+SURE_OF_FIT = 0.85  # the same for whether a put object fits: widths are measured by two outlines at two depths
 ROBUST = 0.9
 # The chance, at most and at each look, that those which are left would change whether the answer is sure, and whether
 # it is robust, if they were drawn like those that were run.
 MAY_CHANGE, MAY_CHANGE_ROBUST = 0.01, 0.12
-MATTERS, MATTERS_OF = 0.2, 50  # correlation with the outcome from which a parameter is named, of so many worlds
+MATTERS, MATTERS_OF = 0.2, 50  # least correlation with the outcome to name a parameter, for that many worlds
 MOST_NAMED = 3
 
 KIND_OF: dict[AskedRelation, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
@@ -44,11 +44,11 @@ FIRST_MET: tuple[AskedForm, ...] = ("which-first", "where", "what-happens")  # t
 
 @dataclass(frozen=True)
 class Query:
-    """What is asked, with the bodies that it is about."""
+    """The question, with the bodies that it is about."""
 
     asked: Asked
     target: int | None = None  # None: any
-    subject: int = 0  # who does it
+    subject: int = 0  # the acting body
     among: tuple[int, ...] = ()  # the things that are meant; empty: any
     is_decidable: bool = True  # by worlds
     sure: float = SURE  # share of the worlds from which an answer is given
@@ -85,7 +85,7 @@ class EnsembleResult:
     shown: ObservedWorlds
     ensemble: ObservedWorlds | None
     query: Query | None
-    decided: Decided | None  # null where nothing is asked, or there is no ensemble
+    decided: Decided | None  # null if nothing is asked, or there is no ensemble
 
 
 def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[EnsembleResult, ...]:
@@ -98,7 +98,7 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     given, queries = (world,), [query]
     if world.removed or world.placed_before:
         as_it_is = query
-        if query is not None and query.asked.form == "changes":  # of the world as it is: what it is that would change
+        if query is not None and query.asked.form == "changes":  # of the unchanged world: what would change
             form = "what-happens" if query.target is None else "whether"
             as_it_is = replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
         given, queries = (world, world.as_it_is()), [query, as_it_is]
@@ -155,7 +155,7 @@ def _observed(world: WorldInput, worlds: Worlds, draws: Floats) -> ObservedWorld
 
 
 def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], draws: Floats) -> list[Decided | None]:
-    """What is decided of each world; None where worlds decide nothing."""
+    """What is decided of each world; None if worlds decide nothing."""
     decided: list[Decided | None] = []
     for asked, each in zip(queries, worlds, strict=True):
         if asked is None or not asked.is_decidable or (asked.asked.form == "changes" and len(worlds) == 1):
@@ -168,7 +168,7 @@ def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], d
 
 
 def _is_settled(decided: Decided, query: Query | None, count: int, size: int) -> bool:
-    """Whether so many worlds, drawn from `size`, are not likely to say otherwise than all of them would.
+    """Whether the worlds run so far, drawn from `size`, most likely give the same answer as all of them.
 
     The worlds that agree are hypergeometrically distributed; what all of them would say differs where they cross a
     share, and is likeliest to do so just beyond it.
@@ -184,7 +184,7 @@ def _is_settled(decided: Decided, query: Query | None, count: int, size: int) ->
 
 
 def _chance_beyond(agreeing: float, count: int, size: int, share: float) -> float:
-    """The chance of so many agreeing ones, or of more extreme numbers, among `count` drawn from `size` worlds of which
+    """The chance of this many agreeing worlds, or a more extreme number, among `count` drawn from `size` worlds, where
     the agreeing share lies just beyond a share, on the other side than theirs."""
     least = ceil(share * size)  # of all, to reach it
     if agreeing >= share * count:
@@ -240,7 +240,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
     probability = shown = float(np.where(misread, 0.5, agrees).mean())  # what was misread tells neither way
     times = _happens(query, events)
     times = times[np.isfinite(times)]
-    if asked.form in ("whether", "when"):  # that what is asked happens, or, where it is negated, does not
+    if asked.form in ("whether", "when"):  # that the event happens, or, if negated, does not
         happens = probability if answer else 1 - probability
         shown = 1 - happens if asked.negated else happens
     return Decided(

@@ -202,7 +202,7 @@ class _EventsOf(dict[int, Events]):
 
 @dataclass(frozen=True)
 class WorldEvents:
-    """What happens in worlds: the encounters of every body that moves, and what becomes of each body."""
+    """What happens in worlds: the encounters of every moving body, and the end of each body."""
 
     of: Mapping[int, Events]  # by subject
     moved: Floats  # [K, B] s: when it is set in motion
@@ -211,7 +211,7 @@ class WorldEvents:
     landed: Floats  # [K, B] s: when it first meets the floor
     placed: Floats | None = None  # [K] s: when the mover is where it was to be put; infinite where it does not fit
     order: tuple[int, ...] = (0,)  # of the first draw: what moves, in the order in which it is set in motion
-    misread: Mask | None = None  # [K]: the mover began inside another body, or beside what carries it
+    misread: Mask | None = None  # [K]: the mover began inside another body, or off its support
 
 
 def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats, size: tuple[int, int]) -> WorldEvents:
@@ -250,7 +250,7 @@ def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats,
 
 
 def _is_misread(shapes: Sequence[RigidShape], run: WorldRun, layout: Layout) -> bool:
-    """Whether the mover of a world began where no picture shows one: inside another body, or beside what carries it."""
+    """Whether the mover of a world began at an impossible place: inside another body, or off its support."""
     mover, on, supports = shapes[0], layout.supports[0], layout.supports
     if mover.is_ghostly or layout.put or not mover.is_active or any(shape.pieces for shape in shapes):
         return False  # drawings show what touches

@@ -24,11 +24,11 @@ from cow_service.vision.types import Floats, Floats32, Mask
 
 SAMPLES = 6000  # pixels that the floor is sought in
 TRIES = 300  # planes through three of them
-LEVEL = math.radians(20)  # the floor rolls no more than that against the vertical that is assumed
+LEVEL = math.radians(20)  # largest roll of the floor against the assumed vertical
 STEEPEST, FLATTEST = math.radians(79), math.radians(-10)  # pitches at which a floor is a floor
 LEAST_TOLERANCE = 0.01  # of the depth: how far a pixel of the floor may lie off its plane
 BELOW = 3.0  # how much more a pixel that would lie under the floor counts than one on it
-LEAST_FLOOR = 0.1  # of the pixels that show no body: the floor has at least so many
+LEAST_FLOOR = 0.1  # smallest share of floor among the pixels that show no body
 FARTHEST = 8.0  # of the nearest depths: what lies beyond tells little of the floor that things stand on
 CELLS = 3, 4  # rows and columns: errors of a depth map are alike within such a part of the image
 SURE = 0.003  # of the depth: no map is more exact
@@ -40,10 +40,10 @@ TRIM = 2.0  # percent of the points at either end that are left out
 FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
 TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
 AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
-ALIKE = 0.3  # of the error of a depth that is left where that of the floor beside it is known
+ALIKE = 0.3  # share of the depth error that remains if the error of the floor next to it is known
 GRAIN = 6  # over such a part of the width of an image the errors of depth maps change altogether
 BENT = 0.5  # of its width: with so much doubt of how deep a body is, the map does not tell
-ON_TOP = 0.3  # of the height of a body: its lower end may be so far from the top of what it stands on
+ON_TOP = 0.3  # of a body's height: largest distance of its lower end from the top of its support
 BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
 SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
 LEAST_PART = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
@@ -63,7 +63,7 @@ class DepthMap:
     source: Literal["request", "model"] = "request"
 
     def metres_per_pixel(self, bbox: BBox, focal: float) -> float | None:
-        """At what is in the middle of a box (px), for a focal length (px); None where nobody knows it."""
+        """At what is in the middle of a box (px), for a focal length (px); None if it is unknown."""
         x0, y0, x1, y1 = bbox
         across, down = (x1 - x0) / 4, (y1 - y0) / 4
         inner = self.depth[int(y0 + down) : math.ceil(y1 - down), int(x0 + across) : math.ceil(x1 - across)]
@@ -158,7 +158,7 @@ class Measurement:
 def measure_scene(
     given: DepthMap, fit: CameraFit, bodies: Sequence[SeenBody], seen: Sequence[int | None], in_air: Sequence[bool]
 ) -> tuple[CameraFit, Measurement | None]:
-    """The camera and the bodies by a depth map, where the camera is known as `fit` says; None where it has no floor.
+    """The camera and the bodies by a depth map, where the camera is known as `fit` says; None if it has no floor.
 
     `seen` is what the bodies stand on as the picture alone shows it; `in_air` are those that stand nowhere.
     """
@@ -205,7 +205,7 @@ def rise_above(given: DepthMap, measured: Measurement, boxes: Sequence[BBox]) ->
 
 
 def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], roll: float = 0.0) -> Floor | None:
-    """The floor in a depth map of an image with that focal length (px), beside bodies; None where none is seen.
+    """The floor in a depth map of an image with that focal length (px), outside bodies; None if no floor is visible.
 
     It is the plane, level but for the pitch of the camera, on which most pixels lie and beneath which hardly any do.
     `roll` (radians) is that of the vertical that is assumed.
@@ -244,7 +244,7 @@ def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], rol
     share = float(near.mean())
     if share < LEAST_FLOOR or not _is_level(plane, roll) or float(score.max()) <= 0:
         return None
-    # Neighbouring pixels are wrong alike: a sum over parts of the image, each of which has one error.
+    # Neighbouring pixels have the same error: this sums over parts of the image with one error each.
     used, places = rows[near], chosen[near] * np.array(CELLS) // np.array([height, width])
     inverse = np.linalg.inv(used.T @ used)
     parts = [used[(places == cell).all(axis=1)].sum(axis=0) for cell in np.unique(places, axis=0)]
@@ -287,7 +287,7 @@ def camera_over(floor: Floor, fit: CameraFit) -> CameraFit:
 def measure(
     given: DepthMap, focal: float, floor: Floor, bodies: Sequence[SeenBody], in_air: Sequence[bool]
 ) -> tuple[Footprint | None, ...]:
-    """The footprints of bodies, of which some are in the air; None of one whose depth is not known."""
+    """The footprints of bodies, some of them in the air; None for a body of unknown depth."""
     known, covered = np.isfinite(given.depth), np.zeros(given.depth.shape, bool)
     for body in bodies:
         body.mask.add_to(covered)
@@ -309,7 +309,7 @@ def _floor_error(
 ) -> float | None:
     """How far the depths [H, W] of the free pixels [H, W] around the foot of a body are off the floor, as a factor.
 
-    Errors of a map are alike in neighbouring pixels: the body is off by the same. None where no floor is seen there.
+    Errors of a map are alike in neighbouring pixels: the body is off by the same. None if no floor is seen there.
     """
     (x0, y0, x1, y1), (height, width) = body.bbox, depth.shape
     across, down = AROUND * (x1 - x0), AROUND * (y1 - y0)
@@ -339,7 +339,7 @@ class _View:
 def _is_flat(view: _View, depth: Floats32, known: Mask, off: float) -> bool:
     """Whether the map shows floor where a body rises above it, or hangs over it: it is one of another scene.
 
-    A body that is too low to be told from the floor is not.
+    A body that is too low to be distinguished from the floor is not.
     """
     body, (width, height) = view.body, view.size
     (x0, y0, x1, y1), mask = body.bbox, body.mask
@@ -428,7 +428,7 @@ def _upright(view: _View, points: Floats, edge: float, bend: float, share: float
     if is_round or is_cube:
         half_depth, bend = half_width, 0.0
         high[1] = low[1] + 2 * half_width
-    elif bend > BENT * 2 * half_width:  # how deep it is cannot be told from the error
+    elif bend > BENT * 2 * half_width:  # how deep it is cannot be distinguished from the error
         half_depth = 0.0
     x, z = ((low + high) / 2 @ turn).tolist()
     distance = math.hypot(right, ahead, floor.height)

@@ -35,9 +35,7 @@ ORDER = 17  # how far the draws of one body's depth are from those of the next
 NEAREST, FARTHEST = 0.05, 40.0  # depths, in those of the first body: what seems to lie elsewhere is put there
 BOX_SIDE = 0.82  # of the seen width of a box whose yaw is not known: its side
 HUNG, MAYBE_HUNG = 4.0, 0.5  # how much likelier it hangs over that than where the camera's priors have it; in clutter
-MAYBE_OFF = (
-    1.3  # deviations of the height of what, in clutter, may stand on a thing that nobody named: added to its own
-)
+MAYBE_OFF = 1.3  # deviations added to the height of an object that, in clutter, may stand on an unnamed one
 HUNG_SIGMA = 0.3  # of the mover's half width: how far ahead of the other it is
 DEPTH_SIGMA = 0.3  # of the logarithm of the depth of what stands nowhere
 APART = 0.98  # of the distance of two bodies: together they are so wide at most
@@ -161,7 +159,7 @@ class _Picture:
     draws: Floats
 
     def placed(self, cameras: Cameras, parameters: Floats, fit: CameraFit) -> tuple[Cameras, list[LiftedBody]]:
-        """The cameras at the heights that the mover tells, and the bodies."""
+        """The cameras at the heights that follow from the mover, and the bodies."""
         bodies, motion, draws = self.bodies, self.motion, self.draws
         mover, depth = bodies[0], cameras.focal * motion.metres_per_pixel.value
         if not mover.flies(motion):
@@ -178,7 +176,7 @@ class _Picture:
         if under is not None:
             below = self.standing(under, cameras.at_height(np.ones(len(draws))), draws)
             if below is not None:
-                # In most draws it hangs over what is seen below it, at a distance of so many heights of the camera.
+                # In most draws it hangs over the object below it, at a distance of this many camera heights.
                 # What a shadow tells of the height weighs against it.
                 aside = HUNG_SIGMA * ball.half_width * draws[:, COLUMN["turn"]]
                 aligned = (ball.centre[:, 2] + aside) / below.centre[:, 2]
@@ -236,7 +234,7 @@ class _Picture:
         return above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper)
 
     def depth_of(self, body: SeenBody, draws: Floats) -> Floats:
-        """How deep a body is along the line of sight [K], of its width: nothing tells that of an unknown thing."""
+        """Depth of a body along the line of sight [K], relative to its width; for an unknown object it is a guess."""
         if body.is_depth_known or any(self.bodies[on] is body for on in self.supports if on is not None):
             return np.ones(len(draws))  # what carries something is deep enough for it
         return drawn_depths(body, draws)
@@ -256,7 +254,7 @@ class _Picture:
 
 @dataclass(frozen=True)
 class _Measured(_Picture):
-    """What a depth map shows; what it does not show is where the picture has it, by the camera over the same floor."""
+    """Bodies as a depth map shows them; those that it does not show are placed by the camera over the same floor."""
 
     measured: Measurement
 
@@ -276,7 +274,7 @@ class _Measured(_Picture):
         scale = cameras.height / height
 
         def place(index: int) -> LiftedBody:
-            """A body, after what it stands on."""
+            """Places a body, after its support."""
             footprint, on = footprints[index], self.supports[index]
             if index not in found and footprint is None:
                 found[index] = self.body_at(index, cameras, depth)

@@ -62,7 +62,7 @@ class Cameras:
         return replace(self, height=height)
 
     def repeated(self, count: int, draw: int = 0) -> Cameras:
-        """The camera of one draw so many times."""
+        """The camera of one draw, repeated."""
         one = slice(draw, draw + 1)
         focal, axes, height = (np.repeat(values[one], count, axis=0) for values in (self.focal, self.axes, self.height))
         return replace(self, focal=focal, axes=axes, height=height)
@@ -128,7 +128,7 @@ def above(
     depth_share: Floats | float = 1.0,
     taper: float = 1.0,
 ) -> LiftedBody | None:
-    """A body that stands on a horizontal plane at a height [K] (m); None where its foot lies at or above the horizon.
+    """A body that stands on a horizontal plane at a height [K] (m); None if its foot lies at or above the horizon.
 
     The foot is the middle of the box's lower edge; the body's middle lies half its depth there further away, which is
     `taper` of that at its top. A sphere's depth follows from its radius and its middle.
@@ -193,7 +193,7 @@ def velocity_towards(
     others: Sequence[LiftedBody],
     speed_name: str,
 ) -> Floats:
-    """[K, 3] m/s right, up and ahead; `goal` is what it moves towards, `others` are all other bodies."""
+    """[K, 3] m/s right, up and ahead; `goal` is the body that it moves towards, `others` are all other bodies."""
     if motion.direction is None or motion.speed == 0:
         return np.zeros((len(draws), 3))
     speed = motion.speed * motion.metres_per_pixel.value * speed_factors(motion, draws, speed_name)

@@ -1,4 +1,4 @@
-"""The worlds of a result as they begin, for a program that runs them again elsewhere: the page does while one drags.
+"""The initial worlds of a result, for a program that runs them again elsewhere, as the page does while you drag.
 
 Coordinates are metres right, above the floor and ahead, the camera above their origin. Of what differs between worlds
 there is a list with a value for each, the likeliest world first; what is the same in all of them is one value.
@@ -21,7 +21,7 @@ from cow_service.physics.layout import FARTHEST
 from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
 from cow_service.vision.types import Floats
 
-DIGITS = 6  # significant: the engine computes with no more
+DIGITS = 6  # significant digits: the engine uses no more
 CONSTANTS: dict[str, float] = {
     "gravity": GRAVITY,
     "clock": CLOCK,

@@ -1,4 +1,4 @@
-"""What becomes of a body that was put somewhere: in, on, over, beside, or fallen off, in each world of an ensemble.
+"""What happens to a body that was put somewhere: in, on, over, beside, or fallen off, in each world of an ensemble.
 
 The rule for `into`, by where things come to rest. What is wider than the opening, or whose lower end lies no more than
 a tenth of the container's depth below the rim, is `on-the-rim`: it is held up there. What has gone through the opening
@@ -24,13 +24,13 @@ CARRIED = 1.0  # s that it takes, at most
 MOST_CARRIED = 0.5  # of the clip
 SETTLES = 2.0  # s, at least, for which what is released is followed, whatever the clip shows
 DROP = 0.06  # of its half width: from so high it is released
-BESIDE_GAP = 0.5  # of its half width: between it and what it is put beside
+BESIDE_GAP = 0.5  # of its half width: the gap to the object that it is put next to
 WIDTH_SIGMA, TURNED_SIGMA = 0.08, 0.25  # of the logarithm of a body's width against that of an opening
 AIM_SIGMA = 0.03  # of its half width, along and across: where it is released
 AIM_OFF = 0.01  # of its half width, to the right
 OFF_TOP = 0.1  # the same on a ball or a tip: nothing is put there so exactly that it stays
 HIDDEN_HEIGHT = 0.5  # of a container's width: its height at least, where its foot is hidden
-CLEARANCE = 0.5  # of its half width: so high it passes over what it is carried over
+CLEARANCE = 0.5  # of its half width: the height at which it passes over objects
 LEAST_RISE = 0.3  # of the way that it is carried
 STICKS_OUT = 1.0  # of the container's depth: how far the upper end is above the rim
 GONE_IN = 0.1  # of the container's depth: how far below the rim the lower end of what is inside is
@@ -40,7 +40,7 @@ THINNEST = 0.03  # of the half width: a thinner wall would let fast things throu
 LEAST_OPENING = 0.3  # of the half width
 FLOOR_SHARE = 0.08  # of the height: how thick the floor of a container is
 NARROWEST = 0.3  # of the opening: its floor
-OVERLAPPING = 0.02  # of the half width: so much too close, bodies are taken to touch, not to overlap
+OVERLAPPING = 0.02  # of the half width: bodies that overlap less than this are taken to touch
 
 STAYING: tuple[PlacementResult, ...] = ("inside", "sticks-out", "on-the-rim", "on-top", "beside")
 Shapes = tuple[RigidShape, ...]  # the bodies of one world
@@ -136,7 +136,7 @@ def carry(
     runs: list[WorldRun] = []
     for bodies, then, run in zip(shapes, released, settled, strict=True):
         body = then[goal.body]
-        # A Bezier curve up, over and down that leaves and arrives upright and passes over what it is carried over.
+        # A Bezier curve up, over and down that leaves and arrives upright and passes over the objects on the way.
         start, end = np.array(bodies[goal.body].position), np.array(body.position)
         top = max(then[i].position[1] + then[i].half_height for i in goal.targets)
         over = top + body.half_height + CLEARANCE * body.half_width - (start[1] + end[1]) / 2
@@ -208,7 +208,7 @@ def settle(
 
 
 def new_supports(goals: Sequence[PlacementGoal], supports: Sequence[int | None]) -> Mapping[int, int | None]:
-    """What each put body stands on where it is put: its target, or beside that what the target stands on."""
+    """The support of each put body at its new place: its target, or the target's support if it is put next to that."""
     found: dict[int, int | None] = {}
     for goal in goals:
         target = goal.targets[0]
@@ -243,7 +243,7 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
         bodies[goal.targets[0]] = whole
     body = bodies[goal.body]
     if goal.opening is not None:
-        # How wide it is against the opening is told by two outlines at two depths, of a box by a corner that turns.
+        # Its width relative to the opening is measured by two outlines at two depths, for a box by a corner that turns.
         sigma = TURNED_SIGMA if body.shape == "box" and not goal.opening.square else WIDTH_SIGMA
         wider = math.exp(sigma * float(row[COLUMN["outline"]]))
         sides = {name: wider * getattr(body, name) for name in ("half_width", "half_depth")}
@@ -324,7 +324,7 @@ def classify(
 def _on_target(
     goal: PlacementGoal, released: Sequence[RigidShape], run: WorldRun
 ) -> tuple[PlacementResult, float, float]:
-    """As `classify`, of what is put into or onto something."""
+    """As `classify`, for bodies put into or onto something."""
     body, target = released[goal.body], released[goal.targets[0]]
     (there, turn), (middle, lean) = ((run.positions[i, -1], run.turns[i, -1]) for i in (goal.body, goal.targets[0]))
     tall, tipped, hollow = _half_height(body, turn), _upright(lean) < TIPPED, target.hollow

@@ -32,7 +32,7 @@ MOVED = 0.5  # px: what moves less in the image stays where it is
 PUSHED = 2.0  # px: what something is put into or onto stays where it is if it moves less
 SETTLED = 0.25  # px per frame: what moves less is at rest
 LEAST_BOUNCE = 0.1  # m/s: a weaker contact with the floor is rolling or sliding
-MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are told
+MAX_FUTURES = 8  # worlds of the ensemble whose paths of the mover are recorded
 FUTURE_DECIMALS, BAND_DECIMALS = 1, 2  # px: more digits say nothing and are half of a result
 STATE_DECIMALS, SCALE_DECIMALS, ROTATION_DECIMALS = 5, 6, 3  # m and m/s; of the size at first; degrees
 TURN_DECIMALS, LEAST_TURN = 4, 0.002  # of quaternions: what turns less does not
@@ -240,7 +240,7 @@ class _Shown:
     # --- paths
 
     def record_paths(self) -> tuple[Path, ...]:
-        """Paths of the mover, from its grounded point, and of what it set in motion; from where they are put."""
+        """Paths of the mover, from its grounded point, and of bodies that it set in motion; from their put places."""
         moved = MOVED if self.worlds.placements is None else PUSHED
         ways = {i: self.paths[i].points[0] - self.paths[i].points[0, 0] for i in self.moving}
         return tuple(
@@ -319,7 +319,7 @@ class _Shown:
         )
 
     def _turns(self, index: int) -> tuple[tuple[float, float, float, float], ...]:
-        """Quaternions of how a body has turned since its first frame; none of a sphere, or of what has not turned."""
+        """Quaternions of a body's turn since its first frame; empty for a sphere, or if it has not turned."""
         x, y, z, w = np.moveaxis(self.worlds.runs[0].turns[index], 1, 0)
         a, b, c, d = -x[0], -y[0], -z[0], w[0]  # the first one, inverted: each is followed from there
         since = np.stack([
@@ -338,7 +338,7 @@ class _Shown:
     # --- what was put somewhere
 
     def record_placed(self) -> tuple[records.PlacedBefore, ...]:
-        """What becomes of each thing that is put somewhere before the motion; nothing of the world as it is."""
+        """The result for each object put somewhere before the motion; empty for the unchanged world."""
         found: list[records.PlacedBefore] = []
         for number, goal in enumerate(self.world.placed_before):
             placements = self.worlds.before[number]
@@ -453,5 +453,5 @@ def moving_until(paths: Sequence[Path], fps: float) -> float:
 
 
 def rounded(values: Floats, decimals: int) -> Floats:
-    """Values with so many decimals; none of them is a negative zero."""
+    """Values rounded to a number of decimals, without negative zeros."""
     return np.round(values, decimals) + 0.0

@@ -39,7 +39,7 @@ Extent: TypeAlias = tuple[Any, Any, Any]  # numbers, or arrays [F]
 
 @dataclass(frozen=True)
 class Density:
-    """How many points a body gets: one for each square of `spacing` (px), but at least and at most so many."""
+    """How many points a body gets: one for each square of `spacing` (px), within limits."""
 
     spacing: float
     least: int
@@ -138,7 +138,7 @@ class _Silhouettes:
         return seen + shift[:, None], (cosine >= FACING) | ~normals.any(axis=2)
 
     def fields(self, body: int, carried: tuple[Floats, Bools]) -> dict[str, Any]:
-        """Fields of a path: points of a body, and where they are seen; None where nothing ever hides one."""
+        """Fields of a path: points of a body, and where they are seen; None if nothing ever hides one."""
         # What is no simple shape, such as a bottle's neck, may be carried beside where it is drawn.
         points, seen = carried[0], carried[1] & self._covered(body, carried[0])
         # What stays where the image shows it is chosen where it is seen: only what moves can come before it.
@@ -153,7 +153,7 @@ class _Silhouettes:
         return {"tracks": tuple(pairs(track) for track in tracks), "tracks_visible": hidden}
 
     def _covered(self, body: int, points: Floats) -> Bools:
-        """Whether points [F, N, 2] lie in a body's silhouette, or right beside it."""
+        """Whether points [F, N, 2] lie in a body's silhouette, or right next to it."""
         path, back = self._paths.get(body), points
         if path is not None:
             start = np.array(path.points[0] if self._poses or body else self._start)
@@ -167,7 +167,7 @@ class _Silhouettes:
 
 
 class _Grown:
-    """The hull of a mask, and what lies right beside it: outlines are seen with gaps, as on a side in the shade."""
+    """The hull of a mask and a margin, as visible outlines have gaps, for example on a shaded side."""
 
     def __init__(self, mask: CroppedMask) -> None:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * SAFE + 1,) * 2)
@@ -229,7 +229,7 @@ def _level(shape: Shape, places: Floats, half: Floats) -> Floats:
 
 
 def at_rate(trajectory: Trajectory, fps: float, num_frames: int, lead: int = 0) -> Trajectory:
-    """What a generator is told, at another frame rate: straight on between frames, and at rest after the last.
+    """The trajectory at another frame rate, for a generator: linear between frames, at rest after the last.
 
     What is true at the frames before and after a time is true at that time. `lead` frames before the motion begins
     stay as they are, and are not counted. Encounters and the ensemble's paths, which count frames, are left out.

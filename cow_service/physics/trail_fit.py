@@ -1,4 +1,4 @@
-"""What the positions of a thrown ball's trail tell: how fast it is for its gravity, and where it heads in depth.
+"""Fits the trail of a thrown ball: its speed relative to gravity, and its heading in depth.
 
 The positions are taken to be equally far apart in time, by an interval that is not known. In radii of the ball and in
 intervals, its place now, its velocity and its gravity are fitted to the centres and radii seen, together with pitch and
@@ -42,7 +42,7 @@ class TrailFit:
 def fit_throw(positions: Sequence[Position], camera: CameraFit, size: tuple[int, int]) -> TrailFit | None:
     """The throw through positions, the oldest first, in an image of a size (width, height), px.
 
-    None where there are fewer than three, or no throw leads through them.
+    None if there are fewer than three, or no throw leads through them.
     """
     if len(positions) < 3:
         return None

@@ -119,7 +119,7 @@ class Views:
 
 
 def _slanted(segments: Segments, box: Floats) -> Floats:
-    """Likelihoods [1, S] of segments as sides of a cone in a box with corners [2, 2], or as none of its edges."""
+    """Likelihoods [1, S] of segments as sides of a cone in a box with corners [2, 2], or as not belonging to it."""
     apex = np.array([box[:, 0].mean(), box[0, 1]])
     way = apex - segments.middle
     way /= np.linalg.norm(way, axis=1, keepdims=True) + 1e-12

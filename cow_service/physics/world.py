@@ -36,7 +36,7 @@ RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15
 CONE_MIDDLE, MIDDLE_SIGMA = 0.25, 0.12  # of a body's height: its centre of mass; and how uncertain any is
 RAISED = 0.05  # of its height: what engines with other contacts knock over, this one does at such a centre of mass
 LOWEST_MIDDLE, HIGHEST_MIDDLE = 0.15, 0.75
-# Of the width on which a thing seems to stand: what it stands on, as edges are round; and of its logarithm.
+# Share of the visible base on which an object really stands, as edges are round; and its log deviation.
 BASE, BASE_SIGMA = 0.85, 0.15
 LEAST_BASE, WHOLE_BASE = 0.3, 0.95  # of the width: from so much on it stands on all of it
 WEIGHT_SIGMA = 0.5  # of the logarithm: how heavy the mover is against the others
@@ -51,7 +51,7 @@ LEAST_HALF, MOST_HALF = 0.02, 60.0  # half widths and heights of bodies, in thos
 
 @dataclass(frozen=True)
 class PrescribedMotion:
-    """A path that is given, at the rate of the clip: of what stands by its foot in the image, else by its positions."""
+    """A given path, at the rate of the clip: from the foot of a standing object, else from its positions."""
 
     positions: Floats  # [F, 3] m in the frame of the camera
     feet: Floats  # [F, 2] px
@@ -131,7 +131,7 @@ class Worlds:
         )
 
     def cut(self, frames: int, until: float = math.inf) -> Worlds:
-        """With so many recorded frames, the last one repeated as needed, and the meetings up to a time (s)."""
+        """With this number of recorded frames, the last one repeated as needed, and the meetings up to a time (s)."""
         return replace(self, runs=tuple(run.cut(frames, until) for run in self.runs))
 
     @property
@@ -279,7 +279,7 @@ class _Draw:
         return x0 <= 0 or y0 <= 0 or x1 >= self.given.size[0] or y1 >= self.given.size[1]
 
     def balance(self, seen: SeenBody, shape: Shape, tall: float, centre: tuple[float, float, float]) -> dict[str, Any]:
-        """On what a body stands and where its centre of mass is: fields of its shape; none of what cannot tip."""
+        """The base of a body and its centre of mass, as fields of its shape; empty for a body that cannot tip."""
         if shape == "sphere":
             return {}
         row = self.draws[self.k]
@@ -309,7 +309,7 @@ class _Draw:
                 factor = float(speed_factors(motion, self.draws[self.k : self.k + 1], speed)[0])
                 changes["course"] = course_of(motion, velocities, motion.speed * factor)
         fast = float(np.hypot(velocity[0], velocity[2]))
-        # A vehicle is longer along its heading than across, as wide as it is seen.
+        # A vehicle is longer along its heading than its visible width across.
         is_measured = self.layout.bodies[index].yaw is not None
         if seen.elongated and fast > 0 and given.level is None and not is_measured:
             placed, k = self.layout.bodies[index], self.k
@@ -321,7 +321,7 @@ class _Draw:
         return replace(body, **changes)
 
     def along_path(self, path: PrescribedMotion) -> Floats:
-        """Positions [F, 3] along a path: on the floor for what stands there, if its foot is below the horizon."""
+        """Positions [F, 3] along a path: on the floor for a standing object whose foot is below the horizon."""
         mover, cameras, k = self.layout.bodies[0], self.layout.cameras, self.k
         height = float(cameras.height[k])
         if not mover.stands:

@@ -1,1 +1,1 @@
-"""Readers: who looks at the image and says what moves, and how."""
+"""Readers: they look at the image and say what moves, and how."""

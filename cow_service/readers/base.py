@@ -1,4 +1,4 @@
-"""The Protocol of readers: what reads an image for a question. Stages know this file, never an implementation."""
+"""The Protocol of readers, which read an image for a question. Stages know this file, never an implementation."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -29,7 +29,7 @@ Unit = Literal["px", "m", "widths", "px/s", "m/s", "widths/s"]  # `widths`: of t
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number with its unit, as somebody said it."""
+    """A number with its unit, as it was said."""
 
     value: float
     unit: Unit
@@ -83,8 +83,8 @@ class ReaderInput:
     language: Language = "en"  # of what is said of the simulation
     seed: int | None = None  # None: an MLLM is sent none, and draws as it likes
     motion_wanted: bool = True  # stage 2 is left to the reader, too
-    known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: nobody need look for them
-    sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, beside the question's
+    known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: not to be searched
+    sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, besides the question's
     until: float | None = None  # Unix time, s, after which an MLLM that refuses is not asked again; None: its own limit
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = lambda: None  # to be called while waiting; raises `Canceled`
@@ -136,7 +136,7 @@ class NamedChange:
 class QuestionReading:
     """What the words of a question say, without a look at the image and without a model."""
 
-    asked: records.Asked | None = None  # null where the reader cannot tell from the words alone
+    asked: records.Asked | None = None  # null if the reader cannot tell from the words alone
     changes: tuple[NamedChange, ...] = ()  # what is taken away or put somewhere
     trail_named: bool = False  # the question speaks of a trail
     nouns: tuple[str, ...] = ()  # of the things that it names, each once
@@ -156,9 +156,9 @@ class GroundingReading:
     hints: MotionHints | None = None
     prior: ObjectPrior | None = None  # of the mover
     mask: Mask | None = None  # [H, W] of the mover, where it does not follow from the box
-    asked: records.Asked | None = None  # what the question wants to know; null where the reader cannot say
+    asked: records.Asked | None = None  # what the question wants to know; null if the reader cannot say
     changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
-    is_doubtful: bool = False  # what is seen in the box may not be what it is called
+    is_doubtful: bool = False  # the object in the box may not be the named one
     language: Language | None = None  # of the question, as far as the reader can say
 
 
@@ -171,7 +171,7 @@ class MotionReading:
     cue: records.Cue
     along_arrow: bool | None = None
     depth: float = 0.0  # see `Motion.depth`
-    depth_deviation: float | None = None  # degrees; null where the reader says nothing of the depth
+    depth_deviation: float | None = None  # degrees; null if the reader says nothing of the depth
     towards: LocatedObject | None = None  # see `Motion.towards`
     rises: bool = False  # see `Motion.rises`
     speed: SpeedWord | Quantity | None = None  # a word: as for such a thing
@@ -181,8 +181,8 @@ class MotionReading:
     steps: tuple[StepReading, ...] = ()
     trail: tuple[Point, ...] = ()  # earlier positions that are shown, oldest first, px
     others: tuple[OtherMotionReading, ...] = ()
-    speed_deviation: float | None = None  # of ln speed; null where the reader says nothing of the speed
-    metres_per_pixel: records.MetresPerPixel | None = None  # null where the reader cannot tell
+    speed_deviation: float | None = None  # of ln speed; null if the reader says nothing of the speed
+    metres_per_pixel: records.MetresPerPixel | None = None  # null if the reader cannot tell
     down: Vector = (0.0, 1.0)  # unit vector: which way things fall in the image
     sentence: str | None = None
     warnings: tuple[str, ...] = ()
@@ -190,7 +190,7 @@ class MotionReading:
 
 @dataclass(frozen=True)
 class Imagined:
-    """What an answer may be drawn from besides the image: the simulation and its frames."""
+    """What an answer may use besides the image: the simulation and its frames."""
 
     simulation: records.Simulation
     frames: tuple[Image, ...]  # RGB [h, w, 3] of `simulation.frames`, in their order
@@ -201,14 +201,14 @@ class Imagined:
 class AnswerReading:
     """One answer as a reader gives it: the letter of an option, or text where the question offers none."""
 
-    answer: str | None  # null where it is not sure and no option says so
+    answer: str | None  # null if it is not sure and no option says so
     not_sure: bool
-    reasoning: str = ""  # empty where the reader does not reason in words
+    reasoning: str = ""  # empty if the reader does not reason in words
     notes: tuple[str, ...] = ()  # what the answer rests on or lacks, in whole sentences: warnings for the caller
 
 
 class WordReader(Protocol):
-    """Reads words alone, without an image, weights or calls: for every request, whoever looks at its image."""
+    """Reads only words, without an image, weights or calls; used for every request, whatever its reader."""
 
     def read_question(self, question: str) -> QuestionReading:
         """What a question says in words that it understands."""
@@ -230,26 +230,26 @@ class Reader(Protocol):
     info: records.ReaderInfo
     """Name, model and revision. The run adds prompts and stages."""
     fingerprint: str
-    """All that decides what it reads, besides what it is given: model, revision, prompts, options."""
+    """Everything that determines its results besides its inputs: model, revision, prompts, options."""
 
     heeds_seed: bool
     """Whether the seed of a request changes anything. Of a reader without this attribute it is taken to."""
 
     def repeats_answers(self, votes: int) -> bool:
-        """Whether `answer` with so many votes gives the same ones each time that it is asked the same.
+        """Whether `answer` gives the same votes every time for the same input.
 
         Where not, its answers are samples: none is handed to two requests. Readers without this method are sampled.
         """
         ...
 
     def ground(self, given: ReaderInput) -> GroundingReading:
-        """Which object moves and where it is. Raises `CannotGround` where that cannot be told."""
+        """Which object moves and where it is. Raises `CannotGround` if that cannot be told."""
         ...
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
         """How the grounded object moves. `hints` are those of `ground`, where this reader grounded the object.
 
-        Raises `CannotReadDirection` where that cannot be told.
+        Raises `CannotReadDirection` if that cannot be told.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""What a reader that asks a multimodal LLM offers beside its readings: chats with that MLLM itself."""
+"""Chats with the MLLM of a reader, which such a reader offers besides its readings."""
 
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -9,7 +9,7 @@ from cow_service.adaptive import AdaptivePlaces
 
 @dataclass(frozen=True)
 class Upstream:
-    """The OpenAI-compatible server behind a reader: where it is, and what it is sent of this server's own."""
+    """The OpenAI-compatible server behind a reader: its address, and this server's own credentials for it."""
 
     base_url: str  # without a slash at its end
     model: str  # as it is served there
@@ -33,7 +33,7 @@ class ChatTurn:
 
 @runtime_checkable
 class CallsMllm(Protocol):
-    """A reader that calls an MLLM, so many times at once."""
+    """A reader that calls an MLLM, with a limit of simultaneous calls."""
 
     @property
     def places(self) -> AdaptivePlaces:
@@ -47,7 +47,7 @@ class ChatReader(Protocol):
 
     @property
     def upstream(self) -> Upstream | None:
-        """Where chats can be sent on as they are; None where its MLLM does not speak OpenAI's protocol."""
+        """Where chats can be sent on as they are; None if its MLLM does not speak OpenAI's protocol."""
         ...
 
     async def chat(self, body: dict[str, Any]) -> ChatTurn:

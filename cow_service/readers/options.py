@@ -84,7 +84,7 @@ _TEXT = re.compile(
 
 
 def read_choices(question: str, given: Sequence[str | AnswerOption] | None) -> tuple[AnswerOption, ...]:
-    """The options of the request, lettered A, B, C..., else those that the question lists; empty where it is open."""
+    """The options of the request, lettered A, B, C..., else those that the question lists; empty if it is open."""
     if not given:
         return tuple(AnswerOption(letter=letter, text=text) for letter, text in split_options(question).options)
     texts = [" ".join(text.split()) for text in given if isinstance(text, str)]

@@ -43,7 +43,7 @@ class Prompt:
 
 @cache
 def load_prompt(name: str, of: Resources = PROMPTS) -> Prompt:
-    """A shipped prompt. Raises `LookupError` where there is none, `ValueError` where its file is not well formed."""
+    """A shipped prompt. Raises `LookupError` if there is none, `ValueError` where its file is not well formed."""
     return parse_prompt(name, of.read(name))
 
 

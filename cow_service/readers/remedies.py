@@ -1,4 +1,4 @@
-"""What a caller can do where a reader finds no place or no direction: the end of its error messages."""
+"""What a caller can do if a reader finds no place or no direction; used at the end of its error messages."""
 
 GIVE_DIRECTION = "Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y down."
 GIVE_OBJECT = "Give its box under that name in `objects`."

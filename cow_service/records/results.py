@@ -1,4 +1,4 @@
-"""The results of a request: frames, simulation, answer; and what the service says of itself and of its jobs."""
+"""The results of a request: frames, simulation, answer; and descriptions of the service and its jobs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FramePolicy = Literal["initial", "uniform", "events"]
 class Frame(Record):
     """One picture of the clip."""
 
-    index: int = Field(ge=0, description="Which frame of the clip.")
+    index: int = Field(ge=0, description="Number of the frame in the clip.")
     time: float = Field(ge=0, description="Seconds.")
     url: str
     sha256: Sha256
@@ -34,19 +34,19 @@ class Video(Record):
 
 
 class ReaderInfo(Record):
-    """Who read the image, and what would have to be the same to read it so again."""
+    """The reader (the part that understands image and question), in enough detail to repeat its work."""
 
     name: str
-    model: str | None = Field(default=None, description="The multimodal LLM, as it is served.")
+    model: str | None = Field(default=None, description="Name under which the multimodal LLM is served.")
     revision: str | None = None
-    prompts: dict[str, int] = Field(default_factory=dict, description="Version of each prompt that it was sent.")
+    prompts: dict[str, int] = Field(default_factory=dict, description="Version of each prompt sent.")
     stages: tuple[Literal["gating", "grounding", "motion", "answering"], ...] = Field(
-        default=(), description="The stages it was asked for; the others came with the request."
+        default=(), description="The stages that used the reader; the request gave the others."
     )
 
 
 class Usage(Record):
-    """What the multimodal LLM was asked, re-asks and failed tries that it counted included."""
+    """Use of the multimodal LLM, including repeats and failed tries that it counted."""
 
     calls: int = Field(default=0, ge=0)
     input_tokens: int = Field(default=0, ge=0)
@@ -61,27 +61,27 @@ class Usage(Record):
 
 
 class GeneratorInfo(Record):
-    """Who made the frames, and what would have to be the same to make them again."""
+    """The generator (the part that makes the frames), in enough detail to make them again."""
 
     name: str
     model: str | None = None
     revision: str | None = None
     seed: int
-    steps: int | None = Field(default=None, description="Sampling steps; null where there are none.")
+    steps: int | None = Field(default=None, description="Sampling steps; null if it has none.")
     options: dict[str, bool | int | float | str] = Field(default_factory=dict)
     is_toy: bool = Field(default=False, description="Its weights are random: the frames mean nothing.")
 
 
 class Clip(Record):
-    """Stage 4: the frames chosen for reasoning, the whole clip as video where it is wanted, and the overlay."""
+    """Stage 4: the frames for reasoning, the whole clip as video if requested, and the overlay."""
 
     frames: tuple[Frame, ...] = Field(description="The frames chosen for reasoning.")
     factual_frames: tuple[Frame, ...] = Field(
-        default=(), description="The same frames of the scene as it is, where something is taken away or put elsewhere."
+        default=(), description="The same frames of the unchanged scene, if an object is taken away or put elsewhere."
     )
     video: Video | None = Field(description="Null where the request said `video: false`.")
     overlay: Artifact = Field(
-        description="JPEG of the input with box, point, arrow and path drawn, 1280 px at most on the longer side."
+        description="JPEG of the input with box, point, arrow and path drawn, at most 1280 px on the longer side."
     )
     generator: GeneratorInfo
 
@@ -96,16 +96,14 @@ class Result(Record):
     image: ImageInfo
     reader: ReaderInfo
     usage: Usage = Field(
-        default=Usage(), description="What this request cost, everything together, but not stages that are `reused`."
+        default=Usage(), description="Total use of the multimodal LLM by this request, without `reused` stages."
     )
     usage_total: Usage = Field(
         default_factory=lambda fields: fields.get("usage", Usage()),
-        description="What it would have cost without reuse; of results of earlier versions, what it cost.",
+        description="What the use would have been without reuse; in results of earlier versions, the actual use.",
     )
     timings: dict[str, float] = Field(description="Seconds per stage.")
-    reused: tuple[str, ...] = Field(
-        default=(), description="Stages whose cached result was used: an earlier request had asked for the same."
-    )
+    reused: tuple[str, ...] = Field(default=(), description="Stages whose result was cached from an earlier request.")
     warnings: tuple[str, ...] = ()
 
 
@@ -171,35 +169,35 @@ class ProblemField(BaseModel):
 
 
 class MllmRefusal(BaseModel):
-    """What the server of a multimodal LLM refused a call with."""
+    """How the server of a multimodal LLM refused a call."""
 
-    status: int = Field(description="Of its HTTP response.")
-    message: str = Field(description="In its own words.")
-    retry_after: float | None = Field(default=None, ge=0, description="When it may be asked again, s.")
+    status: int = Field(description="HTTP status of its response.")
+    message: str = Field(description="Its own message.")
+    retry_after: float | None = Field(default=None, ge=0, description="Seconds to wait before the next call.")
 
 
 class Problem(BaseModel):
     """Why a request failed (RFC 9457)."""
 
-    type: str = Field(description="Stable URI; its last segment is the code.")
+    type: str = Field(description="Stable URI whose last segment is the error code.")
     title: str = Field(description="The kind of error, the same for every occurrence.")
     status: int
-    detail: str = Field(description="What was wrong, with the value, and what to do where `remedy` does not say that.")
+    detail: str = Field(description="What was wrong, with the value, and what to do unless `remedy` says so.")
     remedy: str | None = Field(
         default=None,
         exclude_if=lambda remedy: remedy is None,
-        description="What to give in the request; left out where `detail` says all.",
+        description="What to give in the request; omitted if `detail` says everything.",
     )
     errors: list[ProblemField] = Field(default_factory=list[ProblemField])
     usage: Usage | None = Field(
         default=None,
         exclude_if=lambda usage: usage is None,
-        description="What was asked of a multimodal LLM before it failed; left out where that was nothing.",
+        description="Use of the multimodal LLM before the failure; omitted if there was none.",
     )
     refusal: MllmRefusal | None = Field(
         default=None,
         exclude_if=lambda refusal: refusal is None,
-        description="What the multimodal LLM refused a call with; left out where it did not.",
+        description="How the multimodal LLM refused a call; omitted if it did not.",
     )
 
     @property
@@ -212,23 +210,23 @@ OptionsSource = Literal["request", "question-letters", "question-list", "none"]
 
 
 class AnswerOption(Record):
-    """One of the answers that a question offers."""
+    """One of the answers to choose from."""
 
     letter: str = Field(pattern="^[A-Z]$")
     text: str
 
 
 class Verdict(Record):
-    """What was answered, and how sure that is. The reasoning is the answerer's own; none is made up for it."""
+    """An answer, and how sure it is. `reasoning` is in the words of the model that answered."""
 
     answer: str | None = Field(
-        description="A letter, or text for an open question; null where it is not sure and no option says so."
+        description="A letter, or text for an open question; null if it is not sure and no option says so."
     )
     option: str | None = Field(default=None, description="Text of the option with that letter.")
     not_sure: bool
     reasoning: str = ""
     votes: dict[str, int] = Field(
-        default_factory=dict, description="How often each was answered; `not sure` where no option says so."
+        default_factory=dict, description="How often each answer was given; `not sure` if no option says so."
     )
 
 
@@ -236,42 +234,40 @@ GateReason = Literal["agreed", "disagreed", "not-sure", "unreadable"]
 
 
 class Gate(Record):
-    """What decided whether to imagine, where the request leaves that to the answers from the image alone."""
+    """The decision of `imagine: auto`: whether the answers from the image alone were enough."""
 
     answer: str | None = Field(
-        description="The leading answer, as in `Verdict`; null where it is not sure and no option says so, or there is "
+        description="The leading answer, as in `Verdict`; null if it is not sure and no option says so, or there is "
         "none."
     )
-    votes: dict[str, int] = Field(description="How often each was answered, as in `Verdict`.")
-    asked: int = Field(
-        ge=1, description="Votes asked for; 1 where the reader gives the same answer however often it is asked."
-    )
-    agreement: float = Field(ge=0, le=1, description="Share of the votes asked for that the leading answer has.")
+    votes: dict[str, int] = Field(description="How often each answer was given, as in `Verdict`.")
+    asked: int = Field(ge=1, description="Votes requested; 1 if the reader always gives the same answer.")
+    agreement: float = Field(ge=0, le=1, description="The leading answer's share of the requested votes.")
     threshold: float = Field(gt=0, le=1, description="`imagine_threshold` of the request.")
     imagined: bool = Field(
-        description="Whether imagining followed; where that failed, `simulation_problem` says why, and the leading "
-        "answer is taken."
+        description="Whether a simulation followed. If it failed, `simulation_problem` says why, and the leading "
+        "answer is used."
     )
     reason: GateReason = Field(
-        description="Why: agreed: the leading answer reached the threshold, and is the answer; disagreed: it did not, "
-        "or was tied; not-sure: it is that the reader is not sure; unreadable: no vote could be read."
+        description="agreed: the leading answer reached the threshold and is final; disagreed: it did not, or was "
+        "tied; not-sure: the leading answer is that the reader is not sure; unreadable: no vote could be read."
     )
 
 
 class Answer(Verdict, Result):
     """The way from image and question to an answer: what `POST /answer` returns."""
 
-    options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty where it is open.")
+    options: tuple[AnswerOption, ...] = Field(description="From the request or the question; empty if it is open.")
     options_source: OptionsSource = Field(
         default="none",
-        description="Where they stand: in the request, in the question with letters, or there as a list without (which "
-        "get A, B, C...).",
+        description="Where the options come from: the request, letters in the question, or a list without letters in "
+        "the question (which get A, B, C...).",
     )
-    simulation: Simulation | None = Field(description="Null where nothing was imagined, or that failed.")
-    simulation_problem: Problem | None = Field(default=None, description="Why imagining failed, where it did.")
-    gate: Gate | None = Field(default=None, description="Of `imagine: auto`; else null.")
+    simulation: Simulation | None = Field(description="Null if nothing was simulated, or the simulation failed.")
+    simulation_problem: Problem | None = Field(default=None, description="Why the simulation failed, if it did.")
+    gate: Gate | None = Field(default=None, description="The decision of `imagine: auto`; else null.")
     baseline: Verdict | None = Field(
-        description="The answer without frames, where it was asked for; of `imagine: auto`, that of the gate."
+        description="The answer without frames, if requested; with `imagine: auto`, that of the gate."
     )
 
 
@@ -279,7 +275,7 @@ VIDEO_FILE = "video.mp4"
 
 
 def artifacts_of(result: Simulation | Answer) -> dict[str, Sha256]:
-    """The digests of frames, overlay and video by the names of files; none of an answer without a simulation."""
+    """The digests of frames, overlay and video by file name; empty for an answer without a simulation."""
     simulation = result.simulation if isinstance(result, Answer) else result
     if simulation is None:
         return {}
@@ -294,7 +290,7 @@ def verdict_of(result: Simulation | Answer) -> str:
 
 
 def documents_of(result: Simulation | Answer) -> dict[str, str]:
-    """The result as JSON by the names of files; beside an answer its simulation."""
+    """The result as JSON by file name; with an answer also its simulation."""
     if isinstance(result, Simulation):
         return {"simulation.json": _text(result)}
     simulation = {} if result.simulation is None else documents_of(result.simulation)
@@ -309,23 +305,21 @@ BackendKind = Literal["reader", "generator", "segmenter", "detector", "depth", "
 
 
 class BackendInfo(Record):
-    """A reader, a generator or a model that sees: what it is, what it needs, whether it is ready."""
+    """A reader, a generator or a vision model: what it is, what it needs, whether it is ready."""
 
     name: str
-    kind: BackendKind | None = Field(default=None, description="Null only from servers that do not tell it yet.")
-    default: bool = Field(description="Used where a request names none; of models that see: used by the server.")
-    ready: bool | None = Field(description="Null where nothing is known of it before it is used.")
+    kind: BackendKind | None = Field(default=None, description="Null only from servers of earlier versions.")
+    default: bool = Field(description="Used if a request names none; for vision models: used by the server.")
+    ready: bool | None = Field(description="Null if this is unknown until it is used.")
     needs: tuple[str, ...] = Field(default=(), description="Python modules that it uses.")
     summary: str
     licence: str | None = None
-    weights: str | None = Field(default=None, description="Repository of its weights; null where it has none.")
+    weights: str | None = Field(default=None, description="Repository of its weights; null if it has none.")
     missing: tuple[str, ...] = Field(
         default=(), description="Python modules that are not installed, and settings (COW_...) that are not set."
     )
     install: str | None = Field(default=None, description="The command that installs them.")
-    pull: str | None = Field(
-        default=None, description="The command that downloads its weights, where they are not here."
-    )
+    pull: str | None = Field(default=None, description="The command that downloads its weights, if they are missing.")
     defaults: dict[str, bool | int | float | str] = Field(default_factory=dict)
 
 
@@ -334,29 +328,29 @@ class Models(Record):
 
     readers: tuple[BackendInfo, ...]
     generators: tuple[BackendInfo, ...]
-    perception: tuple[BackendInfo, ...] = Field(default=(), description="Models that the service can see with.")
-    mllms: tuple[str, ...] = Field(default=(), description="Manifests of multimodal LLMs: what `COW_MLLM` may name.")
+    perception: tuple[BackendInfo, ...] = Field(default=(), description="Vision models.")
+    mllms: tuple[str, ...] = Field(default=(), description="Multimodal LLMs that `COW_MLLM` may name.")
 
 
 class SeenObject(Record):
-    """A thing that the models of the server see."""
+    """An object that the server's vision models see."""
 
     bbox: BBox = Field(description="[x0, y0, x1, y1], px.")
     mask: str | None = Field(
-        description="data:image/png;base64,...: white where it is; null where its outline is not certain."
+        description="data:image/png;base64,...: white on the object; null if its outline is uncertain."
     )
-    score: float = Field(ge=0, le=1, description="How sure the model is of it.")
-    name: str | None = Field(default=None, description="The noun under which it was looked for.")
+    score: float = Field(ge=0, le=1, description="Confidence of the model.")
+    name: str | None = Field(default=None, description="The noun that was searched for.")
 
 
 class Look(Record):
     """What `POST /look` returns."""
 
-    image: Sha256 = Field(description="Of the image: later looks may name it as artifact while it is kept in memory.")
+    image: Sha256 = Field(description="Digest of the image, for later looks while the server keeps it in memory.")
     width: int
     height: int
     things: tuple[SeenObject, ...] = Field(
-        description="Best first. At a point, several are things within each other; none: no two looks agree."
+        description="Best first. At a point there may be several objects within each other, or none that is certain."
     )
 
 
@@ -371,17 +365,17 @@ class Job(Record):
     id: str
     kind: JobKind
     status: JobStatus
-    stage: str | None = Field(default=None, description="The stage that it is in, or was in when it ended.")
+    stage: str | None = Field(default=None, description="The current stage, or the last one when the job ended.")
     progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
     question: str | None = Field(
         default=None,
-        description="The request's; in lists at most 200 characters of it, the last of them `…` where it is longer. "
-        "Null for jobs of earlier versions.",
+        description="The question; in lists cut to 200 characters, the last of them `…`. Null for jobs of earlier "
+        "versions.",
     )
     answer: str | None = Field(
         default=None,
-        description="What it came to, in at most 200 characters: the answer, or of a simulation what its worlds say. "
-        "Null until it has succeeded, where nothing was asked, and for jobs of earlier versions.",
+        description="The answer, or the verdict of a simulation, in at most 200 characters. Null until the job has "
+        "succeeded, if there was no question to answer, and for jobs of earlier versions.",
     )
     given: tuple[str, ...] = Field(
         default=(),
@@ -389,21 +383,21 @@ class Job(Record):
         "request gave instead of leaving it to the reader.",
     )
     image: Sha256 | None = Field(
-        default=None, description="The artifact that the request's image is kept as; null for jobs of earlier versions."
+        default=None, description="Artifact of the request's image; null for jobs of earlier versions."
     )
     created_at: str = Field(description="RFC 3339, UTC.")
     finished_at: str | None = Field(default=None, description="RFC 3339, UTC.")
     position: int | None = Field(
         default=None,
         ge=0,
-        description="Jobs that are taken before it, while it is queued and asked for by its id; null otherwise.",
+        description="Number of jobs ahead of it, if it is queued and requested by its id; else null.",
     )
     expected_wait: float | None = Field(
-        default=None, ge=0, description="Seconds until it is taken, at the rate of the last minutes; null if not known."
+        default=None, ge=0, description="Seconds until it starts, at the rate of the last minutes; null if unknown."
     )
-    generator: str = Field(description="Who makes its frames.")
-    result: Simulation | Answer | None = Field(default=None, description="Of a succeeded job, but not in lists.")
-    problem: Problem | None = Field(default=None, description="Of a failed job.")
+    generator: str = Field(description="The generator of its frames.")
+    result: Simulation | Answer | None = Field(default=None, description="Result of a succeeded job; not in lists.")
+    problem: Problem | None = Field(default=None, description="Why the job failed.")
 
 
 class AcceptedRequest(Record):
@@ -411,8 +405,8 @@ class AcceptedRequest(Record):
 
     kind: JobKind = Field(description="`simulate`: of `POST /simulate`; `answer`: of `POST /answer`.")
     request: dict[str, Any] = Field(
-        description="The body, which can be sent again as it stands: image and masks as artifacts, without fields that "
-        "have their default, and without the webhook."
+        description="The body, ready to be sent again: image and masks as artifacts, without default values and "
+        "without the webhook."
     )
 
 
@@ -436,35 +430,35 @@ class GpuMemory(Record):
 
 
 class WorkerJob(Record):
-    """A job that is being computed: how far it is, never what was asked nor who asked."""
+    """A running job: its progress, never its question or its owner."""
 
     id: str | None = Field(default=None, description="Null for callers who do not administer the server.")
     kind: JobKind
     stage: str | None = None
     progress: float = Field(ge=0, le=1, description="Share of the work that is done, all stages together.")
-    seconds: float = Field(ge=0, description="Since it began to be computed.")
+    seconds: float = Field(ge=0, description="Time since it started.")
 
 
 class WorkerLoad(Record):
-    """What the jobs of a worker wait for just now."""
+    """What the jobs of a worker are waiting for."""
 
-    cpu_waiting: int = Field(ge=0, description="Jobs that wait for a place on the CPU.")
-    mllm_calls: int = Field(ge=0, description="Calls of an MLLM that have no reply yet.")
-    mllm_limit: int = Field(ge=0, description="Calls at the same time; adapts to what the MLLM takes. 0: no MLLM.")
-    mllm_waiting: int = Field(ge=0, description="Calls that wait for others to end.")
+    cpu_waiting: int = Field(ge=0, description="Jobs that wait for a CPU.")
+    mllm_calls: int = Field(ge=0, description="Calls of a multimodal LLM without a reply yet.")
+    mllm_limit: int = Field(ge=0, description="Most calls at the same time; adapts to the LLM. 0: no LLM.")
+    mllm_waiting: int = Field(ge=0, description="Calls that wait for other calls to end.")
 
 
 class WorkerInfo(Record):
     """What computes jobs: a worker process, or the threads of the server itself (`COW_WORKERS=0`)."""
 
     name: str = Field(description="Its queue and a number.")
-    queue: str | None = Field(description="Whose jobs it computes; null: of all queues.")
+    queue: str | None = Field(description="The queue that it takes jobs from; null: all queues.")
     pid: int | None = Field(default=None, description="Null for callers who do not administer the server.")
     memory_mb: float = Field(ge=0, description="Resident memory, MB (10^6 bytes).")
     jobs_done: int = Field(ge=0)
-    jobs: tuple[WorkerJob, ...] = Field(default=(), description="At hand; several where jobs wait for an MLLM.")
-    gpus: tuple[GpuMemory, ...] = Field(default=(), description="That it uses.")
-    load: WorkerLoad | None = Field(default=None, description="Null while that is not known.")
+    jobs: tuple[WorkerJob, ...] = Field(default=(), description="Running jobs; several if jobs wait for an LLM.")
+    gpus: tuple[GpuMemory, ...] = Field(default=(), description="GPUs that it uses.")
+    load: WorkerLoad | None = Field(default=None, description="Null while this is unknown.")
 
 
 class ProcessInfo(Record):
@@ -475,10 +469,10 @@ class ProcessInfo(Record):
     role: ProcessRole
     host: str | None = Field(default=None, description="Null for callers who do not administer the server.")
     pid: int | None = Field(default=None, description="Null for callers who do not administer the server.")
-    version: str = Field(description="Of COW.")
-    workflow_version: str = Field(description="Jobs of this version are taken, no others.")
+    version: str = Field(description="Version of COW.")
+    workflow_version: str = Field(description="The process takes only jobs of this version.")
     queues: dict[str, int] = Field(
-        default_factory=dict, description="Queues that it takes jobs from, and how many of each at the same time."
+        default_factory=dict, description="Queues that it takes jobs from, and how many jobs of each at the same time."
     )
     workers: tuple[WorkerInfo, ...] = ()
 
@@ -488,20 +482,20 @@ class QueueInfo(Record):
 
     name: str
     queued: int = Field(ge=0, description="Jobs that wait.")
-    running: int = Field(ge=0, description="Jobs that are computed.")
-    capacity: int = Field(ge=0, description="Jobs that all processes together take at the same time.")
+    running: int = Field(ge=0, description="Running jobs.")
+    capacity: int = Field(ge=0, description="Most running jobs in all processes.")
     oldest_seconds: float | None = Field(default=None, ge=0, description="How long the oldest of `queued` has waited.")
-    jobs_per_minute: float = Field(ge=0, description="That ended, over the last five minutes.")
+    jobs_per_minute: float = Field(ge=0, description="Jobs ended per minute, over the last five minutes.")
 
 
 class Unserved(Record):
-    """Jobs that wait, and that no process takes."""
+    """Waiting jobs that no process takes."""
 
     queue: str
     workflow_version: str
     jobs: int = Field(gt=0)
     reason: Literal["version", "queue"] = Field(
-        description="No process has their workflow version, or none of those that have it serves their queue."
+        description="version: no process has their workflow version; queue: none of that version takes their queue."
     )
 
 

@@ -17,12 +17,12 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 class Record(BaseModel):
     """A frozen record; unknown fields are an error, so that a misspelt one is never ignored."""
 
-    # Validators are built when first used: whoever imports the SDK or the command line must not wait for all of them.
+    # Validators are built at first use, so that importing the SDK or the command line stays quick.
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class Artifact(Record):
-    """Bytes kept by the service. It names them; it does not hold them."""
+    """A reference to bytes that the service keeps."""
 
     sha256: Sha256
     url: str = Field(description="Path of the bytes on the server that made them.")
@@ -31,12 +31,12 @@ class Artifact(Record):
 
 
 class ImageInfo(Record):
-    """The input image, upright. `sha256` is that of the bytes as they were sent."""
+    """The input image, upright. `sha256` is the digest of the bytes as sent."""
 
     width: int = Field(gt=0, description="Pixels.")
     height: int = Field(gt=0, description="Pixels.")
     sha256: Sha256
-    focal: float | None = Field(default=None, gt=0, description="Focal length by its EXIF, px; null: it has none.")
+    focal: float | None = Field(default=None, gt=0, description="Focal length in its EXIF data, px; null: none.")
 
 
 Source = Literal["mllm", "embedded", "request"]
@@ -69,39 +69,38 @@ class Asked(Record):
         "comes down on the floor."
     )
     subject: str | None = Field(
-        default=None, description="Who does it, in the question's words, where that is not the mover; null: the mover."
+        default=None, description="The acting object, in the question's words; null: the moving object."
     )
-    target: str | None = Field(default=None, description="The thing asked about in the question's words; null: any.")
-    negated: bool = Field(default=False, description="Asked is that it does not happen: to miss, to stay visible.")
+    target: str | None = Field(default=None, description="The object in question, in its words; null: any.")
+    negated: bool = Field(default=False, description="The event is that it does not happen: to miss, to stay visible.")
     among: tuple[str, ...] = Field(
-        default=(),
-        description="The things that are meant where the question names several, or things of a kind; empty: any.",
+        default=(), description="The objects in question, if it names several or a kind of objects; empty: any."
     )
-    every: bool = Field(default=False, description="It counts only where it happens with each of `among`.")
-    partly: bool = Field(default=False, description="Of `covers` and `covered`: it counts where any part is hidden.")
+    every: bool = Field(default=False, description="It counts only if it happens with each of `among`.")
+    partly: bool = Field(default=False, description="For `covers` and `covered`: any hidden part counts.")
     within: float | None = Field(
-        default=None, gt=0, description="How long it may take to happen, s; null: until everything rests or has left."
+        default=None, gt=0, description="Time limit for the event, s; null: until everything is at rest or out of view."
     )
 
 
 class Estimate(Record):
-    """A value that somebody estimated: a prior, never taken as truth."""
+    """An estimated value: a prior, never taken as truth."""
 
     value: float
     deviation: float = Field(ge=0, description="One standard deviation, in the unit of the value.")
 
 
 class ObjectPrior(Record):
-    """What is said of an object beside its place in the image. What is null is left to the image."""
+    """What is known about an object besides its place in the image. Null values are estimated from the image."""
 
     shape: Shape | None = None
     size: Estimate | None = Field(default=None, description="Its longest side, m.")
     stands_on: str | None = Field(default=None, description="`floor`, `air`, or an object in words.")
-    height: Estimate | None = Field(default=None, description="Of its lower end above what it stands on, m.")
+    height: Estimate | None = Field(default=None, description="Height of its lower end above its support, m.")
     elongated: bool = Field(default=False, description="Longer along its heading than across, as vehicles are.")
     equal_sided: bool = Field(default=False, description="As wide as high, as cubes are.")
     opening: Opening | None = Field(
-        default=None, description="Of a container, the form of its opening; `none`: nothing goes into it."
+        default=None, description="Shape of a container's opening; `none`: nothing fits into it."
     )
 
 
@@ -110,45 +109,47 @@ class LocatedObject(Record):
 
     object: str
     bbox: BBox = Field(description="[x0, y0, x1, y1], px.")
-    role: ObjectRole = Field(default="target", description="target: the question asks about it; obstacle: it is there.")
+    role: ObjectRole = Field(default="target", description="target: in the question; obstacle: it could be in the way.")
     mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
     prior: ObjectPrior | None = None
     source: Source | None = Field(default=None, description="Who located it; null in results of older versions.")
     is_doubtful: bool = Field(
-        default=False, description="What is seen there may not be what it is called: no answer that names it is sure."
+        default=False, description="The object there may not be the named one, so no answer about it is sure."
     )
 
 
 class Intervention(Record):
-    """A change of the scene before anything moves; where the mover is put somewhere, that can be the motion."""
+    """A change of the scene before anything moves. Putting the moving object somewhere can be the whole motion."""
 
     kind: InterventionKind
-    object: LocatedObject = Field(description="What is taken away or put somewhere.")
-    relation: PlaceRelation | None = Field(default=None, description="Of `place`: how it is put to the `targets`.")
-    targets: tuple[LocatedObject, ...] = Field(default=(), description="Of `place`: two for `between`, else one.")
+    object: LocatedObject = Field(description="The object to take away or put somewhere.")
+    relation: PlaceRelation | None = Field(
+        default=None, description="With `place`: where it goes, relative to the `targets`."
+    )
+    targets: tuple[LocatedObject, ...] = Field(default=(), description="With `place`: two for `between`, else one.")
 
 
 class Grounding(Record):
-    """Stage 1: which object moves, and where it is. It does not say how it moves."""
+    """Stage 1, grounding: which object moves and where it is, not how it moves."""
 
     object: str = Field(description="Words that single it out.")
-    point: Point = Field(description="[x, y], px: the centre of the box, or where a reader pointed that gave no box.")
+    point: Point = Field(description="[x, y], px: the centre of the box, or the point of a reader that gave no box.")
     bbox: BBox = Field(description="[x0, y0, x1, y1], px.")
     mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
     others: tuple[LocatedObject, ...] = Field(
-        default=(), description="Other things that the question names or that matter, where they were found."
+        default=(), description="Other objects that the question names or that matter, if they were found."
     )
     interventions: tuple[Intervention, ...] = Field(
-        default=(), description="What is taken away or put in before the motion; not among `others`."
+        default=(), description="Objects taken away or put somewhere before the motion; not in `others`."
     )
     prior: ObjectPrior | None = None
     asked: Asked | None = Field(
-        default=None, description="What the question wants to know; null where that was not understood."
+        default=None, description="What the question wants to know; null if that was not understood."
     )
     trail_named: bool = Field(
-        default=False, description="The question speaks of a trail: balls that look alike, one after another, are one."
+        default=False, description="The question mentions a trail: similar balls in a row are one ball over time."
     )
-    is_doubtful: bool = Field(default=False, description="As `LocatedObject.is_doubtful`, of what moves.")
+    is_doubtful: bool = Field(default=False, description="As `LocatedObject.is_doubtful`, for the moving object.")
     language: Language | None = Field(default=None, description="Of the question, where a multimodal LLM says it.")
     source: Source
 
@@ -158,11 +159,11 @@ class MetresPerPixel(Record):
 
     value: float = Field(gt=0, description="Metres per pixel at the object's depth.")
     source: Literal["default", "reference", "request", "depth"]
-    note: str = Field(default="", description="What it was taken from, in words.")
+    note: str = Field(default="", description="What it is based on, in words.")
 
 
 class MotionStep(Record):
-    """A further leg of a motion, after the one before has ended."""
+    """A further leg of a motion, after the previous one has ended."""
 
     direction: Vector = Field(description="Unit vector in the image, px.")
     depth: float = Field(default=0.0, ge=-1, le=1, description="As `Motion.depth`.")
@@ -183,13 +184,13 @@ class AlsoMoving(Record):
 
 
 class Motion(Record):
-    """Stage 2: how the object moves. It does not say where it gets to."""
+    """Stage 2, motion: how the object starts to move, not where it ends up."""
 
     kind: MotionKind
     law: Law = Field(
         default="ballistic",
-        description="contact: floor, bounces, pushes, rolling, tipping; ballistic: constant velocity plus gravity, "
-        "through everything.",
+        description="Physics of the motion. contact: floor, bounces, pushes, rolling, tipping; ballistic: constant "
+        "velocity plus gravity, through everything.",
     )
     direction: Vector | None = Field(description="Unit vector in the image, px; null for a fall or a static object.")
     depth: float = Field(
@@ -203,33 +204,35 @@ class Motion(Record):
     )
     towards: LocatedObject | None = Field(
         default=None,
-        description="What it moves or is thrown towards, over the floor: the direction is that to it in the image.",
+        description="The object that it moves or is thrown towards, which sets the direction in the image.",
     )
     rises: bool = Field(
         default=False,
-        description="Of a linear motion: it leaves what it stands on and moves through the air, as what is lifted "
-        "does. What does not rise moves along the floor, away from the camera where the direction is up.",
+        description="For a linear motion: it leaves its support and moves through the air, as if lifted. Otherwise it "
+        "moves along the floor, and away from the camera if the direction is up.",
     )
     cue: Cue
-    along_arrow: bool | None = Field(default=None, description="Along or against it, where the cue is an arrow.")
+    along_arrow: bool | None = Field(
+        default=None, description="Whether along the arrow, if the cue is one; else against it."
+    )
     speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
     speed_deviation: float = Field(
         default=0.0, ge=0, le=3, description="One standard deviation of the speed's natural logarithm."
     )
     distance: float | None = Field(
-        default=None, gt=0, description="px at the depth of the first frame, after which the object is stopped."
+        default=None, gt=0, description="Stops after this distance, px at the depth of the first frame."
     )
-    duration: float | None = Field(default=None, gt=0, description="s, after which the object is stopped.")
+    duration: float | None = Field(default=None, gt=0, description="Stops after this time, s.")
     until: Until | None = Field(
-        default=None, description="contact: stopped where it first meets something; null: it goes on by itself."
+        default=None, description="contact: stops at its first contact; null: does not stop so."
     )
     steps: tuple[MotionStep, ...] = Field(default=(), description="Further legs; the first is this motion.")
     trail: tuple[Point, ...] = Field(
-        default=(), description="[x, y], px: earlier positions of the object's centre that are shown, oldest first."
+        default=(), description="[x, y], px: earlier positions of the object's centre in the image, oldest first."
     )
-    others: tuple[AlsoMoving, ...] = Field(default=(), description="What is set moving at the same time.")
+    others: tuple[AlsoMoving, ...] = Field(default=(), description="Other objects set moving at the same time.")
     gravity: Vector = Field(default=(0.0, 0.0), description="px/s^2.")
-    down: Vector = Field(default=(0.0, 1.0), description="Unit vector: which way things fall in the image.")
+    down: Vector = Field(default=(0.0, 1.0), description="Unit vector: the direction of a fall in the image.")
     metres_per_pixel: MetresPerPixel
     sentence: str = Field(description="The motion in one declarative sentence: the generator's prompt.")
     source: Source
@@ -239,11 +242,11 @@ EncounterKind = Literal["touches", "occludes", "occluded-by"]
 MEETINGS: dict[EncounterKind, str] = {  # what the mover does with the other object, in words
     "touches": "hits", "occludes": "passes in front of", "occluded-by": "passes behind",
 }  # fmt: skip
-BAND_PERCENTILES = (10, 90)  # of the points over the ensemble, across and down apart: what `Path.band` lies between
+BAND_PERCENTILES = (10, 90)  # of x and of y over the ensemble: the limits of `Path.band`
 Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "outline", "faint", "depth"]
-"""What a world is uncertain of: `place` is how far from the camera and how high bodies are, `identity` whether things
-are what they are called, `outline` where their outlines run, `faint` whether what is too faint to tell is a thing,
-`depth` whether the depth map is one of this scene."""
+"""What a world is uncertain about. `place`: how far away and how high bodies are; `identity`: whether objects are the
+named ones; `outline`: where their outlines run; `faint`: whether a faint mark is an object; `depth`: whether the depth
+map fits the scene."""
 CLEAR = 0.77  # confidence of a body below which no outcome that rests on it is sure
 CameraSource = Literal["request", "exif", "depth", "edges", "shadow", "side-view", "prior"]
 
@@ -258,18 +261,18 @@ class CameraDeviations(Record):
 
 
 class CameraEstimate(Record):
-    """The pinhole camera that took the image, as it was estimated. Its centre is the origin of all positions."""
+    """The estimated pinhole camera. Its centre is the origin of all positions."""
 
-    focal: float = Field(gt=0, description="px.")
-    pitch: float = Field(description="Degrees that it looks down on the floor.")
+    focal: float = Field(gt=0, description="Focal length, px.")
+    pitch: float = Field(description="Degrees that the camera looks down.")
     roll: float = Field(default=0.0, description="Degrees that the vertical leans to the left in the image.")
     height: float = Field(gt=0, description="m above the floor.")
-    source: CameraSource = Field(description="What it was estimated from beside the priors.")
+    source: CameraSource = Field(description="What it was estimated from, besides priors.")
     deviations: CameraDeviations
 
 
 class Footprint(Record):
-    """How a body stands, as seen from above: right of the camera and ahead of it, over the floor."""
+    """A body seen from above: to the right of the camera and ahead of it, over the floor."""
 
     centre: tuple[float, float] = Field(description="[right, ahead], m.")
     half_width: float = Field(ge=0, description="m, of the side that `yaw` turns.")
@@ -278,11 +281,11 @@ class Footprint(Record):
     height: float = Field(ge=0, description="m, of the body.")
     covariance: tuple[float, float, float] | None = Field(
         default=None,
-        description="Of the centre over the ensemble: of right, of right with ahead, and of ahead, m^2; null without "
-        "one.",
+        description="Of the centre over the ensemble (the simulated versions): right-right, right-ahead, ahead-ahead, "
+        "m^2; null without one.",
     )
     seen: float | None = Field(
-        default=None, ge=0, le=1, description="Share of its pixels whose depth is known; null without a depth map."
+        default=None, ge=0, le=1, description="Share of its pixels with a known depth; null without a depth map."
     )
 
 
@@ -291,29 +294,29 @@ class Surface(Record):
 
     body: int | None = Field(description="Which of `Trajectory.bodies` it is the top of; null: the floor.")
     normal: Position = Field(description="Unit vector upwards in the frame of the camera.")
-    distance: float = Field(description="Of the camera above it, m.")
+    distance: float = Field(description="Height of the camera above it, m.")
     extent: BBox | None = Field(
-        default=None, description="[right, ahead, right, ahead], m: what it spans; null: no end is known."
+        default=None, description="[right, ahead, right, ahead], m: its extent; null: unlimited or unknown."
     )
 
 
 class DepthEstimate(Record):
-    """The depth map that a world was measured in."""
+    """The depth map from which a world was measured."""
 
-    source: Literal["request", "model"] = Field(description="Who gave it: the request, or a model of the server.")
+    source: Literal["request", "model"] = Field(description="The request, or a model of the server.")
     scale: float | None = Field(description="Metres per unit; null: relative depth.")
     focal: float = Field(gt=0, description="px.")
-    valid: float = Field(ge=0, le=1, description="Share of the pixels whose depth is known.")
-    deviation: float = Field(ge=0, description="Relative: one standard deviation.")
+    valid: float = Field(ge=0, le=1, description="Share of the pixels with a known depth.")
+    deviation: float = Field(ge=0, description="Relative error: one standard deviation.")
     floor: float | None = Field(
-        description="Share of the pixels beside the bodies that show the floor; null: the map shows none, or the image "
-        "is a drawing without depth, and the map was not used."
+        description="Share of floor among the pixels outside the bodies; null: the map shows no floor, or the image is "
+        "a drawing without depth, and the map was not used."
     )
-    mover: float = Field(ge=0, le=1, description="Share of the mover's pixels whose depth is known; 0: too few.")
+    mover: float = Field(ge=0, le=1, description="Share of the moving object's pixels with a known depth; 0: too few.")
 
     @property
     def is_of_scene(self) -> bool:
-        """Whether an outcome can rest on it: the floor and the mover are seen in it."""
+        """Whether an outcome can rest on it: it shows the floor and the moving object."""
         return self.floor is not None and self.mover > 0
 
 
@@ -328,21 +331,21 @@ class Body(Record):
     support: str = Field(description="`floor`, `air`, or the name of the body that it stands on.")
     rotation: float = Field(
         default=0.0,
-        description="Degrees, clockwise, that it leans in the image against how the input shows it: of what was put "
-        "somewhere before the motion.",
+        description="Degrees clockwise by which it leans in the image, compared with the input; for objects that were "
+        "put somewhere before the motion.",
     )
     footprint: Footprint | None = Field(default=None, description="Null in results of older versions.")
-    source: Literal["embedded", "mllm", "request"] = Field(description="Who says that it is there.")
+    source: Literal["embedded", "mllm", "request"] = Field(description="Who located it.")
     confidence: float = Field(
         ge=0,
         le=1,
-        description="How sure it is that this is one separate thing with this outline; where that is in doubt, how "
-        f"well two ways of cutting it out agree (IoU). Below {CLEAR} no outcome that rests on it is sure.",
+        description="Confidence that this is one separate object with this outline; in doubt, the agreement (IoU) of "
+        f"two ways to cut it out. Below {CLEAR} no outcome that depends on it is sure.",
     )
 
     @property
     def is_clear(self) -> bool:
-        """Whether an outcome that rests on it can be sure."""
+        """Whether an outcome that depends on it can be sure."""
         return self.confidence >= CLEAR
 
 
@@ -363,7 +366,7 @@ class Path(Record):
     )
     rotation: tuple[float, ...] = Field(
         default=(),
-        description="Per frame: degrees turned in the image since the first frame, clockwise; empty: not turned"
+        description="Per frame: degrees turned clockwise in the image since the first frame; empty: not turned"
         f"{_MINIMAL}.",
     )
     turns: tuple[tuple[float, float, float, float], ...] = Field(
@@ -378,10 +381,10 @@ class Path(Record):
     )
     futures: tuple[tuple[Point, ...], ...] = Field(
         default=(),
-        description="Of the mover alone: the point in other worlds of the ensemble, at most 8 of them, each [x, y] per "
-        f"frame, px, to 0.1 px; empty where `band` is{_MINIMAL}.",
+        description="Only for the moving object: its point in at most 8 other simulated versions, each [x, y] per "
+        f"frame, px, to 0.1 px; empty if `band` is{_MINIMAL}.",
     )
-    moved_at: float | None = Field(default=None, ge=0, description="Seconds until it is set in motion; null: never.")
+    moved_at: float | None = Field(default=None, ge=0, description="Seconds until it starts to move; null: never.")
     tipped_at: float | None = Field(
         default=None, ge=0, description="Seconds until its upright axis leans by more than 45 degrees; null: never."
     )
@@ -390,55 +393,53 @@ class Path(Record):
     )
     tracks_visible: tuple[tuple[bool, ...], ...] | None = Field(
         default=None,
-        description="Per track and frame: nothing hides the point, and it faces the camera; it may be outside the "
-        f"image. Null: nothing ever hides one{_MINIMAL}.",
+        description="Per track and frame: whether the point faces the camera and is not hidden; it may be outside the "
+        f"image. Null: always{_MINIMAL}.",
     )
 
 
 class StillTracks(Record):
-    """Points on a body that stays where it is: what moves may hide them for a while."""
+    """Points on a body that does not move; a moving object may hide them for a while."""
 
     body: int = Field(ge=0, description="Which of `Trajectory.bodies`.")
     points: tuple[Point, ...] = Field(description="[x, y], px, at every frame.")
     visible: tuple[tuple[bool, ...], ...] | None = Field(
-        default=None, description="Per point and frame: nothing hides it. Null: nothing ever does."
+        default=None, description="Per point and frame: whether it is not hidden. Null: it never is."
     )
 
 
 class Contact(Record):
-    """Two bodies begin to touch, or a body meets the floor, in the likeliest world."""
+    """Two bodies begin to touch, or a body touches the floor, in the likeliest version."""
 
     a: int = Field(ge=0, description="Which of `Trajectory.bodies`.")
     b: int | None = Field(description="Which of `Trajectory.bodies`; null for the floor.")
     time: float = Field(ge=0, description="Seconds.")
     point: Point = Field(description="[x, y], px.")
-    impulse: float = Field(
-        ge=0, description="Change of velocity of `a`, m/s: 0 where nothing is exchanged, as under the ballistic law."
-    )
+    impulse: float = Field(ge=0, description="Change of velocity of `a`, m/s; 0 if none, as under the ballistic law.")
 
 
 class Encounter(Record):
-    """The mover meets another object, covers it or is covered by it. Computed: a hypothesis."""
+    """A body touches another object, covers it or is covered by it. This is computed: a hypothesis."""
 
     object: str
     bbox: BBox = Field(description="[x0, y0, x1, y1], px, of the other object at the first frame.")
     body: int | None = Field(default=None, ge=0, description="Which of `Trajectory.bodies`.")
-    subject: int = Field(default=0, ge=0, description="Which of `Trajectory.bodies` meets it; 0: the mover.")
+    subject: int = Field(default=0, ge=0, description="Which of `Trajectory.bodies` does so; 0: the moving object.")
     kind: EncounterKind
     first_frame: int = Field(
-        ge=0, description="The first clip frame of the encounter, in the likeliest world; the last one if it is later."
+        ge=0, description="First frame of the encounter in the likeliest version; the last frame if it is later."
     )
     time: float | None = Field(
         default=None,
         ge=0,
-        description="Seconds until it begins, in the likeliest world: after the last frame's it happens after the clip "
-        "has ended. Null in results of older versions.",
+        description="Seconds until it begins in the likeliest version, possibly after the end of the clip. Null in "
+        "results of older versions.",
     )
     share: float | None = Field(
-        default=None, ge=0, le=1, description="Of an occlusion: the largest share of what is hidden that is covered."
+        default=None, ge=0, le=1, description="For an occlusion: the largest share of the object that is hidden."
     )
     probability: float | None = Field(
-        default=None, ge=0, le=1, description="Share of the ensemble's worlds in which it happens; null without one."
+        default=None, ge=0, le=1, description="Share of the simulated versions in which it happens; null without any."
     )
 
 
@@ -472,38 +473,36 @@ PlacementResult = Literal["inside", "sticks-out", "on-the-rim", "on-top", "besid
 
 
 class Placement(Record):
-    """What becomes of an object that is put somewhere."""
+    """What happens to an object that is put somewhere."""
 
     object: str
-    result: PlacementResult = Field(description="In the likeliest world.")
+    result: PlacementResult = Field(description="In the likeliest version.")
     probabilities: dict[PlacementResult, float] = Field(
-        default_factory=dict, description="Share of the ensemble's worlds with each result; empty without an ensemble."
+        default_factory=dict, description="Share of the simulated versions with each result; empty without any."
     )
     fits: float | None = Field(
         default=None,
         ge=0,
         le=1,
-        description="Probability that it ends as it was meant to: inside and not held up at the rim, on top, or beside "
+        description="Probability that it ends as intended: inside and not held up at the rim, on top, or beside "
         "without overlapping.",
     )
     clearance: float | None = Field(
-        default=None, description="Width of the opening less that of the object, as a share of the opening."
+        default=None, description="Width of the opening minus width of the object, relative to the opening."
     )
-    above_rim: float | None = Field(
-        default=None, ge=0, le=1, description="Share of the object's height that is higher than the rim."
-    )
+    above_rim: float | None = Field(default=None, ge=0, le=1, description="Share of the object's height above the rim.")
 
 
 class PlacedBefore(Placement):
-    """What becomes of an object that is put somewhere before the motion."""
+    """What happens to an object that is put somewhere before the motion."""
 
-    body: int = Field(ge=0, description="Which of `Trajectory.bodies`: there is its new place.")
+    body: int = Field(ge=0, description="Which of `Trajectory.bodies`, with its new place.")
     place: str = Field(description="Where it is put, in words.")
     by_heading: bool = Field(
-        default=False, description="In front of or behind the mover by the way that it goes, not as the camera sees it."
+        default=False, description="In front and behind are meant in the direction of motion, not of the camera."
     )
     visible: float = Field(
-        ge=0, le=1, description="Share of it that is seen there at the first frame: 0 behind others or off the image."
+        ge=0, le=1, description="Share of it that is visible in the first frame; 0: behind others or outside the image."
     )
 
 
@@ -519,72 +518,70 @@ _OF_PATHS = ("states", "points", "visible", "scale", "tracks", "tracks_visible")
 
 
 class Trajectory(Record):
-    """Stage 3: what every body does over the clip, what meets what, and how sure that is.
+    """Stage 3, trajectory: what every body does over the clip, which bodies meet, and how sure that is.
 
-    `bodies[0]` is the mover and `paths[0]` its path; a body without a path stays where it is.
+    `bodies[0]` is the moving object and `paths[0]` its path; a body without a path does not move.
     """
 
     law: Law = "ballistic"
     fps: float = Field(gt=0, description="Frames per second of the clip.")
     units: TrajectoryUnits = TrajectoryUnits()
-    camera: CameraEstimate | None = Field(default=None, description="Null where nothing was estimated.")
-    depth: DepthEstimate | None = Field(default=None, description="Null where no depth map was given.")
-    surfaces: tuple[Surface, ...] = Field(default=(), description="What bodies stand on, the floor first.")
+    camera: CameraEstimate | None = Field(default=None, description="Null if nothing was estimated.")
+    depth: DepthEstimate | None = Field(default=None, description="Null if there was no depth map.")
+    surfaces: tuple[Surface, ...] = Field(default=(), description="Surfaces that bodies stand on, the floor first.")
     bodies: tuple[Body, ...] = ()
-    paths: tuple[Path, ...] = Field(min_length=1, description="Of the bodies that move, the mover's first.")
-    contacts: tuple[Contact, ...] = Field(default=(), description="In the order of their times.")
+    paths: tuple[Path, ...] = Field(min_length=1, description="Of the bodies that move, the moving object's first.")
+    contacts: tuple[Contact, ...] = Field(default=(), description="In the order of time.")
     light: Vector | None = Field(
         default=None,
-        description="Metres that a shadow lies to the right of what casts it, and away from the camera, per metre of "
-        "height above the floor; null where no shadow in the air tells.",
+        description="Metres by which a shadow lies to the right of its object, and further from the camera, per metre "
+        "of height above the floor; null if no shadow of an object in the air shows it.",
     )
     moving_until: float | None = Field(
-        default=None, ge=0, description="Seconds from which nothing moves any more, or the mover has left the image."
+        default=None, ge=0, description="Seconds until everything is at rest, or the moving object has left the image."
     )
-    tracks_given: bool = Field(default=False, description="The tracks are those of the request, and the only ones.")
+    tracks_given: bool = Field(default=False, description="The tracks come from the request, and there are no others.")
     still_tracks: tuple[StillTracks, ...] = Field(
-        default=(), description=f"Of the bodies that stay where they are; empty in results of older versions{_MINIMAL}."
+        default=(), description=f"Of the bodies that do not move; empty in results of older versions{_MINIMAL}."
     )
     anchors: tuple[Point, ...] = Field(description="Static points on the background that hold the camera still, px.")
     encounters: tuple[Encounter, ...] = ()
     faint: tuple[BBox, ...] = Field(
         default=(),
-        description="Boxes [x0, y0, x1, y1] (px) of what may be things and is too faint to tell: no world has them. An "
-        "outcome is not sure where the mover's way leads over one.",
+        description="Boxes [x0, y0, x1, y1] (px) of marks too faint to be objects for certain. They are not simulated; "
+        "if the path crosses one, the outcome is not sure.",
     )
     encounters_known: bool = Field(
-        default=True, description="False where the surroundings could not be told apart: then nothing is listed."
+        default=True, description="False if the objects around could not be told apart; then none is listed."
     )
-    ensemble: int = Field(default=0, ge=0, description="How many worlds the probabilities are counted in.")
-    outcome: Outcome | None = Field(
-        default=None, description="Null where the question asks for nothing that the world can tell."
-    )
+    ensemble: int = Field(default=0, ge=0, description="Number of simulated versions behind the probabilities.")
+    outcome: Outcome | None = Field(default=None, description="Null if the simulation cannot answer the question.")
     placement: Placement | None = Field(
-        default=None, description="Of the mover that is seen going somewhere; null where it is put nowhere."
+        default=None, description="Result for a moving object that is put somewhere; else null."
     )
     placed: tuple[PlacedBefore, ...] = Field(
-        default=(), description="What is put somewhere before the motion, in its order."
+        default=(), description="Objects put somewhere before the motion, in that order."
     )
     live: Artifact | None = Field(
         default=None,
-        description="JSON: the worlds as they begin, with all that a program needs to run them with another aim. Null "
-        "where the request did not ask for it (`live`), where something is put somewhere, and where nothing moves "
-        "along a direction.",
+        description="JSON: the initial state of the simulated versions, for programs that run them with another aim. "
+        "Null unless the request asked for it (`live`), if an object is put somewhere, and if nothing moves along a "
+        "direction.",
     )
     factual: Trajectory | None = Field(
         default=None,
-        description="The same motion in the scene as it is, where something is taken away, or put somewhere before; "
-        "null where nothing is.",
+        description="The same motion in the unchanged scene, if an object is taken away or put elsewhere first; else "
+        "null.",
     )
 
     @property
     def path(self) -> Path:
-        """The mover's."""
+        """The path of the moving object."""
         return self.paths[0]
 
     @property
     def num_frames(self) -> int:
-        """Of the clip."""
+        """Number of frames in the clip."""
         return len(self.paths[0].points)
 
     @model_validator(mode="before")

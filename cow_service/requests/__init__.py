@@ -1,4 +1,4 @@
-"""What a caller may ask: the bodies of `POST /simulate` and `POST /answer`. Checked once, here, then trusted."""
+"""The bodies of `POST /simulate` and `POST /answer`. They are checked once, here, and trusted afterwards."""
 
 from cow_service.requests.simulation import *  # noqa: F403
 from cow_service.requests.values import *  # noqa: F403

@@ -1,4 +1,4 @@
-"""The bodies of `POST /simulate` and `POST /answer`: places of objects, motions, and at the end the requests."""
+"""The bodies of `POST /simulate` and `POST /answer`: places of objects, motions, and finally the requests."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ Box = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_with_area
 
 
 class PlaceRequest(Record):
-    """An object's place in the image, and what the caller knows of it beside. What is left out is read or assumed."""
+    """An object's place in the image, and what the caller knows about it. Omitted values are estimated."""
 
     bbox: Box | None = Field(default=None, description="[x0, y0, x1, y1], px of the upright image, x right, y down.")
     point: tuple[Finite, Finite] | None = Field(
-        default=None, description="[x, y], px, on the object: its outline is cut from the image around it."
+        default=None, description="[x, y], px: a point on the object, from which its outline is found."
     )
     mask: MaskRef | None = Field(
-        default=None, description="PNG of the upright image's size, white where the object is and black elsewhere."
+        default=None, description="PNG of the upright image's size, white on the object and black elsewhere."
     )
     shape: records.Shape | None = None
     size: Annotated[Finite, Field(ge=1e-4, le=1000)] | None = Field(default=None, description="Its longest side, m.")
-    stands_on: ObjectWords | None = Field(default=None, description="`floor`, `air`, or an object in words.")
+    stands_on: ObjectWords | None = Field(default=None, description="`floor`, `air`, or another object in words.")
 
     @property
     def prior(self) -> records.ObjectPrior | None:
-        """What it says of the object beside its place, taken as exact."""
+        """What it says about the object besides its place, taken as exact."""
         if self.shape is None and self.size is None and self.stands_on is None:
             return None
         size = None if self.size is None else records.Estimate(value=self.size, deviation=0.0)
@@ -64,20 +64,20 @@ class PlaceRequest(Record):
     @model_validator(mode="after")
     def _one_place(self) -> PlaceRequest:
         if (self.bbox is not None) + (self.point is not None) + (self.mask is not None) != 1:
-            raise ValueError("give either `bbox` or `point`, or instead of both a `mask`")
+            raise ValueError("give exactly one of `bbox`, `point` and `mask`")
         return self
 
 
 class GroundingRequest(PlaceRequest):
-    """Skips stage 1: the object that moves, by its box, its mask, or a point on it."""
+    """Where the moving object is: a box, a mask or a point on it. Skips stage 1, grounding (finding the object)."""
 
-    object: ObjectWords | None = Field(default=None, description="What it is called.")
+    object: ObjectWords | None = Field(default=None, description="Name of the object.")
 
 
 class LookRequest(Record):
-    """What the models of the server see in an image: at a point, in a box, or of the things that a question names.
+    """Asks the server's vision models what is at a point, in a box, or which objects of a question they find.
 
-    Without any of them the image is only made ready for points and boxes.
+    Without point, box and question, the image is only prepared for later requests.
     """
 
     image: ImageRef
@@ -88,7 +88,7 @@ class LookRequest(Record):
     @model_validator(mode="after")
     def _one_place(self) -> LookRequest:
         if (self.bbox is not None) + (self.point is not None) + (self.question is not None) > 1:
-            raise ValueError("give one of `point`, `bbox` and `question`")
+            raise ValueError("give only one of `point`, `bbox` and `question`")
         return self
 
 
@@ -97,45 +97,45 @@ class ObjectRequest(PlaceRequest):
 
     object: ObjectWords
     role: records.ObjectRole = Field(
-        default="target", description="target: the question asks about it; obstacle: it is there."
+        default="target", description="target: the question asks about it; obstacle: it could be in the way."
     )
 
 
 class AskedRequest(records.Asked):
-    """What the question wants to know. Objects are named as in `objects`, or as the question names them."""
+    """What the question wants to know. Objects are named as in `objects`, or as in the question."""
 
-    subject: ObjectWords | None = Field(default=None, description="Who does it; null: the object that moves.")
-    target: ObjectWords | None = Field(default=None, description="The thing asked about; null: any.")
+    subject: ObjectWords | None = Field(default=None, description="The acting object; null: the moving object.")
+    target: ObjectWords | None = Field(default=None, description="The object in question; null: any.")
     among: tuple[ObjectWords, ...] = Field(
-        default=(), max_length=MAX_OBJECTS, description="The things that are meant where there are several; empty: any."
+        default=(), max_length=MAX_OBJECTS, description="The objects in question, if several; empty: any."
     )
     within: Annotated[Finite, Field(gt=0, le=3600)] | None = Field(
-        default=None, description="How long it may take to happen, s; null: until everything rests or has left."
+        default=None, description="Time limit for the event, s; null: until everything is at rest or out of view."
     )
 
 
 class InterventionRequest(Record):
-    """A change of the scene before anything moves. Its objects are named as in `objects`, or in words to look for."""
+    """A change of the scene before anything moves. Objects are named as in `objects`, or in words to look for."""
 
     kind: records.InterventionKind
     object: ObjectWords
     relation: records.PlaceRelation | None = Field(
-        default=None, description="Of `place`: how it is put to the `targets`."
+        default=None, description="With `place`: where the object goes, relative to the `targets`."
     )
     targets: tuple[ObjectWords, ...] = Field(
-        default=(), max_length=2, description="Of `place`: what it is put into, onto or beside; two for `between`."
+        default=(), max_length=2, description="With `place`: the object or place it refers to; two for `between`."
     )
 
     @model_validator(mode="after")
     def _is_whole(self) -> InterventionRequest:
         if self.kind == "remove" and (self.relation is not None or self.targets):
-            raise ValueError("`remove` takes an `object` alone; `relation` and `targets` belong to `place`")
+            raise ValueError("`remove` takes only an `object`; `relation` and `targets` belong to `place`")
         if self.kind == "place":
             wanted = 2 if self.relation == "between" else 1
             if self.relation is None or len(self.targets) != wanted:
-                raise ValueError(f"`place` needs a `relation` and {wanted} of `targets`")
+                raise ValueError(f"`place` needs a `relation`, and `targets` of length {wanted}")
             if len({" ".join(name.lower().split()) for name in (self.object, *self.targets)}) <= wanted:
-                raise ValueError("`object` and `targets` must be different things")
+                raise ValueError("`object` and `targets` must be different objects")
         return self
 
 
@@ -147,7 +147,7 @@ _OF_A_LINE = ("distance", "duration", "until", "steps")
 
 def _has_length(direction: records.Vector) -> records.Vector:
     if not 1e-9 < math.hypot(*direction) < 1e12:
-        raise ValueError(f"[dx, dy] must have a length, got {list(direction)}")
+        raise ValueError(f"[dx, dy] must not have zero length, got {list(direction)}")
     return direction
 
 
@@ -158,7 +158,7 @@ Speed = Annotated[Finite, Field(ge=0, le=100_000)]
 
 
 class MotionStepRequest(Record):
-    """A further leg of a motion, after the one before has ended."""
+    """A further leg of a motion, after the previous one has ended."""
 
     direction: Direction = Field(description="[dx, dy] in the image, any length but zero.")
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
@@ -169,13 +169,13 @@ class MotionStepRequest(Record):
 class OtherMotionRequest(Record):
     """Another object that is set moving at the first frame."""
 
-    object: ObjectWords = Field(description="As it is named in `objects`.")
+    object: ObjectWords = Field(description="Its name in `objects`.")
     kind: Literal["linear", "projectile", "fall"] | None = Field(
         default=None, description="By default linear; a fall takes no `direction`."
     )
     direction: Direction | None = Field(default=None, description="[dx, dy] in the image.")
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
-    speed: Speed | None = Field(default=None, description="px/s; by default as for the mover.")
+    speed: Speed | None = Field(default=None, description="px/s; by default as for the moving object.")
 
     @property
     def stated_kind(self) -> records.MotionKind:
@@ -191,59 +191,56 @@ class OtherMotionRequest(Record):
 
 
 class MotionRequest(Record):
-    """Skips stage 2: how the object moves. Without `kind` and `direction` these are read from the question."""
+    """How the object moves. Skips stage 2, motion; without `kind` and `direction` they are read from the question."""
 
     kind: records.MotionKind | None = Field(
         default=None,
-        description="linear: straight on; projectile: thrown; fall: dropped; static: it stays; place: it is put "
-        "somewhere. By default linear where there is a `direction`, else read from the question.",
+        description="linear: straight on; projectile: thrown; fall: dropped; static: stays; place: put somewhere. By "
+        "default linear if there is a `direction`, else read from the question.",
     )
     law: records.Law = Field(
         default="contact",
-        description="contact: it bounces, pushes, rolls, comes to rest; ballistic: straight through everything.",
+        description="Physics of the motion. contact: bounces, pushes, rolls, comes to rest; ballistic: constant "
+        "velocity plus gravity, straight through everything.",
     )
     direction: Direction | None = Field(
         default=None,
         description="[dx, dy] in the image, x right, y down, any length but zero: [-1, 0] is to the left. By default "
-        "read from the question and from arrows drawn in the image; not needed for a fall or a static object.",
+        "read from the question and from arrows drawn in the image. Not for a fall or a static object.",
     )
     depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
     rises: Flag = Field(
-        default=False, description="See `Motion.rises`: by default what stands on the floor moves along it."
+        default=False, description="See `Motion.rises`; by default an object on the floor moves along the floor."
     )
     speed: Speed | None = Field(
         default=None,
-        description="px/s; by default 0.26 image widths per second, and of a throw under the contact law that of a "
-        "toy thrown at 1.8 m/s.",
+        description="px/s; by default 0.26 image widths per second, or 1.8 m/s for a throw under the contact law.",
     )
     distance: Length | None = Field(
-        default=None, description="px at the depth of the first frame, after which it is stopped."
+        default=None, description="Stops after this distance, px at the depth of the first frame."
     )
-    duration: Seconds | None = Field(default=None, description="s, after which it is stopped.")
-    until: records.Until | None = Field(
-        default=None, description="contact: it is stopped where it first meets something."
-    )
+    duration: Seconds | None = Field(default=None, description="Stops after this time, s.")
+    until: records.Until | None = Field(default=None, description="contact: stops at its first contact.")
     steps: tuple[MotionStepRequest, ...] = Field(
         default=(), max_length=MAX_STEPS, description="Further legs, after this one."
     )
     others: tuple[OtherMotionRequest, ...] = Field(
-        default=(), max_length=MAX_STEPS, description="What is set moving at the same time."
+        default=(), max_length=MAX_STEPS, description="Other objects set moving at the same time."
     )
     metres_per_pixel: Annotated[Finite, Field(ge=1e-6, le=1000)] | None = Field(
-        default=None, description="By default the image is taken to be 3 m wide at the object."
+        default=None, description="Scale at the object; by default the image is assumed to be 3 m wide there."
     )
     depth_deviation: Annotated[Finite, Field(ge=0, le=90)] | None = Field(
         default=None,
-        description="See `Motion.depth_deviation`; by default 20 for a throw without `depth`, else 0: what is given is "
-        "taken as it is.",
+        description="See `Motion.depth_deviation`; by default 20 for a throw without `depth`, else 0.",
     )
     speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(
-        default=None, description="See `Motion.speed_deviation`; by default 0 for a `speed` that is given."
+        default=None, description="See `Motion.speed_deviation`; by default 0 for a given `speed`."
     )
 
     @property
     def stated_kind(self) -> records.MotionKind | None:
-        """The kind of motion; None where the motion is left to the reader."""
+        """The kind of motion; None if the reader decides."""
         return self.kind or ("linear" if self.direction is not None else None)
 
     @model_validator(mode="after")
@@ -258,20 +255,20 @@ class MotionRequest(Record):
             raise ValueError(f"a {kind} motion takes no `direction`, `speed` or `depth`; a throw is a `projectile`")
         lengths = [name for name in _OF_A_LINE if getattr(self, name) not in (None, ())]
         if kind not in (None, "linear") and lengths:
-            raise ValueError(f"a {kind} motion takes no `{lengths[0]}`: it ends by what it meets")
+            raise ValueError(f"a {kind} motion takes no `{lengths[0]}`: physics decides where it ends")
         return self
 
 
 class TrajectoryRequest(Record):
-    """Skips stage 3: where the object's centre is, at `fps`. After the last point it stays there."""
+    """The path of the object's centre, at `fps`; it stays at the last point. Skips stage 3, trajectory."""
 
     points: Points = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
     fps: Finite = Field(default=16, gt=0, le=240)
     visible: Flags | None = Field(
-        default=None, max_length=4096, description="Per point inside the image: the object can be seen there."
+        default=None, max_length=4096, description="Per point inside the image: whether the object is visible."
     )
     scale: tuple[Annotated[Finite, Field(ge=0.001, le=1000)], ...] | None = Field(
-        default=None, max_length=4096, description="Per point: apparent size, 1 as it is in the image. By default 1."
+        default=None, max_length=4096, description="Per point: apparent size relative to the image. By default 1."
     )
     tracks: Annotated[tuple[Points, ...], Field(fail_fast=True)] | None = Field(
         default=None,
@@ -282,12 +279,12 @@ class TrajectoryRequest(Record):
     tracks_visible: Annotated[tuple[Flags, ...], Field(fail_fast=True)] | None = Field(
         default=None,
         max_length=MAX_TRACKS,
-        description="Per track and point: it can be seen. By default inside the image.",
+        description="Per track and point: whether it is visible. By default inside the image.",
     )
     anchors: Points | None = Field(
         default=None,
         max_length=MAX_TRACKS,
-        description="Points that stay where they are. By default spread over the image.",
+        description="Points of the background that do not move. By default spread over the image.",
     )
 
     @model_validator(mode="after")
@@ -309,11 +306,11 @@ class TrajectoryRequest(Record):
 
 
 class CameraRequest(Record):
-    """What the caller knows of the camera that took the image; the rest is estimated."""
+    """What the caller knows about the camera; the rest is estimated."""
 
-    focal: Annotated[Finite, Field(ge=1, le=1_000_000)] | None = Field(default=None, description="px.")
+    focal: Annotated[Finite, Field(ge=1, le=1_000_000)] | None = Field(default=None, description="Focal length, px.")
     pitch: Annotated[Finite, Field(ge=-90, le=90)] | None = Field(
-        default=None, description="Degrees that it looks down on the floor."
+        default=None, description="Degrees that the camera looks down."
     )
     roll: Annotated[Finite, Field(ge=-180, le=180)] | None = Field(
         default=None, description="Degrees that the vertical leans to the left in the image."
@@ -327,21 +324,20 @@ class CameraRequest(Record):
 
 
 class DepthRequest(Record):
-    """A depth map of the image: how far from the camera, along its optical axis, what each pixel shows is."""
+    """A depth map of the image: for each pixel the distance from the camera along its optical axis."""
 
     map: MaskRef = Field(
-        description="PNG of the upright image's size, grey with 16 bits: the depth in units of `scale`; 0 where "
-        "nothing is known."
+        description="16-bit grey PNG of the upright image's size: the depth in units of `scale`; 0: unknown."
     )
     scale: Annotated[Finite, Field(ge=1e-9, le=1e6)] | None = Field(
         default=None,
-        description="Metres per unit of the map; null: it is not known, and values are proportional to distances.",
+        description="Metres per unit of the map; null: unknown, values are proportional to depth.",
     )
     focal: Annotated[Finite, Field(ge=1, le=1_000_000)] | None = Field(
-        default=None, description="Focal length that the map was made with, px; by default the camera's."
+        default=None, description="Focal length of the map, px; by default the camera's."
     )
     deviation: Annotated[Finite, Field(ge=0, le=1)] = Field(
-        default=0.05, description="How far its depths may be off, relative: one standard deviation."
+        default=0.05, description="Relative error of its depths: one standard deviation."
     )
 
 
@@ -360,7 +356,7 @@ class OptionRequest(records.AnswerOption):
 
 
 def _kind_of_options(options: Any) -> str:
-    """Which of the two forms they have, by the first of them."""
+    """The form of the options, judged by the first one."""
     first = options[0] if isinstance(options, list | tuple) and options else None
     return "pairs" if isinstance(first, Mapping | OptionRequest) else "texts"
 
@@ -379,7 +375,7 @@ class FramesRequest(Record):
 
     policy: records.FramePolicy = Field(
         default="events",
-        description="events: before, at and after what matters, and the end; uniform: evenly over the clip; "
+        description="events: before, at and after the events that matter, and the end; uniform: evenly over the clip; "
         "initial: frames 1, 3, 5, ..., as in the paper.",
     )
     count: Whole = Field(default=4, ge=1, le=64, description="How many pictures.")
@@ -391,8 +387,8 @@ class FramesRequest(Record):
     )
     factual: Flag | None = Field(
         default=None,
-        description="Where something is taken away, or put elsewhere first: also the same frames of the scene as it "
-        "is. By default only of a generator on the CPU: a video model takes as long for them as for the clip.",
+        description="If an object is taken away or put elsewhere first: also make the same frames of the unchanged "
+        "scene. By default only with a generator on the CPU, because a video model would take twice as long.",
     )
 
 
@@ -403,13 +399,13 @@ class SimulateRequest(Record):
     question: Words = Field(
         min_length=1,
         max_length=4000,
-        description="What if? In English, naming what moves and how: 'If the red ball moves to the left, will it hit "
-        "the vase?', 'If the cup falls, what does it land on?'",
+        description="A what-if question in English that names the moving object and its motion: 'If the red ball moves "
+        "to the left, will it hit the vase?', 'If the cup falls, what does it land on?'",
     )
     options: Options | None = Field(
         default=None,
-        description="Answers to choose from: texts, which get the letters A, B, C..., or each with a letter of its "
-        "own; by default those that the question lists. Used by `/answer`.",
+        description="Answers to choose from: texts, which get the letters A, B, C..., or texts with letters; by "
+        "default those that the question lists. Used by `/answer`.",
     )
     language: Language | None = Field(
         default=None,
@@ -423,60 +419,56 @@ class SimulateRequest(Record):
     objects: tuple[ObjectRequest, ...] = Field(
         default=(),
         max_length=MAX_OBJECTS,
-        description="Other objects that matter and where they are: they come before what the reader finds there.",
+        description="Other objects that matter, and their places, which take precedence over what the reader finds.",
     )
     interventions: tuple[InterventionRequest, ...] = Field(
         default=(),
         max_length=8,
-        description="What is taken away or put somewhere before the motion, beside the question's.",
+        description="Objects to take away or put somewhere before the motion, in addition to the question's.",
     )
     asked: AskedRequest | None = Field(
         default=None, description="What the question wants to know; by default it is read from the question."
     )
     camera: CameraRequest | None = None
     depth: DepthRequest | None = Field(
-        default=None, description="A depth map: the floor, the camera and the bodies are then measured in it."
+        default=None, description="A depth map, from which the floor, the camera and the objects are measured."
     )
     ensemble: Whole = Field(
         default=50,
         ge=0,
         le=500,
-        description="How many worlds the probabilities are counted in, at most: no more are run as soon as the others "
-        "are not likely to change what is answered. 0: none, and no probabilities.",
+        description="Most simulated versions of the scene over which probabilities are counted; fewer are run once "
+        "more would not change the answer. 0: no probabilities.",
     )
-    reader: Name | None = Field(default=None, description="Who looks at the image; by default the server's.")
-    generator: Name | None = Field(default=None, description="Who makes the frames; by default the server's.")
+    reader: Name | None = Field(default=None, description="Part that understands the question; default: the server's.")
+    generator: Name | None = Field(default=None, description="Part that makes the frames; default: the server's.")
     num_frames: Whole = Field(default=81, ge=2, le=MAX_FRAMES, description="Frames of the clip.")
     fps: Finite = Field(default=16, ge=1, le=60, description="Frames of the clip per second.")
     seed: Annotated[Whole, Field(ge=0, le=2**32 - 1)] | None = Field(
         default=None,
-        description="Of all random numbers. By default 0 for the clip, and none for a multimodal LLM: a provider that "
-        "takes seeds would give every repeat the same reply.",
+        description="Random seed. By default 0 for the clip, and none for a multimodal LLM, whose repeats would "
+        "otherwise all be the same.",
     )
-    video: Flag = Field(default=True, description="Whether to make the mp4 of the whole clip.")
+    video: Flag = Field(default=True, description="Whether to make a video (mp4) of the whole clip.")
     live: Flag = Field(
         default=False,
-        description="Whether the result names its worlds as they begin (`trajectory.live`), to run them elsewhere: the "
-        "page does while somebody drags.",
+        description="Whether the result includes the initial state of its simulated versions (`trajectory.live`), so "
+        "that others can run them; the page does while you drag.",
     )
     frames: FramesRequest = FramesRequest()
-    generator_options: dict[str, Any] = Field(default_factory=dict, description="As the generator defines them.")
-    priority: Priority = Field(
-        default="normal",
-        description="Among the jobs that wait with the same API key: the higher come first. The share of the key stays "
-        "what it is.",
-    )
+    generator_options: dict[str, Any] = Field(default_factory=dict, description="Options of the generator.")
+    priority: Priority = Field(default="normal", description="Order among the waiting jobs of a key, high first.")
     webhook: str | None = Field(
         default=None,
         min_length=1,
         max_length=2048,
-        description="URL to call when the job has ended, signed as Standard Webhooks says; off unless the server has a "
-        "secret for it.",
+        description="URL to call when the job has ended, signed by Standard Webhooks; only on servers with a webhook "
+        "secret.",
     )
 
     @property
     def place(self) -> GroundingRequest | None:
-        """Where the object is, as far as the request says: a given trajectory begins on it, so it grounds it, too."""
+        """Where the moving object is, if the request says so. A given trajectory begins on it."""
         if self.grounding is None and self.trajectory is not None:
             return GroundingRequest(point=self.trajectory.points[0])
         return self.grounding
@@ -495,23 +487,23 @@ class SimulateRequest(Record):
 
     @property
     def law(self) -> records.Law:
-        """The law of the motion, whoever reads it."""
+        """The law of the motion."""
         return MotionRequest().law if self.motion is None else self.motion.law
 
     @property
     def stated_motion(self) -> MotionRequest | None:
-        """The motion, where the request says more of it than its law."""
+        """The motion, if the request gives more than its law."""
         return None if self.motion is None or self.motion.stated_kind is None else self.motion
 
     @property
     def changed_names(self) -> tuple[str, ...]:
-        """The names of all objects of its interventions, each once."""
+        """The names of all objects in its interventions, without repeats."""
         named = (name for each in self.interventions for name in (each.object, *each.targets))
         return tuple(dict.fromkeys(named))
 
     @property
     def attached(self) -> tuple[MaskRef, ...]:
-        """The pictures that it gives beside its image: masks, the mover's first, and the depth map."""
+        """The pictures besides its image: masks, the moving object's first, and the depth map."""
         places = (*([] if self.grounding is None else [self.grounding]), *self.objects)
         masks = (place.mask for place in places if place.mask is not None)
         return (*masks, *([] if self.depth is None else [self.depth.map]))
@@ -519,11 +511,13 @@ class SimulateRequest(Record):
     @model_validator(mode="before")
     @classmethod
     def _not_too_much(cls, given: Any) -> Any:
-        """Each wrong element of a long list would be an error of its own; of a trajectory's only the first is told."""
+        """Limits long lists, as each wrong element would be an error. Of a trajectory only the first is reported."""
         fields: dict[str, Any] = given if isinstance(given, dict) else {}
         for name, value in fields.items():
             if name != "trajectory" and has_more_values(value, MAX_VALUES):
-                raise ValueError(f"holds more than {MAX_VALUES} values in `{shortened(name, 80)}`: none needs so many")
+                raise ValueError(
+                    f"holds more than {MAX_VALUES} values in `{shortened(name, 80)}`, more than any field needs"
+                )
         return given
 
     @field_validator("options")
@@ -556,27 +550,26 @@ class SimulateRequest(Record):
 
 
 class AnswerRequest(SimulateRequest):
-    """As a simulation, and how to answer from it."""
+    """A simulation, and how to answer from it."""
 
-    video: Flag = Field(default=False, description="Whether to make the mp4 of the whole clip, too.")
+    video: Flag = Field(default=False, description="Whether to make a video (mp4) of the whole clip, too.")
 
     imagine: Literal["always", "auto", "never"] = Field(
         default="always",
-        description="never: answer from the image alone, without a simulation; auto: only where the first answers from "
-        "the image alone disagree, or are not sure.",
+        description="Whether to simulate before answering. never: answer from the image alone; auto: simulate only if "
+        "the first answers from the image alone disagree or are unsure.",
     )
     imagine_votes: Whole = Field(
-        default=3, ge=1, le=32, description="Of `imagine: auto`: how often to ask before anything is imagined."
+        default=3, ge=1, le=32, description="With `imagine: auto`: number of first answers from the image alone."
     )
     imagine_threshold: Finite = Field(
         default=1.0,
         gt=0,
         le=1,
-        description="Of `imagine: auto`: the share of those votes that the leading answer must have to be taken as it "
-        "is.",
+        description="With `imagine: auto`: the share of those votes that an answer needs to be final.",
     )
-    baseline: Flag = Field(default=False, description="Answer without frames, too, for comparison.")
-    votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer is taken.")
+    baseline: Flag = Field(default=False, description="Also answer without frames, for comparison.")
+    votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer wins.")
 
 
 Stage = Literal["gating", "grounding", "depth", "motion", "trajectory", "generation", "answering"]

@@ -1,4 +1,4 @@
-"""What fields of a request are made of: strict numbers, text that can be kept, points, images."""
+"""Types of request fields: strict numbers, text that can be stored, points, images."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -20,21 +20,21 @@ def _number(value: Any) -> Any:
 
 
 def writable(text: str) -> str:
-    """Text that every database and file can hold."""
+    """Text that every database and file can store."""
     if "\0" in text:
-        raise ValueError(f"holds the character NUL (U+0000) at position {text.index(chr(0))}; leave it out")
+        raise ValueError(f"contains the character NUL (U+0000) at position {text.index(chr(0))}; leave it out")
     return text
 
 
 def _says_something(text: str) -> str:
-    """Text with at least one character to be seen: zero-width and control characters are none."""
+    """Text with at least one visible character."""
     if not any(character.isprintable() and not character.isspace() for character in text):
         raise ValueError(f"is empty: it holds only {len(text)} blank or invisible characters")
     return text
 
 
 def has_more_values(value: Any, most: int) -> bool:
-    """Whether a JSON value, with all that it holds, is more than so many. Looks at no more."""
+    """Whether a JSON value contains more than `most` values, counting nested ones. Stops counting there."""
     held = [value]
     for _ in range(most):
         if not held:
@@ -49,20 +49,20 @@ Whole = Annotated[int, BeforeValidator(_number)]
 Flag = Annotated[bool, Field(strict=True)]
 Words = Annotated[str, AfterValidator(writable), AfterValidator(_says_something)]
 Name = Annotated[str, Field(max_length=MAX_NAME)]
-# Of a long list only the first wrong element is reported: the others would fill the memory.
+# Only the first wrong element of a long list is reported: all of them would fill the memory.
 Near = Annotated[Finite, Field(ge=-1e6, le=1e6)]  # px, of a point in the image or not too far from it
 Points = Annotated[tuple[tuple[Near, Near], ...], Field(fail_fast=True)]
 Flags = Annotated[tuple[Flag, ...], Field(fail_fast=True)]
 
 
 class ImageArtifact(Record):
-    """An image that the service already keeps."""
+    """An image that the service already has, by its SHA-256."""
 
     artifact: Sha256
 
 
 class ImageUrl(Record):
-    """An image to be fetched; off unless the server allows it."""
+    """An image for the server to fetch; only from hosts that the server allows."""
 
     url: str = Field(max_length=4096)
 
@@ -71,7 +71,7 @@ ImageRef = Annotated[str, Field(description="data:image/png;base64,... (PNG, JPE
 
 
 def _no_address(mask: str | ImageArtifact) -> str | ImageArtifact:
-    """Masks are drawn by the caller: there is nothing to be fetched."""
+    """Masks are drawn by the caller, so none is fetched from a URL."""
     if isinstance(mask, str) and not mask[:5].lower() == "data:":
         raise ValueError('must be a data URL (data:image/png;base64,...) or {"artifact": "<sha256>"}')
     return mask
@@ -91,7 +91,7 @@ _UNION_BRANCHES = frozenset({"ImageArtifact", "ImageUrl", "str", "texts", "pairs
 def field_errors(
     found: Sequence[Any], placed: Callable[[str], str] = lambda pointer: pointer
 ) -> tuple[FieldError, ...]:
-    """One for each place of a pydantic error's `errors()`; `placed` says where a JSON Pointer stands in the request."""
+    """One error per place in a pydantic error's `errors()`; `placed` maps a JSON Pointer into the request."""
     fields: dict[str, FieldError] = {}
     for item in found:
         # Without the names of union branches and validators, which callers cannot see.
@@ -99,17 +99,17 @@ def field_errors(
         pointer = placed("".join("/" + pointer_part(part) for part in parts))
         detail = _with_value(_OURS.get(item["type"], str(item["msg"])), item["input"])
         if "is empty" in detail and pointer.endswith("/question"):
-            detail += ". Ask such as 'If the red ball moves to the left, will it hit the vase?'"
+            detail += ". Ask, for example: 'If the red ball moves to the left, will it hit the vase?'"
         fields.setdefault(pointer, FieldError(pointer, detail))
     return tuple(fields.values())
 
 
 def _with_value(message: str, value: Any) -> str:
-    """A validator's message with the value; our own messages name it where it helps."""
+    """A validator's message with the value. Our own messages contain it already where it helps."""
     ours = message.removeprefix("Value error, ")
     if ours != message or not isinstance(value, str | int | float):
         return ours
-    reason = message.partition(", got ")[0]  # a kind of number, in place of the number
+    reason = message.partition(", got ")[0]  # pydantic says the kind of number there, we say the number
     if isinstance(value, str) and len(value) > SHOWN_CHARACTERS:
         return f"{reason}, got {len(value)} characters"
     return f"{reason}, got {shortened(json.dumps(value), SHOWN_CHARACTERS)}"

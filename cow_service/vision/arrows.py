@@ -170,7 +170,7 @@ class _Profile:
 
 
 def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) -> _Profile | None:
-    """The widths of a patch's points [N, 2] along an axis, or None where they are no shaft followed by a wider head."""
+    """The widths of a patch's points [N, 2] along an axis, or None if they are no shaft followed by a wider head."""
     normal = np.array([-axis[1], axis[0]])
     along, across = (points - centre) @ axis, (points - centre) @ normal
     length = float(along.max() - along.min())

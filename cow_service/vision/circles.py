@@ -73,7 +73,7 @@ class Edges:
 
     @staticmethod
     def of(image: Image) -> Edges | None:
-        """The edges of an RGB image [H, W, 3]; None where it is too cluttered, or plain."""
+        """The edges of an RGB image [H, W, 3]; None if it is too cluttered, or plain."""
         small = scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2])))
         return Edges.at(lab_gradients(lab_of(small)), (image.shape[1], image.shape[0]))
 
@@ -156,7 +156,7 @@ class Edges:
     def notch(self, a: Circle, b: Circle) -> float | None:
         """How deep the outline is notched where two circles overlap: 1 as theirs is, 0 as straight as a bottle's side.
 
-        None where no edges are seen there, or the circles lie apart.
+        None if no edges are seen there, or the circles lie apart.
         """
         stretch = np.array(self.stretch)
         start, end = (np.array([c.x, c.y]) / stretch - 0.5 for c in (a, b))
@@ -180,7 +180,7 @@ class Edges:
         return step / max(float(depth[between].mean() - depth[beside].mean()), 1e-6)
 
     def _fitted(self, x: float, y: float, radius: float) -> Circle | None:
-        """The circle by least squares over the edges near one of the working size, twice; None where few lie on it."""
+        """The circle by least squares over the edges near one of the working size, twice; None if few lie on it."""
         reach = 1.6 * radius
         first, last = np.searchsorted(self.points[:, 1], (y - reach, y + reach))
         columns = self.points[first:last, 0]

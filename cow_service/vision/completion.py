@@ -83,7 +83,7 @@ def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
 
 
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
-    """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None where too few do."""
+    """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None if too few do."""
     rng = np.random.default_rng(0)  # the same outline must give the same circle
     a, b, c = np.moveaxis(outline[rng.integers(0, len(outline), (TRIES, 3))], 1, 0)  # [T, 2] each: not finite on a line
     ab, ac = b - a, c - a
@@ -117,7 +117,7 @@ NECK_STEP = 1.0  # Lab units between the neck and the floor beside it, in the me
 
 
 def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
-    """The mask [h, w] of the neck between a mouth and a body [h, w]; None where they are no one thing's.
+    """The mask [h, w] of the neck between a mouth and a body [h, w]; None if they are no one thing's.
 
     `lab` [h, w, 3] is the image in CIE Lab.
     """
@@ -152,7 +152,7 @@ BLUR = 0.25  # of the largest steps: less is the blur of an edge
 SIDE = 0.5  # of the object's width: how far away the sides are looked at, and the width of what is searched
 LEAST_SIDE = 5  # px at the working size
 UPPER_ROWS = 0.15  # of the object's height: where its middle is taken
-OFF_MIDDLE = 0.15  # of the object's width, by which it may stand beside that middle
+OFF_MIDDLE = 0.15  # of the object's width, by which it may be off that middle
 SUNK = 0.25  # of the object's height: so far below the object's upper end its foot may lie
 LEAST_HEIGHT, MOST_HEIGHT = 3, 0.6  # px at the working size: less is blur; of the object's height: more is no part
 SHARP = 0.6  # share of its outline that lies on edges
@@ -161,7 +161,7 @@ DARK, SHADE_DEPTH = 20, 0.65  # the percentile of its lightness that counts, and
 
 
 def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | None:
-    """The mask [h, w] of what stands on a part [h, w] that is not empty, or None. `taken` [h, w] are other objects.
+    """The mask [h, w] of objects on a part [h, w] that is not empty, or None. `taken` [h, w] are other objects.
 
     `lab` [h, w, 3] is the image in CIE Lab, `edges` [h, w] is set on its edges.
     """
@@ -222,7 +222,7 @@ FLAT = 1.5  # width of a dark part over its height, at least
 
 
 def is_underside(part: BBox, thing: BBox) -> bool:
-    """Whether the box [x0, y0, x1, y1] of a dark part lies at the lower end of a thing's, not before or beside it."""
+    """Whether the box [x0, y0, x1, y1] of a dark part lies at the lower end of a thing's, not before or next to it."""
     height = thing[3] - thing[1]
     width = min(part[2], thing[2] + BESIDE * height) - max(part[0], thing[0] - BESIDE * height)
     inside = width * (min(part[3], thing[3] + LOW * height) - max(part[1], thing[1]))
@@ -281,7 +281,7 @@ def white_sides(view: View, core: Mask) -> Mask:
             surely_white.add(top)
 
     def has_side(top: int, side: _Box, area: int, lit: bool) -> bool:
-        """Whether a side is that of a top: small beside it, and lit or right below it."""
+        """Whether a side belongs to a top: small compared with it, and lit or right below it."""
         x, y, w, _ = side
         tx, ty, tw, _, top_area = tops[top].tolist()
         hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > HANGS * w and y >= ty
@@ -304,7 +304,7 @@ def white_sides(view: View, core: Mask) -> Mask:
 
 
 def black_faces(view: View, black: Mask) -> Mask:
-    """Black patches with the lit faces beside them: dark patches between strong edges."""
+    """Black patches with the lit faces next to them: dark patches between strong edges."""
     faces = black.copy()
     if not black.any():
         return faces

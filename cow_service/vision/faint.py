@@ -25,7 +25,7 @@ DARKEST = -5.0  # Lab lightness against the floor on any side: what is darker is
 
 
 def find_faint(view: View, size: tuple[int, int], regions: Sequence[Region]) -> tuple[BBox, ...]:
-    """Boxes [x0, y0, x1, y1] (px) of what may be things of an image (width, height), none of which is a region."""
+    """Boxes [x0, y0, x1, y1] (px) of possible things in an image (width, height) that are not regions."""
     taken, found = np.zeros(size[::-1], bool), list[BBox]()
     for region in regions:
         region.mask.add_to(taken)

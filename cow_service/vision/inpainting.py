@@ -1,4 +1,4 @@
-"""Inpainting: fills what is left behind when a thin drawing or a whole object is taken out of an image."""
+"""Inpainting: fills the hole after a thin drawing or a whole object is removed from an image."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,7 @@ def erase_drawing(image: Image, mask: Mask) -> Image:
 
 
 def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
-    """The image [H, W, 3] with a hole [H, W] closed: shading drawn in from the rim, texture taken from beside it.
+    """The image [H, W, 3] with a hole [H, W] closed: shading drawn in from the rim, texture copied from next to it.
 
     Pixels of `avoid` (other objects) give neither shading nor texture, unless nothing else is left. The object's own
     shadow around the hole gives none either; it fades out over the few pixels next to it.
@@ -120,7 +120,7 @@ def _mean_along(values: Floats32, band: Mask) -> Floats32:
 
 
 def shadow_beside(image: Image, hole: Mask, avoid: Mask) -> Mask:
-    """What is much darker [H, W] than most right around a hole, and none of `avoid`: the shadow of what stood there."""
+    """What is much darker [H, W] than most right around a hole, not in `avoid`: the shadow of the removed object."""
     found = np.zeros_like(hole)
     around = _surroundings(image, hole, avoid, round(SHADOW_REACH * float(np.sqrt(np.count_nonzero(hole)))) + 4)
     if around is not None:
@@ -143,7 +143,7 @@ class _Surroundings:
 
 
 def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> _Surroundings | None:
-    """Within a margin (px) of a hole; None where there is no hole, or nothing else."""
+    """Within a margin (px) of a hole; None if there is no hole, or nothing else."""
     crop = window_of(hole, margin)
     if crop is None:
         return None
@@ -294,7 +294,7 @@ def _around(centre: int, reach: int, length: int) -> slice:
 
 
 def _best_offset(coarse: Floats32, todo: Mask, barred: Mask, y: int, x: int) -> tuple[int, int] | None:
-    """Rows and columns from a tile to the place that fits its surroundings best, or None where there is no place."""
+    """Rows and columns from a tile to the place that fits its surroundings best, or None if there is no place."""
     reach = TILE // 2 + CONTEXT
     window = _around(y, reach, coarse.shape[0]), _around(x, reach, coarse.shape[1])
     template = coarse[window]

@@ -88,7 +88,7 @@ def is_among(bbox: BBox, others: Iterable[BBox]) -> bool:
 
 
 def dilated(mask: Mask, width: int = 3, times: int = 1) -> Mask:
-    """A mask [H, W] grown by a square of a width (px), so many times."""
+    """A mask [H, W] grown by a square of a width (px), repeatedly."""
     return cv2.dilate(mask.view(np.uint8), np.ones((width, width), np.uint8), iterations=times).view(np.bool_)
 
 
@@ -98,7 +98,7 @@ def eroded(mask: Mask, width: int = 3, beyond: int = 1) -> Mask:
 
 
 def outline_of(mask: Mask) -> Mask:
-    """The pixels [H, W] of a mask that have a pixel outside it beside them."""
+    """The pixels [H, W] of a mask that have a neighbour outside it."""
     return mask & ~eroded(mask)
 
 
@@ -127,14 +127,14 @@ def hull(mask: Mask) -> Mask:
 
 
 def without_holes(mask: Mask) -> Mask:
-    """The mask [H, W] with what it encloses."""
+    """The mask [H, W] with its holes filled."""
     outlines, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return cv2.drawContours(np.zeros(mask.shape, np.uint8), outlines, -1, 1, cv2.FILLED).view(np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
 class CroppedMask:
-    """A mask of an image, of which only the part that is not empty is stored."""
+    """A mask of an image; only the part that is not empty is stored."""
 
     shape: tuple[int, int]  # height and width of the image, px
     rows: slice

@@ -43,7 +43,7 @@ def measure_opening(image: Image, mask: CroppedMask, square: bool = False) -> Se
     if rim is None:
         return SeenOpening(THICKNESS, UNSEEN_SIGMA, 1.0 if square else 0.7, square)
     x0, _, x1, _ = mask.bbox
-    share = min(1.0, 2 * rim[2] / (x1 - x0))  # a handle stands beside the rim
+    share = min(1.0, 2 * rim[2] / (x1 - x0))  # a handle is next to the rim
     inner = _inner_share(image, mask, rim)
     bottom = 1.0 if square else _bottom(mask, rim)
     known, sigma = (THICKNESS, ASSUMED_SIGMA) if inner is None else (inner, MEASURED_SIGMA)

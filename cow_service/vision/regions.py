@@ -339,7 +339,7 @@ def _without_rim(one: _Found, balls: Mask) -> _Found:
 
 
 def _hidden(found: Sequence[_Found]) -> list[bool]:
-    """Of which of them much of the outline lies along one thing of another colour that ends lower in the image."""
+    """Which of them have much of their outline along one thing of another colour that ends lower in the image."""
     things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
     return [
         any(low > own[0] and not colours & own[1] and near[outline].mean() > HIDDEN for low, colours, near in things)
@@ -353,7 +353,7 @@ def _half_width(mask: Mask) -> float:
 
 
 def _blobs(mask: Mask, least: float) -> list[Mask]:
-    """Connected blobs of at least so many pixels."""
+    """Connected blobs of at least a number of pixels."""
     _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     areas = np.bincount(labels.ravel())  # OpenCV's statistics take longer than the components
     return [labels == i for i in (np.nonzero(areas[1:] >= max(least, 12))[0] + 1).tolist()]
@@ -391,7 +391,7 @@ def _with_mouths(view: View, found: Sequence[_Found]) -> list[_Found]:
 
 
 def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
-    """Adds to each part what stands on it; smaller parts that are taken up by this are left out."""
+    """Adds to each part the parts that stand on it; smaller parts absorbed in this way are left out."""
     edges = masks.dilated(view.edges > view.edge_threshold)
     areas = [int(np.count_nonzero(one.mask)) for one in found]
     kept = dict(enumerate(found))

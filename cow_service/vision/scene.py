@@ -177,7 +177,7 @@ class Scene:
 
     @cached_property
     def regions(self) -> tuple[Region, ...]:
-        """Objects of the image, largest first; empty where it is too cluttered to tell."""
+        """Objects of the image, largest first; empty if it is too cluttered to tell."""
         if self.side_view is not None:
             drawn = (drawn_region(self.clean, shape) for shape in self.side_view.shapes)
             return tuple(sorted(drawn, key=lambda region: -region.mask.area))
@@ -193,7 +193,7 @@ class Scene:
         return () if self.side_view else find_faint(self._view, (self.width, self.height), self.regions)
 
     def faint_beside(self, known: Sequence[BBox]) -> tuple[BBox, ...]:
-        """Those of `faint` whose middles lie in none of the boxes of what was located: that is there, if pale."""
+        """Those of `faint` whose middles are outside the boxes of all located objects, which are known even if pale."""
         middles = [((x0 + x1) / 2, (y0 + y1) / 2) for x0, y0, x1, y1 in self.faint]
         inside = [any(a < x < c and b < y < d for a, b, c, d in known) for x, y in middles]
         return tuple(box for box, is_known in zip(self.faint, inside, strict=True) if not is_known)
@@ -218,7 +218,7 @@ class Scene:
         return other
 
     def measured(self) -> Measured:
-        """What was measured so far that depends on nothing but the image: not to be written to."""
+        """The measurements so far that depend only on the image; read-only."""
         alone = OF_THE_IMAGE
         if self.__dict__.get("_all_trails") == ():  # then nothing depends on which end of one is meant
             alone = (*alone, "clean", "regions", "faint")
@@ -323,7 +323,7 @@ class Scene:
         return other
 
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
-        """The objects beside the mover in a box: first what the question names, by that name, then others, by colour.
+        """The objects besides the mover in a box: first those that the question names, then others, named by colour.
 
         Found once for the same arguments. Of known regions their own mask is taken, which is cheaper than another
         silhouette, unless a mask was given.
@@ -404,7 +404,7 @@ def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
 
 MOST_IMAGES = 8
 ImageKey = tuple[str | None, str]
-"""Whose image it is, so that nobody learns by the time it takes what others ask about; and its SHA-256."""
+"""The owner of the image, so that timing does not reveal the images of others; and its SHA-256."""
 MOST_PIXELS = 13_000_000  # of all of them together: each holds some bytes per pixel
 
 
@@ -416,7 +416,7 @@ class SeenImages:
         self._kept: OrderedDict[ImageKey, tuple[int, Measured]] = OrderedDict()
 
     def recall(self, key: ImageKey, scene: Scene) -> None:
-        """Gives a scene what is known of its image."""
+        """Gives a scene the known measurements of its image."""
         with self._lock:
             found = self._kept.get(key)
             if found is None:

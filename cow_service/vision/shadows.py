@@ -105,7 +105,7 @@ class _Floor:
             best[((xs - x) / (cleared * a)) ** 2 + ((ys - y) / (cleared * b)) ** 2 <= 1] = 0
 
     def stands_alone(self, seen: Ellipse) -> bool:
-        """Whether the floor is lighter than the ellipse on each of its four sides, unlike beside an edge of light."""
+        """Whether the floor is lighter than the ellipse on each of its four sides, unlike next to an edge of light."""
         x, y, a, b = seen
         rows = slice(max(0, int(y - RING[1] * b)), int(y + RING[1] * b) + 2)
         columns = slice(max(0, int(x - RING[1] * a)), int(x + RING[1] * a) + 2)
@@ -120,7 +120,7 @@ class _Floor:
         return min(steps) > MIN_EVENNESS * float(np.mean(steps))
 
     def contrast(self, a: float, b: float) -> Floats32:
-        """Per pixel [h, w] how much darker an ellipse there is than the ring about it, as a share; 0 beside objects."""
+        """Per pixel [h, w] how much darker an ellipse there is than the ring about it, as a share; 0 near objects."""
         ry, rx = int(np.ceil(RING[1] * b)), int(np.ceil(RING[1] * a))
         ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]
         radius = np.sqrt((xs / a) ** 2 + (ys / b) ** 2)
@@ -179,7 +179,7 @@ class _Floor:
 
 
 def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
-    """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None where it has none or several patches could be it."""
+    """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None if it has none or several patches could be it."""
 
     def find() -> Shadow | None:
         if scene.region_of(bbox) is None or bbox[2] - bbox[0] < LEAST_WIDTH:

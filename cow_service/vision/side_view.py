@@ -1,4 +1,4 @@
-"""Tells a drawing that is seen from the side: flat shapes on a level ground, before a flat background.
+"""Recognizes a drawing seen from the side: flat shapes on a level ground, before a flat background.
 
 In such a picture there is no depth: the ground is a line, and what is drawn above it is that far above it.
 """
@@ -85,7 +85,7 @@ def _flat_colours(image: Image) -> list[NDArray[np.int16]] | None:
 
 
 def _ground(labels: NDArray[np.int64], background: int) -> tuple[Mask | None, int]:
-    """The ground [H, W] of one colour, and the height in the image of its upper edge; None where there is none."""
+    """The ground [H, W] of one colour, and the height in the image of its upper edge; None if there is none."""
     height, width = labels.shape
     kernel = np.ones((1, round(LINE * width)), np.uint8)
     best, level = None, 0

@@ -22,8 +22,8 @@ THIN = 41  # px: side of the median window; narrower structures stand out from i
 STANDS_OUT = 28  # grey levels from that median, in any channel
 TOLERANCES = (26, 52)  # grey levels around a flat colour: strict first, then with the fringes that JPEG leaves
 FLAT = 14  # grey levels: median distance of a drawing's pixels from its colour
-SHARP = 56  # grey levels between a drawing and what lies beside it
-SHARP_SHARE = 0.85  # of what lies beside it
+SHARP = 56  # grey levels between a drawing and its surroundings
+SHARP_SHARE = 0.85  # of its surroundings
 GAP_SHARE = 0.25  # of the surroundings that have the colour of a patch which is a part of them
 FRINGE = 4  # px around a drawing that compression has mixed with it
 OUTLINE_MOST = 5  # px: maximum width of an outline
@@ -146,7 +146,7 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
 
 
 def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
-    """The hollow drawing of which a stroke may be the rim, and that of which it may be the inside."""
+    """The hollow drawings whose rim, and whose inside, a stroke may be."""
     whole = without_holes(stroke.patch)
     if np.count_nonzero(whole & ~stroke.patch) > LEAST_INSIDE * np.count_nonzero(whole):
         inside = eroded(whole & ~stroke.patch, beyond=0)
@@ -156,8 +156,8 @@ def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
         return
     if eroded(stroke.patch, beyond=0).sum() <= LEAST_INSIDE * stroke.patch.sum():
         return
-    # The rim around a flat patch has a colour of its own, unlike the patch and what lies beyond. Compression may have
-    # broken it: as a stroke of its own it is then not found.
+    # The rim around a flat patch differs in colour from the patch and from its surroundings. Compression may have
+    # broken it: then it is not found as a separate stroke.
     pad = OUTLINE_MOST + FRINGE + 1
     window, patch = stroke.surroundings(image, pad)
     near = image[window].astype(np.int16)

@@ -157,7 +157,7 @@ class _Floor:
         return at + np.stack(offsets, axis=1), (wide * self.width / 2, flat * wide * self.width / 2)
 
     def darkest(self) -> Floats | None:
-        """The row that is darkest against the floor about it; None where none is."""
+        """The row that is darkest against the floor about it; None if none is."""
         (height, width), (x, y) = self.shade.shape, self.places[-1].tolist()
         ys, xs = np.mgrid[:height, :width]
         # Where the middle of the present position's shadow may lie.

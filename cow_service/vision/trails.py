@@ -76,7 +76,7 @@ class Position:
         return self.x - self.radius, self.y - self.radius, self.x + self.radius, self.y + self.radius
 
     def disc(self, shape: tuple[int, int], grown: float = 0.0) -> Mask:
-        """Mask [H, W], its radius larger by so many px."""
+        """Mask [H, W], its radius larger by a number of px."""
         ys, xs = np.ogrid[: shape[0], : shape[1]]
         return np.hypot(xs + 0.5 - self.x, ys + 0.5 - self.y) <= self.radius + grown
 
@@ -187,9 +187,9 @@ class _Search:
         return False
 
     def trail_through(self, a: Circle, b: Circle) -> Trail | None:
-        """The trail through two positions; None where fewer than three lie along a path.
+        """The trail through two positions; None if fewer than three lie along a path.
 
-        Its more opaque end is the last; where they are alike, that of which more is seen.
+        Its more opaque end is the last; if both are alike, the end that is less hidden.
         """
         best: Chain = ()
         reach = 0.5 * math.dist(a.centre, b.centre) + 1.6 * max(a.radius, b.radius)
@@ -218,7 +218,7 @@ class _Search:
         return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
 
     def between(self, edges: Edges, a: Circle, b: Circle, inner: int) -> Chain | None:
-        """Two circles with so many others between them, evenly along an arc that bulges to one side or the other."""
+        """Two circles with others between them, evenly along an arc that bulges to one side or the other."""
         apart = math.dist(a.centre, b.centre)
         gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
         if not LEAST_GAP * mean < gap < MOST_GAP * mean:
@@ -292,7 +292,7 @@ class _Search:
         return self.opacities(chain) is not None
 
     def opacities(self, chain: Chain, compared: bool = True) -> Floats | None:
-        """Opacity [N] of each circle against one that is the most opaque; None where they do not look alike.
+        """Opacity [N] of each circle against one that is the most opaque; None if they do not look alike.
 
         Without `compared` they are known to.
         """
@@ -334,7 +334,7 @@ def sampled(image: Image, of: Circle | Position, u: Floats | Floats32, v: Floats
 
 
 def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float | None:
-    """The share of a model's contrast [N, 3] that is seen [N, 3]; None where what is seen is no share of it.
+    """The share of a model's contrast [N, 3] that is seen [N, 3]; None if what is seen is no share of it.
 
     `plain` [N, 3] are the differences of the colours themselves, which do not depend on the background; `unrest`
     is how much that varies (grey levels), infinite where they are known to be alike.

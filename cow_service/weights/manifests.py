@@ -40,7 +40,7 @@ class Resources:
         return found[name]
 
     def _files(self) -> dict[str, Traversable]:
-        # The wheel's own copy comes first: what lies beside an installed package is site-packages, not ours.
+        # The wheel's own copy comes first: the folder next to an installed package is site-packages, not ours.
         shipped = files("cow_service").joinpath("_shipped")
         root: Traversable = shipped if shipped.is_dir() else Path(__file__).resolve().parents[2]
         folder = root.joinpath(self.folder)
@@ -168,7 +168,7 @@ def load_families() -> dict[str, Family]:
 
 @cache
 def find_manifest(name: str) -> Manifest | None:
-    """One shipped manifest; None where there is none of that name. Only its own file is read."""
+    """One shipped manifest; None for an unknown name. Only its own file is read."""
     return Manifest.model_validate(_parse(MANIFESTS.read(name))) if name in MANIFESTS.names() else None
 
 

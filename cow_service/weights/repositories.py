@@ -45,14 +45,14 @@ _MAX_LISTED = 10
 _LISTING_SECONDS = 30.0  # timeout
 _LOG_IN = "Log in with `hf auth login`, or set HF_TOKEN, for an account that may read it"
 _REACH = "Check the network, the proxy and HF_ENDPOINT, and run it again"
-_AGAIN = "Run it again: files that are whole stay"
+_AGAIN = "Run it again: complete files are kept"
 
 # By the names of exceptions, because those of the HTTP library differ between versions of huggingface_hub. The first
 # that fits is told: the reason, then the remedy.
 REASONS: tuple[tuple[str, str, str], ...] = (
     ("GatedRepoError", "its owner has not granted access", f"Ask for it on the repository's page. {_LOG_IN}"),
     ("RepositoryNotFoundError", "the hub knows no such repository, or it is private", f"Check the name. {_LOG_IN}"),
-    ("RevisionNotFoundError", "it has no revision '{revision}'", "Name one that it has, such as --revision main"),
+    ("RevisionNotFoundError", "it has no revision '{revision}'", "Name an existing one, such as --revision main"),
     ("RemoteEntryNotFoundError", "a file is no longer there", "Choose another revision, such as --revision main"),
     ("DisabledRepoError", "the hub has disabled it", "Choose another revision or another model"),
     ("OfflineModeIsEnabled", "HF_HUB_OFFLINE is set", "Unset it to download"),
@@ -65,7 +65,7 @@ REASONS: tuple[tuple[str, str, str], ...] = (
 
 
 def inside(path: str) -> str:
-    """The path itself, where it names a file of the repository. Raises `ValueError` where it could lead elsewhere.
+    """The path itself, where it names a file of the repository. Raises `ValueError` if it could lead elsewhere.
 
     Refused are absolute paths, `..`, what Windows reads as a drive, and the names that the download keeps for itself.
     """
@@ -143,7 +143,7 @@ def check(source: Source, weights_dir: Path, digests: bool = True) -> tuple[Find
 
 
 def verify(source: Source, weights_dir: Path, name: str) -> Path:
-    """The folder of a source's files. Raises `WeightsUnavailable` where they are not as recorded, with the remedy."""
+    """The folder of a source's files. Raises `WeightsUnavailable` if they are not as recorded, with the remedy."""
     findings = check(source, weights_dir)
     if findings:
         messages = [finding.message for finding in findings[:_MAX_LISTED]]
@@ -188,7 +188,7 @@ def read_lock(weights_dir: Path, repository: str) -> Lock | None:
             return None
         except ValidationError as error:
             raise WeightsUnavailable(
-                f"The record of the weights of '{repository}', {path.parent.name}/{LOCK_NAME}, is spoilt: "
+                f"The record of the weights of '{repository}', {path.parent.name}/{LOCK_NAME}, is damaged: "
                 f"delete it and pull them again."
             ) from error
 
@@ -247,8 +247,8 @@ def disk_errors(repository: str) -> Generator[None]:
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else type(error).__name__
         raise WeightsUnavailable(
-            f"The weights of '{repository}' cannot be read or written ({reason}): make the folder for weights "
-            f"(COW_MODELS_DIR) one that may be."
+            f"The weights of '{repository}' cannot be read or written ({reason}): check the permissions "
+            f"of the folder for weights (COW_MODELS_DIR)."
         ) from error
 
 
@@ -262,7 +262,7 @@ class Download:
 
 
 def resolve(source: Source, weights_dir: Path, revision: str | None = None, *, endpoint: str | None = None) -> Download:
-    """What is missing of a source. The hub is asked only for what is not recorded. Raises `WeightsUnavailable`.
+    """The missing files of a source. The hub is asked only about files without a record. Raises `WeightsUnavailable`.
 
     `revision` is a branch, tag or commit; by default the recorded one, or at first the newest. `endpoint` is the hub's
     address, by default HF_ENDPOINT or the public one.
@@ -301,7 +301,7 @@ def download(
                     held.enter_context(FileLock(kept / "cow.lock").acquire(timeout=0))
                 except Timeout as error:
                     why = "another pull is downloading it"
-                    raise _unavailable(each.lock.repository, why, "Wait for that to end") from error
+                    raise _unavailable(each.lock.repository, why, "Wait until it has ended") from error
                 # What killed downloads have left. Their names are unique to one: the library never resumes them.
                 for left in kept.rglob("*.*.*.incomplete"):
                     left.unlink(missing_ok=True)
@@ -337,7 +337,7 @@ def _download_file(hub: HfApi, lock: Lock, file: LockedFile, weights_dir: Path) 
     for finding in examine(lock, (file,), weights_dir):
         with disk_errors(lock.repository):
             (folder / file.path).unlink(missing_ok=True)
-        why = f"what came is not what the hub lists: {finding.message}"
+        why = f"the download differs from what the hub lists: {finding.message}"
         raise _unavailable(lock.repository, why, "The file was deleted: run it again")
 
 

@@ -164,4 +164,4 @@ def main(descriptor: int) -> None:
     except (EOFError, OSError):
         pass
     tracing.stop()
-    os._exit(0)  # threads may be at work; nobody wants what they do
+    os._exit(0)  # threads may be at work; their results are not wanted

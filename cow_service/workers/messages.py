@@ -1,4 +1,4 @@
-"""What a server and its worker processes say to each other: JSON, so that neither runs what the other one sends.
+"""Messages between a server and its worker processes: JSON, so that neither executes what the other one sends.
 
 A worker decodes images and runs models, and may be taken over by one of them. All that the server takes from it is
 data: of a limited size, and checked.
@@ -24,7 +24,7 @@ MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
 
 @dataclass(frozen=True)
 class Begin:
-    """The first message: the settings of the worker, of which those of concurrency are its own share, as JSON."""
+    """The first message: the settings of the worker as JSON, with its own share of concurrency."""
 
     settings: str
     kind: Literal["begin"] = "begin"
@@ -40,7 +40,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Cancel:
-    """Nobody wants the result any more."""
+    """The result is no longer wanted."""
 
     job_id: str
     kind: Literal["cancel"] = "cancel"
@@ -66,7 +66,7 @@ class End:
 
 @dataclass(frozen=True)
 class Loaded:
-    """The default backends are loaded, or the error, as JSON, for which they are not."""
+    """The default backends are loaded, or the error, as JSON, why they are not."""
 
     error: dict[str, Any] | None
     kind: Literal["loaded"] = "loaded"
@@ -131,7 +131,7 @@ class Succeeded:
 
 @dataclass(frozen=True)
 class Failed:
-    """The job failed with an error, as JSON; `Canceled` where it was canceled."""
+    """The job failed with an error, as JSON; `Canceled` if it was canceled."""
 
     job_id: str
     error: dict[str, Any]
@@ -147,19 +147,19 @@ _FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(
 
 
 def send(connection: Connection, message: ToWorker | FromWorker) -> None:
-    """Sends a message. Only one thread may do so at a time. Raises `OSError` where the other process has ended."""
+    """Sends a message. Only one thread may do so at a time. Raises `OSError` if the other process has ended."""
     connection.send_bytes(to_json(message))
 
 
 def receive_by_worker(connection: Connection) -> ToWorker:
-    """Waits for the next message to a worker. Raises `OSError` or `EOFError` where the server has ended."""
+    """Waits for the next message to a worker. Raises `OSError` or `EOFError` if the server has ended."""
     return _TO_WORKER.validate_json(connection.recv_bytes())
 
 
 def receive_from_worker(connection: Connection) -> FromWorker:
     """Waits for the next message of a worker.
 
-    Raises `OSError` or `EOFError` where it has ended, and for a message that is too long; `ValidationError` for what is
+    Raises `OSError` or `EOFError` if it has ended, and for a message that is too long; `ValidationError` for what is
     no message.
     """
     return _FROM_WORKER.validate_json(connection.recv_bytes(MAX_MESSAGE_BYTES))

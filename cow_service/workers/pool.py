@@ -40,7 +40,7 @@ class Group:
     """The workers for one kind of jobs: the first is started when it is needed, the others when that has loaded."""
 
     def __init__(self, name: str, settings: Settings, metrics: Metrics) -> None:
-        """`settings` are those of the server, of which each worker has its share."""
+        """`settings` are the server's; each worker gets its share of them."""
         waiting, calls = waiting_jobs(settings), settings.mllm_concurrency
         size, cpu, computing, generator = 1, 1, 1, settings.generator
         if name == LIGHT:
@@ -114,7 +114,7 @@ class Group:
             time.sleep(POLL_SECONDS)
 
     def give_back(self, worker: Worker, *, renew: bool) -> None:
-        """The job of a worker is over. One that is to be renewed gets no more jobs, and ends without any."""
+        """The job of a worker has ended. A worker due for renewal gets no more jobs, and ends once it has none."""
         with self._lock:
             self._taken[worker] -= 1
             if (renew or not worker.is_alive) and worker in self.workers:
@@ -164,7 +164,7 @@ class Group:
             return
         pause = min(FIRST_PAUSE_SECONDS * 2**self._failed_starts, LONGEST_PAUSE_SECONDS)
         self._failed_starts, self._next_start = self._failed_starts + 1, time.monotonic() + pause
-        often = "" if self._failed_starts == 1 else f" {self._failed_starts} were started in vain."
+        often = "" if self._failed_starts == 1 else f" {self._failed_starts} starts have failed."
         fault = (
             f"The worker process {worker.name} {worker.end_reason} before it had loaded its backends.{often} Another "
             f"one is started {pause:g} s later; the log says more."
@@ -325,6 +325,6 @@ class WorkerPool(Computer):
             limit = f"{self._settings.load_timeout:g} s, which COW_LOAD_TIMEOUT allows"
             worker.kill("load", f"was ended, as it had not started within {limit},")
         elif worker.is_loaded and now - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:
-            worker.kill("frozen", f"was ended, as it said nothing for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
+            worker.kill("frozen", f"was ended, as it did not respond for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
         elif worker.memory_bytes > self._memory_limit:
-            worker.kill("memory", f"was ended, as it took {worker.memory_bytes / 1e6:.0f} MB", is_final=True)
+            worker.kill("memory", f"was ended, as it used {worker.memory_bytes / 1e6:.0f} MB", is_final=True)

@@ -175,7 +175,7 @@ class Worker:
                 raise self._overdue(begun, canceled)
 
     def _overdue(self, begun: bool, canceled: bool) -> CowError:
-        """The error of a job whose time is over. A process that goes on with it is ended; one that loads goes on."""
+        """The error of a job past its time limit. A process still computing it is ended; one still loading is not."""
         if begun:
             self.kill("timeout", "was ended, as another job of it had to end")
         if canceled:
@@ -210,8 +210,8 @@ class Worker:
         except (EOFError, OSError):
             self._process.kill()  # also where it sent a message that is too long
         except ValidationError:
-            log.exception("the worker %s sent what is no message", self.name)
-            self.kill("crashed", "sent what is no message, and was ended")
+            log.exception("the worker %s sent an invalid message", self.name)
+            self.kill("crashed", "sent an invalid message, and was ended")
         self._ended.set()
         self._loaded.set()
         for inbox in list(self._inboxes.values()):

@@ -61,7 +61,7 @@ def draw_car(random: Random, level: str, want: int) -> Draft:
 
 
 def draw_first(random: Random, level: str, want: int) -> Draft:
-    """Three named objects, of which the mover hits one first; a second one may stand behind it."""
+    """Three named objects; the mover hits one of them first, and another one may be behind it."""
     palette = Palette(random)
     things, heading, speed = pair(random, palette, pick(random, SLIDING), 0)
     start = np.array(things[0].centre[:2])

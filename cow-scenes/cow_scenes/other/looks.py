@@ -105,7 +105,7 @@ def drawn_backdrop(random: np.random.Generator, width: int, height: int) -> Imag
 
 
 def photographed_backdrop(random: np.random.Generator, width: int, height: int, avoid: frozenset[str]) -> Image.Image:
-    """A cutting of a photograph, slightly out of focus; `coffee` shows a cup and is left out beside others."""
+    """A cutting of a photograph, slightly out of focus; `coffee` shows a cup and is left out next to other objects."""
     names = tuple(n for n in PHOTOGRAPHS if not (n == "coffee" and avoid & {"mug", "bowl", "pot"}))
     photograph = Image.fromarray(scan(str(pick(random, names))))
     scale = max(width / photograph.width, height / photograph.height) * random.uniform(1.0, 1.4)

@@ -1,1 +1,1 @@
-"""What stands around the routes: order, ids, origins, logs, limits, authentication."""
+"""The layers around the routes: order, ids, origins, logs, limits, authentication."""

@@ -36,7 +36,7 @@ def hash_of(key: str) -> str:
 
 
 def key_owner(key: str, hashes: Mapping[str, str]) -> str | None:
-    """The name of a key's owner, or None where nobody has it. `hashes` are those of COW_API_KEYS, by name."""
+    """The name of a key's owner, or None for an unknown key. `hashes` are those of COW_API_KEYS, by name."""
     asked = hash_of(key)
     owner = None
     for name, known in hashes.items():  # all of them, so that the time is always the same
@@ -110,7 +110,7 @@ class Callers:
                 # A right key passes in any case: else one bad neighbour behind an address would lock all others out.
                 if self._failures is not None and (wait := self._failures.take(address_of(scope))):
                     return rate_limited("Too many requests without a valid key came from your address.", wait)
-                what = "a key that is none of this server's" if key else "no key"
+                what = "a key that this server does not know" if key else "no key"
                 return Unauthorized(
                     f"The request has {what}. Send the header `Authorization: Bearer <key>` with a key that the "
                     "server's operator gave you.",
@@ -131,7 +131,7 @@ class Callers:
         for unit, buckets in self._limits.items():
             if wait := buckets.take(caller, 1 if unit == "requests" else 0):
                 whose = "this key" if caller.startswith("key ") else "your address"
-                return rate_limited(f"The server takes {buckets.per_minute:g} {unit} a minute with {whose}.", wait)
+                return rate_limited(f"The server allows {buckets.per_minute:g} {unit} per minute with {whose}.", wait)
         return None
 
 
@@ -167,7 +167,7 @@ class Buckets:
         return len(self._levels)
 
     def take(self, caller: str, tokens: float = 1) -> float:
-        """Takes tokens: 0 where there were as many, else the seconds until there are."""
+        """Takes tokens: returns 0, or the seconds until there are enough."""
         missing = tokens - self.charge(caller, 0)
         if missing > 0:
             return missing / self._rate
@@ -219,12 +219,12 @@ class Origins:
             is_own = bool(place) and place == (host.removesuffix(port) if port else host)
             if origin not in self._allowed and "*" not in self._allowed and not is_own:
                 return OriginNotAllowed(
-                    f"A page of '{origin[:200]}' may not use this server. Its operator can list that origin in "
+                    f"Pages from '{origin[:200]}' may not use this server. Its operator can add that origin to "
                     "COW_CORS_ORIGINS."
                 )
         if self._only_local and not self._is_local(host):
             return OriginNotAllowed(
-                f"The server listens on this machine only, without keys, and is not known as '{host[:200]}'. Ask for "
+                f"The server listens only on this machine, without keys, and not under the name '{host[:200]}'. Use "
                 "localhost or 127.0.0.1; its operator can list https://<name> in COW_CORS_ORIGINS, or set COW_API_KEYS."
             )
         return None
@@ -232,7 +232,7 @@ class Origins:
     def _is_local(self, host: str) -> bool:
         name = _PORT.sub("", host).strip("[]")
         if "." not in name or name.endswith(".localhost") or name in self._hosts:
-            return True  # nobody can register a name without a dot
+            return True  # a name without a dot cannot be registered
         try:
             ip_address(name)
         except ValueError:

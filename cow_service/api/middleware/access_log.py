@@ -81,7 +81,7 @@ class AccessLog:
     def _record(self, scope: Scope, status: int, seconds: float) -> None:
         method = scope["method"] if scope["method"] in METHODS else "other"
         route, path = getattr(scope.get("route"), "path", None), _shown(scope)
-        if not isinstance(route, str):  # the one that would have been taken: of those there are only so many
+        if not isinstance(route, str):  # the route that would have matched: there are few of those
             if self._templates is None:
                 self._templates = [(compile_path(template)[0], template) for template in self._paths()]
             fitting = (template for regex, template in self._templates if regex.match(scope["path"]))

@@ -1,4 +1,4 @@
-"""Refuses a body that is too large, as soon as that is known, also without a Content-Length, too slow, or too much."""
+"""Refuses bodies that are too large (even without a Content-Length), too slow, or too many at once."""
 
 import asyncio
 from collections import Counter
@@ -67,9 +67,9 @@ class BodyLimit:
                 raise self._too_large()
             if self._held.total() > most or self._held[owner] > most_own:
                 raise QueueFull(
-                    f"The server holds {self._held.total() / 1e6:.0f} MB of bodies that it has not read yet, of which "
-                    f"{self._held[owner] / 1e6:.0f} MB are of this caller: COW_MAX_BODIES_MB allows "
-                    f"{most / 1e6:.0f} in all and {most_own / 1e6:.0f} for one. Send the request again in a while.",
+                    f"The server holds {self._held.total() / 1e6:.0f} MB of unread request bodies, of which "
+                    f"{self._held[owner] / 1e6:.0f} MB are yours: COW_MAX_BODIES_MB allows "
+                    f"{most / 1e6:.0f} in all and {most_own / 1e6:.0f} for one. Send the request again later.",
                     headers={"Retry-After": "1", "Connection": "close"},
                 )
             return message
@@ -112,5 +112,5 @@ class BodyLimit:
 
 
 def release_body(request: Request) -> None:
-    """Counts the body of a request no longer: it was read, and its bytes are kept no more."""
+    """Stops counting the body of a request, which was read and is no longer kept."""
     request.scope.get("state", {}).get(_RELEASE, lambda: None)()

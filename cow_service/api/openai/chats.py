@@ -1,4 +1,4 @@
-"""A chat as it arrived. It goes on unchanged in meaning; here is what COW needs to know of it."""
+"""A chat as it arrived, and what COW needs to know about it. Its meaning is forwarded unchanged."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -40,7 +40,7 @@ class ImagePart:
 
 @dataclass(frozen=True)
 class Chat:
-    """The body of a chat completion. Nothing of `fields` is validated but what is a field here."""
+    """The body of a chat completion. Only the fields declared here are validated."""
 
     fields: dict[str, Any]
     model: str
@@ -76,7 +76,7 @@ class Chat:
 
 
 def role_of(message: Any) -> str:
-    """The role of a message; empty where it has none."""
+    """The role of a message; empty if it has none."""
     role = cast("dict[str, Any]", message).get("role") if isinstance(message, dict) else None
     return role if isinstance(role, str) else ""
 

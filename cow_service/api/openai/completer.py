@@ -90,7 +90,7 @@ class Completer:
                     created_at = await submitter.submit(submission, wanted)
                     return self._stream(submission, created_at, what_if, reader)
                 result = await submitter.result(request, submission, wanted)
-                assert result is not None, "it waits as long as it takes"
+                assert result is not None, "this request waits without a limit"
                 wanted = await to_thread.run_sync(what_if.take, result, self.service.artifacts)
             enriched = await to_thread.run_sync(what_if.enriched, self.service.artifacts)
         except errors.CowError as error:
@@ -124,7 +124,7 @@ class Completer:
     def _stream(
         self, submission: submitting.Submission, created_at: str | None, what_if: WhatIf, reader: ChatReader
     ) -> stream.Streamed:
-        """Progress while the simulations run, of which the first is submitted; then the reply's own events."""
+        """Progress while the simulations run (the first is submitted); then the reply's own events."""
         stack, running = AsyncExitStack(), (submission, created_at)
 
         async def events() -> Events:
@@ -219,8 +219,8 @@ def preferences_without_key(request: Request) -> submitting.Preferences:
     prefer = submitting.preferences_of(request.headers)
     if prefer.key is not None:
         raise errors.InvalidRequest(
-            "The header `Idempotency-Key` cannot be kept here: a chat with an MLLM is not a stored job, and the same "
-            "key would not bring the same reply. Leave it out; with /simulate and /answer it counts."
+            "The header `Idempotency-Key` has no effect here: a chat with a multimodal LLM is not a stored job. "
+            "Leave it out; it works with /simulate and /answer."
         )
     return submitting.Preferences(fresh=prefer.fresh)
 
@@ -264,7 +264,7 @@ def elect(chat: Chat, replies: Sequence[ChatTurn]) -> tuple[ChatTurn, dict[str, 
 
 
 def answer_in(reply: ChatTurn, options: Sequence[AnswerOption]) -> str | None:
-    """The letter that a reply gives; None where it gives none, or several."""
+    """The letter that a reply gives; None if it gives none, or several."""
     from cow_service.readers.mllm.answer import read_answer  # noqa: PLC0415 # an extra, which the reader has imported
 
     match reply.body:

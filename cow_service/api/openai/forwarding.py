@@ -1,4 +1,4 @@
-"""Sends chats on to the OpenAI-compatible server behind a model, and its replies back: each once, and as it is."""
+"""Forwards chats to the OpenAI-compatible server behind a model, and its replies back, once and unchanged."""
 
 import asyncio
 import json
@@ -117,7 +117,7 @@ def _translated() -> Generator[None]:
 
 
 async def _events(response: httpx.Response) -> Events:
-    """The events of a stream. Raises `MllmUnavailable` where it breaks off before its end."""
+    """The events of a stream. Raises `MllmUnavailable` if it ends early."""
     ended = False
     with _translated():
         async with aclosing(EventSource(response).aiter_sse()) as events:
@@ -137,7 +137,7 @@ def _whole(response: httpx.Response, upstream: Upstream) -> ChatTurn:
         value = json.loads(text)
     if status == HTTPStatus.OK:
         if not isinstance(value, dict):
-            raise MllmBadReply("The server of the multimodal LLM replied with something that is no JSON object.")
+            raise MllmBadReply("The server of the multimodal LLM replied with something other than a JSON object.")
         return ChatTurn(cast("dict[str, Any]", value))
     if status in NOT_THE_CALLERS or status < HTTPStatus.BAD_REQUEST:
         raise MllmUnavailable(

@@ -1,4 +1,4 @@
-"""What a chat with an MLLM has imagined, and the chat with what is shown of that: frames, a placebo, or facts."""
+"""The imagination of a chat with an MLLM, and the chat with frames, a placebo, or facts added."""
 
 import base64
 import math
@@ -31,7 +31,7 @@ OF_ANSWERS = {  # fields of an `AnswerRequest`, and what does the same for a cha
     "imagine": "is said by `model`",
     "options": "the MLLM reads them in the messages",
 }
-NAMED_FRAMES = {"count": 3, "max_side": 512}  # beside the policy of a model's name: as in the paper
+NAMED_FRAMES = {"count": 3, "max_side": 512}  # in addition to the policy in a model's name: as in the paper
 OF_CLIP = (
     "generator",
     "generator_options",
@@ -76,7 +76,7 @@ class WhatIf:
     results: list[Simulation] = field(default_factory=list[Simulation])
 
     def without(self, error: errors.CowError) -> EnrichedChat:
-        """The chat where nothing could be imagined. Raises what the caller is to hear instead."""
+        """The chat if nothing could be imagined. Raises the error for the caller, if there is one."""
         own = {"/image": self.image.url_pointer, "/question": f"/messages/{self.message}/content"}
         located = locate_in_chat(error, own)
         given = {f"/{EXTENSION}/{name}" for name in self.chat.cow}
@@ -89,7 +89,7 @@ class WhatIf:
         )
 
     def take(self, result: str, artifacts: ArtifactStore) -> SimulateRequest | None:
-        """Takes a result (JSON), and returns the request for the simulation that is needed beside it, if any.
+        """Takes a result (JSON), and returns the request for a second simulation that is needed, if any.
 
         Its frames are those of the first one, as many and at the same times. CPU work. Raises `CannotReadDirection`.
         """
@@ -113,7 +113,7 @@ class WhatIf:
         )
 
     def enriched(self, artifacts: ArtifactStore) -> EnrichedChat:
-        """The chat with a note and what is shown behind its question; of two worlds, a named strip of each.
+        """The chat with a note and pictures after its question; for two worlds, a named strip of each.
 
         All images are seen in the `detail` of the caller's own. CPU work. Raises `ArtifactNotFound`.
         """
@@ -196,7 +196,7 @@ def find_what_if(chat: Chat, answerer: Answerer) -> WhatIf | ChatImagination:
 
 
 def check_fields(chat: Chat, answerer: Answerer) -> None:
-    """Raises `InvalidRequest` for what COW itself is told and cannot use, whatever the messages hold."""
+    """Raises `InvalidRequest` for COW's own fields that it cannot use, whatever the messages hold."""
     refused = dict.fromkeys(FIELDS_OF_CHAT, "is said by `messages`; leave it out")
     refused |= {name: f"leave it out: {instead}" for name, instead in OF_ANSWERS.items()}
     if answerer.policy is not None:
@@ -213,7 +213,7 @@ def check_fields(chat: Chat, answerer: Answerer) -> None:
 
 
 def check_votable(chat: Chat, votes: int) -> None:
-    """Raises `InvalidRequest` where the question offers no answers, or each vote would be several, or the same."""
+    """Raises `InvalidRequest` if the question offers no answers, or each vote would be several, or the same."""
     place, question = chat.question()
     if not read_choices(question, None):
         pointer = "/messages" if place < 0 else f"/messages/{place}/content"

@@ -1,4 +1,4 @@
-"""What the `/v1` operations return: OpenAI's records, each with what COW has to say besides as `cow`.
+"""The responses of `/v1`: OpenAI's records, each with COW's own fields as `cow`.
 
 Replies of an MLLM go on as they came: of those, these records say only what COW adds.
 """
@@ -17,7 +17,7 @@ from cow_service.service import Service
 
 
 class ChatModel(Record):
-    """A model: who answers, with imagination or without."""
+    """A model: the answerer, with imagination or without."""
 
     id: str
     object: Literal["model"] = "model"
@@ -94,7 +94,7 @@ class ChatImagination(Record):
     prompts: dict[str, int] = Field(default_factory=dict, description="Version of the note that introduces them.")
     usage: Usage = Field(default=Usage(), description="Of imagining alone; the reply's own is `usage` beside `cow`.")
     usage_total: Usage = Field(default=Usage(), description="What imagining would have cost without reuse.")
-    reused: tuple[str, ...] = Field(default=(), description="Stages of the simulation that were found again.")
+    reused: tuple[str, ...] = Field(default=(), description="Stages of the simulation that were cached.")
     warnings: tuple[str, ...] = ()
 
 
@@ -220,7 +220,7 @@ def find_answerer(service: Service, model: str) -> Answerer:
 
 
 def usable_models(service: Service) -> tuple[str, ...]:
-    """The names of the models of which nothing is known that would keep them from answering."""
+    """The names of the models that can answer, as far as is known."""
     unready = {reader.name for reader in service.models().readers if reader.ready is False}
     return tuple(name for name, one in answerers(service).items() if one.reader not in unready)
 
@@ -238,7 +238,7 @@ def _readers(service: Service) -> dict[str, str]:
 
 
 def _with_suffixes(reader: str, suffixes: Sequence[str]) -> Answerer | None:
-    """The reader as the suffixes have it asked; None where one is unknown, or they contradict each other."""
+    """The reader as the suffixes have it asked; None if one is unknown, or they contradict each other."""
     fields: dict[str, Any] = {}
     for suffix in suffixes:
         field, value = SUFFIXES.get(suffix, ("", None))

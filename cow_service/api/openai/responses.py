@@ -1,4 +1,4 @@
-"""OpenAI's responses: the chat that asks the same, and its reply as a response. What needs state is refused by name."""
+"""OpenAI's responses: converts them to chats and the replies back. Fields that need state are refused by name."""
 
 import time
 import uuid
@@ -145,13 +145,13 @@ def _as_object(value: Any, pointer: str) -> dict[str, Any]:
 
 
 def _array(value: Any, pointer: str) -> list[Any]:
-    """An array of the request, empty where it is left out."""
+    """An array of the request, empty if it is left out."""
     if value is not None and not isinstance(value, list):
         raise wrong(pointer, "is no array")
     return value or []
 
 
-# Of the request, repeated in the response; what it leaves out has the value that stands here.
+# Fields of the request, repeated in the response, with the defaults given here.
 REPEATED: dict[str, Any] = {
     "instructions": None, "max_output_tokens": None, "metadata": {}, "parallel_tool_calls": True, "temperature": None,
     "tool_choice": "auto", "tools": [], "top_p": None, "reasoning": {"effort": None, "summary": None},
@@ -165,7 +165,7 @@ def response_of(completion: dict[str, Any], request: dict[str, Any]) -> dict[str
     """The response for a whole completion; of several choices the first."""
     response = ResponseEvents(request, completion.get("model", ""))
     for chunk in chunks_of(completion, with_usage=True):
-        list(response.add(chunk))  # of the events, only what they add up to is wanted
+        list(response.add(chunk))  # only the sum of the events is wanted
     list(response.end())
     return response.response
 

@@ -82,7 +82,7 @@ router = APIRouter(prefix=OPENAI_ROOT.rstrip("/"), tags=["OpenAI-compatible"])
     openapi_extra={"requestBody": _body_of(ChatRequest), "parameters": [CHAT_WAIT, *PREFERENCES[1:]]},
 )
 async def chat(request: Request, completer: ChatCompleter) -> Response:
-    """The chat goes on to the MLLM as it is, and the MLLM's reply comes back as it is, with `cow` beside it.
+    """Forwards the chat to the MLLM, and returns the MLLM's reply unchanged, with `cow` added.
 
     Where the last user message asks a what-if question about the only image, what would happen is simulated first,
     and the imagined frames are added behind that message. `cow.imagined` says whether. A model without an MLLM,

@@ -147,7 +147,7 @@ class EventsResponse(EventSourceResponse):
 
 
 async def follow_job(submitter: Submitter, submission: Submission, created_at: str | None) -> AsyncGenerator[Job | str]:
-    """The job as it is now, then whenever it has got further, a few times a second; last its result as JSON.
+    """The job now and at each progress, a few times a second; finally its result as JSON.
 
     Raises what the job fails with.
     """
@@ -161,7 +161,7 @@ async def follow_job(submitter: Submitter, submission: Submission, created_at: s
         try:
             while not ending.done():
                 waiter.changed.clear()
-                with suppress(CowError):  # of which the end tells
+                with suppress(CowError):  # reported at the end
                     job = (await to_thread.run_sync(find)).job
                 if job.status not in TERMINAL and progress_of(job) != shown:
                     shown = progress_of(job)

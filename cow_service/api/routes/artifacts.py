@@ -156,7 +156,7 @@ def make_zip(engine: JobEngine, job_id: str, owner: str | None) -> tuple[FilePat
 
 
 def _told(result: Simulation | Answer, simulation: Simulation) -> Told:
-    """What is told of a result. A question beside a motion that was given instead of it would be another one."""
+    """The question to show with a result. If the request gave the motion, the question alone would mislead."""
     motion = simulation.motion
     given = direction_words(motion.direction, motion.depth) if motion.source == "request" else ""
     return Told.of(result, simulation, given)
@@ -168,12 +168,12 @@ SHARED = {"film": film, "card": card}  # with words of the result; other formats
 def make_file(engine: JobEngine, job_id: str, owner: str | None, wanted: str) -> bytes:
     """What a format other than `zip` makes of a job. Blocks, and raises as `make_zip` does."""
     job, result = _find_succeeded(engine, job_id, owner)
-    again = f"Change GET /jobs/{job.id}/request and send it again"
+    again = f"Take GET /jobs/{job.id}/request and send it again"
     simulation = result.simulation if isinstance(result, Answer) else result
     if simulation is None:
         raise DownloadUnavailable(
-            f"Nothing was imagined for the answer {job.id}, so nothing moves: its zip has all there is. {again}, "
-            "with `imagine: always`, or with what `simulation_problem` says is missing."
+            f"The answer {job.id} has no simulation, so nothing moves: its zip has everything. {again}, "
+            "with `imagine: always`, or fix what `simulation_problem` says."
         )
     if wanted == "page":
         return make_page(engine, result, simulation, again)
@@ -187,12 +187,12 @@ def make_file(engine: JobEngine, job_id: str, owner: str | None, wanted: str) ->
 
 
 def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simulation, again: str) -> bytes:
-    """The page of a result's worlds. Raises `DownloadUnavailable` where it has none."""
+    """The page that runs a result's worlds. Raises `DownloadUnavailable` if it has none."""
     live, read = simulation.trajectory.live, engine.service.artifacts.read
     if live is None:
         raise DownloadUnavailable(
-            f"The job has no live worlds. {again}, with `live: true`; what is put somewhere, and what does not move "
-            "along a direction, has none."
+            f"The job has no live simulation. {again}, with `live: true`; objects that are put somewhere, or do not "
+            "move along a direction, have none."
         )
     with engine.service.cpu.held():
         image = decode(read(simulation.image.sha256), max_megapixels=math.inf).pixels
@@ -200,13 +200,13 @@ def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simula
 
 
 def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[Job, Simulation | Answer]:
-    """The job with its result. Raises `JobNotFound`, and `DownloadUnavailable` where it has none."""
+    """The job with its result. Raises `JobNotFound`, and `DownloadUnavailable` if it has none."""
     found = engine.find(job_id, owner)
     if found.result is not None:
         model = Answer if found.job.kind == "answer" else Simulation
         return found.job, model.model_validate_json(found.result)
     if found.job.status in ("queued", "running"):
-        detail = f"is {found.job.status}: ask again when it has succeeded; GET /jobs/{job_id}/events tells"
+        detail = f"is {found.job.status}: ask again when it has succeeded; GET /jobs/{job_id}/events reports that"
     else:
         end = "was canceled" if found.job.status == "canceled" else "failed"
         why = "" if found.error is None else f" ({found.error.code})"
@@ -223,7 +223,7 @@ def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[
     responses={
         200: {"description": "The bytes.", "content": {"*/*": BINARY}},
         206: {"description": "The ranges asked for.", "content": {"*/*": BINARY}},
-        304: {"description": "The caller has them."},
+        304: {"description": "The caller already has them."},
         307: {
             "description": "Where the bytes are: a signed URL of an object store (`COW_ARTIFACTS`), which works "
             "for 15 minutes, needs no key and answers `Range` itself."

@@ -53,7 +53,7 @@ def readyz(engine: Engine, readiness: Annotated[Readiness, from_app("readiness")
 
 @router.get("/models", tags=["models"], summary="Readers and generators")
 def models(engine: Engine) -> Models:
-    """What each is, what it needs, and whether it is ready."""
+    """What each backend is, what it needs, and whether it is ready."""
     return engine.service.models()
 
 
@@ -66,7 +66,7 @@ def models(engine: Engine) -> Models:
 def workers(engine: Engine, owner: Owner) -> Workers:
     """Every process on the job database, what its workers compute, how full the queues are, and jobs that no
     process takes. A second old at most; processes tell of themselves every two seconds. Where the server has keys,
-    only those that administer it (`COW_ADMIN_KEYS`) are told hosts, process ids and ids of jobs.
+    only the keys in `COW_ADMIN_KEYS` see hosts, process ids and ids of jobs.
     """
     return engine.processes.overview.workers(for_admin=engine.service.settings.is_admin(owner))
 

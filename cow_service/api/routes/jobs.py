@@ -1,4 +1,4 @@
-"""`GET /jobs`, `GET /jobs/{id}`, its request and events, cancellation and deletion. A caller sees those of its key."""
+"""`GET /jobs`, `GET /jobs/{id}`, its request and events, cancellation and deletion. Callers see only their own jobs."""
 
 from collections.abc import AsyncGenerator
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from cow_service.jobs.job_table import JobFilters
 from cow_service.jobs.subscriptions import END, follow
 from cow_service.records import TERMINAL, AcceptedRequest, Job, JobPage
 
-JobId = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9-]+$", description="As the job says.")]
+JobId = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9-]+$", description="The `id` of a job.")]
 GONE = (errors.JobNotFound, errors.InvalidRequest, errors.StorageUnavailable)
 PING_SECONDS = 15  # between comments that keep the connection open
 
@@ -63,7 +63,7 @@ def request_of(engine: Engine, owner: Owner, id: JobId) -> AcceptedRequest:
 
 @router.post("/jobs/{id}/cancel", summary="End a job", response_model=Job, responses=documented(*GONE))
 def cancel(engine: Engine, owner: Owner, id: JobId) -> Response:
-    """Whoever works on it stops at the next step. A job that has ended stays as it is."""
+    """The process that computes it stops at the next step. A job that has ended stays as it is."""
     return json_response(engine.cancel(id, owner).as_json())
 
 
@@ -71,7 +71,7 @@ def cancel(engine: Engine, owner: Owner, id: JobId) -> Response:
     "/jobs/{id}", summary="Delete a job and what only it holds", status_code=204, responses=documented(*GONE)
 )
 def delete(engine: Engine, owner: Owner, id: JobId) -> None:
-    """Ends it first where it has not ended. Its artifacts go unless another job holds them."""
+    """Cancels the job first if it has not ended. Its artifacts are removed unless another job uses them."""
     engine.delete(id, owner)
 
 

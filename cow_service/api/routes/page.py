@@ -1,4 +1,4 @@
-"""`GET /`, the page for people, and `GET /docs`, Swagger UI, with their files. They are no part of the contract."""
+"""`GET /`, the page for people, and `GET /docs`, Swagger UI, with their files. They do not belong to the contract."""
 
 import gzip
 import hashlib
@@ -29,7 +29,7 @@ MEDIA_TYPES = {
     ".txt": "text/plain; charset=utf-8",
     ".wasm": "application/wasm",
 }
-ENGINE = "vendor/rapier"  # what moves the world while somebody drags: loaded then
+ENGINE = "vendor/rapier"  # moves the world while you drag; loaded at that moment
 PRELOADS = "<!-- preloads -->"  # in the page: the place for its modules, which it would find one after another
 SIGNED_SECONDS = 60  # of a URL that is signed only to learn where the object store is
 THUMBNAIL_SIDE = 400  # px
@@ -78,13 +78,13 @@ def docs(request: Request) -> Response:
 def docs_file(request: Request, name: str) -> Response:
     """A file of Swagger UI."""
     if name not in docs_files() or name == "index.html":  # not the page: its addresses are relative to /docs
-        raise NotFound("There is no such file here. The page is at /docs.")
+        raise NotFound("There is no such file. The documentation is at /docs.")
     return _send(request, docs_files()[name], DOCS_HEADERS)
 
 
 @dataclass(frozen=True)
 class StaticFile:
-    """One file as it is sent."""
+    """One file, ready to send."""
 
     body: bytes
     media_type: str
@@ -124,7 +124,7 @@ def static_files() -> dict[str, StaticFile]:
 
 @cache
 def docs_files() -> dict[str, StaticFile]:
-    """The page of `/docs` and what it loads, 1.7 MB, by name; read when first asked for."""
+    """The page of `/docs` and what it loads, 1.7 MB, by name; read on first use."""
     found, swagger_ui = _files_in(WEB / "docs"), files("fastapi_offline").joinpath("static")
     for name in ("swagger-ui-bundle.js", "swagger-ui.css"):
         found[name] = StaticFile(swagger_ui.joinpath(name).read_bytes(), MEDIA_TYPES[Path(name).suffix])
@@ -159,7 +159,7 @@ def page_headers(artifacts: ArtifactStore, redirects: bool) -> dict[str, str]:
 
 
 def is_known(request: Request, etag: str) -> bool:
-    """Whether the caller has what is sent under that tag (RFC 9110, section 13.1.2)."""
+    """Whether the caller has the content of that tag (RFC 9110, section 13.1.2)."""
     known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
     return etag.removeprefix("W/") in known or "*" in known
 

@@ -25,9 +25,9 @@ LOOK_FAILURES = (
 ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
         "model": Job,
-        "description": "The job, where `Prefer` says not to wait so long.",
+        "description": "The job, if `Prefer` limits the wait.",
         "headers": {
-            "Location": {"description": "Where the job is.", "schema": {"type": "string"}},
+            "Location": {"description": "Address of the job.", "schema": {"type": "string"}},
             "Retry-After": {"description": "Seconds.", "schema": {"type": "string"}},
             "Preference-Applied": {"schema": {"type": "string"}},
         },
@@ -48,7 +48,7 @@ KEY = _header(
     "The same key and body come to the same job, however often they are sent, but for one that failed with 503: it is "
     "tried again. A response of a job that was there before has the header `Idempotent-Replayed: true`.",
 )
-FRESH = _header("Cache-Control", "`no-cache`: take no results of earlier requests.")
+FRESH = _header("Cache-Control", "`no-cache`: use no cached results of earlier requests.")
 WAIT = "`respond-async`: answer with the job at once; `wait=N`: after N seconds"
 MINIMAL = "`return=minimal`: leave out what `Path` has per frame, but for `points` and `visible`"
 PREFERENCES = [_header("Prefer", f"{WAIT} (RFC 7240)."), KEY, FRESH]

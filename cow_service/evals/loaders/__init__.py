@@ -69,6 +69,6 @@ def _download(name: str) -> Path:
     except (HfHubHTTPError, LocalEntryNotFoundError, OSError, ValueError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise InvalidRequest(
-            f"The data set '{name}' is no folder here, and could not be had from the hub: {reason}. Download it where "
-            "the network reaches the hub, and name the folder."
+            f"The data set '{name}' is not a folder, and could not be downloaded from the hub: {reason}. "
+            "Download it where the network reaches the hub, and name the folder."
         ) from error

@@ -24,7 +24,7 @@ Numbered = tuple[str, Callable[[], dict[str, Any]]]
 
 
 def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
-    """The rows of a file that is shown by this name. Raises `InvalidRequest` where it is none, or is not whole."""
+    """The rows of a file that is shown by this name. Raises `InvalidRequest` if it is none, or is not whole."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
@@ -35,7 +35,7 @@ def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
                 yield f"{name}, row {number}", partial(dict, row)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
-        raise InvalidRequest(f"{name}: no whole Parquet file ({reason}); get it again.") from error
+        raise InvalidRequest(f"{name}: not a complete Parquet file ({reason}); download it again.") from error
 
 
 META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
@@ -70,7 +70,7 @@ def _scene_row(scene: Path) -> Row:
 
 
 def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
-    """What a scene's folder knows of what really happens; None where that is nothing.
+    """What a scene's folder knows of what really happens; None if that is nothing.
 
     `future_12.jpg` shows sample 12; `fps` samples pass in a second. Raises `RowFault` for a track that is none.
     """
@@ -142,7 +142,7 @@ def _require(fields: dict[str, Any], names: Sequence[str]) -> None:
 
 
 def _options(given: Any, fields: dict[str, Any]) -> list[str] | None:
-    """Those of the row: a list, its JSON, or columns A, B, C...; None where the question lists them."""
+    """Those of the row: a list, its JSON, or columns A, B, C...; None if the question lists them."""
     if isinstance(given, str):
         try:
             given = json.loads(given)
@@ -159,7 +159,7 @@ def _options(given: Any, fields: dict[str, Any]) -> list[str] | None:
 
 
 def _image(given: Any, folder: Path) -> bytes:
-    """The bytes of a picture: a file beside the table, base64, a data URL, or the bytes themselves."""
+    """The bytes of a picture: a file in the folder of the table, base64, a data URL, or the bytes themselves."""
     if isinstance(given, dict):  # as the Hugging Face libraries keep pictures
         given = given.get("bytes") or given.get("path")
     if isinstance(given, bytes):
@@ -191,7 +191,7 @@ def _json_object(text: bytes) -> dict[str, Any]:
     try:
         found = json.loads(text)
     except ValueError as error:
-        raise RowFault(f"no whole JSON ({error}); was the file written to its end?") from error
+        raise RowFault(f"not complete JSON ({error}); was the file written to its end?") from error
     if not isinstance(found, dict):
         raise RowFault(f"must be an object, got {type(found).__name__}")
     return found
@@ -244,7 +244,7 @@ def load_causalspatial(folder: Path, subsets: Sequence[str], pictures: Pictures)
     found = collect(_published_rows(folder, subsets, abstaining), pictures, repeated_rows=True)
     ids = Counter((item.id.partition("/")[0], item.source_id) for item in found.items)
     shared = Counter(subset for (subset, _), count in ids.items() for _ in range(count) if count > 1)
-    told = "rows share their id with others; items are told apart by subset, shard and row."
+    told = "rows share their id with others; items are identified by subset, shard and row."
     notes = [f"{subset}: {count} {told}" for subset, count in shared.items()]
 
     # Which rows have no option that abstains, though the column `not_sure` names one; and where that is the truth.

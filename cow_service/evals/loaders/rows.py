@@ -18,7 +18,7 @@ _TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **
 
 
 class RowFault(ValueError):
-    """Why a row cannot be asked; its text says what is wrong with which value."""
+    """Why a row cannot be asked; the message names the value and the fault."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def item_of(place: str, row: Row, pictures: Pictures) -> Item:
 
 
 def task_of(name: str | None) -> Task:
-    """The task that a data set's name means; `other` where it is none of ours."""
+    """The task that a data set's name means; `other` if it is unknown."""
     for word in re.findall(r"[a-z]+", (name or "").lower()):
         if word in _TASKS:
             return _TASKS[word]
@@ -103,7 +103,7 @@ def _answer(given: str, options: Sequence[AnswerOption]) -> str:
     said = option_named(options, given)
     if said is None:
         shown = ", ".join(f"({option.letter}) {option.text}" for option in options)
-        raise RowFault(f"`answer` is none of the options: {given[:60]!r}; they are {shown[:200]}")
+        raise RowFault(f"`answer` is not one of the options: {given[:60]!r}; they are {shown[:200]}")
     return said.letter
 
 

@@ -105,7 +105,7 @@ def _percent_axis(axes: Axes, low: float, high: float) -> None:
 
 
 def draw_gains(findings: Findings) -> Figure | None:
-    """What every arm gains over the image alone; None where no arm has a gain."""
+    """What every arm gains over the image alone; None if no arm has a gain."""
     summaries, styles = findings.arms, arm_styles(findings.arms)
     groups = {"All questions": [(each.name, each.gain) for each in summaries if each.gain is not None]}
     for task in TASKS:
@@ -160,7 +160,7 @@ def draw_gains(findings: Findings) -> Figure | None:
 
 
 def draw_doses(findings: Findings) -> Figure | None:
-    """The gain over the error of the path that is shown; None where frames of no two errors were shown."""
+    """The gain over the error of the path that is shown; None if frames of no two errors were shown."""
     by_run: dict[str, list[Dose]] = {}
     for each in findings.doses:
         by_run.setdefault(each.name.rpartition(", ")[0], []).append(each)
@@ -198,7 +198,7 @@ Groups = dict[str, dict[str, Rates]]
 
 
 def draw_rates(findings: Findings) -> Figure | None:
-    """Right answers of every arm; None where nothing was replied to."""
+    """Right answers of every arm; None if nothing was replied to."""
     summaries = findings.arms
     if not summaries:
         return None
@@ -265,7 +265,7 @@ def _draw_rate_panel(axes: Axes, groups: Groups, styles: dict[str, ArmStyle], sp
 
 
 def draw_calibration(findings: Findings) -> Figure | None:
-    """Told probabilities against what happened; None where none was told."""
+    """Predicted probabilities against what happened; None if there are none."""
     curves: list[tuple[list[str], Calibration]] = []
     for each in findings.arms:  # arms that share their simulations tell the same: one curve, with all of their names
         same = next((names for names, found in curves if found == each.calibration), None)
@@ -281,10 +281,10 @@ def draw_curves(curves: Sequence[tuple[list[str], Calibration]]) -> Figure:
     figure = Figure(figsize=(SQUARE + 0.6, SQUARE + 0.5 + 0.42 * len(curves)), layout="constrained")
     axes = figure.add_subplot()
     (diagonal,) = axes.plot([0, 100], [0, 100], color=DIM, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
-    lines, names = [diagonal], ["as told (perfect calibration)"]
+    lines, names = [diagonal], ["as predicted (perfect calibration)"]
     for place, (arms, found) in enumerate(curves):
         base = sum(each.count * each.happened for each in found.bins) / found.count
-        scores = f"Brier score {found.brier:.3f}; base rate {100 * base:.0f}%, always told: {found.base_brier:.3f}"
+        scores = f"Brier score {found.brier:.3f}; base rate {100 * base:.0f}%, always predicted: {found.base_brier:.3f}"
         colour, marker = COLOURS[place % len(COLOURS)], ROUND_FIRST[place % len(ROUND_FIRST)]
         told = [100 * each.told for each in found.bins]
         happened = [100 * each.happened for each in found.bins]
@@ -298,9 +298,9 @@ def draw_curves(curves: Sequence[tuple[list[str], Calibration]]) -> Figure:
         names.append(f"{short(', '.join(arms), 70)}\n{scores}; n = {found.count}")
     axes.set(xlim=(-6, 108), ylim=(-10, 106), aspect="equal")
     axes.grid()
-    axes.set_xlabel("Probability told by the simulation (%)")
+    axes.set_xlabel("Probability predicted by the simulation (%)")
     axes.set_ylabel("Happened (% of cases)")
-    axes.set_title("Told probability against what happened\n(bins of 10 points; marker area: number of questions)")
+    axes.set_title("Predicted probability against what happened\n(bins of 10 points; marker area: number of questions)")
     figure.legend(lines, names, loc="outside lower left", fontsize=8, handlelength=3)
     return figure
 
@@ -316,7 +316,7 @@ MEASURES: dict[str, tuple[str, Callable[[Cost], float | None]]] = {  # by title:
 
 
 def draw_cost(findings: Findings) -> Figure | None:
-    """Right answers against their cost; None where nothing is known to have cost anything."""
+    """Right answers against their cost; None if nothing is known to have cost anything."""
     shown: dict[str, list[tuple[ArmSummary, float]]] = {}
     for title, (_, sum_of) in MEASURES.items():
         known = [(each, sum_of(each.cost)) for each in findings.arms]

@@ -30,7 +30,7 @@ TITLES = {
     "gains": "Gains over the image alone",
     "doses": "Dose and response",
     "rates": "Right answers by task and level",
-    "calibration": "Calibration of the told probabilities",
+    "calibration": "Calibration of the predicted probabilities",
     "cost": "Right answers against their cost",
 }
 # Fields of an observation that are known from its item and its arm.

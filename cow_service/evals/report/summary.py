@@ -58,16 +58,16 @@ class Primary(Record):
 
 
 class Split(Record):
-    """The gain of simulated frames over the image alone, on the questions of which something is so."""
+    """The gain of simulated frames over the image alone, on a group of questions."""
 
     name: str
-    by: str = Field(description="What the questions are told apart by.")
+    by: str = Field(description="Property by which the questions are grouped.")
     value: str
     gain: Gain
 
 
 class Dose(Record):
-    """The gain of frames whose path is off by so much, over the image alone."""
+    """The gain of frames with a given error of the path, over the image alone."""
 
     name: str
     error: float = Field(description="In units of the simulation's own error.")
@@ -155,7 +155,7 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
 def _contrasts(
     name: str, reference: str, seen: Sequence[Observation], other: Sequence[Observation], explored: bool
 ) -> list[Contrast]:
-    """On all questions; over the image alone also on those of each task, where there are several."""
+    """The gain on all questions; over the image alone also per task, if there are several."""
     pairs: list[tuple[str | None, Sequence[Observation], Sequence[Observation]]] = [(None, seen, other)]
     of_task, there = _by_task(seen), _by_task(other)
     if len(of_task) > 1 and reference == BASELINE:
@@ -179,7 +179,7 @@ def matched(seen: Sequence[Observation], other: Sequence[Observation]) -> tuple[
 
 
 def _primary(place: int, run: EvalRun, *, several: bool) -> Primary | None:
-    """Of a run: the question that its plan states, else that of its arms; None where it has no placebo."""
+    """Of a run: the question that its plan states, else that of its arms; None if it has no placebo."""
     plan, question = run.info.plan, primary(run.info.points)
     arm, placebos = ("", ()) if question is None else (question[0].name, tuple(each.name for each in question[1]))
     if plan is not None:
@@ -202,7 +202,7 @@ def _primary(place: int, run: EvalRun, *, several: bool) -> Primary | None:
 
 
 def _splits(name: str, seen: Sequence[Observation], baseline: Sequence[Observation]) -> list[Split]:
-    """The gain by what is known of each question's simulation, where something is.
+    """The gain by known properties of each question's simulation.
 
     Nothing here may depend on the baseline's replies: groups that are chosen by what is compared differ by themselves.
     """
@@ -257,6 +257,6 @@ def read_prices(path: Path) -> dict[str, Price]:
         raise InvalidRequest(f"The prices '{path}' cannot be read: {error.strerror or error}.") from error
     except (yaml.YAMLError, ValidationError) as error:
         raise InvalidRequest(
-            f"'{path}' holds no prices: it must be like {{openai/gpt-5: {{input: 1.25, output: 10}}}}, per million "
+            f"'{path}' holds no prices: it must look like {{openai/gpt-5: {{input: 1.25, output: 10}}}}, per million "
             f"tokens. {str(error).splitlines()[0]}"
         ) from error

@@ -1,4 +1,4 @@
-"""The tables of a report, with what the paper printed beside them, as Markdown, CSV and LaTeX."""
+"""The tables of a report, with the paper's figures next to ours, as Markdown, CSV and LaTeX."""
 
 import csv
 import io
@@ -37,13 +37,13 @@ PROTOCOL = (
 )
 DATA = (
     "The paper's cells do not all follow from the published data (n = 1030; some of its cells have fewer questions, "
-    "and its abstain rates fit 958): figures stand beside each other and are not tuned to agree.",
+    "and its abstain rates fit 958): figures are shown side by side and are not tuned to agree.",
     "The option that abstains is found by its text, not by the column `not_sure`.",
-    "Items are told apart by subset, shard and row: ids are not unique.",
+    "Items are identified by subset, shard and row: ids are not unique.",
 )
 DIFFERENCES = {"Protocol": PROTOCOL, "Reading replies": READING, "Data": DATA}  # from the paper, by what they are about
 ALL = "all"
-NONE = ""  # a cell of which nothing is known
+NONE = ""  # a cell without a value
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Table:
 
 
 def tables(findings: Findings, *, published: bool = False) -> tuple[Table, ...]:
-    """All tables that have rows; of the published data with the paper's figures beside them."""
+    """All tables that have rows; for the published data with the paper's figures."""
     arms = findings.arms
     found = (
         *(primary(findings), by_level(arms, published), overview(arms), contrasts(findings, published=published)),
@@ -133,7 +133,7 @@ def _gain(gain: Gain) -> tuple[str, ...]:
 
 
 def contrasts(findings: Findings, *, by_task: bool = True, published: bool = False) -> Table:
-    """What each arm gains over those that it is compared with; of the published data also what the paper printed."""
+    """The gain of each arm over those it is compared with; for the published data also the paper's figures."""
     rows = [
         (each.name, each.reference, each.task or ALL, *_gain(each.gain), *_p(each))
         for each in findings.contrasts
@@ -157,14 +157,14 @@ def _p(each: Contrast) -> tuple[str, str]:
 
 
 def splits(findings: Findings) -> Table:
-    """Why simulated frames help or hurt: the gain by what is known of each question's simulation."""
+    """Why simulated frames help or hurt: the gain by known properties of each question's simulation."""
     rows = tuple((each.name, each.by, each.value, *_gain(each.gain)) for each in findings.splits)
-    title = f"Gains over `{BASELINE}` by what is known of the simulation; looked at after the fact, so without p"
-    return Table("why", title, ("arm", "questions told apart by", "value", *_GAIN), rows)
+    title = f"Gains over `{BASELINE}` by properties of the simulation; explored after the fact, so without p"
+    return Table("why", title, ("arm", "questions grouped by", "value", *_GAIN), rows)
 
 
 def doses(findings: Findings) -> Table:
-    """What frames gain that are off by so much."""
+    """The gain of frames by the error of their path."""
     rows = tuple(
         (
             each.name,
@@ -179,11 +179,11 @@ def doses(findings: Findings) -> Table:
 
 
 def calibration(summaries: Sequence[ArmSummary]) -> Table:
-    """How good the probabilities are that the simulations told."""
+    """How good the predicted probabilities of the simulations are."""
     known = [(each.name, found) for each in summaries if (found := each.calibration) is not None]
     rows = tuple((name, str(found.count), f"{found.brier:.3f}", f"{found.base_brier:.3f}") for name, found in known)
     header = ("arm", "questions", "Brier score", "of the base rate")
-    return Table("calibration", "Told probabilities of what is asked", header, rows)
+    return Table("calibration", "Predicted probabilities of the event in question", header, rows)
 
 
 def costs(summaries: Sequence[ArmSummary]) -> Table:

@@ -14,14 +14,14 @@ from cow_service.evals.runs import EvalRun
 
 SUFFIXES = (".svg", ".png")
 PNG_DPI = 150
-PUBLISHED = "causalspatial"  # in the name of the data of which the paper printed figures
+PUBLISHED = "causalspatial"  # in the name of the data whose figures the paper printed
 FORMATS = {"md": tables.markdown, "csv": tables.csv_text, "tex": tables.latex}
 
 
 def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]) -> str:
     """Writes all files of a report into a folder; returns its main tables as text.
 
-    Raises `InvalidRequest` where nothing has been replied to, and `StorageUnavailable`.
+    Raises `InvalidRequest` if nothing has been replied to, and `StorageUnavailable`.
     """
     findings = summarize(runs, prices)
     if not findings.arms:
@@ -80,7 +80,7 @@ def write_plots(folder: Path, findings: Findings) -> tuple[Path, ...]:
     The files are `gains`, `doses`, `rates`, `calibration` and `cost`, each as `.svg` and `.png`. The same findings make
     the same bytes of SVG.
     """
-    # A second of imports, which nobody but the writer of a report should wait for.
+    # A second of imports, needed only to write a report.
     from matplotlib import style  # noqa: PLC0415
 
     from cow_service.evals.report import figures  # noqa: PLC0415

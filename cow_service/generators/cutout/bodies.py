@@ -34,7 +34,7 @@ class Extent:
 
     bbox: BBox  # [x0, y0, x1, y1], px of the image
     airborne: bool  # the image does not say how far away it is
-    depth: float | None = None  # m from the camera, along its axis; None where no camera is known
+    depth: float | None = None  # m from the camera, along its axis; None if no camera is known
     bottom: float = 0.0  # m above the floor
     top: float = 0.0
 
@@ -59,7 +59,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Ground:
-    """The floor and what stands still on it, seen by the camera; image points are px of the clip."""
+    """The floor and the still objects on it, seen by the camera; image points are px of the clip."""
 
     camera: FloorCamera
     factor: float  # clip px per image px
@@ -68,7 +68,7 @@ class Ground:
 
     @staticmethod
     def of(given: GeneratorInput, factor: float) -> Ground | None:
-        """None where the trajectory has no camera."""
+        """None if the trajectory has no camera."""
         trajectory, scene = given.trajectory, given.scene
         if trajectory.camera is None or not trajectory.bodies:
             return None
@@ -89,7 +89,7 @@ class Ground:
         return self.factor * self.camera.project(position[None])[0]
 
     def depth(self, position: Floats) -> float:
-        """Metres along the camera's axis, of what can be projected."""
+        """Metres along the camera's axis, for points that can be projected."""
         return max(float(position[2]), NEAREST * self.camera.height)
 
     def shape_on_floor(self, position: Floats) -> Floats:
@@ -197,7 +197,7 @@ def warping(
 
 
 def clipped(low: Floats, high: Floats, size: tuple[int, int]) -> Window | None:
-    """The window between two corners x, y (px), inside a frame of a size (width, height); None where that is empty."""
+    """The window between two corners x, y (px), inside a frame of a size (width, height); None if that is empty."""
     x0, y0 = (math.floor(min(max(float(v), 0.0), side)) for v, side in zip(low, size, strict=True))
     x1, y1 = (math.ceil(min(max(float(v), 0.0), side)) for v, side in zip(high, size, strict=True))
     return (slice(y0, y1), slice(x0, x1)) if x1 > x0 and y1 > y0 else None

@@ -120,7 +120,7 @@ def _far_to_near(layers: Layers, index: int) -> list[tuple[MovingBody, Sprite]]:
 
 
 def _seen(layers: Layers, body: MovingBody, sprite: Sprite, index: int) -> tuple[Window, Floats32] | None:
-    """A body at a frame, but for what still bodies hide of it; None where nothing is seen."""
+    """A body at a frame, but for what still bodies hide of it; None if nothing is seen."""
     path, extent = body.path, body.extent(index)
     rotation = path.rotation[index] if path.rotation else 0.0
     point = layers.factor * np.array(path.points[index])

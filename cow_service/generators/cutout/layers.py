@@ -1,4 +1,4 @@
-"""Takes a scene apart: the background without what moves and its shadows, sprites, and what stands still."""
+"""Splits a scene: the background without moving objects and their shadows, sprites, and still objects."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class CutoutOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    clean_cues: bool = Field(default=True, description="Take drawn arrows and boxes out of the frames.")
+    clean_cues: bool = Field(default=True, description="Remove drawn arrows and boxes from the frames.")
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def without_bodies(
 
 
 def _hole_of(body: MovingBody, unshaded: UnshadedScene, cues: Mask | None) -> Mask:
-    """What a body leaves behind [h, w]: its mask, its rim, and what was too dark beside it."""
+    """The hole of a removed body [h, w]: its mask, its rim, and parts next to it that were too dark."""
     noisy = unshaded.noisy.get(body.path.body)
     growth = max(2, round(HOLE_GROWTH * float(np.sqrt(np.count_nonzero(body.mask)))))
     hole = _dilated(body.mask, 2 * (growth if noisy is None else growth + SHADED_RIM) + 1)

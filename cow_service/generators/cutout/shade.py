@@ -1,4 +1,4 @@
-"""Measures the shadow that an object casts on the floor beside it: where the floor is darker than further away.
+"""Measures the shadow that an object casts on the floor next to it: where the floor is darker than further away.
 
 A shadow is, per pixel and colour, the share of light that it takes away: dividing by what is left of the light takes it
 out of the image, and multiplying by that puts it back, with the floor's texture kept both times. In a shadow the floor
@@ -24,7 +24,7 @@ FAR = 2.0  # deviations of the floor's texture
 FIRST = 0.03  # of the lightness: the least deviation that the fit begins with
 UNEVEN = 0.07  # of the floor's lightness, in deviations: on a floor as varied as this no shadow can be told
 LEAST_SHADE, MOST_SHADE = 0.035, 0.85  # share of the light that is taken away
-NO_SHADE = 0.008  # share of light that nobody sees
+NO_SHADE = 0.008  # an invisible share of the light
 MOST_GIVEN = 0.1  # share of light that a coloured object may add in its own colour
 SAME_HUE = 0.3  # by which the shares that are left of red, green and blue may differ
 TOUCH = 3.0  # px at the working size: a shadow begins so near to its object
@@ -69,7 +69,7 @@ class Shade:
 
 
 def contact_shade(image: Image, body: Mask, box: BBox, floor: Mask) -> Shade | None:
-    """The shadow on the floor beneath and beside an object [h, w] that stands there; None where it has none.
+    """The shadow on the floor beneath and next to a standing object [h, w]; None if it has none.
 
     `floor` [h, w] is where there may be floor: no pixel of any object. Beneath the object it is continued from beside.
     """
@@ -80,7 +80,7 @@ def contact_shade(image: Image, body: Mask, box: BBox, floor: Mask) -> Shade | N
 
 
 def cast_shade(image: Image, ellipse: Mask, box: BBox, floor: Mask) -> Shade | None:
-    """The shadow at an ellipse [h, w] on the floor, whose box is given (px); None where the floor is not darker."""
+    """The shadow at an ellipse [h, w] on the floor, whose box is given (px); None if the floor is not darker."""
     width, height = box[2] - box[0], box[3] - box[1]
     around = box[0] - 0.6 * width, box[1] - 0.8 * height, box[2] + 0.6 * width, box[3] + 0.8 * height
     return _measured(image, ellipse, floor | ellipse, around, max(width, height), REACH, reject_open=False)
@@ -148,7 +148,7 @@ def _floor_in_light(smooth: Floats32, known: Mask, around: Mask) -> tuple[Floats
     """A smooth floor [h, w, 3] without its dark parts.
 
     The floor is the surface that is seen `around` [h, w] the object. Beside it the deviation of its texture, as a
-    share; None where there is too little floor, or a varied one.
+    share; None if there is too little floor, or a varied one.
     """
     ys, xs = np.nonzero(known)
     if len(ys) < LEAST_FLOOR or around.sum() < LEAST_FLOOR / 2:

@@ -21,7 +21,7 @@ from cow_service.vision.shadows import find_shadow
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 FADED = 0.6  # of its height: a standing thing that has risen so far has no contact shadow any more
-SKY, SHARPNESS = 1.5, 2.0  # so much of the power of that share is lost: light also comes in from beside
+SKY, SHARPNESS = 1.5, 2.0  # the part of that share that is lost: light also comes in from the side
 MOST_TAKEN = 0.85  # share of light
 EXTENT = 2.5  # radii around the foot, within which a sphere's shade is drawn
 CELLS = 40  # along the longer side: such a shade is smooth, and computed at so few cells

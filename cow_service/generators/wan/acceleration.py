@@ -29,7 +29,7 @@ def check_device(acceleration: Acceleration, device: torch.device) -> None:
     with naming_option(f"device: {device}"):
         machine = detect_capabilities(device)
     if sentences := refusals(acceleration, machine):
-        raise GeneratorUnavailable(f"{' '.join(sentences)} Another profile may do (COW_PROFILE).")
+        raise GeneratorUnavailable(f"{' '.join(sentences)} Another profile may work (COW_PROFILE).")
     if acceleration.attention != AUTO:
         from diffusers.models.attention_dispatch import attention_backend  # noqa: PLC0415
 
@@ -142,7 +142,7 @@ def cached_pass(transformer: Any, branch: str) -> Generator[None]:
 def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2, first: int = 0) -> None:
     """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next.
 
-    `steps`: denoising steps of the coming clip, of which those before `first` are left out. `branches`: passes of each
+    `steps`: denoising steps of the coming clip; those before `first` are skipped. `branches`: passes of each
     step here, which are run in `cached_pass`.
     """
     config = getattr(transformer, "mag_cache", None)
@@ -165,7 +165,7 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2, f
         for name in transformer._context_names:  # else the old one would be held until the next pass
             transformer._context_manager.set_context(name)
         return
-    transformer._reset_stateful_cache()  # removed and added anew, the hooks would be in another order
+    transformer._reset_stateful_cache()  # removing and adding them again would change the order of the hooks
 
 
 def pin(module: nn.Module) -> None:

@@ -50,7 +50,7 @@ class TimedBackend:
     """One backend at one shape."""
 
     name: str
-    seconds: float | None  # median; None where it cannot be used
+    seconds: float | None  # median; None if it cannot be used
     error: float | None  # largest difference from native, as a share of native's largest value
     reason: str | None = None  # why it cannot be used
 
@@ -172,7 +172,7 @@ def fetch_kernels(wanted: Iterable[Acceleration], device: torch.device) -> dict[
 
 
 def _fetched(name: str) -> str | None:
-    """Fetches a backend's kernel where it has one. Returns why it cannot be used; None where it can."""
+    """Fetches a backend's kernel where it has one. Returns why it cannot be used; None if it can."""
     try:
         with attention_backend(name):
             return None

@@ -28,7 +28,7 @@ from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsU
 from cow_service.weights.device import listed
 
 PREFIXES = ("model.diffusion_model.", "diffusion_model.")  # of names in one-file checkpoints
-SCALE = ".scale_weight"  # one number per fp8 weight: what it is multiplied by
+SCALE = ".scale_weight"  # one number per fp8 weight: its scale
 UNUSED = (".scale_input", "scaled_fp8")  # for fp8 arithmetic, and the marker that scales are there
 PICKLES = {".pth", ".pt", ".bin", ".ckpt", ".pkl", ".pickle"}
 FLOAT8 = {"F8_E4M3", "F8_E5M2"}
@@ -122,13 +122,13 @@ def diffusers_config(architecture: Architecture) -> dict[str, Any]:
 
 
 def checkpoint_files(path: Path) -> tuple[Path | None, tuple[Path, ...]]:
-    """The folder of a configuration, if any, and the safetensors files. Raises `CheckpointInvalid` where some lack."""
+    """The folder of a configuration, if any, and the safetensors files. Raises `CheckpointInvalid` if some lack."""
     if path.suffix in PICKLES:
         raise CheckpointInvalid(f"{path.name} is a pickle, which can run code when opened. Use its safetensors form.")
     if path.is_file():
         return None, (path,)
     if not path.is_dir():
-        raise CheckpointInvalid(f"There is no checkpoint '{path.name}'.")
+        raise CheckpointInvalid(f"There is no checkpoint '{path.name}'. Check COW_CHECKPOINTS.")
     folder = path / "transformer" if (path / "transformer").is_dir() else path
     files = tuple(sorted(folder.glob("*.safetensors")))
     if not files:
@@ -174,7 +174,7 @@ def _json(file: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise CheckpointInvalid(f"{file.name} cannot be read: {_reason(error)}.") from error
     if not isinstance(found, dict):
-        raise CheckpointInvalid(f"{file.name} is no JSON object.")
+        raise CheckpointInvalid(f"{file.name} is not a JSON object.")
     return cast("dict[str, Any]", found)
 
 
@@ -232,7 +232,7 @@ def _match_names(entries: dict[str, Entry], wanted: Mapping[str, Tensor]) -> dic
 
 
 def _keep_in_float8(weight: Tensor, scale: Tensor | None, dtype: torch.dtype, *, computes: bool) -> Tensor:
-    """A float8 matrix times one number, or as it is, as a weight of which no value is rounded anew.
+    """A weight made of a float8 matrix, with or without a scale, whose values are not rounded again.
 
     It computes in `dtype`, or `computes` in float8, by rounding what it is multiplied with.
     """
@@ -264,7 +264,7 @@ def diffusers_names(originals: Iterable[str]) -> dict[str, str]:
 
 
 def counted(kinds: Mapping[str, Sequence[str]]) -> str:
-    """For an error: how many names there are of each kind, and the first of them; empty where there are none."""
+    """For an error: how many names there are of each kind, and the first of them; empty if there are none."""
     return "; ".join(f"{len(names)} {kind}: {listed(names)}" for kind, names in kinds.items() if names)
 
 
@@ -352,7 +352,7 @@ def add_lora(transformer: nn.Module, file: Path) -> None:
 
 
 def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], file: str) -> dict[str, _Change]:
-    """The changes by the name of their parameter. Raises `CheckpointInvalid` where the file does not fit."""
+    """The changes by the name of their parameter. Raises `CheckpointInvalid` if the file does not fit."""
     found: dict[str, dict[str, Tensor]] = {}
     unknown: list[str] = []
     for key, tensor in tensors.items():

@@ -1,6 +1,6 @@
 """The generator behind `ati`, `wan-move`, `refine` and their toy-sized twins: one clip of a video model.
 
-What a model is told comes from the world: tracks of all bodies, what happens in words, and, where it refines one, the
+The inputs of a model come from the world: tracks of all bodies, what happens in words, and, where it refines one, the
 compositor's clip. All of it has the model's own frame rate; the frames that are shown are those nearest in time.
 """
 
@@ -121,7 +121,7 @@ class WanGenerator(WanLimits):
         """Of a clip, at the image's aspect ratio, in whole patches. Raises `InvalidRequest` if too narrow."""
         clip_width, clip_height = clip_size(self._max_area, width, height, self._cell)
         if max(clip_width, clip_height) > POSITIONS * PATCH * self._cell:
-            detail = f"{width} x {height} px is too narrow for a video model: crop it"
+            detail = f"{width} x {height} px is too narrow for a video model: crop the image"
             raise InvalidRequest(f"`image`: {detail}.", errors=(FieldError("/image", detail),))
         return clip_width, clip_height
 
@@ -244,7 +244,7 @@ class WanGenerator(WanLimits):
         noise = torch.randn(latent_shape(width, height, length, self._channels, self._cell), generator=random)
         progress(0.0)
         try:
-            # Before the texts: beside their encoder there may be no room for the VAE.
+            # Before the texts: with their encoder loaded there may be no room for the VAE.
             latents = None if coarse is None else self.pipeline.encode(coarse.frames)
             progress(0.0)
             clean, (prompt, negative) = cast(WanOptions, given.options).clean_cues, texts
@@ -262,7 +262,7 @@ class WanGenerator(WanLimits):
                 coarse=latents,
                 moving=None if coarse is None else latent_mask(coarse.moving, noise.shape),
             )
-            if self.profile.acceleration.offload == "model":  # else the last encoder stays beside the transformer
+            if self.profile.acceleration.offload == "model":  # else the last encoder stays with the transformer
                 self.pipeline.maybe_free_model_hooks()
             progress(0.0)
             latents = self.denoise(
@@ -275,7 +275,7 @@ class WanGenerator(WanLimits):
             self.pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure
 
     def _chosen(self, options: WanOptions, given: GeneratorInput) -> tuple[Sampling, str, str | None]:
-        """Sampling, prompt and negative prompt, None where no step is guided: the request's, else the model's."""
+        """Sampling, prompt and negative prompt, None if no step is guided: the request's, else the model's."""
         update = options.model_dump(include={"steps", "shift", "guidance_scale", *_STRENGTHS}, exclude_none=True)
         sampling = self.profile.sampling.model_copy(update=update)
         prompt = options.prompt

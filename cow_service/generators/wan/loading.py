@@ -43,7 +43,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning | None, s
     One without sources is built with random weights, at the sizes that it gives. Raises `WeightsUnavailable`,
     `CheckpointInvalid`, `GeneratorOutOfMemory`, or `GeneratorUnavailable` for what this machine cannot do.
     """
-    # Compiled code is kept for the next start. First of all: PyTorch sets a folder of its own when it is first used.
+    # Keeps compiled code for the next start. This comes first, as PyTorch sets its own folder at first use.
     os.environ.setdefault(CODE_FOLDER, str(settings.data_dir / "compiled"))
     manifest = load_manifests()[name]
     profile = profile_of(manifest, settings.profile)

@@ -61,7 +61,7 @@ def need_of(profile: Profile, parameters: Mapping[str, int], blocks: int) -> Nee
 def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], device: torch.device) -> None:
     """Raises `GeneratorUnavailable` for what the profile of that name needs and is not here, naming those that can run.
 
-    Whether weights fit is told by the headers of the files in `folders` (`transformer` and `base`), once all are here.
+    Whether weights fit is read from the headers in `folders` (`transformer` and `base`), once all are here.
     """
     with naming_option(f"device: {device}"):
         machine = detect_capabilities(device)
@@ -72,7 +72,7 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
             return " ".join(sentences)
         if profile.acceleration.keeps_float8 and not has_float8:
             fp8 = profile.acceleration.fp8
-            return f"fp8: {fp8} keeps the float8 of a checkpoint: give one that has some (COW_CHECKPOINTS)."
+            return f"fp8: {fp8} needs a checkpoint stored in float8: name one in COW_CHECKPOINTS."
         if not parameters:
             return ""
         need = need_of(profile, parameters, int(manifest.architecture["num_layers"]))
@@ -91,7 +91,7 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
         pull = "" if parameters else f" Its weights are not all here either: run `cow models pull {manifest.name}`."
         raise GeneratorUnavailable(
             f"'{manifest.name}', profile '{name}': {problem} This machine {remedy}.{pull}",
-            remedy="Or give `generator: cutout`, which needs no GPU and no weights.",
+            remedy="Or use `generator: cutout`, which needs no GPU and no weights.",
         )
 
 
@@ -147,7 +147,7 @@ def within_memory(device: torch.device, clear_caches: Callable[[], None], what: 
             reason = (str(error).splitlines() or [""])[0][:200]
             raise DeviceFailed(
                 f"{what} was not finished: the GPU failed ({reason}). A worker process is replaced, and the job tried "
-                "again; without workers (COW_WORKERS=false) restart the server. If it fails again and again, look at "
+                "again; without workers (COW_WORKERS=false) restart the server. If it fails repeatedly, look at "
                 "`nvidia-smi` and at the Xid messages of the system's log: the GPU may need a reset."
             ) from error
         # The frames of the failed call hold its tensors, and live as long as the traceback does.

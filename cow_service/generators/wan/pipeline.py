@@ -51,7 +51,7 @@ class Conditioning:
     """
 
     prompt: Tensor  # [1, 512, C] text embeddings
-    negative_prompt: Tensor | None  # [1, 512, C]; None where no step is guided
+    negative_prompt: Tensor | None  # [1, 512, C]; None if no step is guided
     image: Tensor | None  # [1, tokens, C] of the image encoder
     condition: Tensor  # of the guided pass
     unconditional: Tensor  # of the unconditional pass

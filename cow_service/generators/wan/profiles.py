@@ -198,7 +198,7 @@ class WanOptions(BaseModel):
     object_strength: float | None = Field(default=None, ge=0, le=1, description=OBJECT)
     prompt: str | None = Field(default=None, max_length=4000, description="By default what happens in the clip.")
     negative_prompt: str | None = Field(default=None, max_length=4000, description="By default that of the model.")
-    clean_cues: bool = Field(default=True, description="Take drawn arrows and boxes out of the first frame.")
+    clean_cues: bool = Field(default=True, description="Remove drawn arrows and boxes from the first frame.")
 
 
 class WanLimits:

@@ -77,7 +77,7 @@ def main(descriptor: int) -> None:
     """Works on the pipe of a file descriptor until it ends."""
     leave_decisions_to_the_parent()
     pipe: Connection[FromRank, ToRank] = Connection(descriptor)
-    failed: CowError = unforeseen()  # also where it was told what it cannot do
+    failed: CowError = unforeseen()  # also after a message that it cannot handle
     try:
         work(pipe)
     except CowError as error:

@@ -114,7 +114,7 @@ class RankGroup:
             finally:
                 met.set()
 
-        # In a thread: whoever waits for another rank there does not notice its end, for minutes or for ever.
+        # In a thread, because a rank that waits for another one may not notice its end for minutes, or ever.
         threading.Thread(target=meet, name="cow-ranks-meet", daemon=True).start()
         while not met.wait(POLL_SECONDS):
             self._check()
@@ -129,7 +129,7 @@ class RankGroup:
         return Sharing(transformer, self._wanted, 0, self._device, store)
 
     def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
-        """As `pipeline.denoise`, with all ranks. Raises `DeviceFailed` where one of them was lost."""
+        """As `pipeline.denoise`, with all ranks. Raises `DeviceFailed` if one of them was lost."""
         self._check()
         sharing, stopped = self._sharing, False
         assert sharing is not None
@@ -180,7 +180,7 @@ class RankGroup:
         raise lost if lost is not None and self._sharing is None else _failure(lost)
 
     def _find_lost(self) -> CowError | None:
-        """Why a rank has ended; None where none has, but by `close`."""
+        """Why a rank has ended; None if none has, but by `close`."""
         if not self._is_over and any(rank.has_ended.is_set() for rank in self._ranks):
             errors = [rank.error for rank in self._ranks if rank.error is not None]
             unknown = WorkerEnded("The process of one of the GPUs ended.")
@@ -191,7 +191,7 @@ class RankGroup:
 def _failure(lost: CowError | None) -> DeviceFailed:
     reason = "A clip ended in the middle of a step." if lost is None else lost.detail
     return DeviceFailed(
-        f"The GPUs that share clips do so no more. {reason} A worker process is replaced, with those of its GPUs, and "
+        f"The GPUs can no longer share clips. {reason} A worker process is replaced, with those of its GPUs, and "
         "the job tried again; without workers (COW_WORKERS=false) restart the server."
     )
 
@@ -266,7 +266,7 @@ class Sharing:
             self._transformer.enable_parallelism(config=self._context)
 
     def prepare(self, noise: Tensor) -> None:
-        """Before each clip, of which `noise` [1, C, T, h, w] has the size: any number of tokens can be split."""
+        """Called before each clip. `noise` [1, C, T, h, w] has its size: any number of tokens can be split."""
         self._use_device()
         if self._context is not None:
             tokens = noise[0, 0].numel() // PATCH
@@ -274,7 +274,7 @@ class Sharing:
             self._context.ulysses_anything = tokens % self._wanted.context_parallel != 0
 
     def __call__(self, branch: Branch, compute: Callable[[], Tensor], like: Tensor) -> Tensor:
-        """What a pass comes to, on every rank: computed here, or by the other half."""
+        """The result of a pass, on every rank: computed here, or by the other half."""
         if not self._wanted.guidance_parallel:
             return compute()
         first = 0 if branch == "cond" else self._wanted.context_parallel  # of the ranks that compute it

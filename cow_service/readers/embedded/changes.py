@@ -1,4 +1,4 @@
-"""Finds what a question takes away or puts somewhere. It refuses where that, or where it is put, is not found."""
+"""Finds what a question takes away or puts somewhere. It refuses if the object or its new place is not found."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ from cow_service.vision.scene import Scene
 
 
 def check_changes(question: Question) -> None:
-    """Raises `CannotGround` where the mover is taken away, or something is put into itself."""
+    """Raises `CannotGround` if the mover is taken away, or something is put into itself."""
     asked = read_asked(question)
     about = () if asked is None else [name for name in (asked.subject, asked.target, *asked.among) if name is not None]
     for change in question.interventions:
@@ -72,7 +72,7 @@ def _both(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[Obje
 
 
 def without(regions: Sequence[Region], removed: Sequence[BBox]) -> tuple[Region, ...]:
-    """The regions of what is left where the things in some boxes are gone."""
+    """The regions that remain without the objects in some boxes."""
     return tuple(region for region in regions if not is_among(region.bbox, removed))
 
 
@@ -90,7 +90,7 @@ def find_placed(
             continue
         puts, others = f"puts '{change.object.text}'", [*question.others, change.object]
         known, found = [mover], list[LocatedObject]()
-        # The thing itself first, then what it is put to.
+        # The object itself first, then the ones that it is put to.
         for phrase in (change.object, *change.targets):
             if found and _is_plural(phrase) and change.relation == "between":
                 found += _both(without(regions, [found[0].bbox]), phrase, others)

@@ -57,7 +57,7 @@ class VehicleModel:
 
     @staticmethod
     def fitted(camera: FloorCamera, bbox: BBox, yaw: float) -> VehicleModel | None:
-        """The car that is turned so and fills a box [x0, y0, x1, y1] (px) best; None where there is no floor."""
+        """The car that is turned so and fills a box [x0, y0, x1, y1] (px) best; None if there is no floor."""
         x0, y0, x1, y1 = bbox
         points = camera.floor_points(np.array([[(x0 + x1) / 2, y0 + _FOOT * (y1 - y0)]]))
         if np.isnan(points).any():
@@ -128,7 +128,7 @@ LOW_PART = 0.6  # of the height: below it, what is darker than the paint is shad
 HIGH_PART = 0.45  # of the height: above it, what is dark is glass and no tyre
 OTHER_STEP, OTHER_SHARE = 14.0, 0.55  # Lab units from the paint's colour, and of its chroma
 SLIT = 5  # px at the working size
-NEUTRAL = 12.0  # chroma below which paint is told by its lightness alone
+NEUTRAL = 12.0  # chroma below which paint is recognized only by its lightness
 BLACK = 32.0  # lightness below which paint hides the tyres
 TINTED, DARKER = 2.5, 0.55  # Lab units of glass from black paint, and its lightness against white
 
@@ -146,7 +146,7 @@ class _Seen:
 def facing(image: Image, mask: Mask, bbox: BBox) -> Vector | None:
     """The way [x, y] (unit vector, px) that the vehicle under a mask [H, W], in a box of an image, faces.
 
-    None where no way fits clearly better than every other.
+    None if no way fits clearly better than every other.
     """
     seen = _seen(image, mask, bbox)
     if seen is None or np.isin(seen.labels, (DARK, OTHER)).sum() < MIN_PARTS * (seen.labels > 0).sum():
@@ -199,7 +199,7 @@ def _seen(image: Image, mask: Mask, bbox: BBox) -> _Seen | None:
 
 
 def _labels(lab: Floats32, own: Mask, near: BBox) -> Labels:
-    """Labels [h, w] of a window whose pixels have these Lab colours, of what a mask and a box are about."""
+    """Labels [h, w] of a window whose pixels have these Lab colours, for a mask and a box."""
     lightness, chroma = lab[..., 0], np.hypot(lab[..., 1], lab[..., 2])
     inner = eroded(own) if eroded(own).any() else own
     paint, colour = float(np.median(lightness[inner])), np.median(lab[..., 1:][inner], axis=0)

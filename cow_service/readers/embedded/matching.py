@@ -112,8 +112,8 @@ def _size(regions: Sequence[Region]) -> float:
 
 CLEARLY_WORSE = 2.5  # log ratio: what is so much less likely than the best, twelve times, is not meant
 EXACT, NEAR = 6.0, 3.0  # log ratios of the name of a region's colour, and of others that people may use for it
-SURE = CLEARLY_WORSE  # log ratio of an outline: more counts no more, so what could be meant too is a rival
-LEAST = -2.0  # log ratio of an outline: less speaks no more against it
+SURE = CLEARLY_WORSE  # log ratio of an outline: capped, so that other candidates remain rivals
+LEAST = -2.0  # log ratio of an outline: lowest evidence against it
 CUT = 0.5  # share of its log ratio that an outline keeps which the border cuts
 CLEAR = 1.0  # log ratio of an outline from which one of several is called so
 POOR = -1.0  # log ratio of an outline: with less it is not called so, unless by its colour
@@ -121,8 +121,8 @@ UNSEEN = -6.0  # log ratio of a name to which no region is assigned
 SHARED = -3.0  # log ratio of a region with two names of the same kind
 ROUND = 0.76  # roundness from which a region passes for a ball; a cube has about 0.7
 NOT_ROUND = 0.6  # roundness below which nothing passes for a ball, even half hidden
-MAX_OTHERS = 5  # names that are assigned beside one: the work grows fast with their number
-CALLED, NOT_CALLED = 3.0, -2.0  # log ratios where a detector found the noun: of what it calls so, of the rest
+MAX_OTHERS = 5  # names that are assigned together with one: the work grows fast with their number
+CALLED, NOT_CALLED = 3.0, -2.0  # log ratios if a detector found the noun: for its finds, for the rest
 IMPOSSIBLE = -math.inf
 NOWHERE = -1  # place of the region of a name that has none
 
@@ -229,7 +229,7 @@ def _fitting(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[O
 def _foremost(
     regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase], count: int = 1
 ) -> list[Region]:
-    """The so many regions that fit a phrase best, and those not clearly worse than the last of them."""
+    """The given number of regions that fit a phrase best, and those not clearly worse than the last of them."""
     ratios = log_ratios(regions, phrase, others)
     ranked = sorted((ratio for ratio in ratios if ratio > IMPOSSIBLE), reverse=True)
     least = ranked[min(count, len(ranked)) - 1] - CLEARLY_WORSE if ranked else 0.0
@@ -246,7 +246,7 @@ def _foremost(
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase] = ()) -> Region | None:
-    """The one region that fits a phrase; None where none or several do."""
+    """The one region that fits a phrase; None if none or several do."""
     fitting = best_matches(regions, phrase, others)
     return fitting[0] if len(fitting) == 1 else None
 
@@ -254,7 +254,7 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
 def match_several(
     regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase], count: int | None
 ) -> list[Region]:
-    """The so many regions that fit a phrase such as "both mugs", or all; empty where it is not clear which."""
+    """The regions that fit a phrase such as "both mugs", as many as it says, or all; empty if it is not clear which."""
     fitting = _foremost(regions, phrase, others, count or 1)
     is_clear = len(fitting) == count
     if count is None:
@@ -281,7 +281,7 @@ TOP, LEGS = 0.05, 0.8  # of its height: a drawn table is as broad as it is at th
 
 
 def table_among(regions: Sequence[Region]) -> Region | None:
-    """The one region of a drawing seen from the side that has legs; None where none or several have."""
+    """The one region of a drawing seen from the side that has legs; None if none or several have."""
     rows = [(each, *(each.mask.patch[int(at * len(each.mask.patch))] for at in (TOP, LEGS))) for each in regions]
     found = [each for each, top, low in rows if top.mean() > LEGS and np.count_nonzero(np.diff(low, prepend=0) > 0) > 1]
     return found[0] if len(found) == 1 else None

@@ -32,7 +32,7 @@ class Said(TypedDict):
 
 
 def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | None = None) -> Said:
-    """The quantities of one leg; `way`, px, is how far it is to what it moves towards, `bbox` is that of what moves.
+    """The quantities of one leg; `way`, px, is the distance to the goal; `bbox` is the moving object's.
 
     Raises `CannotReadDirection`.
     """
@@ -40,7 +40,7 @@ def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | N
     shares = [each.share for each in words if each.share is not None]
     if shares and way is None:
         raise CannotReadDirection(
-            "The question says that it moves a part of the way, but not to what.",
+            "The question says that it moves part of the way, but not where to.",
             remedy=f"{GIVE_DIRECTION} Or give `motion.distance`.",
         )
     distances += [Quantity(share * (way or 0.0), "px") for share in shares]
@@ -74,7 +74,7 @@ def step_readings(steps: Sequence[StepWords], bbox: BBox) -> tuple[StepReading, 
 
 
 def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
-    """What else is set moving. Raises `CannotReadDirection` where it was not found, or which way is not said."""
+    """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
     readings: list[OtherMotionReading] = []
     for other in others:
         name, motion, kind = other.object.text, other.motion, other.motion.kind or "linear"
@@ -107,8 +107,8 @@ def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
 def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:
     """The scene in which the trail that the question may be about ends where the question says, and a warning.
 
-    Where neither the image nor the words tell the end, it is that from which the path leads on to what is asked about.
-    Raises `CannotGround` where the thing that the words tell the end by was not found.
+    If neither the image nor the words show the end, it is the one whose path leads on to the object in question.
+    Raises `CannotGround` if the thing that the words tell the end by was not found.
     """
     words, phrase = question.motion.trail, question.mover
     if phrase is None or not scene.trails:
@@ -146,9 +146,9 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
 
 
 def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> MotionReading | None:
-    """On from the present position of the trail at the mover; None where there is none.
+    """On from the present position of the trail at the mover; None if there is none.
 
-    Raises `CannotReadDirection` where the words speak of one all the same.
+    Raises `CannotReadDirection` if the words speak of one all the same.
     """
     trail = trail_of(scene.trails, grounding.bbox)
     if trail is not None:

@@ -20,12 +20,12 @@ Range = tuple[float, float]
 
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
-CONTRADICTS = 6.0  # misfit from which a thing is not what it is called; of whole things in their own name up to 5.1
+CONTRADICTS = 6.0  # misfit above which an object is not the named one; whole objects under their own name reach 5.1
 UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
 FITS = 2.0  # misfit below which an outline is well described
 _STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
 CIRCLE = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
-ODD = 0.05  # share of outlines that are nobody's: half hidden, or with a shadow
+ODD = 0.05  # share of outlines that fit no shape: half hidden, or with a shadow
 
 # Rows over which a width is taken, from the upper end, as shares of the height.
 BANDS = ((0.08, 0.2), (0.2, 0.35), (0.35, 0.5), (0.5, 0.8), (0.8, 0.95))
@@ -44,7 +44,7 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "car": ((0.3, 0.9), (0.82, 0.96), (0.2, 0.9), (0.5, 0.97), (0.85, 1.0), (0.75, 1.0), (0.2, 0.97)),
     "box": ((0.4, 1.6), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
 }
-# Share of things of which something reaches out on one side between their ends, or has a hole; of others `NO_HANDLE`.
+# Share of objects with a part that reaches out on one side between their ends, or a hole; for others `NO_HANDLE`.
 HANDLES = {"mug": 0.52, "cone": 0.45, "car": 0.3, "candle": 0.15}
 NO_HANDLE = 0.04
 _REACHES, _BARE = 0.15, 0.08  # of the width: so far out on one side at least, on the other at most
@@ -58,7 +58,7 @@ _ALIKE = {
     "car": "bus truck van taxi lorry train",
 }  # fmt: skip
 _FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALIKE.items() for other in words(said)}
-# Rows that tell a thing for what it is (nearly anything can look like a box or a can), from this log ratio on.
+# From this log ratio on, a row identifies an object (nearly anything can look like a box or a can).
 _TELLING, _CLEARLY = ("ball", "bottle", "bowl", "car", "cone", "mug", "vase"), 1.5
 _PLAIN = ("ball", "box", "cube", "cylinder")
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
@@ -80,7 +80,7 @@ def is_unlike(region: Region, form: str) -> bool:
 
 
 def looks_like(region: Region) -> str | None:
-    """The noun of the one row of `OUTLINES` that an outline clearly is; None where it could be many things."""
+    """The noun of the one row of `OUTLINES` that an outline clearly is; None if it could be many things."""
     if region.is_hidden or is_cut(region, "ball"):
         return None
     ratio, form = max((log_ratio(region, form), form) for form in _TELLING)
@@ -88,7 +88,7 @@ def looks_like(region: Region) -> str | None:
 
 
 def is_other_kind(region: Region, noun: str | None) -> bool:
-    """Whether an outline is that of another kind of thing for certain, as it is not where it is torn or half hidden."""
+    """Whether an outline certainly belongs to another kind of object; not certain if it is torn or half hidden."""
     form = form_of(noun)
     if form is None or is_cut(region, form):
         return False
@@ -112,7 +112,7 @@ def log_ratio(region: Region, form: str) -> float:
 
 
 def _density(measured: Sequence[float], form: str) -> float:
-    """exp(-misfit), over its integral over all outlines; or an outline that is nobody's."""
+    """exp(-misfit), over its integral over all outlines; or an outline that fits no shape."""
     (low, high), *shares = OUTLINES[form]
     sides = [math.log(high / low), *(end - start for start, end in shares)]
     integral = math.prod(side + 2 * step for side, step in zip(sides, _STEPS, strict=True))

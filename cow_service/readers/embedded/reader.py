@@ -1,4 +1,4 @@
-"""The reader that needs no weights: rules for the question, classical vision for the image. It refuses, not guesses."""
+"""The reader that needs no weights: rules for the question, classical vision for the image. It never guesses."""
 
 import math
 from collections.abc import Sequence
@@ -76,7 +76,7 @@ class EmbeddedReader:
         return found if found and kind.count in (None, len(found)) else (words,)
 
     def ground(self, given: ReaderInput) -> base.GroundingReading:
-        """The region that fits the mover's words. Raises `CannotGround` where none or several do."""
+        """The region that fits the mover's words. Raises `CannotGround` if none or several do."""
         question = parse(given.question)
         mover, motion, left = question.mover, question.motion, unread(question)
         parts = (motion.kind, motion.arrow, motion.direction, motion.forward, motion.towards, motion.trail)
@@ -111,7 +111,7 @@ class EmbeddedReader:
             located = (*others.values(), *matching.things_of_kinds(regions, question, bbox, given.known))
             boxes = {other.object: other.bbox for other in located}
             missing = [
-                f"The question names '{each.text}', which was not found, or not for certain, so no encounter is told "
+                f"The question names '{each.text}', which was not found, or not for certain, so no encounter is listed "
                 f"of it by that name. Seen: {describe(scene.regions)}."
                 for each in question.others
                 if each.text not in boxes
@@ -130,7 +130,7 @@ class EmbeddedReader:
             boxes |= {mover.text: bbox}
             things = [(each, boxes[each.text]) for each in (mover, *question.others) if each.text in boxes]
             doubts, doubtful = matching.noun_doubts(scene, things)
-        doubts += [f"The words '{each}' were not understood, so no outcome is told." for each in left.turning]
+        doubts += [f"The words '{each}' were not understood, so no outcome is given." for each in left.turning]
         doubts += [f"The words '{each}' were not understood and changed nothing." for each in left.beside]
         return base.GroundingReading(
             mover.text,
@@ -170,7 +170,7 @@ class EmbeddedReader:
         imagined: base.Imagined | None,
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
-        """What the world tells of the question, the same for every vote; not sure where it does not."""
+        """The world's answer to the question, the same for every vote; not sure if it has none."""
         question = parse(given.question)
         simulation = None if imagined is None else imagined.simulation
         asked, say = read_asked(question) if grounding is None else grounding.asked, phrases_of(given.language)
@@ -182,7 +182,7 @@ class EmbeddedReader:
 
 
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
-_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # what does so keeps touching what it stands on
+_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
 _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
 _SEVERAL = frozenset({"both", "two", "three", "all", "four", "several"})
 
@@ -233,8 +233,8 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
 def _bbox_of(
     regions: Sequence[Region], phrase: ObjectPhrase, mover: BBox, others: Sequence[ObjectPhrase]
 ) -> BBox | None:
-    """The box of the one region, besides the mover, that fits a phrase; what several fit stays unnamed."""
-    # What models outlined is a thing of its own, also where its box is nearly that of the mover before it.
+    """The box of the one region, besides the mover, that fits a phrase; None if several fit."""
+    # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
     beside = [each for each in regions if each.bbox != mover and (each.called or not is_same_object(each.bbox, mover))]
     region = matching.match_one(beside, phrase, others)
     return None if region is None else region.bbox
@@ -283,7 +283,7 @@ def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> Moti
 
 
 def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grounding) -> MotionReading | None:
-    """The motion whose direction the words give; None where they give none."""
+    """The motion whose direction the words give; None if they give none."""
     if words.arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
         along = words.arrow == "along"

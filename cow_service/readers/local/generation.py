@@ -31,7 +31,7 @@ from cow_service.media.images import decode
 # One space after commas and colons, as most JSON in training data has it. Free whitespace would let a model write
 # line breaks up to the limit of tokens.
 _LAYOUT: Any = {"whitespace_flexible": False, "item_separator": ", ", "key_separator": ": "}
-_BY_NAME = ("properties", "$defs", "definitions")  # what they hold is schemas by names that may be anything
+_BY_NAME = ("properties", "$defs", "definitions")  # they hold schemas under arbitrary names
 _AS_IT_IS = ("allOf", "enum", "const", "default", "examples")  # parts of one object, and values
 # With the one, the chat templates of models that think open a reply; the other is the token that ends the thought.
 _THOUGHT_START, _THOUGHT_END = "<think>", "</think>"
@@ -124,7 +124,7 @@ class PendingGeneration:
     images: list[Image.Image]
     sampling: TokenSampling
     limit: int  # the most tokens that the reply may have
-    grammar: str | None = None  # what it is held to
+    grammar: str | None = None  # the schema that it is held to
     future: Future[ai.ModelResponse] = field(default_factory=Future[ai.ModelResponse])
 
 
@@ -151,7 +151,7 @@ class BatchRow:
         return self._is_finished or self.pending.future.done()
 
     def choose(self, logits: Tensor) -> Tensor:
-        """The id, [], of a token with which the reply can go on, from logits, [vocabulary]."""
+        """The id, [], of a valid next token of the reply, from logits, [vocabulary]."""
         if self.matcher is not None and self.thought_end is not None:
             logits = logits.index_fill(0, torch.tensor(list(self.ends), device=logits.device), -torch.inf)  # too early
         elif self.matcher is not None:
@@ -179,7 +179,7 @@ class BatchRow:
     def take(self, token: int) -> None:
         """Adds the chosen token, and ends the reply where that completes it or reaches its limit.
 
-        Raises `RuntimeError` where the grammar does not go on, which its mask makes impossible.
+        Raises `RuntimeError` if the grammar does not go on, which its mask makes impossible.
         """
         if token in self.ends:
             self._end("stop")
@@ -191,7 +191,7 @@ class BatchRow:
         else:
             self.tokens.append(token)
             if self.matcher is not None and not self.matcher.consume_token(token):
-                raise RuntimeError(f"The grammar of a reply broke down: {self.matcher.get_error()}")
+                raise RuntimeError(f"The grammar of a reply failed: {self.matcher.get_error()}")
         if self.matcher is not None and self.matcher.is_stopped():
             self._end("stop")
         elif len(self.thought) + len(self.tokens) >= self.pending.limit:
@@ -279,7 +279,7 @@ class BatchGenerator:
         except ValueError as error:
             if not any(images):
                 raise
-            raise ImageUnreadable(f"The multimodal LLM does not take such an image: {error}.") from error
+            raise ImageUnreadable(f"The multimodal LLM cannot use this image: {error}.") from error
         inputs = inputs.to(self._model.device, dtype=self._model.dtype)
         counts: list[int] = inputs["attention_mask"].sum(-1).tolist()
         rows = [self._row(*row) for row in zip(batch, texts, counts, strict=True)]

@@ -105,7 +105,7 @@ PROFILE = ModelProfile(
     supports_tools=False,
     supports_json_schema_output=True,
     default_structured_output_mode="native",
-    # A grammar holds the reply to the schema but tells the model nothing: what it may write stands in its prompt.
+    # A grammar enforces the schema but tells the model nothing, so the prompt describes the schema, too.
     native_output_requires_schema_in_instructions=True,
 )
 
@@ -162,7 +162,7 @@ class LocalModel(Model[None]):
     ) -> ModelResponse:
         """The reply. Its finish reason is `length` where it was cut off, as the caller's limit or the model's wants it.
 
-        Raises `MllmUnavailable` where memory runs out, `ImageUnreadable` and the other errors of `images.decode` for
+        Raises `MllmUnavailable` if memory runs out, `ImageUnreadable` and the other errors of `images.decode` for
         images, and `UserError` for tools, files that are no images, schemas that replies cannot be held to, and
         settings out of range.
         """

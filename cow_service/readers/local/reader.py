@@ -35,7 +35,7 @@ def create(settings: Settings) -> MllmReader:
     manifest = resolve_model(settings).manifest
     family = load_families()[manifest.family or ""]
     configured = ConfiguredModel(model, manifest.name, manifest, family, model.deterministic)
-    # One batch is written, the next one waits; whoever waits longer would only use up COW_MLLM_TIMEOUT.
+    # One batch is written and the next one waits; longer waits would only use up COW_MLLM_TIMEOUT.
     most = min(settings.mllm_concurrency, 2 * LocalOptions.model_validate(manifest.local).max_batch)
     client = MllmClient(configured, settings.model_copy(update={"mllm_concurrency": most}))
     return MllmReader("local", client, weights_identity(manifest, settings))

@@ -1,4 +1,4 @@
-"""Qwen3-VL at toy size: the real classes with seeded random weights and a toy tokenizer, made here from nothing.
+"""Qwen3-VL at toy size: the real classes with seeded random weights and a toy tokenizer, both made here.
 
 It goes the whole way in a fraction of a second on a CPU. What it says means nothing: it is for tests, and to try a
 deployment out.

@@ -39,7 +39,7 @@ def answer_calls(
     votes: int,
     reasoning_length: int,
 ) -> list[PromptCall[AnswerReading]]:
-    """One call per vote. `jpegs` are the image, then the frames; what the simulation found is told in words."""
+    """One call per vote. `jpegs` are the image, then the frames; the prompt describes the simulation in words."""
     inputs: dict[str, object] = {"question": question_without(question, options), "options": tuple(options)}
     return [
         PromptCall(
@@ -64,7 +64,7 @@ def answer_schema(options: Sequence[AnswerOption], reasoning_length: int) -> rep
 
 
 def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
-    """The answer that a reply gives. Raises `ReplyError` where it gives none of the options, or more than one."""
+    """The answer that a reply gives. Raises `ReplyError` if it gives none of the options, or more than one."""
     said = replies.without_thinking(reply)
     parts = (part for value in replies.values_in(said) for part in replies.listed(value))
     objects = [replies.fields_of(part) for part in parts if isinstance(part, dict)]
@@ -80,7 +80,7 @@ def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
 
 
 def _read_fields(fields: dict[str, Any], options: Sequence[AnswerOption]) -> Iterator[AnswerReading]:
-    """A reading of every field that answers; those beside the first must not say otherwise."""
+    """The answer of every field that holds one; later ones must not contradict the first."""
     reasoning = replies.text_of(replies.first_of(fields, *_REASONING_KEYS))[:MAX_REASONING]
     present = [fields[key] for key in _KEYS if key in fields]
     for written in present[:1] + [each for each in present[1:] if not replies.is_none(each)]:

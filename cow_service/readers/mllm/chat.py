@@ -1,7 +1,7 @@
 """A chat of OpenAI's protocol through pydantic-ai, for MLLMs that do not speak it.
 
 What can be sent is; `ChatTurn.warnings` names the fields that were left out. Messages that cannot be sent are refused,
-as leaving them out would change what is asked.
+as leaving them out would change the question.
 """
 
 import base64
@@ -187,7 +187,7 @@ def _list_of(given: dict[str, Any], name: str) -> list[Any]:
 
 
 def _at(value: Any, pointer: str, *names: str) -> Any:
-    """What stands below these names. Raises `InvalidRequest` where one is missing."""
+    """What stands below these names. Raises `InvalidRequest` if one is missing."""
     for name in names:
         if not isinstance(value, dict) or name not in value:
             raise _wrong(pointer, f"`{name}` is missing")

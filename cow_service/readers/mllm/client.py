@@ -37,7 +37,7 @@ from cow_service.readers.prompts import load_prompt
 from cow_service.records import Usage
 from cow_service.settings import Settings
 
-MAX_REASKS = 2  # times that a model is told what was wrong with its reply
+MAX_REASKS = 2  # repeats in which a model hears what was wrong with its reply
 CANCEL_POLL_SECONDS = 0.2
 MAX_SEED = 2**31  # what every provider takes is below
 SYSTEM_PROMPT = "looking"
@@ -60,7 +60,7 @@ class PromptCall(Generic[T]):
     images: tuple[bytes, ...]
     schema: Schema
     parse: Callable[[str], T]
-    vote: int = 0  # each has a seed of its own
+    vote: int = 0  # each has its own seed
     temperature: float | None = None  # by default that of the manifest
 
 
@@ -80,7 +80,7 @@ class _ReplyParser(Generic[T]):
         except ReplyError as error:
             self.fault = str(error)
             raise ModelRetry(f"That cannot be used: {error}.") from error
-        except _PARSER_BUGS as error:  # over something that nobody foresaw; the other votes must not be lost
+        except _PARSER_BUGS as error:  # on an unforeseen reply; the other votes must not be lost
             log.warning("a reply could not be parsed", exc_info=error)
             self.fault = "it could not be read"
             raise ModelRetry("That cannot be read. Reply with the JSON object alone.") from error
@@ -156,7 +156,7 @@ class MllmClient:
         except errors.ModelAPIError as error:
             raise MllmUnavailable(f"{self._name} could not be asked: {reason_of(error)}.") from error
         except TimeoutError as error:
-            detail = f"{self._name} took no more chats for {self._budget:g} s (COW_MLLM_BUDGET)."
+            detail = f"{self._name} accepted no chats for {self._budget:g} s (COW_MLLM_BUDGET)."
             raise MllmUnavailable(detail) from error
         except errors.ContentFilterError as error:
             raise MllmBadReply(f"{self._name} refused to answer: its content filter held the reply back.") from error
@@ -232,12 +232,12 @@ class MllmClient:
             fault += ", and it was cut off: it has no more room than `max_tokens` of the model's manifest"
         excerpt = " ".join(parser.reply.split())[:160]
         return MllmBadReply(
-            f"{self._name} was asked {model.calls} times ({call.prompt}) and gave no reply that can be used. "
+            f"{self._name} was asked {model.calls} times ({call.prompt}) and gave no usable reply. "
             f"Of the last one, '{excerpt}': {fault}."
         )
 
     def _refusal(self, error: errors.ModelAPIError) -> dict[str, Any] | None:
-        """What a caller of `/v1` is told as the model's server said it; None for what is not the caller's to mend."""
+        """The refusal of the model's server, for callers of `/v1`; None if the caller cannot fix it."""
         is_own = isinstance(error, errors.ModelQuotaExceededError)
         if is_own or not isinstance(error, errors.ModelHTTPError) or error.status_code not in _CALLERS_STATUS:
             return None
@@ -252,7 +252,7 @@ class MllmClient:
         return {"status": error.status_code, "message": message, "retry_after": error.retry_after}
 
     def _closed(self) -> MllmUnavailable:
-        return MllmUnavailable(f"{self._name} is asked no more: this server is stopping.")
+        return MllmUnavailable(f"{self._name} is not called any more: this server is stopping.")
 
 
 def seed_of_vote(seed: int, vote: int) -> int:
@@ -416,7 +416,7 @@ def is_busy(error: errors.ModelAPIError) -> bool:
 
 
 def reason_of(error: errors.ModelAPIError) -> str:
-    """What went wrong and what to do about it, in words without addresses, keys or the server's own text."""
+    """What went wrong and what to do about it, without addresses, keys or the server's own text."""
     for kind, words in _REASONS:
         if isinstance(error, kind):
             return words
@@ -434,7 +434,7 @@ class EventLoopThread:
     def __init__(self, model: Model) -> None:
         self._model = model
         self._loop = asyncio.new_event_loop()
-        # A daemon, so that a reader that nobody closed does not keep the process alive.
+        # A daemon, so that a reader that was not closed does not keep the process alive.
         self._thread = Thread(target=self._loop.run_forever, name="mllm", daemon=True)
         self.closed = False
         self._thread.start()

@@ -1,4 +1,4 @@
-"""What a multimodal LLM can be shown beside a question: what was imagined, or a placebo in its place.
+"""What a multimodal LLM can be shown with a question: the imagined frames, or a placebo instead.
 
 A placebo has as many pictures of the same size, and tells nothing of what would happen. What the imagined frames gain
 over it is what imagining brings; what a placebo gains over the image alone is what more pictures bring.
@@ -31,12 +31,12 @@ _ENDS = ("distance", "duration", "until")
 
 
 def still_frame(image: NDArray[np.uint8], max_side: int) -> bytes:
-    """PNG of the image itself (height, width, 3), as large as a frame of at most so many px."""
+    """PNG of the image itself (height, width, 3), scaled like a frame of a maximum size in px."""
     return encode_png(fit_within(image, max_side))
 
 
 def facts_of(simulation: Simulation) -> tuple[str, ...]:
-    """What a simulation found, in the words in which `/answer` tells it to a multimodal LLM."""
+    """The findings of a simulation, in the words that `/answer` sends to a multimodal LLM."""
     told: Any = hypothesis(Imagined(simulation, ()))
     nothing = "The moving object meets nothing." if told["encounters_known"] else "It is not known what it meets."
     return (*told["facts"], *told["encounters"]) or (nothing,)

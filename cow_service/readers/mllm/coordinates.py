@@ -107,7 +107,7 @@ class CoordinateFrame:
         return number(0, int(max(self._full)), kind)
 
     def point(self, written: object) -> Point:
-        """A point in pixels. Raises `ReplyError` where two numbers inside the image are not what was written."""
+        """A point in pixels. Raises `ReplyError` if two numbers inside the image are not what was written."""
         return self._inside(*self._pairs(written, 1, "a point is 2 numbers")[0])
 
     def bbox(self, written: object) -> BBox:
@@ -144,7 +144,7 @@ class CoordinateFrame:
         return min(max(x, 0.0), width) / width * self.width, min(max(y, 0.0), height) / height * self.height
 
     def _pairs(self, written: object, count: int, wanted: str) -> list[tuple[float, float]]:
-        """So many (x, y) pairs in the family's units, also from points in a list or by name. Raises `ReplyError`."""
+        """Pairs (x, y) in the family's units, also from points in a list or by name. Raises `ReplyError`."""
         fields = fields_of(written)
         ends = next(([fields[a], fields[b]] for a, b in _CORNERS if a in fields and b in fields), written)
         if count == 2 and len(listed(ends)) == 2:
@@ -159,7 +159,7 @@ class CoordinateFrame:
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """An image as it is sent: JPEG, and how the model sees it."""
+    """An image ready to send, as JPEG, and its size as the model sees it."""
 
     jpeg: bytes
     coordinate_frame: CoordinateFrame

@@ -208,7 +208,7 @@ Seconds = Annotated[float | None, PlainValidator(seconds_of), WithJsonSchema(wor
 
 
 def support_named(said: str, own: str, others: Sequence[str]) -> str | None:
-    """`floor`, `air`, the name of one of the other objects, or what was said; None where it names nothing but `own`.
+    """`floor`, `air`, the name of one of the other objects, or what was said; None if it names nothing but `own`.
 
     An object comes before the floor: where a table was located, a table top is that table.
     """

@@ -1,4 +1,4 @@
-"""Second prompt: where the object is and what is around it, which way it moves, and what tells so; third: the scale."""
+"""Second prompt: the object's place and surroundings, its direction and the cue for it; third prompt: the scale."""
 
 import itertools
 import math
@@ -73,7 +73,7 @@ class SeenObject(Reply):
 
     @property
     def prior(self) -> ObjectPrior | None:
-        """The estimates with widths; null where there are none."""
+        """The estimates with widths; null if there are none."""
         size, height = self.size, self.height_above
         width = 0.0 if height is None else max(estimates.HEIGHT_DEVIATION * height, estimates.MIN_HEIGHT_DEVIATION)
         prior = ObjectPrior(
@@ -92,7 +92,7 @@ class Surroundings(Reply):
 
 
 class Line(Reply):
-    """Which way the object moves, as far as the reply tells: `direction` in px of the upright image."""
+    """The object's direction of motion in the reply: `direction` in px of the upright image."""
 
     other_names: ClassVar = {"direction": _DIRECTION_KEYS[1:]}
     cue: Annotated[records.Cue | None, WithJsonSchema(replies.one_of(*CUES))]
@@ -189,7 +189,7 @@ def locate_schema(
 def read_located(
     reply: str, frame: CoordinateFrame, wanted: str, others: Sequence[str], wants_box: bool, wants_direction: bool
 ) -> Located | None:
-    """What a reply says of the object `wanted`; None where it says that it does not see it. Raises `ReplyError`.
+    """What a reply says of the object `wanted`; None if it says that it does not see it. Raises `ReplyError`.
 
     `others` are the things that the question names besides.
     """
@@ -239,7 +239,7 @@ def read_located(
 def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
     """The others without those that have the box of the mover or of one before them, and with few obstacles.
 
-    A target that goes is told of in a warning.
+    A warning reports a target that is dropped.
     """
     kept: list[LocatedObject] = []
     warnings: list[str] = []
@@ -254,7 +254,7 @@ def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tupl
 
 
 def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: str) -> WrittenPlace | None:
-    """The place that the reply gives for the object; None where it says that it does not see it."""
+    """The place that the reply gives for the object; None if it says that it does not see it."""
     places = [place for value in values for place in _places(value, frame)] or list(_places_in_prose(said))
     if not places:
         if any(map(replies.is_none, values)):
@@ -278,7 +278,7 @@ def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wan
 
 
 def _places(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[WrittenPlace]:
-    """Places in a value, each with what it is called: by a field of its own, or by the field in which it stands."""
+    """Places in a value with their names, from a separate field or from the field that holds them."""
     if isinstance(value, list):
         parts = replies.listed(value)
         if parts and all(map(replies.is_number, parts)):
@@ -336,7 +336,7 @@ def _named(
 
 
 def _read_line(values: Sequence[object], said: str, context: estimates.ReadingContext) -> Line:
-    """The one line that a reply gives. Raises `ReplyError` where it gives none, several, or one that cannot be."""
+    """The one line that a reply gives. Raises `ReplyError` if it gives none, several, or one that cannot be."""
     written = [fields for value in values for fields in _line_fields(value)]
     if not written and not values and "<" not in said and (corners := _CORNER_PAIRS.search(said)):
         written = [{"direction": list(corners.groups())}]
@@ -417,7 +417,7 @@ class Scale(Reply):
 
     @property
     def metres_per_pixel(self) -> records.MetresPerPixel | None:
-        """Null where nothing was known of any size."""
+        """Null if nothing was known of any size."""
         if self.metres is None or self.ends is None:
             return None
         span = math.dist(*self.ends)

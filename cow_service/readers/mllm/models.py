@@ -25,14 +25,14 @@ OWN_PROTOCOL = ("anthropic", "google", "google-gla")  # these speak their own pr
 
 @dataclass(frozen=True)
 class ConfiguredModel:
-    """A model that can be called, and what is known of it."""
+    """A model that can be called, and what is known about it."""
 
     model: Model
     name: str  # as it is served
     manifest: Manifest
     family: Family
     deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
-    upstream: Upstream | None = None  # the OpenAI-compatible server; None for a protocol of its own
+    upstream: Upstream | None = None  # the OpenAI-compatible server; None for another protocol
 
     @property
     def supports_schema(self) -> bool:
@@ -46,14 +46,14 @@ class ResolvedModel:
     """What COW_MLLM means."""
 
     manifest: Manifest
-    provider: str | None  # null where one runs one's own server
+    provider: str | None  # null if one runs one's own server
     name: str  # as it is served
 
 
 def resolve_model(settings: Settings) -> ResolvedModel:
     """The manifest, provider and served name of the settings. A manifest with a base URL is on one's own server.
 
-    Raises `ReaderUnavailable` where COW_MLLM is not set or names nothing.
+    Raises `ReaderUnavailable` if COW_MLLM is not set or names nothing.
     """
     name, manifests = settings.mllm, mllm_manifests()
     if name is None:
@@ -99,7 +99,7 @@ def configure(settings: Settings) -> ConfiguredModel:
         family = next(matching, families[UNKNOWN])
     key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
 
-    # A server of OpenAI's protocol, whoever made it.
+    # Any server of OpenAI's protocol.
     if base_url is not None and provider not in OWN_PROTOCOL:
         profile = OpenAIModelProfile(
             supports_json_schema_output=family.structured_output == "native",

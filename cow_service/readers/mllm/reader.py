@@ -36,7 +36,7 @@ DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing e
 
 
 class MllmReader:
-    """Asks one model for everything. It keeps its connections, and nothing of what it read."""
+    """Asks one model for everything. It keeps its connections, but no readings."""
 
     source: records.Source = "mllm"
 
@@ -67,7 +67,7 @@ class MllmReader:
     heeds_seed = True
 
     def repeats_answers(self, votes: int) -> bool:
-        """Only of a model that is deterministic at temperature 0, where that is what it is asked with."""
+        """True only for a model that is deterministic at temperature 0, if it is asked with that."""
         temperature = VOTING_TEMPERATURE if votes > 1 else self._model.manifest.defaults.get("temperature")
         return self._model.deterministic and temperature == 0
 
@@ -174,7 +174,7 @@ class MllmReader:
         imagined: base.Imagined | None,
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
-        """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` where all of them fail."""
+        """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` if all of them fail."""
         with given.cpu():
             pixels = (given.scene.image, *(() if imagined is None else pictures(imagined)))
             jpegs = tuple(encode(each, self._model.family).jpeg for each in pixels)
@@ -186,7 +186,7 @@ class MllmReader:
         return readings
 
     def _identify(self, given: ReaderInput) -> tuple[EncodedImage, Identified | None]:
-        """The image as it is sent, and what is asked of it."""
+        """The image as it is sent, and the question about it."""
         with given.cpu():
             image = encode(given.scene.image, self._model.family)
         return image, self._client.complete(identify_call(given.question, image, self._reasoning), given)
@@ -196,7 +196,7 @@ class MllmReader:
     ) -> tuple[Located | None, MotionHints]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
-        None where the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
+        None if the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
         """
         kind = (identified.kind if identified else None) or DEFAULT_KIND
         others: tuple[str, ...] = ()
@@ -254,7 +254,7 @@ class MllmReader:
 
 
 def create(settings: Settings) -> MllmReader:
-    """Factory for the registry. Raises `ReaderUnavailable` where COW_MLLM cannot be used."""
+    """Factory for the registry. Raises `ReaderUnavailable` if COW_MLLM cannot be used."""
     return MllmReader("mllm", MllmClient(configure(settings), settings), settings.mllm_base_url or "")
 
 
@@ -284,7 +284,7 @@ def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading) -> MotionRead
 
 
 def box_warnings(scene: Scene, bbox: BBox, name: str) -> tuple[str, ...]:
-    """What speaks against a box that was given for an object of this name; empty where nothing does."""
+    """What speaks against a box that was given for an object of this name; empty if nothing does."""
     found: list[str] = []
     if covers_image(scene.width, scene.height, bbox):
         found.append("The reader's box covers nearly the whole image: it may not be that of one object.")

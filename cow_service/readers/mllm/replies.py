@@ -1,4 +1,4 @@
-"""What a model wrote, as values: JSON wherever in the text it stands, read into models that declare what a prompt asks.
+"""Reads a model's reply: finds the JSON anywhere in the text, and parses it into the models that a prompt declares.
 
 Models fence their JSON, quote it as Python does, think aloud before it or write prose around it. What is malformed is
 repaired by a library, but only where its brackets close: a reply that was cut short must not become a shorter number.
@@ -15,8 +15,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, mo
 Schema = dict[str, Any]
 
 MAX_LENGTH = 20_000  # characters behind the thinking; a longer reply is not looked through
-MAX_NAME = 120  # characters of an object's name, and of any text without a limit of its own
-MAX_LISTED = 4  # entries of a list without a limit of its own
+MAX_NAME = 120  # characters of an object's name, and of any text without another limit
+MAX_LISTED = 4  # entries of a list without another limit
 COORDINATES = "coordinates"  # key of a schema that stands for so many numbers as the model's family writes them
 _FENCE = re.compile(r"```[\w+-]*[ \t]*\n?(.*?)```", re.DOTALL)
 _THOUGHT = re.compile(r"</(?:think|thinking|thought|reasoning|seed:think)>|◁/think▷|<\|channel\|>final<\|message\|>")
@@ -56,7 +56,7 @@ R = TypeVar("R", bound=Reply)
 
 
 def usable(kind: type[R]) -> BeforeValidator:
-    """Reads a list of objects, or one alone. What is none of that kind is left out."""
+    """Reads a list of objects, or one alone. Other entries are left out."""
 
     def read(written: object) -> tuple[R, ...]:
         found: list[R] = []
@@ -108,7 +108,7 @@ def schema_of(*kinds: type[Reply], reasoning_length: int, numbers: Schema | None
 
 
 def words(longest: int) -> Schema:
-    """The schema of a text of at most so many characters."""
+    """The schema of a text with a maximum length."""
     return {"type": "string", "maxLength": longest}
 
 
@@ -128,7 +128,7 @@ def nullable(schema: Schema) -> Schema:
 
 
 def without_thinking(text: str) -> str:
-    """The reply behind its thinking. Raises `ReplyError` where there is nothing else, or far too much."""
+    """The reply behind its thinking. Raises `ReplyError` if there is nothing else, or far too much."""
     ends = list(_THOUGHT.finditer(text))
     if not ends and _THINKING.search(text):
         raise ReplyError("the reply ended while it was still thinking; think less and give the JSON object")
@@ -167,7 +167,7 @@ def fields_of(value: object) -> dict[str, Any]:
 
 
 def first_of(fields: dict[str, Any], *names: str) -> Any:
-    """The value of the first of some fields that is there; None where none is."""
+    """The value of the first of some fields that is there; None if none is."""
     return next((fields[name] for name in names if name in fields), None)
 
 
@@ -187,13 +187,13 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 
 def truth_of(value: object) -> bool | None:
-    """A field that should hold true or false, also as a word; None where it holds neither."""
+    """A field that should hold true or false, also as a word; None if it holds neither."""
     meanings = {"true": True, "yes": True, "false": False, "no": False}
     return value if isinstance(value, bool) else meanings.get(text_of(value).lower())
 
 
 def text_of(value: object) -> str:
-    """A field that should hold words, as one line; empty where it holds something else."""
+    """A field that should hold words, as one line; empty if it holds something else."""
     return " ".join(value.split()) if isinstance(value, str) else ""
 
 
@@ -220,7 +220,7 @@ def _bracketed(text: str) -> list[Any]:
     values: list[Any] = []
     for span in _spans(text):
         with suppress(ValueError, RecursionError):
-            values.append(repair_json(span, return_objects=True))  # which leaves well-formed JSON as it is
+            values.append(repair_json(span, return_objects=True))  # which does not change well-formed JSON
     return [value for value in values if isinstance(value, dict | list)]
 
 

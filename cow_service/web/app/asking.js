@@ -22,12 +22,12 @@ export const tellAway = (away) => {
   if (get().away !== away) set({ away });
 };
 
-/** What went wrong, as the page shows it; null for what somebody broke off. */
+/** What went wrong, as the page shows it; null for a request that was canceled. */
 export function shownProblem(error) {
   if (error?.name === "AbortError") return null;
   if (error?.code) return error;
   console.error(error);
-  return { code: "page-error", title: "The page made a mistake.", detail: String(error?.message ?? error), errors: [] };
+  return { code: "page-error", title: "The page has an error.", detail: String(error?.message ?? error), errors: [] };
 }
 
 /** Ends what the page waits for, its job too, and begins anew. */
@@ -49,10 +49,10 @@ async function cancelJob(id) {
 
 /** Sends a request and returns its job. The picture is sent where the server does not keep it.
 
-A request that is on its way is not broken off: whoever aborts meanwhile cancels its job. */
+A request that was sent is not aborted: an abort meanwhile cancels its job. */
 async function submit(picture, kind, request, signal) {
   const headers = { Prefer: "respond-async", "Idempotency-Key": newIdempotencyKey() };
-  const wanted = { ...request, live: true }; // that the world moves while somebody drags
+  const wanted = { ...request, live: true }; // so that the world moves while dragging
   const send = () => {
     if (picture.sha256) return postJson(`/${kind}`, { ...wanted, image: { artifact: picture.sha256 } }, headers);
     const { question, ...rest } = wanted;
@@ -92,7 +92,7 @@ function outcomeOf(job) {
   return { answer, simulation, problem: problem && { ...problem, code: codeOf(problem), errors: problem.errors ?? [] } };
 }
 
-/** Reads the place in the queue, of which the events tell nothing. */
+/** Reads the place in the queue, which the events do not report. */
 async function lookAtLine(id, signal) {
   if (get().run?.job.status !== "queued") return;
   const job = await callJson(`/jobs/${id}`, { signal }).catch(() => null); // the events tell what is wrong
@@ -240,7 +240,7 @@ export async function choosePicture(blob, name, question = "", asks = false) {
     }
   } catch {
     const detail = `“${name}” is no picture that the browser can show. Take a PNG, JPEG or WebP.`;
-    if (number === chosen) set({ problem: { code: "not-a-picture", title: "That is no picture.", detail, errors: [] } });
+    if (number === chosen) set({ problem: { code: "not-a-picture", title: "That is not a picture.", detail, errors: [] } });
   }
   if (sent === null || number !== chosen) return URL.revokeObjectURL(url);
   begin();
@@ -276,7 +276,7 @@ async function look(picture) {
   } catch (error) {
     if (waits.signal.aborted) return undefined; // it was removed meanwhile
     if (isShown() && (error.code?.startsWith("image-") || error.code === "body-too-large")) set({ problem: error });
-    // Else there are no suggestions: what is wrong with the server is told when something is asked.
+    // Otherwise there are no suggestions: the error is shown with the next request.
   }
   return undefined;
 }
@@ -286,7 +286,7 @@ export function forgetLook() {
   if (looked === null) return;
   const { id, waits } = looked;
   looked = null;
-  waits.abort(); // first: whoever follows a job that is gone is told of an error
+  waits.abort(); // first: following a deleted job would raise an error
   call(`/jobs/${id}`, { method: "DELETE", keepalive: true }).catch(() => {});
 }
 

@@ -67,7 +67,7 @@ export function waypointFrames({ points, visible }, { width, height }, most = 5)
 /** Whether a point is so far from all others. */
 export const isFree = ([x, y], others, least) => others.every(([ox, oy]) => Math.hypot(x - ox, y - oy) >= least);
 
-/** The points of a path of which one was moved: its neighbours follow, less and less up to the next handles. */
+/** The points of a path after one was moved: its neighbours follow, less and less up to the next handles. */
 export function pulledPath(points, frames, place, [dx, dy]) {
   const frame = frames[place];
   const before = place === 0 ? 0 : frames[place - 1];

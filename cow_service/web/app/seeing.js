@@ -58,7 +58,7 @@ async function thingsOf(what) {
     return isShown() ? lit : null;
   } catch {
     if (!isShown()) return null;
-    set({ blind: true }); // what is wrong is told when something is asked
+    set({ blind: true }); // the error is shown with the next request
     return [];
   }
 }

@@ -19,7 +19,7 @@ export class Problem extends Error {
   }
 }
 
-/** Nobody answered: the network or the server is away. */
+/** No answer: the network or the server is down. */
 export class Unreachable extends Error {
   code = "unreachable";
   title = "The server does not answer.";

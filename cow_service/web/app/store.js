@@ -41,14 +41,14 @@ let state = {
   future: [],
   tool: "select", // or "mover", "object", "direction"
   blind: false, // a look at the picture failed: boxes are drawn
-  lit: null, // {things, others} under the pointer, the first of which is lit: [{bbox, mask, score, name, light}]
+  lit: null, // {things, others} under the pointer; the first one is lit: [{bbox, mask, score, name, light}]
   named: new Map(), // a question: the things that it names
   taken: null, // the thing that was chosen last as what moves
   run: null, // {job, done: [stages], settings} while a job is in the making
   result: null, // {jobId, kind, answer, simulation, settings, asked} of the last job that succeeded
   before: null, // the result before that one, of the same picture
-  compared: [], // what stands beside the result: by another reader or generator, or the one before
-  isForeseeing: false, // somebody drags: the result is that of another world
+  compared: [], // shown next to the result: by another reader or generator, or the previous one
+  isForeseeing: false, // while dragging: the result is from another world
   problem: null,
   away: false,
   keyWanted: null, // {reason, answer}

@@ -13,7 +13,7 @@ export const STAGES = {
   gating: "First answers",
   grounding: "Find the object",
   motion: "Read the motion",
-  trajectory: "Compute the world",
+  trajectory: "Simulate the motion",
   generation: "Make the frames",
   answering: "Look and answer",
 };
@@ -55,7 +55,7 @@ export function encounterWords(encounter, trajectory) {
 export function shareWords({ yes, count, first, isSure }, trajectory) {
   const agreeing = first === undefined ? Math.max(yes, count - yes) : yes;
   const name = first === undefined ? (2 * yes >= count ? "Yes" : "No") : first < 0 ? "Nothing" : trajectory.bodies[first]?.object ?? "It";
-  const says = `${agreeing} of ${plural(count, "world")}`;
+  const says = `${agreeing} of ${plural(count, "simulated version")}`;
   return { agreeing, text: isSure ? `${name}: ${says}` : `Not sure: ${says} say ${name.toLowerCase()}` };
 }
 
@@ -66,11 +66,11 @@ export function when(time) {
   return today ? then.toLocaleTimeString() : then.toLocaleString();
 }
 
-const NAME_IT = "Draw a box around what moves: choose “What moves” above the picture, or name it as the picture shows it.";
+const NAME_IT = "Draw a box around the moving object: choose “What moves” above the picture, or name it as the picture shows it.";
 
 const REMEDIES = {
   "object-not-found": NAME_IT,
-  "cannot-ground": "Draw a box around what moves: choose “What moves” above the picture.",
+  "cannot-ground": "Draw a box around the moving object: choose “What moves” above the picture.",
   "cannot-read-direction": "Draw the direction: choose “Direction” above the picture, and drag from the object to where it goes.",
   "artifact-not-found": "The picture is no longer kept by the server. Choose it again.",
   "job-not-found": "It was deleted, or belongs to another key.",

@@ -1,4 +1,4 @@
-// Runs the worlds of a result again while somebody drags, a little in each frame of the screen.
+// Runs the worlds of a result again while you drag, a little in each frame of the screen.
 
 import { bodiesOf, cameraOf, countOf, meetingsOf, positionsAlong, runWorlds, sharesOf, verdictOf } from "./world.js";
 

@@ -454,7 +454,7 @@ function isMisread(world, run, k) {
   return run.meetings.some(({ a, b, time }) => a === 0 && b !== null && time < world.constants.at_start && b !== mover.support && world.bodies[b].support !== 0);
 }
 
-/** Per body when what is asked happens with it in one world. */
+/** Per body, when the event in question happens with it in one world. */
 function timesOf(world, run, k, { fps, every }) {
   const { asked, constants: c, horizon } = world;
   const step = every / fps;
@@ -491,7 +491,7 @@ function timesOf(world, run, k, { fps, every }) {
   });
 }
 
-const FIRST_MET = ["which-first", "where", "what-happens"]; // forms of questions that are told apart by what is met first
+const FIRST_MET = ["which-first", "where", "what-happens"]; // forms of questions whose answer depends on what is met first
 
 /** What one world says to the question: the body that is met first (-1: none), or 1 for yes, 0 for no, and 0.5 where it was misread; null where it cannot say. */
 export function verdictOf(world, run, k, timing) {
@@ -509,7 +509,7 @@ export function verdictOf(world, run, k, timing) {
 export function sharesOf({ asked, mover, constants: c }, verdicts) {
   if (!verdicts.length || verdicts[0] === null) return null;
   const count = verdicts.length;
-  const sureOfMiss = mover.kind === "projectile" && mover.depth_sigma > 0 ? c.sure_of_miss : c.sure; // nobody tells its heading
+  const sureOfMiss = mover.kind === "projectile" && mover.depth_sigma > 0 ? c.sure_of_miss : c.sure; // its heading is unknown
   if (!FIRST_MET.includes(asked.form)) {
     const yes = verdicts.reduce((sum, value) => sum + value, 0);
     const isHit = asked.negated ? 2 * yes < count : 2 * yes >= count;

@@ -68,7 +68,7 @@ function Objects({ simulation, corrections, found, picture }) {
         <input aria-label=${`Name of object ${place + 1}`} dir="auto" maxlength="200" value=${object.object} onChange=${(event) => event.target.value.trim() && rename(place, event.target.value.trim())} />
         ${removed.includes(object.object) ? html`<small>taken away</small>` : html`<select aria-label=${`What ${object.object} is`} value=${object.role} onChange=${(event) => correct({ objects: changed(place, { role: event.target.value }) })}>
           <option value="target" selected=${object.role === "target"}>asked about</option><option value="obstacle" selected=${object.role === "obstacle"}>in the way</option></select>`}
-        <button class="plain" aria-label=${`Forget ${object.object}`} onClick=${() => correct({
+        <button class="plain" aria-label=${`Remove ${object.object}`} onClick=${() => correct({
           objects: own.filter((_, index) => index !== place),
           interventions: interventions.filter((each) => each.object !== object.object && !each.targets?.includes(object.object)),
         })}>✕</button>
@@ -110,10 +110,10 @@ export function Correct({ state }) {
   const corrected = correctedWords(corrections) !== "";
   if (!simulation && !found.length && !corrected && !problem) return null;
   return html`<details class="correct" open=${!matchMedia("(max-width: 48rem)").matches}>
-    <summary>What was read, to correct</summary>
-    ${corrections.trajectory && html`<p class="hint">The path is yours. <button class="plain" onClick=${() => correct({ trajectory: null })}>Compute it again</button></p>`}
+    <summary>Correct what was read</summary>
+    ${corrections.trajectory && html`<p class="hint">You changed the path. <button class="plain" onClick=${() => correct({ trajectory: null })}>Compute it again</button></p>`}
     ${simulation && html`<fieldset><legend>What moves</legend><div class="row">
-      <input aria-label="Name of what moves" dir="auto" maxlength="200" value=${corrections.grounding?.object ?? simulation.grounding.object} onChange=${(event) => event.target.value.trim()
+      <input aria-label="Name of the moving object" dir="auto" maxlength="200" value=${corrections.grounding?.object ?? simulation.grounding.object} onChange=${(event) => event.target.value.trim()
         && correct(moverWith(simulation, corrections, { object: event.target.value.trim() }))} />
       <button onClick=${() => set({ tool: "mover" })}>Draw its box</button></div></fieldset>`}
     ${(simulation || corrections.grounding || problem) && html`<${Motion} simulation=${simulation} corrections=${corrections} />`}

@@ -19,9 +19,9 @@ function Row({ frames, label, player }) {
 
 export function Filmstrip({ simulation, player }) {
   return html`<div class="strips">
-    <h2>Frames that were looked at</h2>
-    <${Row} frames=${simulation.frames} label="Frames that were looked at" player=${player} />
-    ${simulation.factual_frames.length > 0 && html`<h2>The same moments in the scene as it is</h2>
+    <h2>Frames used for the answer</h2>
+    <${Row} frames=${simulation.frames} label="Frames used for the answer" player=${player} />
+    ${simulation.factual_frames.length > 0 && html`<h2>The same moments in the unchanged scene</h2>
       <${Row} frames=${simulation.factual_frames} label="The scene as it is" player=${player} />`}
   </div>`;
 }

@@ -45,7 +45,7 @@ export function useDrag(unit, onMove, onEnd) {
       const [x, y] = pointIn(event.currentTarget.ownerSVGElement, event);
       const [dx, dy] = [x - drag.current[0], y - drag.current[1]];
       drag.current = null;
-      event.currentTarget.blur(); // nobody is at it any more: the film that comes may play
+      event.currentTarget.blur(); // released: the coming film may play
       latest.current.onEnd(dx, dy);
     },
     onPointerCancel() {

@@ -63,7 +63,7 @@ export function Jobs() {
       <button onClick=${refresh}>Refresh</button>
     </div>
     ${page === null && html`<p role="status">Reading the jobs…</p>`}
-    ${page?.jobs.length === 0 && html`<p class="hint">${filters.status || filters.kind ? "No job is like that." : "There are no jobs yet. Ask something, and it is listed here."}</p>`}
+    ${page?.jobs.length === 0 && html`<p class="hint">${filters.status || filters.kind ? "No job matches." : "There are no jobs yet. Ask a question, and it is listed here."}</p>`}
     <ul class="joblist">${page?.jobs.map((job) => html`<${JobRow} key=${job.id} job=${job} act=${act} />`)}</ul>
     <div class="row">
       ${cursors.length > 1 && html`<button onClick=${() => setCursors(cursors.slice(0, -1))}>Newer</button>`}

@@ -52,9 +52,9 @@ export function KeyDialog({ wanted }) {
     answer(null);
   }}>
     <form onSubmit=${submit}>
-      <h2 id="key-title">This server wants an API key</h2>
+      <h2 id="key-title">This server needs an API key</h2>
       ${wanted.reason && html`<p class="warning" role="alert">${wanted.reason}</p>`}
-      <p>Whoever runs the server has one for you. It is kept in this tab alone, and forgotten when the tab is closed.</p>
+      <p>Ask the operator of this server for a key. It is kept only in this tab, and forgotten when the tab is closed.</p>
       <label>API key<input ref=${field} type="password" autocomplete="off" required maxlength="500" /></label>
       <div class="row"><button class="primary">Use it</button><button type="button" onClick=${() => answer(null)}>Cancel</button></div>
     </form>

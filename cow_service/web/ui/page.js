@@ -78,5 +78,5 @@ export function Page() {
 
 const TEXT = "textarea, input:not([type]), input[type=text], input[type=number], input[type=password]";
 
-/** Whether keys belong to a text that somebody writes. */
+/** Whether keys belong to a text being written. */
 export const isTyping = (target) => target instanceof Element && target.closest(TEXT) !== null;

@@ -23,7 +23,7 @@ export function usePlayer(simulation, isBusy) {
     setPlaying(false);
   }, [simulation?.id]);
 
-  // The film starts by itself once it can, unless less motion is wanted or somebody is at a handle.
+  // The film starts by itself once it can, unless reduced motion is set or a handle is held.
   useEffect(() => {
     if (simulation && !calm() && !isBusy() && (url || !video)) setPlaying(true);
   }, [simulation?.id, url]);
@@ -52,7 +52,7 @@ export function usePlayer(simulation, isBusy) {
         film.cancelVideoFrameCallback(handle);
         film.removeEventListener("ended", stop);
         film.pause();
-        show(film.currentTime); // it may have gone on since the last frame that was told
+        show(film.currentTime); // it may have advanced since the last reported frame
       };
     }
     const began = performance.now() - (1000 * frame) / fps;

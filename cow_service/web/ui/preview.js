@@ -1,4 +1,4 @@
-// The world that answers while somebody drags: the paths, the thing on its way, other futures, and what they say.
+// The simulation that answers while you drag: the paths, the moving object, other futures, and their verdict.
 
 import { html, useEffect, useRef, useState } from "../vendor/htm-preact.js";
 import { address } from "../app/address.js";
@@ -17,7 +17,7 @@ async function loaded() {
   return { R, Preview };
 }
 
-/** {shown, prepare, aim, end, isLive}: what is foreseen of a result while somebody drags; nothing where it has no live worlds. */
+/** {shown, prepare, aim, end, isLive}: the preview of a result while dragging; nothing if it has no live worlds. */
 export function usePreview(simulation) {
   const [shown, show] = useState(null);
   const held = useRef({ preview: null, aim: null, ready: null });
@@ -97,5 +97,5 @@ export function Foretold({ shown, trajectory }) {
   if (shown && !shown.shares && !shown.isDone) return null;
   const words = shown?.shares && shareWords(shown.shares, trajectory);
   return html`<p class="foretold" role="status">${words ? html`<meter min="0" max=${shown.shares.count} value=${words.agreeing}></meter> <b>${words.text}</b>`
-    : html`<b>Let go, and the server tells what happens.</b>`}</p>`;
+    : html`<b>Release, and the server computes what happens.</b>`}</p>`;
 }

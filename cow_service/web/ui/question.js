@@ -38,7 +38,7 @@ export function Question({ state }) {
       onInput=${(event) => set({ question: event.target.value })}
       onKeyDown=${(event) => event.key === "Enter" && !event.shiftKey && !event.isComposing && send(event)}></textarea>
     <${Chips} state=${state} />
-    ${suggestions.length > 0 && html`<ul class="suggestions" aria-label=${stuck ? "Questions that would be understood" : "Suggestions"}>
+    ${suggestions.length > 0 && html`<ul class="suggestions" aria-label=${stuck ? "Suggested questions" : "Suggestions"}>
       ${suggestions.map((text) => html`<li key=${text}><button type="button" dir="auto" onClick=${() => {
         set({ question: text });
         void ask();
@@ -65,10 +65,10 @@ function Chips({ state }) {
     return () => clearTimeout(timer);
   }, [asked, picture.url, canFind]);
   const things = (canFind && named.get(asked)) || [];
-  return things.length > 0 && html`<ul class="chips" aria-label="What was found, to take as what moves">
+  return things.length > 0 && html`<ul class="chips" aria-label="Objects found: choose the moving one">
     <li class="hint">What moves?</li>
     ${things.map((thing, place) => html`<li key=${place}><button type="button" dir="auto" aria-pressed=${isSameBox(corrections.grounding?.bbox, thing.bbox)}
-      title=${thing.light ? "Take it as what moves" : "Take its box as what moves: its outline is not certain"} onClick=${() => takeAsMover(thing)}
+      title=${thing.light ? "Use it as the moving object" : "Use its box as the moving object: its outline is uncertain"} onClick=${() => takeAsMover(thing)}
       onFocus=${() => light(thing)} onBlur=${() => light(null)} onPointerEnter=${() => light(thing)} onPointerLeave=${() => light(null)}>${thing.name}</button></li>`)}
   </ul>`;
 }

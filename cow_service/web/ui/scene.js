@@ -35,7 +35,7 @@ function useUnit(element, width) {
   return unit;
 }
 
-/** A finger at a handle, or one that draws, does not scroll the page; two zoom it. Of `touch-action` browsers heed only the SVG's own. */
+/** A finger at a handle, or one that draws, does not scroll the page; two zoom it. Browsers honour `touch-action` only on the SVG itself. */
 function useTouch(svg, isDrawing) {
   useEffect(() => {
     const { current } = svg;
@@ -60,7 +60,7 @@ export function Scene({ state }) {
   const layers = { ...chosen, futures: chosen.futures ?? Math.max(probability, 1 - probability) < AGREED };
   const [draft, setDraft] = useState(null);
   const [pending, setPending] = useState(null); // {bbox, mask} of an object that has no name yet
-  const busy = useRef(false); // somebody drags
+  const busy = useRef(false); // while dragging
   const pressed = useRef([0, 0]); // where the pointer went down, CSS px of the window
   busy.current = draft !== null;
   const player = usePlayer(simulation, () => busy.current || svg.current.contains(document.activeElement));
@@ -79,7 +79,7 @@ export function Scene({ state }) {
   }, [picture.url, hasSight]);
   useEffect(() => light(null), [isSeeing]);
   useEffect(() => void (state.run || draft || preview.end()), [state.run]); // no other film will come
-  useEffect(() => void (draft?.direction && foresee({ direction: draft.direction })), [simulation?.id]); // still in somebody's hand
+  useEffect(() => void (draft?.direction && foresee({ direction: draft.direction })), [simulation?.id]); // still being dragged
   useEffect(() => set({ isForeseeing: shown !== null }), [shown !== null]);
 
   const camera = simulation?.trajectory.camera ? { ...simulation.trajectory.camera, ...corrections.camera } : null;

@@ -1,4 +1,4 @@
-// The stages of a request: which are done, which one runs, which were found again.
+// The stages of a request: which are done, which one runs, which were cached.
 
 import { html } from "../vendor/htm-preact.js";
 import { STAGES, percent, plural, seconds, stagesOf } from "../app/words.js";

@@ -7,21 +7,21 @@ import { set } from "../app/store.js";
 import { calm } from "./player.js";
 
 
-// Each with its question, and what it comes to.
+// Each with its question and its answer.
 const EXAMPLES = [
   ["ball-and-mug", "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?", "Yes"],
   ["falling-ball", "If the black ball falls freely from its current position, will it land on the orange cylinder?", "Yes"],
   ["bottle-passes-cylinder", "If the red bottle moves in the direction of the arrow, will the white cylinder be occluded at some moment?", "Yes"],
   ["thrown-ball", "If the pink ball is thrown in the direction of the arrow, will it hit the white cube?", "Yes"],
 ];
-const QUIET = 1000; // ms after the page is there: films come after all that somebody needs
+const QUIET = 1000; // ms after the page is there: films load after everything that is needed
 
 const exampleAddress = (name) => address(`/web/examples/${name}`);
 
 /** Shows an example and asks its question. */
 async function takeExample(name, question) {
   const response = await fetch(exampleAddress(`${name}.jpg`));
-  if (!response.ok) return set({ problem: { code: "no-example", title: "That example is not there.", detail: `The server answered ${response.status}.`, errors: [] } });
+  if (!response.ok) return set({ problem: { code: "no-example", title: "That example does not exist.", detail: `The server answered ${response.status}.`, errors: [] } });
   await choosePicture(await response.blob(), `${name}.jpg`, question, true);
   return undefined;
 }
@@ -67,7 +67,7 @@ export function Choose({ short = false }) {
 export function Start() {
   return html`<section class="start" aria-label="Choose a picture">
     <h1>Look before you answer.</h1>
-    <p>Give a picture and ask what would happen. The service finds what moves, computes where it goes, shows it, and answers after it has looked.</p>
+    <p>Give a picture and ask what would happen. The service finds the moving object, simulates its motion, shows it, and then answers.</p>
     <div class="drop"><p>Drop or paste a picture here</p><${Choose} /></div>
     <h2>Or try one of these</h2>
     <ul class="examples">${EXAMPLES.map(([name, question, answer]) => html`<li key=${name}><button onClick=${() => takeExample(name, question)}>

@@ -10,7 +10,7 @@ import { call } from "../app/server.js";
 import { set } from "../app/store.js";
 
 const FORMS = { curl: "curl", python: "Python", json: "JSON" };
-const SHARED = { film: ["Film to share", "The film with question, other futures and verdict, at most 3 MB"], card: ["Picture of it", "One moment with question and verdict, as pages show it for a link"],
+const SHARED = { film: ["Film to share", "The film with question, other futures and verdict, at most 3 MB"], card: ["Picture of it", "One moment with question and verdict, for link previews"],
   page: ["Page to play with", "An HTML file whose arrow can be dragged, also without a network"] };
 const FILES = { zip: "Everything (zip)", gif: "GIF", webp: "WebP", sheet: "Contact sheet" };
 const ENDINGS = { zip: "zip", gif: "gif", webp: "webp", sheet: "png", film: "mp4", card: "jpg", page: "html" };

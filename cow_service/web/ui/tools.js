@@ -6,30 +6,30 @@ import { set } from "../app/store.js";
 
 const TOOLS = [
   ["select", "Move", "Drag the arrow's tip, boxes, or points of the path."],
-  ["mover", "What moves", "Draw a box around what moves."],
+  ["mover", "What moves", "Draw a box around the moving object."],
   ["object", "Another object", "Draw a box around another object, then name it."],
   ["direction", "Direction", "Drag from the object to where it goes."],
 ];
 const CLICKS = {
-  select: "Click what moves, or draw it: choose “What moves”.",
-  mover: "Click what moves, or draw a box around it.",
+  select: "Click the moving object, or draw a box around it: choose “What moves”.",
+  mover: "Click the moving object, or draw a box around it.",
   object: "Click another object, or draw a box around it; then name it.",
 };
 const LAYER_NAMES = { names: "Names", path: "Path", band: "Band", futures: "Futures", floor: "Floor" };
 const LAYER_HINTS = {
-  names: "Names of what was found",
-  path: "The path of what moves",
-  band: "Where most of the computed worlds have it",
-  futures: "Where it is in some other worlds",
-  floor: "The floor as a grid, to correct how far down the camera looks",
+  names: "Names of the objects found",
+  path: "The path of the moving object",
+  band: "Where most simulated versions have it",
+  futures: "Where some other simulated versions have it",
+  floor: "The floor as a grid, to correct the tilt of the camera",
 };
 
 /** What to do now. `isSeeing`: what is clicked is outlined by the server. */
 function hintOf({ tool, lit, result }, isSeeing) {
-  if (!isSeeing && tool === "select" && !result?.simulation) return "Ask what would happen; then drag the arrow, and the world answers.";
-  if (!isSeeing && tool === "select") return result.simulation.trajectory.live ? "Drag the tip of the arrow: the world answers at once." : "Drag boxes, or points of the path, where something was misread.";
+  if (!isSeeing && tool === "select" && !result?.simulation) return "Ask what would happen; then drag the arrow to see other outcomes.";
+  if (!isSeeing && tool === "select") return result.simulation.trajectory.live ? "Drag the tip of the arrow: the outcome changes at once." : "Drag boxes, or points of the path, where something was misread.";
   if (!isSeeing) return TOOLS.find(([name]) => name === tool)[2];
-  if (lit?.others) return `Click again for another of the ${lit.others + 1} things that lie here within each other.`;
+  if (lit?.others) return `Click again for another of the ${lit.others + 1} objects that overlap here.`;
   return lit && !lit.things.length ? "No clear outline here: draw a box." : CLICKS[tool];
 }
 

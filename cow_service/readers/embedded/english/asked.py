@@ -28,7 +28,7 @@ _HOLLOW = lex.words("bowl basket hole pocket goal bin bucket pit hoop net drawer
 
 
 def read_asked(question: Question) -> Asked | None:
-    """What the question asks for; None where it is not one of ours, or not put plainly.
+    """What the question asks for; None if it is not one of ours, or not put plainly.
 
     `target` is worded as in `Question.others`, where the question names it there. Of `which-first` it is None: see
     `read_alternatives`.
@@ -50,7 +50,7 @@ def read_asked(question: Question) -> Asked | None:
 
 
 def read_alternatives(question: Question) -> tuple[ObjectPhrase, ...]:
-    """The things, or the one kind, among which a question asks for the first; empty where it asks for any."""
+    """The things, or the one kind, among which a question asks for the first; empty if it asks for any."""
     asking = _read(question)
     if asking is None or asking.form != "which-first":
         return ()
@@ -81,7 +81,7 @@ def _in_full(thing: ObjectPhrase | None, question: Question) -> str | None:
 
 @lru_cache(maxsize=64)  # two readers and a stage of every request ask for it
 def _read(question: Question) -> Asking | None:
-    """The one clause of the question that asks; None where none is understood, or several ask."""
+    """The one clause of the question that asks; None if none is understood, or several ask."""
     found = sentences(question)
     if len(found) > MAX_SENTENCES or any(len(sentence.words) > MAX_TOKENS for sentence in found):
         return None
@@ -103,7 +103,7 @@ def _read(question: Question) -> Asking | None:
     phrases = [word.phrase for word in listed]
     said |= {at for at, item in enumerate(items) if listed and (item.phrase in phrases or item.key == "or")}
     said |= {at for at, item in enumerate(items) if item.key == "still" and question.interventions}
-    # A time limits what is asked, not the motion; "after 2 s" does only where it is asked what has happened.
+    # A time limits the event, not the motion; "after 2 s" does so only in questions about what has happened.
     limits = {at: item.quantity.within for at, item in enumerate(items) if item.quantity and item.quantity.within}
     have = not {"has", "have", "had"}.isdisjoint(items[place].key for place in said)
     apart = not any(items[place] in question.clause for place in said)
@@ -226,7 +226,7 @@ _WORD = re.compile(r"\w+(?:['’]\w+)*")  # "won't" is one, and two items
 
 @dataclass(frozen=True)
 class Unread:
-    """Words that were not understood: `turning`, where they may change what is asked or how it moves."""
+    """Words that were not understood: `turning` if they may change the question or the motion."""
 
     turning: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()

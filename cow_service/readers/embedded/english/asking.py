@@ -11,7 +11,7 @@ from cow_service.readers.embedded.english.lexicon import ObjectPhrase, Word, key
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.records import AskedForm, AskedRelation
 
-# By the node of an act: the relation, and whether the subject of the clause is what it is done to.
+# By the node of an act: the relation, and whether the subject of the clause is its object.
 _ACTS = {
     act: (relation, table == "done_to")
     for table in ("does", "done_to")
@@ -64,7 +64,7 @@ class Clause:
         self.mover_acted = any(word.kind in {"M", "PRONOUN"} for word in self.objects)
 
     def read(self) -> Asking | None:
-        """What the clause asks; None where that is not plain."""
+        """What the clause asks; None if that is not plain."""
         names, nodes, others = self.names, set(self.names), self.question.others
         form: AskedForm = next(_FORMS[name] for name in names if name in _FORMS)
         things = [] if form == "where" else self.things  # "what does it land on, the floor or the mug?"
@@ -100,7 +100,7 @@ class Clause:
         return replace(asking, target=others[0] if of_it else target)
 
     def _of_several(self, asking: Asking) -> Asking | None:
-        """What is asked of several things: it happens with one of them at least, with each, or with none."""
+        """How a question about several things counts: with at least one of them, with each, or with none."""
         relation, every = self.relation, "all_of" in self.names
         suffer = any(word.kind == "S" for word in self.subject)
         if len(self.several) > 1 or (every and "no" in self.names) or (self.done_to and self.doer is not None):

@@ -144,7 +144,7 @@ def parse_ends(start: str, words: Sequence[Word]) -> dict[int, Node]:
 
 
 def parse_all(start: str, words: Sequence[Word]) -> Node | None:
-    """The tree of a rule over all of some words; None where they are no such thing."""
+    """The tree of a rule over all of some words; None if they are no such thing."""
     return parse_ends(start, words).get(len(words))
 
 

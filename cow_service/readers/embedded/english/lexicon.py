@@ -171,7 +171,7 @@ class QuantityWords:
     own_widths: float | None = None  # a distance, in widths of what moves
     duration: float | None = None  # s
     until: Until | None = None
-    within: float | None = None  # s: a limit of what is asked about, not of the motion
+    within: float | None = None  # s: a limit for the event, not for the motion
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class MotionCandidate:
     """A motion that the question may be about: its verb is at `at`, in the clause that begins at `start`.
 
     `verb` is empty for a condition without a verb of motion.
-    Its subject is None where the clause has a pronoun, or nothing.
+    Its subject is None if the clause has a pronoun, or nothing.
     """
 
     at: int
@@ -97,7 +97,7 @@ def read_clauses(found: Sequence[Item]) -> tuple[list[MotionCandidate], list[tup
 
 
 def _opened(found: Sequence[Item], at: int, clause: _Clause) -> _ClauseKind | None:
-    """The kind of the clause that begins at a word, or behind the last one; None where none begins."""
+    """The kind of the clause that begins at a word, or behind the last one; None if none begins."""
     key = key_at(found, at)
     if key in _ENDS:
         return "plain"
@@ -268,7 +268,7 @@ class MotionWords:
     `direction` is a unit vector in image pixels, x right, y down. A fall has one only where it leaves the vertical
     ("falls to the left"): its kind stays "fall". `depth` is the sine of the angle out of the image plane: -1 towards
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
-    form, empty where no known verb of motion stands in the question. `towards` is the object that the motion aims at;
+    form, empty if no known verb of motion stands in the question. `towards` is the object that the motion aims at;
     the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
     `contradictory`: two of its words are opposites, such as to fall upwards, or left and right in one leg.
     `steps` are the legs behind the first, `others` what moves at the same time. `read` are the places in the text of

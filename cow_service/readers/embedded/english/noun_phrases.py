@@ -225,7 +225,7 @@ def _with_mark(text: str, item: Item, links: Sequence[str], mark: Item) -> Item 
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
-    """The first noun phrase of a text such as "the red toy car"; None where there is none."""
+    """The first noun phrase of a text such as "the red toy car"; None if there is none."""
     found = items("the " + text.removeprefix("the "))
     phrase = next((item.phrase for item in found if item.phrase is not None), None)
     if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
@@ -261,7 +261,7 @@ def table_at_end(found: Sequence[Item]) -> tuple[ObjectPhrase | None, str]:
 
 
 def with_nouns(found: Sequence[Item]) -> list[Item]:
-    """The items, where a reference has what it means.
+    """The items, with references replaced by what they mean.
 
     "The red one" is of the kind that is asked for ("which cone", "which of the cones"), or of that of all things
     before it.
@@ -307,7 +307,7 @@ _PUTS = lex.words("put place insert set position lower stand stick pop plonk plo
 
 
 def with_places(found: Sequence[Item]) -> list[Item]:
-    """The items, each thing with what is said behind it of its place joined to one."""
+    """The items, each object joined with the words after it about its place."""
     texts = [item.phrase.text.lower() for item in found if item.phrase is not None]
 
     def join(at: int) -> tuple[Item, int] | None:
@@ -315,7 +315,7 @@ def with_places(found: Sequence[Item]) -> list[Item]:
         thing = item.thing
         if thing is None or at + 1 == len(found):
             return None
-        # "Push the ball behind the mug", "put the ball on the mug": where it gets to, not where it is.
+        # "Push the ball behind the mug", "put the ball on the mug": a destination, not where it is.
         moved = lex.moves(verb) or (verb is not None and verb.lemma in _PUTS)
         if moved and after not in {"that", "which", ","}:
             return None
@@ -348,7 +348,7 @@ def _head(name: str) -> str | None:
 
 
 def shape_of(name: str) -> Shape | None:
-    """The shape of what is called so; None where the noun does not say."""
+    """The shape of what is called so; None if the noun does not say."""
     head = _head(name)
     return next((shape for shape, nouns in _SHAPES.items() if head in nouns), None)
 
@@ -393,7 +393,7 @@ ContainerForm = Literal["round", "square", "none", "unknown"]
 def container_form(name: str) -> ContainerForm:
     """Round or square for what is called a container, `none` for a solid thing, `unknown` where the noun says nothing.
 
-    A box is a container: whoever means a solid one does not ask what goes into it.
+    A box is a container: a question about a solid one would not ask what goes into it.
     """
     head = _head(name)
     if head in lex.SETS["round"]:

@@ -1,4 +1,4 @@
-"""Parses a what-if question in English with plain rules: what moves, how, what else is named, what is asked.
+"""Parses a what-if question in English with plain rules: what moves, how, what else is named, and the question itself.
 
 No model and no list of nouns: verbs and function words are closed lists, the noun phrases are what lies between.
 """
@@ -54,7 +54,7 @@ class Question:
     read: frozenset[int] = frozenset()
 
     def has_read(self, at: int) -> bool:
-        """Whether the item at a place tells the motion and was understood."""
+        """Whether the item at a place expresses the motion and was understood."""
         return self.items[at].start in self.read
 
     def means_mover(self, phrase: ObjectPhrase) -> bool:
@@ -112,11 +112,11 @@ def parse(question: str) -> Question:
 
 
 def _best(found: Sequence[Item], candidates: Sequence[MotionCandidate]) -> MotionCandidate | None:
-    """The verb that tells the motion: the first of the highest rank."""
+    """The verb of the motion: the first of the highest rank."""
     best = max(candidates, key=lambda candidate: candidate.rank, default=None)
     if best is None or best.asked or not best.moves or found[best.start].key != "while":
         return best
-    # In front of "while", where both are told: "the mug slides left by 20 px while the ball drops".
+    # In front of "while", where both motions are given: "the mug slides left by 20 px while the ball drops".
     told = [
         each
         for each in candidates
@@ -132,12 +132,12 @@ def _mover(
     best: MotionCandidate | None,
     changes: Sequence[InterventionWords],
 ) -> ObjectPhrase | None:
-    """What moves, as it is worded most fully."""
+    """The moving object, in its fullest wording."""
     at = best.at if best else len(found)
     mover = best.subject if best else None
     certain = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and not motion.is_vague(item)]
     if mover is None:
-        # A pronoun, or a clause without a subject, stands for who acts in a passive question, else for its subject.
+        # A pronoun, or a clause without a subject, means the agent of a passive question, else its subject.
         acting = [
             phrase
             for place, phrase in certain
@@ -164,7 +164,7 @@ def _motion(
     mover: ObjectPhrase | None,
     changes: Sequence[InterventionWords],
 ) -> tuple[range, MotionWords]:
-    """The places of the clause that tells the motion, and what it tells."""
+    """The places of the clause with the motion, and its content."""
     at, start = (best.at, best.start) if best else (len(found), 0)
     verb, kind = (best.verb, best.kind) if best else ("", None)
     if best is None:
@@ -208,7 +208,7 @@ def _movers_beside(
         if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
         and each.at > best.at and each.start > best.at and each.moves
         and each.subject is not None and (each.subject.noun or each.subject.colour)
-        and all(item.key != "whether" for item in found[best.at : each.at])  # it is asked, not told
+        and all(item.key != "whether" for item in found[best.at : each.at])  # it is a question, not a statement
         and not _repeats(each.subject, best.subject)
     ]  # fmt: skip
 
