@@ -141,7 +141,7 @@ def test_facts_in_place_of_frames(served: Served, mllm: RandomMllm) -> None:
     cow = ask(served, f"{NAME}:text", cow=COW | TWO)["cow"]
     note, frames = shown(mllm)
     assert (frames, cow["frames"], cow["prompts"], cow["content"]) == ([], [], {"imagined-facts": 1}, "text")
-    assert re.search(r"- .*the blue object after .* worlds agree", note)
+    assert re.search(r"- .*the blue object after about .*\n- \d+ of \d+ simulated versions agree", note)
     assert "images" not in note
 
 

@@ -171,7 +171,7 @@ def test_two_worlds_are_two_named_strips(served: Served, mllm: RandomMllm) -> No
     taken = {"objects": [cube], "interventions": [{"kind": "remove", "object": "blue cube"}]}
     cow = told(post(served, {"model": NAME, "messages": what_if(), "cow": {**COW, **taken}}))["cow"]
     _, _, note, *strips = mllm.last()["messages"][0]["content"]
-    assert '"With the blue cube removed"' in note["text"]
+    assert '"Without the blue cube"' in note["text"]
     assert (len(strips), len(cow["frames"])) == (2, 2)
 
 

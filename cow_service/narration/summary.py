@@ -42,7 +42,7 @@ def narrate(grounding: Grounding, trajectory: Trajectory, language: Language) ->
         answer=answer,
         summary=say.templates["between"].join(filter(None, (said, agreement))),
         agreement=agreement,
-        share=summary.share() if trajectory.ensemble else None,
+        share=summary.share() if trajectory.ensemble and (outcome is None or outcome.probability is not None) else None,
         story=story,
     )
 
@@ -77,11 +77,11 @@ def why_unsure(outcome: Outcome, in_worlds: bool, say: Phrases) -> str:
 
 
 def found_in(mover: str, trajectory: Trajectory, say: Phrases) -> str:
-    """What most simulated versions have of what the question asks, and how many, in a sentence; empty without any."""
-    outcome = trajectory.outcome
+    """What most versions say to the question, else how many agree with the story, in a sentence; empty without any."""
+    summary, outcome = _Summary(mover, trajectory, say), trajectory.outcome
     if outcome is None or outcome.probability is None or not trajectory.ensemble:
-        return ""
-    return capitalised(say("stated", statement=_Summary(mover, trajectory, say).counted()))
+        return summary.agreement()
+    return capitalised(say("stated", statement=summary.counted()))
 
 
 def label_of_changes(grounding: Grounding, trajectory: Trajectory, say: Phrases) -> str:
@@ -167,10 +167,10 @@ class _Summary:
         return self._outcome
 
     def share(self) -> float | None:
-        """The share of the versions that agree with the answer or, where nothing is asked, with the story."""
+        """The share of the versions that agree with the answer or, if there is none to the question, with the story."""
         outcome = self._outcome
         if outcome is None or outcome.probability is None:
-            return self.story.agreement() if outcome is None else None
+            return self.story.agreement()
         is_yes = outcome.asked.form not in ("whether", "when", "changes") or happens(outcome)
         return outcome.probability if is_yes else 1 - outcome.probability
 

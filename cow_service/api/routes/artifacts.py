@@ -30,7 +30,7 @@ from cow_service.jobs.engine import JobEngine
 from cow_service.media.artifacts import extension_of
 from cow_service.media.images import decode
 from cow_service.media.share import Told, card, film, page
-from cow_service.media.video import animation
+from cow_service.media.video import animation, frames_in
 from cow_service.narration.words import direction_words
 from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
 
@@ -195,7 +195,10 @@ def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simula
             "move along a direction, have none."
         )
     with engine.service.cpu.held():
-        image = decode(read(simulation.image.sha256), max_megapixels=math.inf).pixels
+        if simulation.trajectory.factual is not None and simulation.video is not None:  # without what was taken away
+            image, _ = next(frames_in(read(simulation.video.sha256)))
+        else:
+            image = decode(read(simulation.image.sha256), max_megapixels=math.inf).pixels
         return page(image, read(live.sha256).decode(), simulation, _told(result, simulation))
 
 
