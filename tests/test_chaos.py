@@ -37,7 +37,7 @@ def seeds() -> list[int]:
     return [SEEDS[0]] if SCALE == 1 else [*SEEDS, 0]
 
 
-@pytest.mark.parametrize("arrangement", [one_machine, fleet])
+@pytest.mark.parametrize("arrangement", [pytest.param(one_machine, marks=pytest.mark.soak_only), fleet])
 @pytest.mark.parametrize("seed", seeds())
 def test_what_was_acknowledged_is_true_whatever_fails(arrangement: Arrangement, seed: int, tmp_path: Path) -> None:
     seed = seed or secrets.randbelow(10**6)

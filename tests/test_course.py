@@ -166,7 +166,7 @@ def test_two_movers_meet_half_way() -> None:
 
 
 def test_another_mover_must_be_located() -> None:
-    with pytest.raises(InvalidRequest, match=r"motion\.others\.0\.object.*'car' names 0 of .*'Blue block'"):
+    with pytest.raises(InvalidRequest, match=r"motion\.others\.0\.object.*'car' matches 0 of .*'Blue block'"):
         moved(direction=(1, 0), others=[{"object": "car", "direction": (1, 0)}])
 
 

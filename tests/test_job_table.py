@@ -265,7 +265,7 @@ def test_a_job_that_ends_its_process_each_time_fails(database: Database) -> None
     assert found is not None
     assert (found.job.status, ended) == ("failed", ["https://call.test"])
     assert isinstance(found.error, InternalError)
-    assert "again and again" in found.error.detail
+    assert "ended repeatedly" in found.error.detail
 
 
 def test_pages_show_each_job_once(database: Database) -> None:

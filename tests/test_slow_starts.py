@@ -85,6 +85,7 @@ def test_a_server_that_starts_while_its_database_is_away_waits_and_says_so(tmp_p
             assert served.http.post("/simulate", json=BODY).is_success
 
 
+@pytest.mark.soak_only  # fifteen seconds of waiting
 def test_a_second_worker_that_cannot_start_is_tried_more_and_more_rarely(tmp_path: Path) -> None:
     with bad_starts(tmp_path, COW_CONCURRENCY="2") as served:
         both = eventually(lambda: found if len(found := workers_of(served)) == 2 else None)

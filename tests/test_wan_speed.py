@@ -94,6 +94,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 
 @pytest.mark.slow
 class TestTheScript:
+    @pytest.mark.soak_only  # twenty seconds of imports; the classes below run the same script with every package
     def test_it_runs_where_only_the_models_libraries_are(self, whole: Whole) -> None:
         assert "ftfy is not installed" in whole.warned
         assert [result["status"] for result in whole.found["results"]] == ["measured"] * 3
