@@ -65,8 +65,9 @@ document.body.insertAdjacentHTML("beforeend", """
 POLICY = "img-src data:", "script-src 'unsafe-inline'"
 FRAMED = """<style>.framed h1, .framed small { display: none }
 .framed main { padding: 0 }
-.framed #told { margin: .7rem; font-size: 1rem; flex-wrap: nowrap; white-space: nowrap }
-.framed meter { inline-size: 5rem }</style>
+.framed #told { margin: .5rem .7rem; font-size: .9rem; line-height: 1.2; flex-wrap: nowrap; min-block-size: 1.6rem }
+.framed meter { inline-size: 4rem; flex: none }
+.framed circle.tip { stroke: #fff; stroke-width: 4px }</style>
 </head>"""
 
 
@@ -88,7 +89,7 @@ def asked(service: Service, place: str) -> tuple[bytes, Simulation, Told, str]:
     image, question, given = {"artifact": service.keep_image(picture).sha256}, meta["question"], ""
     request = {"image": image, "question": question, "live": True, "video": True}
     if place.endswith(BOXED):
-        (width, height), given = meta["image_size"], "The boxes of the objects were given."
+        (width, height), given = meta["image_size"], "COW was given the boxes of the objects."
         starts = {name: boxes[0] for name, boxes in meta["boxes"].items()}
         boxes = {n: [max(0, x0), max(0, y0), min(width, x1), min(height, y1)] for n, (x0, y0, x1, y1) in starts.items()}
         request["grounding"] = {"object": meta["object"], "bbox": boxes.pop(meta["object"])}
@@ -96,7 +97,7 @@ def asked(service: Service, place: str) -> tuple[bytes, Simulation, Told, str]:
         if meta["motion"] != "fall":
             request["motion"], given = (
                 {"direction": meta["direction"]},
-                given.replace(" were", " and the direction were"),
+                given.replace("objects", "objects and the direction"),
             )
     answer = service.answer(AnswerRequest.model_validate(request))
     simulation = answer.simulation
@@ -130,7 +131,7 @@ def card(service: Service, place: str, name: str, files: dict[str, bytes]) -> st
             f'{given} <a href="{address}">Larger</a>',
         )
     size = f"--width: {simulation.image.width}; --height: {simulation.image.height}"
-    said = f"<b>{html.escape(told.question)}</b> {html.escape(told.verdict.capitalize())}. {given}"
+    said = f"<b>{html.escape(told.question)}</b> As asked: {html.escape(told.verdict)}. {given}"
     return (
         f'<figure class="scene" data-world="{address}" style="{size}">\n<div>{shown}</div>\n'
         f"<figcaption>{said}</figcaption>\n</figure>\n"

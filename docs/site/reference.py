@@ -230,8 +230,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     markdown = re.sub(r"(?<!!)\[([^\[\]]+)\]\(\.\./([^)\s]+)\)", turned, markdown)
     name = page.file.src_uri
-    if name in (*REFERENCE, "errors.md"):
-        page.meta.setdefault("search", {"boost": 2})
+    if name in (*REFERENCE, "errors.md"):  # searches find the pages that explain first
+        page.meta["search"] = {"boost": 0.5}
     if name == "errors.md":
         own = re.compile(r"^\| code \|.*\n\|[-| ]+\n(?:\|.*\n)+", re.MULTILINE)
         markdown = own.sub(lambda found: codes(found[0]), markdown) if own.search(markdown) else markdown + codes("")

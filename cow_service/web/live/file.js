@@ -44,7 +44,8 @@ export async function show(world, load, wasm) {
     const box = now.met ? world.bodies[now.met.body].bbox : null;
     met.setAttribute("d", box ? `M${box[0]} ${box[1]}H${box[2]}V${box[3]}H${box[0]}Z` : "");
     if (!now.shares && isAimed) {
-      told.textContent = now.met ? `It meets the ${world.bodies[now.met.body].name} first.` : "It meets nothing.";
+      const hits = now.met ? `It hits the ${world.bodies[now.met.body].name} first.` : "It hits nothing.";
+      told.textContent = world.asked ? `${hits} What the question asks is not computed here.` : hits;
     } else if (now.shares) {
       const { agreeing, text } = shareWords(now.shares, trajectory);
       const meter = Object.assign(document.createElement("meter"), { min: 0, max: now.shares.count, value: agreeing });
