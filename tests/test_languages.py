@@ -16,13 +16,22 @@ from hypothesis import strategies as st
 from runs import run_of
 from servers import data_url
 from test_answer import CHOICES, outcome, simulated
-from test_facts import THROWN, grounded
+from test_facts import THROWN, body, grounded, path, touch, world
 
 from cow_service.api.submission import language_of
 from cow_service.narration.summary import narrate
 from cow_service.narration.words import TEMPLATES, phrases_of
 from cow_service.readers.mllm.identify import read_identified
-from cow_service.records import Asked, Doubt, Language, PlacementResult, PlaceRelation
+from cow_service.records import (
+    Asked,
+    AskedForm,
+    AskedRelation,
+    Doubt,
+    Language,
+    Outcome,
+    PlacementResult,
+    PlaceRelation,
+)
 from cow_service.stages.keys import StageResult
 
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -61,14 +70,57 @@ def test_every_word_of_the_records_has_a_template(language: Language) -> None:
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_every_outcome_is_told_in_every_language(language: Language) -> None:
     said = set[str]()
-    for world, _, _ in CHOICES:
-        simulation = simulated(world)
+    for decided, _, _ in CHOICES:
+        simulation = simulated(decided)
         narration = narrate(simulation.grounding, simulation.trajectory, language)
         assert narration.language == language
         text = f"{narration.summary} {narration.story}"
         assert not re.search(r"[{}]|None|  ", text)
         said.add(narration.answer)
     assert READ[language] in said
+
+
+def _outcome(asked: Asked, rest: dict[str, Any]) -> Outcome:
+    return Outcome(asked=asked, subject=asked.subject, robust=False, **rest)
+
+
+OUTCOMES = st.builds(
+    _outcome,
+    st.builds(
+        Asked,
+        form=st.sampled_from(get_args(AskedForm)),
+        relation=st.sampled_from(get_args(AskedRelation)),
+        negated=st.booleans(),
+        target=st.sampled_from([None, "white cube"]),
+        among=st.sampled_from([(), ("white cube", "mug")]),
+        every=st.booleans(),
+        partly=st.booleans(),
+        within=st.sampled_from([None, 1.0]),
+        subject=st.sampled_from([None, "mug"]),
+    ),
+    st.fixed_dictionaries({
+        "object": st.sampled_from([None, "white cube"]),
+        "probability": st.sampled_from([None, 0.0, 0.3, 0.5, 1.0]),
+        "sure": st.booleans(),
+        "first": st.sampled_from([None, "mug"]),
+        "count": st.sampled_from([None, 0, 1, 3]),
+        "time": st.sampled_from([None, 0.8, 4.0]),
+        "time_band": st.sampled_from([None, (0.5, 1.0)]),
+        "depends_on": st.sampled_from([(), ("speed",), ("faint", "speed"), ("depth",)]),
+    }),
+)  # fmt: skip
+
+
+@given(
+    OUTCOMES, st.sampled_from(LANGUAGES), st.sampled_from(["floor", "air", "white cube"]), st.sampled_from([0, 1, 50])
+)
+def test_any_outcome_has_words(outcome: Outcome, language: Language, support: str, ensemble: int) -> None:
+    bodies = (body("ball", "sphere", support), body("white cube"), body("mug"))
+    told = world(bodies=bodies, paths=(path(), path(1)), encounters=(touch(),), ensemble=ensemble, outcome=outcome)
+    narration = narrate(grounded("ball"), told, language)
+    assert narration.summary
+    assert not re.search(r"[{}]|None|  ", f"{narration.summary} {narration.story}")
+    assert (narration.answer == phrases_of(language).templates["not-sure"]) == (not outcome.sure)
 
 
 @pytest.mark.parametrize(

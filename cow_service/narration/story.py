@@ -23,6 +23,7 @@ MAX_MET = 2  # encounters that are named one by one
 SIDEWAYS = 0.7  # of the speed in depth: from that on something moves to the side
 KINDS: dict[str, records.EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
 OF_TARGET: tuple[records.AskedRelation, ...] = ("tips", "moves")  # what is asked about does these
+OF_COVERING: tuple[records.AskedRelation, ...] = ("covers", "covered")
 OF_ITSELF: tuple[records.AskedRelation, ...] = ("leaves", "lands")  # nothing else is part of these
 # The template of each relation; `-at` behind it: with a time, `-not`: that it does not happen, `-none`: with anything.
 EVENTS: dict[records.AskedRelation, str] = {
@@ -270,7 +271,8 @@ class Story:
         """That what is asked about is not met, or less of it than an encounter has."""
         say = self._say
         relation, meant = outcome.asked.relation, [outcome.object] if outcome.object else outcome.asked.among
-        if outcome.asked.partly and ((outcome.probability or 0.0) >= HAPPENS) != outcome.asked.negated:
+        partly = outcome.asked.partly and relation in OF_COVERING
+        if partly and ((outcome.probability or 0.0) >= HAPPENS) != outcome.asked.negated:
             name = say.name(outcome.object) if outcome.object else say("something")  # less than an encounter has
             return say("cover-part" if relation == "covers" else "covered-part", object=name)
         if relation == "touches" and self._supports[body] in meant:

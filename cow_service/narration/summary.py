@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from cow_service.narration.story import EVENTS, KINDS, OF_TARGET, Story
+from cow_service.narration.story import EVENTS, KINDS, OF_COVERING, OF_TARGET, Story
 from cow_service.narration.words import Phrases, capitalised, phrases_of
 from cow_service.records.results import HAPPENS, Narration
 
@@ -202,7 +202,8 @@ class _Summary:
         elif outcome.subject is not None:
             subjects = [say.name(outcome.subject)]
         # Not to hit each one is to miss one of them: it misses this one or it misses that one.
-        parts = [[each] for each in meant] if asked.every and not does and asked.relation not in OF_TARGET else [meant]
+        is_split = asked.every and not does and meant and asked.relation not in OF_TARGET
+        parts = [[each] for each in meant] if is_split else [meant]
         clauses = [self._within(self._clause(key, does, time, part)) for part in parts]
         statements = [say("statement", subject=each, clause=clause) for each in subjects for clause in clauses]
         return say.joined(statements, "every-and" if asked.every == does else "either-or")
@@ -215,7 +216,7 @@ class _Summary:
             return self.story.placed()
         if asked.relation == "lands" and self._support():
             key, meant = key.replace("land", "fall-off"), self._support()
-        if asked.partly and does:
+        if asked.partly and does and asked.relation in OF_COVERING:
             key = f"{EVENTS[asked.relation]}-part"
         if not does:
             key = f"{key}-not" if meant or asked.relation not in KINDS else f"{key}-none"
