@@ -101,6 +101,7 @@ def test_nothing_asked_draws_nothing(tmp_path: Path) -> None:
     assert write_plots(tmp_path, summarize([])) == ()
 
 
+@pytest.mark.soak_only  # twelve seconds of drawing
 def test_odd_names_of_models_are_drawn(tmp_path: Path) -> None:
     runs = [run(tmp_path / str(place), 12, ("never", "always"), 2, mllm=name) for place, name in enumerate(ODD)]
     assert names(write_plots(tmp_path, summarize(runs))) == set(PLOTS) - {"doses"}

@@ -166,6 +166,7 @@ def test_an_error_of_rank_0_stays_its_own(shared: WanGenerator) -> None:
     assert str(broken(shared, fail)) == "a fault of the code"
 
 
+@pytest.mark.soak_only  # twelve seconds of waiting
 def test_a_rank_that_dies_before_it_is_met_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     met = RankGroup._met
 
