@@ -112,7 +112,7 @@ class EmbeddedReader:
             boxes = {other.object: other.bbox for other in located}
             missing = [
                 f"The question names '{each.text}', which was not found, or not for certain, so no encounter is listed "
-                f"of it by that name. Seen: {describe(scene.regions)}."
+                f"under that name. Seen: {describe(scene.regions)}."
                 for each in question.others
                 if each.text not in boxes
                 and not matching.is_kind_asked(each, question)
