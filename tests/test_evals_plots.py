@@ -19,6 +19,8 @@ from cow_service.evals.report.page import TITLES as PLOTS
 from cow_service.evals.report.summary import Findings, Price, summarize
 from cow_service.evals.report.write import write_plots
 
+pytestmark = pytest.mark.slow
+
 ARMS = (
     "never",
     "always",

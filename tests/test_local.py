@@ -63,6 +63,8 @@ from cow_service.readers.mllm.locate import locate_schema
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Coordinates, Manifest, Source, load_manifests
 
+pytestmark = pytest.mark.slow
+
 BOX = {
     "type": "object",
     "properties": {

@@ -29,6 +29,8 @@ from PIL import Image
 from playwright.sync_api import Page, Request, expect
 from servers import QUESTION, picture
 
+pytestmark = pytest.mark.slow
+
 FIRST_VIEW_BYTES = 150_000
 FROM_MOTION_ON = ("motion", "trajectory", "generation", "answering")
 

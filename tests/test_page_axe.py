@@ -13,6 +13,8 @@ from drawn import clutter, png_bytes
 from playwright.sync_api import Page, expect
 from servers import QUESTION, picture
 
+pytestmark = pytest.mark.slow
+
 
 def start(page: Page) -> None:
     expect(page.get_by_role("button", name="yellow ball")).to_be_visible()

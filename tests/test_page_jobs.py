@@ -17,6 +17,8 @@ from servers import BODY, QUESTION, Served, data_url, eventually, picture, slow
 
 from cow_service.api.middleware.access import hash_of, new_key
 
+pytestmark = pytest.mark.slow
+
 UNREAD = "If the unicorn moves to the right, will it hit the blue cube?"
 UNREADABLE = data_url(png_bytes(clutter(200, 150)))
 LEFT = {"direction": [-1, 0]}

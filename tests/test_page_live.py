@@ -17,6 +17,8 @@ from live_worlds import LOAD, RUN, given_again
 from playwright.sync_api import Page, Route, expect
 from servers import QUESTION, picture
 
+pytestmark = pytest.mark.slow
+
 TURNS = (-2.2, -0.7, 0.5)  # radians by which the arrow is turned
 WITHIN = 0.02  # of the picture's width: paths differ by less
 

@@ -13,6 +13,8 @@ from conftest import Server
 from playwright.sync_api import Page, Request, expect
 from servers import QUESTION, SEEING, Served, picture
 
+pytestmark = pytest.mark.slow
+
 BALL, CUBE, BARE = (63, 80), (187, 85), (20, 20)  # of a picture that is shifted by 3 px
 
 

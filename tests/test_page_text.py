@@ -16,6 +16,8 @@ from drawn import clutter, png_bytes
 from playwright.sync_api import Page, expect
 from servers import BODY, QUESTION, TERMINAL, data_url, eventually, picture
 
+pytestmark = pytest.mark.slow
+
 MARKUP = '<img src=x onerror="document.title=1"><script>document.title=2</script>'
 TEXTS = {
     "markup": MARKUP,

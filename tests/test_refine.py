@@ -27,6 +27,8 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.weights.manifests import load_manifests
 
+pytestmark = pytest.mark.slow
+
 TOYS = ["tiny-refine", "tiny-ati"]
 MODELS = load_manifests()
 CPU = torch.device("cpu")

@@ -11,6 +11,8 @@ import pytest
 from conftest import EXAMPLES
 from test_docs import free_port
 
+pytestmark = pytest.mark.slow
+
 TOUR: dict[str, Any] = json.loads((EXAMPLES / "tour.ipynb").read_text())
 CODE = [cell for cell in TOUR["cells"] if cell["cell_type"] == "code"]
 

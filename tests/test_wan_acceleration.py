@@ -37,6 +37,8 @@ from cow_service.generators.wan.checkpoints import add_lora
 from cow_service.generators.wan.profiles import Acceleration, profile_of
 from cow_service.weights.manifests import load_manifests
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 WIDTH = 24  # of the toy's hidden states
 LAYERS = 3

@@ -32,6 +32,8 @@ from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
 from cow_service.weights.manifests import load_manifests
 
+pytestmark = pytest.mark.slow
+
 BALL = example("ball-and-mug")
 SHORT = {"num_frames": 17, "frames": {"indices": list(range(17)), "max_side": None}}
 

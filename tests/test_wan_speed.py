@@ -36,6 +36,8 @@ import wan_plan  # noqa: E402
 import wan_rows  # noqa: E402
 import wan_speed  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 ATI, TINY = load_manifests()["ati"], load_manifests()["tiny-ati"]
 SMALLEST = wan_models.Case(TINY, CPU, num_frames=5, width=32, height=32, steps=2, runs=1)
