@@ -18,6 +18,7 @@ pytest.importorskip("scipy")
 
 from cow_service.evals.report.page import script_json, write_page
 from cow_service.evals.report.summary import summarize
+from cow_service.evals.report.tables import contrasts
 from cow_service.evals.report.write import write_plots
 from cow_service.evals.runs import EvalRun
 
@@ -151,6 +152,17 @@ def test_a_run_without_pictures_has_a_page(asked: EvalRun, tmp_path: Path, windo
     page = windows.open(write_page(tmp_path, [lost], summarize([lost])).as_uri())
     expect(page.locator(".card")).to_have_count(6)
     expect(page.get_by_text("the file is missing").first).to_be_visible()
+
+
+def test_over_an_arm_that_always_abstains_no_table_has_a_p(asked: EvalRun, tmp_path: Path) -> None:
+    silent = [
+        each.model_copy(update={"read": each.abstain}) if each.arm == "never" else each for each in asked.observations
+    ]
+    run = replace(asked, observations=tuple(each for each in silent if each.arm in ("never", "always")))
+    findings = summarize([run])
+    page = write_page(tmp_path, [run], findings).read_text(encoding="utf-8")
+    assert page.count("<td>abstains</td>") == 2 + 2 * len(findings.arms[1].gains)
+    assert [cells[-2:] for cells in contrasts(findings).rows] == [("abstains", "")] * len(findings.contrasts)
 
 
 def test_data_cannot_end_its_element() -> None:

@@ -219,6 +219,9 @@ def test_a_server_answers_in_the_language_of_the_field_else_of_the_header(http: 
     assert french["answer"] == "Oui"
     assert set(french["reused"]) >= {"grounding", "motion", "trajectory", "generation"}, "nothing is simulated again"
     assert answered({"Accept-Language": "en-GB"})["answer"] == "Yes"
+    options = {"language": "de", "options": ["Nein", "Ja", "Nicht sicher"]}
+    assert answered({}, **options)["answer"] == "B"
+    assert answered({}, **options | {"question": "If the yellow ball moves, is it happy?"})["answer"] == "C"
 
 
 @pytest.mark.parametrize(("said", "language"), [("de", "de"), ("zh-Hans", "zh"), ("Klingon", None), (None, None)])

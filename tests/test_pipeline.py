@@ -10,7 +10,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from conftest import Example, all_scenes
+from conftest import Example, all_scenes, example
 from drawn import DrawnArrow, angle_between, ball, block, floor, png_bytes
 from PIL import Image
 from servers import BODY
@@ -277,3 +277,14 @@ def test_what_is_found_again_is_not_looked_for_in_the_image(service: Service, mo
     again = simulate(service.prepare(request, step=step))
     assert again.reused == ("grounding", "motion", "trajectory", "generation")
     assert again.frames == first.frames
+
+
+def test_the_world_is_the_same_whatever_a_question_names(service: Service) -> None:
+    """Its mugs are seen to be round, also where no word says so."""
+    image, worlds = example("ball-and-mug").image, []
+    for asked in ("will it hit the blue mug", "will it hit the white mug", "what happens"):
+        question = f"If the yellow ball moves opposite to the direction of the arrow, {asked}?"
+        bodies = run(service, image, question, video=False).trajectory.bodies
+        worlds.append(sorted((each.bbox, each.shape, tuple(round(side, 9) for side in each.size)) for each in bodies))
+    assert [shape for _, shape, _ in worlds[0]] == ["sphere", "cylinder", "cylinder"]
+    assert worlds[0] == worlds[1] == worlds[2]

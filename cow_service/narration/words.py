@@ -70,20 +70,10 @@ RELATION_WORDS: dict[str, PlaceRelation] = {
 }
 
 
-_WHERE: dict[PlaceRelation, str] = {"into": "in", "onto": "on"}  # of what is there; else as it is put
-
-
 def place_words(placed: Intervention) -> str:
     """Where something is put, as in: between the bowl and the cone."""
     to = " and ".join(f"the {bare_name(target.object)}" for target in placed.targets)
     return f"{PREPOSITIONS[placed.relation or 'into']} {to}"
-
-
-def state_words(placed: Intervention) -> str:
-    """What is where once it is put there, as in: the white mug next to the blue mug."""
-    at = _WHERE.get(placed.relation or "into", "")
-    where = place_words(placed)
-    return f"the {bare_name(placed.object.object)} {f'{at} {where.split(maxsplit=1)[1]}' if at else where}"
 
 
 TEMPLATES = Resources("prompts/narration", ".yaml", "language")

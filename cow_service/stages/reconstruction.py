@@ -23,6 +23,7 @@ from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.stages.run import Run
 from cow_service.vision.edges import divide
+from cow_service.vision.forms import shape_seen
 from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Obstacle, Scene
@@ -199,24 +200,23 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
         said, region = None if thing is None else thing.prior, scene.region_of(seen.bbox)
         if carrier and same_name(seen.name, carried) and (said is None or said.stands_on is None):
             said = (said or ObjectPrior()).model_copy(update={"stands_on": carrier})
+        shape = None if region is None else shape_seen(region)
+        if situation.side_view is not None and shape != "sphere":
+            shape = "box"
+        if said is not None and said.shape is not None:
+            shape = said.shape
         body = SeenBody(
             name=seen.name,
             bbox=seen.bbox,
             mask=seen.mask,
-            # Where nothing is said of its shape, a disc is a sphere, and the rest stands upright.
-            shape="sphere" if region is not None and region.is_disc else "cylinder",
+            shape=shape or "cylinder",  # it stands upright
+            is_form_known=shape is not None,
             source=(None if thing is None else thing.source) or "embedded",
             confidence=seen.confidence,
             prior=said,
             point=None if bodies else grounding.point,
             stands_out=region is not None or situation.side_view is not None,
         )
-        if said is not None and said.shape is not None:
-            body = replace(body, shape=said.shape)
-        elif situation.side_view is not None:
-            body = replace(body, shape="sphere" if body.shape == "sphere" else "box")
-        elif body.shape != "sphere":
-            body = replace(body, is_form_known=False)
         if said is not None and not bodies:
             body = replace(body, elongated=said.elongated, equal_sided=said.equal_sided)
         bodies.append(body)

@@ -122,7 +122,7 @@ _GAIN: dict[str, Callable[[Gain], str]] = {
     "questions": lambda gain: str(gain.questions),
     "scenes": lambda gain: str(gain.scenes),
     "gain, points": lambda gain: f"{100 * gain.gain:+.2f}",
-    "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}",
+    "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}" if gain.scenes > 1 else "one scene",
     "helped": lambda gain: str(gain.helped),
     "hurt": lambda gain: str(gain.hurt),
 }

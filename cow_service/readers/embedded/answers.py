@@ -15,7 +15,7 @@ from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.asked import Unread
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import may_name, parse_noun_phrase
-from cow_service.readers.options import not_sure_option, plain, says_not_sure
+from cow_service.readers.options import not_sure_option, option_saying, plain, says_not_sure
 from cow_service.records import AnswerOption, Asked, Narration, Outcome, Simulation
 
 _YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECASE)
@@ -189,12 +189,12 @@ def answer_from(
     if asked is None:
         words = "\n".join(unread.turning or unread.beside)[:MAX_UNREAD].splitlines()
         named = say.templates["names-comma"].join(say("quoted", words=each) for each in words)
-        return _unsure(options, say("unsure-not-read", words=named or say("the-question")))
+        return _unsure(options, say, say("unsure-not-read", words=named or say("the-question")))
     if simulation is None or outcome is None:
-        return _unsure(options, say("unsure-no-simulation" if simulation is None else "unsure-no-outcome"))
+        return _unsure(options, say, say("unsure-no-simulation" if simulation is None else "unsure-no-outcome"))
     first = outcome.first
     if outcome.sure and first is not None and alternatives and not any(may_name(each, first) for each in alternatives):
-        return _unsure(options, say("unsure-not-among", said=first))
+        return _unsure(options, say, say("unsure-not-among", said=first))
     return choose_option(options, outcome, simulation.narration, say)
 
 
@@ -203,17 +203,19 @@ def choose_option(
 ) -> AnswerReading:
     """The option that says what the simulation says, or its words where there are none; else not sure, and why."""
     if not outcome.sure:
-        return _unsure(options, narration.summary)
+        return _unsure(options, say, narration.summary)
     if not options:
         return AnswerReading(narration.answer, False, reasoning=narration.summary)
     fitting = _fitting([option for option in options if not says_not_sure(option.text)], outcome)
-    if len(fitting) == 1:
-        return AnswerReading(fitting[0].letter, False, reasoning=narration.summary)
-    return _unsure(options, say("unsure-no-option", said=narration.answer))
+    # Options in another language than English are told by the words of the answer in it, such as "Ja".
+    only = fitting[0] if len(fitting) == 1 else None if fitting else option_saying(options, narration.answer)
+    if only is not None:
+        return AnswerReading(only.letter, False, reasoning=narration.summary)
+    return _unsure(options, say, say("unsure-no-option", said=narration.answer))
 
 
-def _unsure(options: Sequence[AnswerOption], why: str) -> AnswerReading:
-    option = not_sure_option(options)
+def _unsure(options: Sequence[AnswerOption], say: Phrases, why: str) -> AnswerReading:
+    option = not_sure_option(options) or option_saying(options, say("not-sure"))
     return AnswerReading(None if option is None else option.letter, True, reasoning=why)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from cow_service.readers.embedded.english.lexicon import words
+from cow_service.records import Shape
 from cow_service.vision.masks import hull
 from cow_service.vision.regions import Region
 from cow_service.vision.types import Mask
@@ -57,9 +57,11 @@ _ALIKE = {
     "mug": "cup", "cone": "pyramid", "cylinder": "can jar", "box": "block brick cuboid",
     "car": "bus truck van taxi lorry train",
 }  # fmt: skip
-_FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALIKE.items() for other in words(said)}
+_FORMS = {name: name for name in OUTLINES} | {other: name for name, said in _ALIKE.items() for other in said.split()}
 # From this log ratio on, a row identifies an object (nearly anything can look like a box or a can).
 _TELLING, _CLEARLY = ("ball", "bottle", "bowl", "car", "cone", "mug", "vase"), 1.5
+# What is certainly as deep as it is wide, and how it is shaped.
+_ROUND = dict[str, Shape](bottle="cylinder", bowl="cylinder", cone="cone", mug="cylinder", vase="cylinder")
 _PLAIN = ("ball", "box", "cube", "cylinder")
 # Rows that are no rivals of one: a cube is a box, a mug that hides its handle a cylinder.
 _SAME = {"cube": {"cube", "box"}, "box": {"cube", "box"}, "mug": {"mug", "cylinder", "box"}}
@@ -85,6 +87,11 @@ def looks_like(region: Region) -> str | None:
         return None
     ratio, form = max((log_ratio(region, form), form) for form in _TELLING)
     return form if ratio >= _CLEARLY else None
+
+
+def shape_seen(region: Region) -> Shape | None:
+    """The shape that a disc or an outline clearly shows, whatever the thing is called; None if it could be several."""
+    return "sphere" if region.is_disc else _ROUND.get(looks_like(region) or "")
 
 
 def is_other_kind(region: Region, noun: str | None) -> bool:

@@ -14,7 +14,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import parse_noun_phrase
 from cow_service.readers.embedded.matching import best_matches, match_one, noun_doubts
-from cow_service.readers.embedded.outlines import form_of, is_unlike
+from cow_service.vision.forms import form_of, is_unlike
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.regions import Region, find_regions
 from cow_service.vision.scene import Scene
