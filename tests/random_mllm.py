@@ -187,11 +187,17 @@ class _Quiet(ThreadingHTTPServer):
 
 
 @contextmanager
-def random_mllm() -> Iterator[RandomMllm]:
-    """Serves until the block ends."""
+def random_mllm(port: int = 0) -> Iterator[RandomMllm]:
+    """Serves until the block ends; at any free port if 0."""
     mllm = RandomMllm()
-    with _Quiet(("127.0.0.1", 0), type("Handler", (_Handler,), {"mllm": mllm})) as server:
+    with _Quiet(("127.0.0.1", port), type("Handler", (_Handler,), {"mllm": mllm})) as server:
         mllm.address = f"http://127.0.0.1:{server.server_port}/v1"
         threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
         yield mllm
         server.shutdown()
+
+
+if __name__ == "__main__":  # for trying `cow eval` without an MLLM
+    with random_mllm(8009) as served:
+        print(f"Replies at random: {served.address}", flush=True)
+        threading.Event().wait()

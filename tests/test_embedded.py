@@ -131,7 +131,7 @@ def test_a_verb_that_its_direction_contradicts_is_refused(words: str) -> None:
 
 def test_one_is_no_noun() -> None:
     image = ball(block(floor(), (430, 150, 520, 250), RED), (150, 200), 40, RED)
-    assert "2 that fit" in refusal(CannotGround, Scene(jpeg(image)), "If the red one slides left, what happens?")
+    assert "either of 2" in refusal(CannotGround, Scene(jpeg(image)), "If the red one slides left, what happens?")
 
 
 def test_what_is_longer_than_high_is_the_vehicle() -> None:
@@ -149,7 +149,7 @@ def test_bare_names_are_found_together_and_what_is_not_there_is_refused() -> Non
     given = ReaderInput(scene, "If the cylinder is removed and the cube slides right, what happens?")
     (removed,) = reader.ground(given).interventions
     assert removed.object.bbox == grounding.others[0].bbox
-    assert "nothing that fits" in refusal(CannotGround, scene, "If the vase slides right, what happens?")
+    assert "'vase' was not found" in refusal(CannotGround, scene, "If the vase slides right, what happens?")
 
 
 def test_the_only_ball_needs_no_colour() -> None:
@@ -173,7 +173,7 @@ def test_words_of_place_and_size_single_one_out(words: str, x: int) -> None:
 
 def test_a_noun_that_is_not_what_is_seen_is_warned_of() -> None:
     grounding = reader.ground(ReaderInput(drawn(False), "If the red ball rolls right, will it hit the blue cone?"))
-    assert any("names 'blue cone', which was not found" in warning for warning in grounding.warnings)
+    assert any("'blue cone' was not found" in warning for warning in grounding.warnings)
     assert grounding.others == ()  # what is not found is in no answer
     warnings = reader.ground(ReaderInput(drawn(False), "If the blue elephant moves right, what happens?")).warnings
     assert any("whether 'elephant' is right" in warning for warning in warnings)
@@ -232,8 +232,10 @@ def test_refusals_say_what_was_looked_for_what_was_seen_and_what_to_give() -> No
     assert "grounding.point" in told
     told = refusal(CannotGround, drawn(), "Is this nice?")
     assert "does not say in words what moves" in told
-    twins = Scene(jpeg(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED)))
-    assert "found 2 that fit" in refusal(CannotGround, twins, "If the red ball moves left, what happens?")
+    twins = Scene(jpeg(ball(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED), (300, 270), 30, BLUE)))
+    assert "may be either of 2: red at" in refusal(CannotGround, twins, "If the red ball moves left, what happens?")
+    told = "'red ball' may be either of 2: red at"
+    assert told in refusal(CannotReadDirection, twins, "If the blue ball moves towards the red ball, what happens?")
     told = refusal(CannotReadDirection, drawn(False), "If the red ball moves along the arrow, will it hit the cube?")
     assert "no drawn arrow was found" in told
     assert "motion.direction" in told

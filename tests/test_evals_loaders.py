@@ -176,6 +176,9 @@ def written(folder: Path, form: str) -> Path:
     coded = base64.b64encode(image).decode()
     if form == "jsonl":
         path.write_text(json.dumps({**ROW, "image": "1.png"}) + "\n\n")
+    elif form == "batch.jsonl":  # as `cow batch` has them: the answer is copied to its result
+        row = {name: value for name, value in ROW.items() if name != "answer"}
+        path.write_text(json.dumps({**row, "image": "1.png", "meta": {"answer": ROW["answer"]}}))
     elif form == "csv":
         path.write_text('id,image,question,answer,task,level\nq1,1.png,"' + ASKED + '",B,collision,L2\n')
     elif form == "tsv":  # as VLMEvalKit has them
@@ -187,7 +190,7 @@ def written(folder: Path, form: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("form", ["jsonl", "csv", "tsv", "parquet"])
+@pytest.mark.parametrize("form", ["jsonl", "batch.jsonl", "csv", "tsv", "parquet"])
 def test_tables_of_every_form_hold_the_same_question(form: str, tmp_path: Path, pictures: Pictures) -> None:
     (item,) = load(str(written(tmp_path, form)), pictures).items
     assert (item.id, item.task, item.answer, item.abstain) == ("q1", "collision", "B", "C")

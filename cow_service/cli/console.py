@@ -71,11 +71,11 @@ def run_request(
     if simulation is not None:
         print_stages(console, simulation)
     print_answer(console, result)
-    for warning in result.warnings:
-        console.print(f"[yellow]warning[/]: {escape(warning)}")
     problem = result.simulation_problem if isinstance(result, Answer) else None
-    if problem is not None and problem.code in HINTS:
-        console.print(HINTS[problem.code])
+    hint, remedy_of = (None, None) if problem is None else (HINTS.get(problem.code), problem.remedy)
+    for warning in result.warnings:
+        told = warning.replace(remedy_of, hint) if hint and remedy_of else warning
+        console.print(f"[yellow]warning[/]: {escape(told)}")
     if written:
         console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
     return simulation

@@ -121,6 +121,8 @@ def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Unread]:
 
 def _table_row(place: str, read: Callable[[], dict[str, Any]], folder: Path, ignore_columns: bool) -> Row:
     fields = read()
+    if isinstance(fields.get("meta"), dict):  # a batch's file has the answer there
+        fields = {"answer": fields["meta"].get("answer")} | fields
     unknown = [name for name in fields if name not in (*_NAMES, *IGNORED, *LETTERS)]
     if unknown and not ignore_columns:
         close = difflib.get_close_matches(unknown[0], _NAMES, 1)

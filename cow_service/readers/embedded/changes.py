@@ -7,7 +7,7 @@ from cow_service.narration.words import same_name
 from cow_service.readers.embedded.english.asked import read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.matching import describe, match_one, match_several
+from cow_service.readers.embedded.matching import best_matches, match_one, match_several, unclear
 from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import BBox, Intervention, LocatedObject
 from cow_service.vision.masks import is_among
@@ -47,7 +47,7 @@ def find_removed(scene: Scene, question: Question, given: Sequence[LocatedObject
         one = None if _is_plural(phrase) else _one(left, phrase, others, given)
         found = _both(left, phrase, others) if _is_plural(phrase) else [] if one is None else [one]
         if not found:
-            raise _not_found(scene, f"takes '{phrase.text}' away", phrase)
+            raise _not_found(left, f"takes '{phrase.text}' away", phrase, others)
         taken += found
     return tuple(Intervention(kind="remove", object=each) for each in taken)
 
@@ -101,11 +101,11 @@ def find_placed(
             thing = _one(free, phrase, names, given) if again is None else _located(phrase.text, again)
             if thing is None:
                 where = f"{change.relation} '{phrase.text}'" if found else "somewhere"
-                raise _not_found(scene, f"{puts} {where}", phrase)
+                raise _not_found(free, f"{puts} {where}", phrase, names)
             found.append(thing)
             known.append((phrase, thing.bbox))
         if change.relation == "between" and len(found) != 3:
-            raise _not_found(scene, f"{puts} between", change.targets[0])
+            raise _not_found(scene.regions, f"{puts} between", change.targets[0])
         targets = tuple(found[1:])
         placed.append(Intervention(kind="place", object=found[0], relation=change.relation, targets=targets))
     return tuple(placed)
@@ -115,8 +115,8 @@ def _located(name: str, bbox: BBox) -> LocatedObject:
     return LocatedObject(object=name, bbox=bbox, source="embedded")
 
 
-def _not_found(scene: Scene, told: str, phrase: ObjectPhrase) -> CannotGround:
-    return CannotGround(
-        f"The question {told}, and '{phrase.text}' was not found, or not for certain. Seen: {describe(scene.regions)}.",
-        remedy=GIVE_OBJECT,
-    )
+def _not_found(
+    regions: Sequence[Region], told: str, phrase: ObjectPhrase, others: Sequence[ObjectPhrase] = ()
+) -> CannotGround:
+    why = unclear(phrase, best_matches(regions, phrase, others), regions)
+    return CannotGround(f"The question {told}, and {why}.", remedy=GIVE_OBJECT)

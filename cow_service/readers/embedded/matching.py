@@ -251,6 +251,13 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
     return fitting[0] if len(fitting) == 1 else None
 
 
+def unclear(phrase: ObjectPhrase, fitting: Sequence[Region], regions: Sequence[Region]) -> str:
+    """Why not one region is what a phrase names, for a message."""
+    if fitting:
+        return f"'{phrase.text}' may be either of {len(fitting)}: {describe(fitting)}. Name its colour or its place"
+    return f"'{phrase.text}' was not found, or not for certain. Seen: {describe(regions)}"
+
+
 def match_several(
     regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase], count: int | None
 ) -> list[Region]:

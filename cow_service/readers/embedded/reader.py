@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from cow_service import __version__, records
 from cow_service.errors import CannotGround, CannotReadDirection
@@ -84,8 +85,8 @@ class EmbeddedReader:
         if mover is None or not says_motion:
             named = ("', '".join((*left.turning, *left.beside)) or given.question)[:MAX_UNREAD]
             raise CannotGround(
-                "The question does not say in words what moves, as far as the embedded reader understands it; it reads "
-                f"English. It did not understand '{named}'. "
+                "The question does not say in words what moves and how, as far as the embedded reader understands it; "
+                f"it reads English. It did not understand '{named}'. "
                 f'Ask like "If the red ball moves to the left, will it hit the vase?".',
                 remedy=GIVE_PLACE,
             )
@@ -110,9 +111,10 @@ class EmbeddedReader:
                     others.setdefault(place, LocatedObject(object=phrase.text, bbox=place))
             located = (*others.values(), *matching.things_of_kinds(regions, question, bbox, given.known))
             boxes = {other.object: other.bbox for other in located}
+            besides = [each for each in regions if each.bbox != bbox]
+            meant = partial(matching.best_matches, besides, others=wanted)
             missing = [
-                f"The question names '{each.text}', which was not found, or not for certain, so no encounter is listed "
-                f"under that name. Seen: {describe(scene.regions)}."
+                f"{matching.unclear(each, meant(each), besides)}. No encounter is listed under that name."
                 for each in question.others
                 if each.text not in boxes
                 and not matching.is_kind_asked(each, question)
@@ -208,23 +210,14 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
     fitting = matching.best_matches(regions, phrase, question.others)
     if len(fitting) > 1 and question.mentions_arrow:
         fitting = scene.at_arrow(fitting) or fitting
-    seen = describe(scene.regions)
-    if not fitting:
-        raise CannotGround(f"Looked for '{phrase.text}' and found nothing that fits. Seen: {seen}.", remedy=GIVE_PLACE)
-    if len(fitting) > 1:
-        raise CannotGround(
-            f"Looked for '{phrase.text}' and found {len(fitting)} that fit: {describe(fitting)}. Seen in all: {seen}.",
-            remedy=GIVE_PLACE,
-        )
-    if (
-        phrase.colour is None
-        and not matching.is_known(phrase)
-        and len(scene.regions) > 1
-        and phrase.noun not in fitting[0].called
-    ):
+    if len(fitting) != 1:
+        told = f"What moves is not clear: {matching.unclear(phrase, fitting, scene.regions)}."
+        raise CannotGround(told, remedy=GIVE_PLACE)
+    says_nothing = phrase.colour is None and not matching.is_known(phrase) and phrase.noun not in fitting[0].called
+    if says_nothing and len(scene.regions) > 1:
         raise CannotGround(
             f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
-            f"Seen: {seen}.",
+            f"Seen: {describe(scene.regions)}.",
             remedy=GIVE_PLACE,
         )
     return fitting[0].bbox
@@ -342,11 +335,8 @@ def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Locate
         return goal
     bbox = _bbox_of(scene.regions, phrase, grounding.bbox, ())
     if bbox is None:
-        raise CannotReadDirection(
-            f"The {grounding.object} moves towards '{phrase.text}', which was not found. "
-            f"Seen: {describe(scene.regions)}.",
-            remedy=GIVE_DIRECTION,
-        )
+        told = matching.unclear(phrase, matching.best_matches(scene.regions, phrase), scene.regions)
+        raise CannotReadDirection(f"Where the {grounding.object} moves to is not clear: {told}.", remedy=GIVE_DIRECTION)
     return LocatedObject(object=phrase.text, bbox=bbox)
 
 
