@@ -161,7 +161,7 @@ def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
                 ask(client, video=False)
                 first = 1000 * (time.perf_counter() - started)
                 warm = timed(lambda: ask(client, video=False), runs)
-                figures["POST /simulate, 3 frames"] = warm
+                figures["POST /simulate, 4 frames"] = warm
                 figures["first request"] = {"ms": round(first, 1), "against warm": round(first / warm["p50_ms"], 2)}
                 figures["the same picture again"] = timed(lambda: ask_again(client, video=False), runs)
                 numbers = count(2)
@@ -172,7 +172,7 @@ def measure(image: Path, question: str, runs: int) -> dict[str, Any]:
 
                 figures["another question about the image"] = timed(ask_other, runs)
                 before = kept_bytes(Path(data))
-                figures["POST /simulate, 3 frames and 81-frame mp4"] = timed(lambda: ask(client), runs)
+                figures["POST /simulate, 4 frames and 81-frame mp4"] = timed(lambda: ask(client), runs)
                 made = runs + 1
                 figures["kept per job"] = {
                     name: round((size - before[name]) / made) for name, size in kept_bytes(Path(data)).items()

@@ -55,6 +55,18 @@ def test_half_of_a_thing_may_be_a_ball_but_no_vase() -> None:
     assert [is_unlike(region, noun) for noun in ("ball", "cylinder", "vase", "bottle")] == [False, False, True, True]
 
 
+@pytest.mark.parametrize(("height", "is_odd"), [(64, False), (48, True), (38, True)])
+def test_the_lit_cap_of_a_ball_is_no_ball_that_is_seen_whole(height: int, is_odd: bool) -> None:
+    """Its lower part may be as light as the floor."""
+    image = floor()
+    seen = np.zeros(image.shape[:2], np.uint8)
+    cv2.ellipse(seen, (300, 232), (32, 32), 0, 0, 360, 1, -1)
+    seen[200 + height :] = 0
+    image[seen > 0] = GREEN
+    (region,) = find_regions(jpeg(image))
+    assert is_unlike(region, "ball") is is_odd
+
+
 @pytest.mark.parametrize(("noun", "is_odd"), [("cylinder", False), ("can", False), ("bottle", True), ("cone", True)])
 def test_a_squat_cylinder_seen_from_above_is_one(noun: str, is_odd: bool) -> None:
     image = np.ascontiguousarray(floor())

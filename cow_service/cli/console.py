@@ -72,9 +72,9 @@ def run_request(
         print_stages(console, simulation)
     print_answer(console, result)
     problem = result.simulation_problem if isinstance(result, Answer) else None
-    hint, remedy_of = (None, None) if problem is None else (HINTS.get(problem.code), problem.remedy)
+    hint = None if problem is None else HINTS.get(problem.code)
     for warning in result.warnings:
-        told = warning.replace(remedy_of, hint) if hint and remedy_of else warning
+        told = warning.replace(problem.remedy, hint) if problem and problem.remedy and hint else warning
         console.print(f"[yellow]warning[/]: {escape(told)}")
     if written:
         console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")

@@ -20,6 +20,7 @@ Range = tuple[float, float]
 
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
+LESS_THAN_ROUND = 1.0  # misfit above which a ball is not seen whole; whole ones have next to none
 CONTRADICTS = 6.0  # misfit above which an object is not the named one; whole objects under their own name reach 5.1
 UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
 FITS = 2.0  # misfit below which an outline is well described
@@ -78,7 +79,8 @@ def is_unlike(region: Region, form: str) -> bool:
         return False
     is_box = form == "box"  # which may be flat, or as high as a tower
     measured = [0.0, *_measures(region)[1:]] if is_box else _measures(region)
-    return _misfit(measured, form) >= CONTRADICTS or (not is_box and log_ratio(region, form) < UNLIKE)
+    most = LESS_THAN_ROUND if form == "ball" else CONTRADICTS  # of a lit cap neither foot nor size are seen
+    return _misfit(measured, form) >= most or (not is_box and log_ratio(region, form) < UNLIKE)
 
 
 def looks_like(region: Region) -> str | None:

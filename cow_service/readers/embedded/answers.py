@@ -30,10 +30,8 @@ _SEEN = lex.words("visible unobstructed unoccluded uncovered")
 _NEGATIONS = lex.words("not no never n't without nothing neither")
 _ANY_WORDS = lex.words("anything something any object objects nothing")
 _PASSIVE = lex.words("is are be get gets stays stay remains remain being")
-_BARE = {
-    "it will": True, "it does": True, "it would": True, "it will not": False, "it does not": False,
-    "it would not": False, "it can not": False,
-}  # fmt: skip
+_BARE = dict.fromkeys(("it will", "it does", "it would"), True)
+_BARE |= dict.fromkeys(("it will not", "it does not", "it would not", "it can not"), False)
 _NONE = re.compile(
     r"none|nothing|neither|never|not at all|no (?:object|objects|thing|collision|contact|one|time|hit)"
     r"|none of (?:them|these|the above|the objects)|neither of (?:them|these|the two)"

@@ -211,8 +211,8 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
     if len(fitting) > 1 and question.mentions_arrow:
         fitting = scene.at_arrow(fitting) or fitting
     if len(fitting) != 1:
-        told = f"What moves is not clear: {matching.unclear(phrase, fitting, scene.regions)}."
-        raise CannotGround(told, remedy=GIVE_PLACE)
+        told = matching.unclear(phrase, fitting, scene.regions)
+        raise CannotGround(f"What moves is not clear: {told}.", remedy=GIVE_PLACE)
     says_nothing = phrase.colour is None and not matching.is_known(phrase) and phrase.noun not in fitting[0].called
     if says_nothing and len(scene.regions) > 1:
         raise CannotGround(
