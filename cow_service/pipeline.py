@@ -89,18 +89,12 @@ def answer(run: Run[AnswerRequest]) -> Answer:
 
 
 def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, errors.CowError | None]:
-    """The simulation, or the error for which there is none. Raises what leaves no answer either."""
+    """The simulation, or the error for which there is none. Raises what is no fault of the question."""
     try:
         return simulate(run), None
-    except (
-        errors.InvalidRequest,
-        errors.Canceled,
-        errors.MllmRefused,
-        errors.MllmUnavailable,
-        errors.ReaderUnavailable,
-        errors.PerceptionUnavailable,
-        errors.DeviceFailed,
-    ):
-        raise  # the last: another process may be able to imagine
+    except (errors.InvalidRequest, errors.Canceled, errors.MllmRefused):
+        raise
     except errors.CowError as error:
+        if error.status >= 500 and not isinstance(error, errors.MllmBadReply):
+            raise  # the server could not imagine: that is no answer, and another try or process may do it
         return None, error

@@ -1,6 +1,7 @@
 """Settings of the service, read from environment variables: `COW_` plus the field's name in capitals."""
 
 import base64
+import difflib
 import os
 import re
 import sys
@@ -268,8 +269,19 @@ SECRET_SETTINGS = {
 }
 
 
+OF_CLIENTS = {"COW_BASE_URL", "COW_API_KEY"}
+
+
 def load_settings(**overrides: Any) -> Settings:
-    """Settings from the environment, with overrides that are not None. Raises `SettingsError` for a bad value."""
+    """Settings from the environment, with overrides that are not None.
+
+    Raises `SettingsError` for a bad value, and for a name that is nearly a setting's: a server without the keys that
+    its operator believes to have given is open to all.
+    """
+    names = {f"COW_{name.upper()}" for name in Settings.model_fields}
+    for name in sorted({name.upper() for name in os.environ if name.upper().startswith("COW_")} - names - OF_CLIENTS):
+        if close := difflib.get_close_matches(name, names, 1, cutoff=0.85):
+            raise SettingsError(f"Bad settings: {name} is no setting; {close[0]} is. Correct its name, or remove it.")
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except UnreadableSetting as error:

@@ -508,15 +508,15 @@ def test_the_option_that_says_what_the_world_says(world: Outcome, options: list[
 @pytest.mark.parametrize(
     ("world", "said", "why"),
     [
-        (YES, "Yes", "Yes, it hits the vase. 48 of 50 simulated versions agree."),
+        (YES, "Yes", "Yes, it hits the vase. 47 of 50 simulated versions agree."),
         (NO, "No", "No, it misses the vase. 48 of 50 simulated versions agree."),
-        (outcome(FIRST, first="red cube"), "red cube", "The red cube. 48 of 50 simulated versions agree."),
-        (outcome(FIRST), "Nothing", "It hits nothing. 48 of 50 simulated versions agree."),
-        (AT, "After about 1.1 s", "After about 1.1 s (1.0 to 1.3 s in most simulated versions). 48 of 50 simulated "
+        (outcome(FIRST, first="red cube"), "red cube", "The red cube. 47 of 50 simulated versions agree."),
+        (outcome(FIRST), "Nothing", "It hits nothing. 47 of 50 simulated versions agree."),
+        (AT, "After about 1.1 s", "After about 1.1 s (1.0 to 1.3 s in most simulated versions). 47 of 50 simulated "
          "versions agree."),
         (outcome(WHEN, 0.04, time=0.9), "Never", "It misses the vase. 48 of 50 simulated versions agree."),
-        (outcome(COUNT, count=2), "2", "2 objects. 48 of 50 simulated versions agree."),
-        (outcome(COUNT, count=1), "1", "One object. 48 of 50 simulated versions agree."),
+        (outcome(COUNT, count=2), "2", "2 objects. 47 of 50 simulated versions agree."),
+        (outcome(COUNT, count=1), "1", "One object. 47 of 50 simulated versions agree."),
     ],
 )  # fmt: skip
 def test_an_open_question_is_answered_in_words(world: Outcome, said: str, why: str) -> None:
@@ -530,12 +530,12 @@ def test_an_open_question_is_answered_in_words(world: Outcome, said: str, why: s
         (outcome(HIT, None, sure=False), "Not sure: the objects in the image could not be told apart"),
         (
             outcome(HIT, 0.62, sure=False, depends_on=("heading", "speed")),
-            "Not sure: it hits the vase in 31 of 50 simulated versions; it depends most on which way it heads in depth",
+            "Not sure: in 31 of 50 simulated versions it hits the vase; it depends most on which way it heads in depth",
         ),
-        (outcome(HIT, 0.18, sure=False), "Probably not: it misses the vase in 41 of 50 simulated versions."),
+        (outcome(HIT, 0.18, sure=False), "Probably not: in 41 of 50 simulated versions it misses the vase."),
         (
             outcome(FIRST, 0.4, first="red cube", sure=False),
-            "Not sure: the first one is the red cube in 20 of 50 simulated versions.",
+            "Not sure: in 20 of 50 simulated versions the first one is the red cube.",
         ),
     ],
 )

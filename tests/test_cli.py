@@ -260,6 +260,12 @@ def test_bad_settings_are_named(tmp_path: Path) -> None:
     assert "Traceback" not in result.stderr
 
 
+def test_a_misspelled_setting_is_named_with_the_one_that_may_be_meant(tmp_path: Path) -> None:
+    result = cow(tmp_path, "serve", COW_APIKEYS="{}", COW_BASE_URL="http://127.0.0.1:1", COW_API_KEY="key")
+    assert result.returncode == 2
+    assert "COW_APIKEYS is no setting; COW_API_KEYS is." in result.stderr
+
+
 def test_models_and_doctor(tmp_path: Path) -> None:
     assert "cutout (default)" in cow(tmp_path, "models").stdout
     models = Models.model_validate_json(cow(tmp_path, "models", "--json").stdout)

@@ -106,6 +106,13 @@ LEAVES = Asked(relation="leaves")
          "The toy car slides to the right and passes in front of the vase (hiding 45% of it) from about 0.8 s "
          "on.",
          "Yes, it hides the vase. 90 of 100 simulated versions agree."),
+        ("ball", world(bodies=(body("ball", "sphere"), body("vase")), encounters=(occlusion("occluded-by", 0.1),),
+                       ensemble=100, outcome=outcome(Asked(relation="covered", target="vase"), 0.02, "vase")),
+         "The ball rolls to the right and passes behind the vase (which hides 10% of it) from about 0.8 s on.",
+         "No, it is not hidden by the vase. 98 of 100 simulated versions agree."),
+        ("ball", THROWN.model_copy(update={"outcome": outcome(HIT.model_copy(update={"within": 2.0}), 0.9, time=1.1)}),
+         "The ball bounces once, rolls on and hits the white cube after about 1.1 s.",
+         "Yes, it hits the white cube after about 1.1 s. 90 of 100 simulated versions agree."),
         ("ball", world(encounters=(occlusion("occluded-by", 0.6),)),
          "The ball rolls to the right, passes behind the vase (which hides 60% of it) from about 0.8 s on and "
          "hits nothing.",

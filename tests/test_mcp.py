@@ -361,7 +361,8 @@ def test_a_tool_takes_what_people_know_better(here: tuple[Session, Path]) -> Non
         ({"motion_kind": "projectile"}, ("invalid-request", "needs a `direction`")),
         ({"frames_count": 1000}, ("invalid-request", "frames_count: ")),
         ({"generator": "nobody"}, ("invalid-request", "generator: There is no generator 'nobody'", "cutout")),
-        ({"bBox": [1, 2, 3, 4]}, ("invalid-request", "bBox: is not an argument of this tool", "bbox")),
+        ({"bBox": [1, 2, 3, 4]}, ("invalid-request", "No argument of this tool: bBox", "bbox")),
+        ({"grounding": {"point": [1, 2]}}, ("grounding (instead: `object`, `bbox`, `point`)",)),
         ({"question": 7}, ("invalid-request", "question: ")),
     ],
 )

@@ -63,7 +63,7 @@ def test_the_outcome_is_told_as_a_hypothesis() -> None:
     lines = text.splitlines()
     story = "hits the blue mug after about 0.5 s (after the clip ends) and misses the white cube."
     assert f"> The ball stays where it is, {story}" in lines
-    assert "> It hits the white cube in 186 of 200 simulated versions." in lines
+    assert "> In 186 of 200 simulated versions it hits the white cube." in lines
     assert "> It depends most on how fast it moves, which way it heads in depth." in lines
     assert "a computed hypothesis about the first image" in text
     assert "It can be wrong" in text
@@ -74,22 +74,22 @@ def test_the_outcome_is_told_as_a_hypothesis() -> None:
 @pytest.mark.parametrize(
     ("fields", "told"),
     [
-        ({"asked": {"negated": True}}, "It misses the white cube"),
-        ({"asked": {"relation": "covers", "negated": True}}, "It leaves the white cube in view"),
-        ({"asked": {"relation": "covered"}}, "It is hidden by the white cube"),
-        ({"asked": {"target": None}, "object": None}, "It hits something"),
-        ({"asked": {"target": None, "negated": True}, "object": None}, "It hits nothing"),
-        ({"asked": {"form": "which-first"}, "first": "red\nbox"}, "The first one is the red box"),
-        ({"asked": {"form": "which-first"}, "object": None}, "It hits nothing"),
-        ({"asked": {"form": "how-many"}, "count": 2}, "It is 2 objects"),
-        ({"asked": {"relation": "tips"}}, "The white cube is knocked over"),
-        ({"asked": {"within": 1.0}}, "It hits the white cube within 1.0 s"),
-        ({"asked": {"form": "changes"}}, "That makes a difference"),
+        ({"asked": {"negated": True}}, "it misses the white cube"),
+        ({"asked": {"relation": "covers", "negated": True}}, "it leaves the white cube in view"),
+        ({"asked": {"relation": "covered"}}, "it is hidden by the white cube"),
+        ({"asked": {"target": None}, "object": None}, "it hits something"),
+        ({"asked": {"target": None, "negated": True}, "object": None}, "it hits nothing"),
+        ({"asked": {"form": "which-first"}, "first": "red\nbox"}, "the first one is the red box"),
+        ({"asked": {"form": "which-first"}, "object": None}, "it hits nothing"),
+        ({"asked": {"form": "how-many"}, "count": 2}, "it is 2 objects"),
+        ({"asked": {"relation": "tips"}}, "the white cube is knocked over"),
+        ({"asked": {"within": 1.0}}, "it hits the white cube within 1.0 s"),
+        ({"asked": {"form": "changes"}}, "that makes a difference"),
     ],
 )
 def test_every_form_of_question_is_put_in_words(fields: dict[str, Any], told: str) -> None:
     text = prompt(outcome=outcome(probability=0.5, **fields))
-    assert f"> {told} in 100 of 200 simulated versions." in text.splitlines()
+    assert f"> In 100 of 200 simulated versions {told}." in text.splitlines()
     assert "depends" not in text
 
 
@@ -117,8 +117,8 @@ def test_both_worlds_of_a_removal_are_told_and_named() -> None:
     assert 'first strip, named "Without the vase"' in text
     assert 'named "As it is"' in text
     lines = text.splitlines()
-    assert "> Without the vase: It hits the white cube in 194 of 200 simulated versions." in lines
-    assert "> As it is: It misses the white cube in 196 of 200 simulated versions." in lines
+    assert "> Without the vase: In 194 of 200 simulated versions it hits the white cube." in lines
+    assert "> As it is: In 196 of 200 simulated versions it misses the white cube." in lines
     without_strips = prompt("The vase", **given)
     assert 'changed from the beginning: "Without the vase"' in without_strips
     assert "strip" not in without_strips

@@ -1,4 +1,4 @@
-"""The models that see, at toy size: real classes and files, random weights, pulled from a hub and loaded by factory."""
+"""The vision models, at toy size: real classes and files, random weights, pulled from a hub and loaded by factory."""
 
 from __future__ import annotations
 

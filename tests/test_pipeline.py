@@ -156,9 +156,7 @@ def test_doubts_are_told(service: Service) -> None:
     assert "Both `motion` and `trajectory`" in told(motion=motion, trajectory=path)
     assert "from the object's centre" in told(trajectory=path, **place)
     assert "speed" in told(motion={"kind": "projectile", **motion})
-    assert "'green vase' was not found" in told(
-        question="If the red ball moves left, will it hit the green vase?"
-    )
+    assert "'green vase' was not found" in told(question="If the red ball moves left, will it hit the green vase?")
     arrow = DrawnArrow((300, 330), 0.0, 120, 6, (30, 160, 30), "filled").on(block(floor(), (80, 100, 200, 220), RED))
     assert "an arrow at (" in told(image=png_bytes(arrow), question="?", motion=motion, grounding={"point": [140, 160]})
     assert told() == ""

@@ -1,4 +1,4 @@
-"""Checkpoints of the models that see, at toy size: real classes, seeded random weights, files as they are published."""
+"""Checkpoints of the vision models, at toy size: real classes, seeded random weights, files as they are published."""
 
 from __future__ import annotations
 

@@ -70,13 +70,16 @@ Engine = Annotated[JobEngine, from_app("engine")]
 Owner = Annotated[str | None, Depends(_owner)]
 
 
+# A tag such as de-AT, and its weight (RFC 9110, 12.4.2).
+_LANGUAGE_RANGE = re.compile(r"(?:^|,)\s*([a-z]+)(?:-[a-z0-9-]*)?\s*(?:;\s*q\s*=\s*([01](?:\.\d{0,3})?)\s*)?(?=,|$)")
+
+
 def language_of(header: str) -> Language | None:
     """The language that an `Accept-Language` header prefers among those of narrations; None for English, which most
     browsers send unasked: the question's own language says more."""
     weights: dict[str, float] = {}
-    for tag, _, weight in (each.partition(";q=") for each in header.lower().split(",")):
-        with suppress(ValueError):  # of a weight that is no number
-            weights.setdefault(tag.strip()[:2], float(weight or 1))
+    for found in _LANGUAGE_RANGE.finditer(header.lower()):
+        weights.setdefault(found[1], float(found[2] or 1))
     known: list[Language] = [each for each in get_args(Language) if weights.get(each, 0.0) > 0]
     best = max(known, key=lambda each: (weights[each], -[*weights].index(each)), default=None)
     return None if best == "en" else best
@@ -111,6 +114,7 @@ class Submission:
     prefer: Preferences
     job_id: str
     image: bytes | None = None
+    prefers_language: bool = False  # see `JobSpec.prefers_language`
     until: float | None = None  # see `JobSpec.until`
     replayed: bool = False  # the job was there before, under the same Idempotency-Key
 
@@ -199,6 +203,7 @@ class Submitter:
         body = await self.in_thread(submission.owner, partial(parse, raw, model))
         if body.language is None and (language := language_of(request.headers.get("accept-language", ""))):
             body = body.model_copy(update={"language": language})
+            submission.prefers_language = True
         del raw
         if submission.image is None:
             release_body(request)
@@ -356,6 +361,7 @@ class Submitter:
             webhook=body.webhook,
             priority=body.priority,
             until=submission.until,
+            prefers_language=submission.prefers_language,
             request_id=context.request_id.get(),
             traceparent=context.traceparent(),
         )

@@ -241,7 +241,7 @@ async def kept(found: Evidence, client: AsyncClient, pictures: Pictures) -> Evid
 def evidence_of(simulation: AsyncSimulation) -> Evidence:
     """What a simulation gives to show."""
     outcome, step = simulation.trajectory.outcome, 1 / simulation.trajectory.fps
-    moment = None if outcome is None or (outcome.probability or 0.0) < 0.5 else outcome.time
+    moment = outcome.time if outcome is not None and outcome.happens else None
     return Evidence(
         frames=tuple(frame.sha256 for frame in simulation.frames),
         overlay=simulation.overlay.sha256,

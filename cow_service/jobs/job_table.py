@@ -65,13 +65,19 @@ class JobSpec(Record):
         exclude_if=lambda until: until is None,  # earlier versions do not know it
         description="Unix time, s, after which a multimodal LLM that refuses is not asked again.",
     )
+    prefers_language: bool = Field(
+        default=False,
+        exclude_if=lambda prefers: not prefers,
+        description="The language of the request is that of a header, which may differ where a request is sent again.",
+    )
     request_id: str | None = None
     traceparent: str | None = None
 
     @property
     def digest(self) -> str:
         """Equal for requests that ask for the same."""
-        return digest_of({"kind": self.kind, "request": self.request, "fresh": self.fresh, "webhook": self.webhook})
+        asked = {name: value for name, value in self.request.items() if name != "language" or not self.prefers_language}
+        return digest_of({"kind": self.kind, "request": asked, "fresh": self.fresh, "webhook": self.webhook})
 
     @property
     def image(self) -> str:

@@ -79,12 +79,14 @@ def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, An
     Raises `InvalidRequest` for an unknown argument, and where `image` or `question` is missing.
     """
     known = input_schema(tool, "")["properties"]
-    others = f"is not an argument of this tool; it takes: {', '.join(known)}"
-    faults = [FieldError(f"/{name}", others) for name in arguments if name not in known]
+    unknown = [name for name in arguments if name not in known]
+    if unknown:
+        named = [name if (own := _argument_at(name)) == name else f"{name} (instead: {own})" for name in unknown]
+        raise InvalidRequest(f"No argument of this tool: {', '.join(named)}. It takes: {', '.join(known)}.")
     missing = [name for name in ("image", "question") if not isinstance(arguments.get(name), str)]
-    faults += [FieldError(f"/{name}", "is required, as text") for name in missing]
-    if faults:
-        raise InvalidRequest("The arguments of the tool are not valid.", errors=tuple(faults))
+    if missing:
+        faults = tuple(FieldError(f"/{name}", "is required, as text") for name in missing)
+        raise InvalidRequest("The arguments of the tool are not valid.", errors=faults)
     request: dict[str, Any] = {}
     given = DEFAULTS[tool] | {name: value for name, value in arguments.items() if value is not None}
     for name, argument in given.items():

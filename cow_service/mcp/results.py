@@ -79,7 +79,9 @@ async def tool_result(result: Simulation | Answer, client: AsyncClient, base_url
 
 def simulation_text(simulation: Simulation, video: str) -> str:
     """What moves, how, what it meets when; which picture is which; what to mind. `video` is where the clip is."""
-    lines = simulation.narration.summary, *_simulation_lines(simulation, video)
+    narration = simulation.narration
+    said = narration.agreement if simulation.trajectory.outcome is None else narration.summary  # else of the story
+    lines = said, *_simulation_lines(simulation, video)
     return _text(filter(None, lines), simulation.warnings, simulation.image.sha256)
 
 

@@ -53,13 +53,15 @@ class Told:
         trajectory, width = simulation.trajectory, simulation.image.width
         path, narration = trajectory.paths[0], simulation.narration
         share = None if trajectory.outcome is None else narration.share
+        is_of_simulation = not isinstance(result, Answer) or result.reasoning == narration.summary
+        agreeing = (narration.agreement if is_of_simulation else "") or narration.summary
         seen = path.points[: path.visible.index(False)] if False in path.visible else path.points
         met = [each.first_frame for each in trajectory.encounters]
         return Told(
             question=f"{result.question} (Asked of another direction: {given}.)" if given else result.question,
             verdict=verdict_of(result) or simulation.motion.sentence,
             worlds=trajectory.ensemble,
-            agreeing="" if share is None else narration.agreement or narration.summary,
+            agreeing="" if share is None else agreeing,
             share=share,
             futures=tuple(tuple((x / width, y / width) for x, y in future) for future in path.futures),
             path=tuple((x / width, y / width) for x, y in seen),

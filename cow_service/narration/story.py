@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from cow_service import records
 from cow_service.narration.words import Phrases, capitalised, phrases_of
-from cow_service.records.results import HAPPENS
 
 if TYPE_CHECKING:
     from cow_service.records import Encounter, Outcome, Path, Trajectory
@@ -105,6 +104,11 @@ class Story:
         if placement is not None:
             return placement.probabilities.get(placement.result, 0.0) if placement.probabilities else None
         return told[0].probability if told else None
+
+    def support(self) -> list[str]:
+        """What the thing that is asked about stands on, other than the floor."""
+        on = "floor" if self._subject is None else self._supports[self._subject]
+        return [] if on in ("floor", "air") else [on]
 
     def _asked_about(self) -> Encounter | None:
         """The first encounter that the question asks for."""
@@ -231,7 +235,7 @@ class Story:
         asked = None if outcome is None or body != self._subject else outcome.asked.relation
         if outcome is not None and body == self._leaving:
             key, seen = "leave", self._paths[body].visible if body in self._paths else ()
-            happens = ((outcome.probability or 0.0) >= HAPPENS) != outcome.asked.negated
+            happens = outcome.happens != outcome.asked.negated
             time = seen.index(False) / trajectory.fps if False in seen else math.inf
             time = self._time_asked if happens and self._time_asked is not None else time
         elif on == "floor" or (on == "air" and asked != "lands"):
@@ -263,7 +267,8 @@ class Story:
             return []
         if outcome is None or outcome.asked.relation not in KINDS or (outcome.asked.target and not outcome.object):
             return [] if body or any(each.kind == "touches" for each in met) else [self._nothing_touched(body)]
-        if self._subject != body or self._asked is not None:
+        seen = [each for each in met if (each.kind, each.object) == (KINDS[outcome.asked.relation], outcome.object)]
+        if self._subject != body or self._asked is not None or seen:  # of what is seen the story says how little it is
             return []
         return [self._not_met(body, outcome)]
 
@@ -272,7 +277,7 @@ class Story:
         say = self._say
         relation, meant = outcome.asked.relation, [outcome.object] if outcome.object else outcome.asked.among
         partly = outcome.asked.partly and relation in OF_COVERING
-        if partly and ((outcome.probability or 0.0) >= HAPPENS) != outcome.asked.negated:
+        if partly and outcome.happens != outcome.asked.negated:
             name = say.name(outcome.object) if outcome.object else say("something")  # less than an encounter has
             return say("cover-part" if relation == "covers" else "covered-part", object=name)
         if relation == "touches" and self._supports[body] in meant:

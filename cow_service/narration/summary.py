@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from cow_service.narration.story import EVENTS, KINDS, OF_COVERING, OF_TARGET, Story
 from cow_service.narration.words import Phrases, capitalised, phrases_of
-from cow_service.records.results import HAPPENS, Narration
+from cow_service.records.results import Narration
 
 if TYPE_CHECKING:
     from cow_service.records import Doubt, Grounding, Language, Outcome, Trajectory
@@ -51,11 +52,11 @@ def direct(outcome: Outcome, say: Phrases) -> str:
     """The answer to an open question, in as few words as there are for it; empty where only the story tells."""
     match outcome.asked.form:
         case "whether" | "changes":
-            return say("yes" if happens(outcome) else "no")
+            return say("yes" if outcome.happens else "no")
         case "which-first":
             return outcome.first or say("nothing")
         case "when":
-            if outcome.time is None or not happens(outcome):
+            if outcome.time is None or not outcome.happens:
                 return say("never")
             return say("after", time=say.seconds(outcome.time))
         case "how-many":
@@ -104,9 +105,9 @@ def label_of_changes(grounding: Grounding, trajectory: Trajectory, say: Phrases)
     return say("without", object=without) if without else say("with", object=having) if having else ""
 
 
-def happens(outcome: Outcome) -> bool:
-    """Whether what the question asks happens, as most simulated versions have it."""
-    return outcome.probability is not None and outcome.probability >= HAPPENS
+def _whole(count: float) -> int:
+    """A number of versions, of which one that was misread counts half."""
+    return math.floor(count + 1e-6)
 
 
 class _Summary:
@@ -129,7 +130,7 @@ class _Summary:
             said = name if time is None else say("first-at", object=name, time=say.seconds(time))
         elif form == "how-many" and outcome.count:
             said = self._count(outcome.count)
-        elif form == "when" and happens(outcome) and time is not None:
+        elif form == "when" and outcome.happens and time is not None:
             early, late = (say.seconds(each) for each in outcome.time_band or (time, time))
             spread = {"early": early, "late": late} if early != late else {}
             said = say("after-band" if spread else "after", time=say.seconds(time), **spread)
@@ -142,7 +143,7 @@ class _Summary:
         if why or share is None:
             return why
         leaning = share >= LEANING
-        key = "probably-not" if leaning and outcome.asked.form == "whether" and not happens(outcome) else "probably"
+        key = "probably-not" if leaning and outcome.asked.form == "whether" and not outcome.happens else "probably"
         depends = say("depends", doubt=say(f"doubt-{outcome.depends_on[0]}")) if outcome.depends_on else ""
         answer, statement = say(key if leaning else "not-sure"), self.counted()
         return say("unsure", answer=answer, statement=statement, depends=depends)
@@ -152,13 +153,13 @@ class _Summary:
         share, total = self.share(), self._trajectory.ensemble
         if share is None or not total:
             return ""
-        count = round(share * total)
-        return self._say("agree-all" if count == total > 1 else "agree", count=str(count), total=str(total))
+        key = "agree-all" if share == 1 and total > 1 else "agree"
+        return self._say(key, count=str(_whole(share * total)), total=str(total))
 
     def counted(self) -> str:
         """What most versions say, and how many of them, as a clause. There must be an outcome with a probability."""
         total, statement = self._trajectory.ensemble, self._statement(with_time=False)
-        count = str(round((self.share() or 0.0) * total))
+        count = str(_whole((self.share() or 0.0) * total))
         return self._say("in-versions", statement=statement, count=count, total=str(total))
 
     @property
@@ -171,7 +172,7 @@ class _Summary:
         outcome = self._outcome
         if outcome is None or outcome.probability is None:
             return self.story.agreement()
-        is_yes = outcome.asked.form not in ("whether", "when", "changes") or happens(outcome)
+        is_yes = outcome.asked.form not in ("whether", "when", "changes") or outcome.happens
         return outcome.probability if is_yes else 1 - outcome.probability
 
     def _count(self, count: int) -> str:
@@ -181,12 +182,12 @@ class _Summary:
         """What is so in most versions, as a clause with its subject: it hits the blue mug."""
         outcome, say, form = self._given, self._say, self._given.asked.form
         if form == "changes":
-            return say("differs" if happens(outcome) else "differs-not")
+            return say("differs" if outcome.happens else "differs-not")
         if outcome.first is not None:
             return say("first-is", thing=say.name(outcome.first))
         if form == "how-many" and outcome.count:
             return say("it-is", thing=self._count(outcome.count))
-        does = form in ("whether", "when") and happens(outcome) != outcome.asked.negated
+        does = form in ("whether", "when") and outcome.happens != outcome.asked.negated
         return self._event(does, outcome.time if does and with_time else None)
 
     def _event(self, does: bool, time: float | None) -> str:
@@ -204,34 +205,29 @@ class _Summary:
         # Not to hit each one is to miss one of them: it misses this one or it misses that one.
         is_split = asked.every and not does and meant and asked.relation not in OF_TARGET
         parts = [[each] for each in meant] if is_split else [meant]
-        clauses = [self._within(self._clause(key, does, time, part)) for part in parts]
+        clauses = [self._clause(key, does, time, part) for part in parts]
+        clauses = clauses if time is not None else list(map(self._within, clauses))  # a time says it
         statements = [say("statement", subject=each, clause=clause) for each in subjects for clause in clauses]
         return say.joined(statements, "every-and" if asked.every == does else "either-or")
 
     def _clause(self, key: str, does: bool, time: float | None, meant: Sequence[str]) -> str:
         """What its subject does, or does not."""
         say, asked = self._say, self._given.asked
-        placement = self._trajectory.placement
+        placement = None if self._given.subject else self._trajectory.placement  # that of the mover
         if asked.relation == "inside" and placement is not None and (placement.result in _FITTING) == does:
             return self.story.placed()
-        if asked.relation == "lands" and self._support():
-            key, meant = key.replace("land", "fall-off"), self._support()
+        if asked.relation == "lands" and self.story.support():
+            key, meant = key.replace("land", "fall-off"), self.story.support()
         if asked.partly and does and asked.relation in OF_COVERING:
             key = f"{EVENTS[asked.relation]}-part"
         if not does:
             key = f"{key}-not" if meant or asked.relation not in KINDS else f"{key}-none"
-            key = "on-from-start" if asked.relation == "touches" and meant and meant == self._support() else key
+            key = "on-from-start" if asked.relation == "touches" and meant and meant == self.story.support() else key
         last = "names-nor" if not does else "names-and" if asked.every else "names-or"
         name = say.names(meant, last) if meant else say("something")
         if time is None or not key.endswith("-at"):
             return say(key.removesuffix("-at"), object=name)
         return self.story.timed(key, time, object=name)
-
-    def _support(self) -> list[str]:
-        """What the thing that is asked about stands on, other than the floor."""
-        bodies, subject = self._trajectory.bodies, self._given.subject
-        on = next((body.support for body in bodies if body.object == subject), bodies[0].support if bodies else "floor")
-        return [] if on in ("floor", "air") else [on]
 
     def _within(self, clause: str) -> str:
         within = self._given.asked.within

@@ -107,9 +107,6 @@ class Result(Record):
     warnings: tuple[str, ...] = ()
 
 
-HAPPENS = 0.5  # probability from which something is said to happen
-
-
 class Narration(Record):
     """What a simulation says, in words. Everything in it is also a field of the trajectory."""
 

@@ -468,6 +468,11 @@ class Outcome(Record):
     robust: bool = Field(description="Whether at least 90% of the worlds give the answer.")
     depends_on: tuple[Doubt, ...] = Field(default=(), description="What the answer depends on, most first.")
 
+    @property
+    def happens(self) -> bool:
+        """Whether what is asked happens, negation included, as most simulated versions have it."""
+        return (self.probability or 0.0) >= 0.5
+
 
 PlacementResult = Literal["inside", "sticks-out", "on-the-rim", "on-top", "beside", "overlaps", "falls-off", "tips"]
 
@@ -487,9 +492,7 @@ class Placement(Record):
         description="Probability that it ends as intended: inside and not held up at the rim, on top, or beside "
         "without overlapping.",
     )
-    clearance: float | None = Field(
-        default=None, description="Width of the opening minus width of the object, relative to the opening."
-    )
+    clearance: float | None = Field(default=None, description="Width of the opening minus that of the object, over it.")
     above_rim: float | None = Field(default=None, ge=0, le=1, description="Share of the object's height above the rim.")
 
 

@@ -128,7 +128,7 @@ def card(service: Service, place: str, name: str, files: dict[str, bytes]) -> st
         files[f"{name}.html"] = in_frame(PART.sub("", whole), first).encode()
         shown, given = (
             f'<img src="gallery/{name}.jpg" alt="" loading="lazy">',
-            f'{given} <a href="{address}">Larger</a>',
+            f'{given} <a href="{address}" target="_blank">Larger (a new tab)</a>',
         )
     size = f"--width: {simulation.image.width}; --height: {simulation.image.height}"
     said = f"<b>{html.escape(told.question)}</b> As asked: {html.escape(told.verdict)}. {given}"

@@ -204,17 +204,8 @@ REFERENCE: dict[str, tuple[str, Callable[[], str]]] = {
 }
 
 
-def on_config(config: MkDocsConfig) -> None:
-    """Leaves pages out of the navigation that nobody has begun."""
-    known = {path.name for path in Path(config.docs_dir).glob("*.md")} | {*REFERENCE, "errors.md"}
-    for group in config.nav or []:
-        for pages in group.values():
-            pages[:] = [each for each in pages if not isinstance(each, str) or each in known]
-    config.nav = [group for group in config.nav or [] if all(group.values())]
-
-
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds reference pages that nobody has begun."""
+    """Adds the reference pages that no file begins."""
     for name, (title, _) in [*REFERENCE.items(), ("errors.md", ("Errors", None))]:
         if files.get_file_from_path(name) is None:
             files.append(File.generated(config, name, content=f"# {title}\n"))

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cow_service.errors import InvalidRequest, MllmUnavailable, StorageUnavailable
+from cow_service.errors import InvalidRequest, StorageUnavailable
 from cow_service.evals.report import tables
 from cow_service.evals.report.page import write_page
 from cow_service.evals.report.summary import Findings, Price, summarize
@@ -21,15 +21,13 @@ FORMATS = {"md": tables.markdown, "csv": tables.csv_text, "tex": tables.latex}
 def write_report(runs: Sequence[EvalRun], out: Path, prices: Mapping[str, Price]) -> str:
     """Writes all files of a report into a folder; returns its main tables as text.
 
-    Raises `InvalidRequest` or `MllmUnavailable` if nothing has been replied to, and `StorageUnavailable`.
+    Raises `InvalidRequest` if nothing has been replied to, and `StorageUnavailable`.
     """
     findings = summarize(runs, prices)
     if not findings.arms:
         reasons = {each.failure for run in runs for each in run.observations if each.failure is not None}
         why = f" Every question failed: {sorted(reasons)[0]}" if reasons else ""
-        asked_mllm = reasons and all(run.info.ask == "prompt" for run in runs)
-        kind = MllmUnavailable if asked_mllm else InvalidRequest
-        raise kind(f"There is nothing to report: no question has a reply.{why}")
+        raise InvalidRequest(f"There is nothing to report: no question has a reply.{why}")
     try:
         _write(runs, findings, out)
     except OSError as error:

@@ -8,7 +8,6 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
-from cow_service.narration.summary import happens
 from cow_service.narration.words import Phrases
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.english import lexicon as lex
@@ -30,8 +29,9 @@ _SEEN = lex.words("visible unobstructed unoccluded uncovered")
 _NEGATIONS = lex.words("not no never n't without nothing neither")
 _ANY_WORDS = lex.words("anything something any object objects nothing")
 _PASSIVE = lex.words("is are be get gets stays stay remains remain being")
-_BARE = dict.fromkeys(("it will", "it does", "it would"), True)
-_BARE |= dict.fromkeys(("it will not", "it does not", "it would not", "it can not"), False)
+_BARE = dict.fromkeys(("it will", "it does", "it would"), True) | dict.fromkeys(
+    ("it will not", "it does not", "it would not", "it can not"), False
+)
 _NONE = re.compile(
     r"none|nothing|neither|never|not at all|no (?:object|objects|thing|collision|contact|one|time|hit)"
     r"|none of (?:them|these|the above|the objects)|neither of (?:them|these|the two)"
@@ -221,11 +221,11 @@ def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOp
     """The options that say what the world says."""
     form, first = outcome.asked.form, outcome.first
     if form in ("whether", "changes"):
-        is_yes = happens(outcome)
+        is_yes = outcome.happens
         return [option for option in options if says_it_happens(option.text, outcome.asked) is is_yes]
     if form == "how-many":
         return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
-    if (form == "which-first" and first is None) or (form == "when" and not happens(outcome)):
+    if (form == "which-first" and first is None) or (form == "when" and not outcome.happens):
         return [option for option in options if names_none(option.text)]
     if form == "which-first" and first is not None:
         things = [option for option in options if not names_none(option.text)]

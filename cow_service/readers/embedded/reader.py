@@ -335,7 +335,8 @@ def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Locate
         return goal
     bbox = _bbox_of(scene.regions, phrase, grounding.bbox, ())
     if bbox is None:
-        told = matching.unclear(phrase, matching.best_matches(scene.regions, phrase), scene.regions)
+        besides = [each for each in scene.regions if each.bbox != grounding.bbox]
+        told = matching.unclear(phrase, matching.best_matches(besides, phrase), besides)
         raise CannotReadDirection(f"Where the {grounding.object} moves to is not clear: {told}.", remedy=GIVE_DIRECTION)
     return LocatedObject(object=phrase.text, bbox=bbox)
 

@@ -28,14 +28,15 @@ export function stagesOf(settings) {
 }
 
 export const DOUBTS = {
-  speed: "how fast it is",
-  heading: "which way it goes",
-  camera: "where the camera is",
+  speed: "how fast it moves",
+  heading: "which way it heads in depth",
+  camera: "how the camera stands",
   size: "how large things are",
-  place: "how far away things are",
-  friction: "how slippery the floor is",
-  identity: "whether these are the things that you mean",
-  faint: "whether something stands in the way that is too faint to tell",
+  place: "where things are in depth",
+  friction: "how much the floor slows things down",
+  outline: "where the outlines of things run",
+  identity: "whether the things are the ones that the question names",
+  faint: "whether something too faint to make out stands in the way",
   depth: "whether the depth map shows what matters",
 };
 

@@ -27,19 +27,18 @@ function Verdict({ title, verdict, kind }) {
   </article>`;
 }
 
-/** How many simulated versions agree with the summary, as a bar. */
+/** How many simulated versions agree with the simulation's summary, as a bar. */
 function Versions({ simulation: { narration, trajectory } }) {
   if (!trajectory.outcome || narration.share === null) return null;
-  const count = Math.round(narration.share * trajectory.ensemble);
-  const label = `${count} of ${plural(trajectory.ensemble, "simulated version")} agree`;
+  const label = narration.agreement || narration.summary;
   return html`<p class="probability"><meter min="0" max="1" value=${narration.share} aria-label=${label} title=${label}></meter></p>`;
 }
 
-/** What else the answer depends on: the summary of one that is not sure names the first. */
+/** What the simulation's answer depends on, most important first. */
 function Depends({ outcome }) {
-  const rest = (outcome?.depends_on ?? []).slice(outcome?.sure ? 0 : 1);
-  if (!rest.length) return null;
-  return html`<p class="depends">It ${outcome.sure ? "" : "also "}depends on ${rest.map((doubt) => DOUBTS[doubt] ?? doubt).join(", ")}.</p>`;
+  const doubts = outcome?.depends_on ?? [];
+  if (!doubts.length) return null;
+  return html`<p class="depends">It depends on ${doubts.map((doubt) => DOUBTS[doubt] ?? doubt).join(", ")}.</p>`;
 }
 
 const Story = ({ simulation }) => simulation.narration.story && html`<p class="story" dir="auto">${simulation.narration.story}</p>`;
@@ -80,6 +79,7 @@ export function Result({ state }) {
     ${run && html`<p class="hint">Of the request before:</p>`}
     ${answer && html`<${Verdict} title=${simulation ? "After looking" : "From the picture alone"} verdict=${answer} kind="looked" />`}
     ${simulation && !answer && html`<p class="reasoning" dir="auto">${simulation.narration.summary || simulation.motion.sentence}</p>`}
+    ${answer && simulation && answer.reasoning !== simulation.narration.summary && simulation.narration.summary && html`<p class="reasoning" dir="auto">The simulation: ${simulation.narration.summary}</p>`}
     ${simulation && html`<${Versions} simulation=${simulation} /><${Depends} outcome=${outcome} />`}
     ${simulation?.trajectory.placement && html`<p>${`It ends ${simulation.trajectory.placement.result.replaceAll("-", " ")}.`}</p>`}
     ${isCompared && baseline}
