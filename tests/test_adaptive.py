@@ -23,6 +23,8 @@ from cow_service.readers.mllm.models import configure
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass
 class Simulation:

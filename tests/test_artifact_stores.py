@@ -22,6 +22,8 @@ from cow_service.media.artifacts import ArtifactStore
 from cow_service.service import Service, open_artifact_store
 from cow_service.settings import Settings, SettingsError, load_settings
 
+pytestmark = pytest.mark.slow
+
 DATA = b"frame" * 1000
 SHA256 = hashlib.sha256(DATA).hexdigest()
 LONG = 10 * 3600.0  # seconds: more than any grace

@@ -30,6 +30,8 @@ from PIL import Image
 
 from cow_service.requests import AnswerRequest
 
+pytestmark = pytest.mark.slow
+
 PIXELS = block(ball(floor(320, 200), (75, 100), 20, (210, 20, 20)), (215, 80, 255, 125), (50, 80, 200))
 PICTURE = Image.fromarray(PIXELS)
 PNG = png_bytes(PIXELS)

@@ -33,6 +33,8 @@ from cow_service.client.journal import Journal
 from cow_service.client.progress import BatchProgress, describe_load
 from cow_service.records import ProcessInfo, QueueInfo, WorkerInfo, WorkerLoad, Workers
 
+pytestmark = pytest.mark.slow
+
 COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
 

@@ -32,6 +32,8 @@ from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.weights.manifests import load_families
 
+pytestmark = pytest.mark.slow
+
 NAME = "cow/anthropic:claude-x"
 IMAGE = {"type": "image_url", "image_url": {"url": data_url(picture())}}
 COW = {name: BODY[name] for name in ("grounding", "motion", "num_frames", "frames")}

@@ -13,6 +13,8 @@ from contextlib import ExitStack
 import pytest
 from servers import BODY, Served, eventually
 
+pytestmark = pytest.mark.slow
+
 SECONDS = 2.0  # instead of REQUEST_SECONDS
 FILES = 1024  # that the server may have open
 SERVE = f"""

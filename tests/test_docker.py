@@ -33,6 +33,8 @@ from cow_service.server import CLOSE_SECONDS
 from cow_service.settings import Settings, load_settings
 from cow_service.weights.manifests import EXAMPLES, load_manifests
 
+pytestmark = pytest.mark.slow
+
 DOCKER = ROOT / "docker"
 IMAGES = {"cow:cpu": DOCKER / "cpu.Dockerfile", "cow:cuda": DOCKER / "cuda.Dockerfile"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -28,6 +28,8 @@ from cow_service.evals.loaders import load
 from cow_service.evals.loaders.rows import Collected
 from cow_service.readers.options import split_options
 
+pytestmark = pytest.mark.slow
+
 SAMPLE = ROOT / "cow-scenes" / "sample"
 ASKED = "If it moves forward, will it hit the vase? Answer by (A) Yes, (B) No or (C) Not sure."
 WITHOUT_ABSTAIN = "What will be hidden when it has passed? (A) The red cup, (B) the mug or (C) the ball."

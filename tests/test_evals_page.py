@@ -22,6 +22,8 @@ from cow_service.evals.report.tables import contrasts
 from cow_service.evals.report.write import write_plots
 from cow_service.evals.runs import EvalRun
 
+pytestmark = pytest.mark.slow
+
 ARMS = ("never", "always", "placebo-still")
 ODD = "trajectory-3"  # is refused, fails and replies with markup
 

@@ -16,6 +16,8 @@ from cow_service.evals.report.tables import Table, csv_text, latex, markdown, re
 from cow_service.evals.report.write import write_report
 from cow_service.evals.runs import EvalRun
 
+pytestmark = pytest.mark.slow
+
 GOLDEN = ROOT / "tests" / "data" / "evals"
 FORMS = {"md": markdown, "csv": csv_text, "tex": latex}
 TASKS = ("collision", "trajectory", "compatibility", "occlusion")

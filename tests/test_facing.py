@@ -24,6 +24,8 @@ from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 640, 400
 COLOURS = {PAINT: (190, 40, 40), DARK: (18, 18, 18), OTHER: (110, 125, 145)}
 

@@ -19,6 +19,8 @@ from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
 from cow_service.stages.trajectory import compute_trajectory
 
+pytestmark = pytest.mark.slow
+
 RADIUS = 0.15  # m
 RED, BLUE = (200, 30, 30), (40, 60, 200)
 

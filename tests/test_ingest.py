@@ -19,6 +19,8 @@ from servers import ASYNC, BODY, QUESTION, Served, data_url, eventually, picture
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.api.submission import MAX_CONCURRENT_FETCHES
 
+pytestmark = pytest.mark.slow
+
 KEYS = {name: new_key() for name in ("busy", "quiet")}
 # A decoder that runs where requests are taken ends that process. Images may be fetched from this machine.
 SERVE = """

@@ -29,6 +29,8 @@ from cow_service.net import ImageUrls
 from cow_service.service import Service
 from cow_service.settings import Settings
 
+pytestmark = pytest.mark.slow
+
 SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))  # 1 in CI, 10 for a soak test
 REQUESTS = 24 * SCALE
 BITS = 12

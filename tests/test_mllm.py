@@ -271,6 +271,7 @@ def test_one_failure_is_got_over(script, code, mllm: MllmServer, make) -> None:
     assert told["usage"]["calls"] == len(script) + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reply", "code", "told"),
     [

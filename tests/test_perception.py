@@ -37,6 +37,8 @@ from cow_service.stages.grounding import ground
 from cow_service.vision.masks import bbox_of, mask_iou
 from cow_service.vision.types import Mask
 
+pytestmark = pytest.mark.slow
+
 TRUTH = ROOT / "cow-scenes" / "sample" / "truth"
 CANDLE = TRUTH / "collision" / "Collision_Level_1_0"
 

@@ -25,6 +25,8 @@ from cow_service.vision.types import Image
 from cow_service.weights.manifests import find_manifest
 from cow_service.weights.repositories import download, resolve
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 120, 80
 Toys = dict[str, Any]
 FACTORIES: dict[str, Callable[[Settings], Any]] = {

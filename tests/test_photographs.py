@@ -19,6 +19,8 @@ from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
 
+pytestmark = pytest.mark.slow
+
 Boxes = dict[str, tuple[int, int, int, int]]
 IMAGE = "data:image/png;base64," + base64.b64encode(png_bytes(clutter(640, 400))).decode()
 

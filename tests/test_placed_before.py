@@ -30,6 +30,8 @@ from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.openings import SeenOpening
 
+pytestmark = pytest.mark.slow
+
 RED, BLUE, GREEN, YELLOW = (200, 30, 30), (40, 60, 200), (40, 160, 60), (210, 190, 40)
 MOVER, CUBE, POST = (80, 255, 130, 305), (430, 230, 510, 330), (300, 90, 350, 150)
 BOWL = (349.0, 204.0, 492.0, 309.0)

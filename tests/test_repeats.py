@@ -41,6 +41,8 @@ from cow_service.settings import Settings
 from cow_service.stages.answering import gate_of
 from cow_service.stages.keys import FirstAnswers
 
+pytestmark = pytest.mark.slow
+
 REPEATS = 40 if SCALE == 1 else 200
 IMAGE = data_url(png_bytes(ball(floor(96, 64), (30, 40), 8, (210, 20, 20))))
 QUESTION = "If the red ball rolls to the right, will it leave the table? (A) Yes (B) No (C) Not sure"

@@ -34,6 +34,8 @@ from cow_service.observability.metrics import Metrics
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
 
+pytestmark = pytest.mark.slow
+
 TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
 PARENT = f"00-{TRACE}-{SPAN}-01"
 SHA = "0" * 64

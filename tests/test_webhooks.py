@@ -31,6 +31,8 @@ from cow_service.records import Job
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError, load_settings
 
+pytestmark = pytest.mark.slow
+
 SECRET = b"0123456789abcdef0123456789abcdef"
 OUTCOMES = ("refused", "delivered")
 LOST = {**BODY, "grounding": None, "motion": None, "question": "If the pink car turns, what happens?"}

@@ -36,6 +36,8 @@ from cow_service.weights.repositories import (
     verify,
 )
 
+pytestmark = pytest.mark.slow
+
 TOY = "acme/toy"
 CONFIG = Blob(b'{"layers": 2}', lfs=False)
 MODEL = Blob(bytes(range(256)) * 40)
