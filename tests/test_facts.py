@@ -179,6 +179,23 @@ def test_what_happens(mover: str, told: Trajectory, story: str, summary: str) ->
     assert narration.summary.removeprefix(story).strip() == summary
 
 
+@pytest.mark.parametrize(
+    ("relation", "part"), [("covered", "is partly hidden by the vase"), ("covers", "hides a part of the vase")]
+)
+def test_less_than_an_encounter_is_a_part(relation: Any, part: str) -> None:
+    asked = outcome(Asked(relation=relation, target="vase", partly=True), 0.9, "vase")
+    told = world(bodies=(BALL, body("vase")), ensemble=100, outcome=asked)
+    narration = narrate(grounded("ball"), told, "en")
+    assert narration.story == f"The ball rolls to the right and {part}."
+    assert narration.summary == f"Yes, it {part}. 90 of 100 simulated versions agree."
+
+
+def test_no_half_of_a_version_makes_all_of_them_agree() -> None:
+    """One that was misread counts half."""
+    told = world(bodies=(BALL, CUBE), ensemble=50, outcome=outcome(HIT, 0.99))
+    assert narrate(grounded("ball"), told, "en").agreement == "49 of 50 simulated versions agree."
+
+
 def test_the_story_stays_short() -> None:
     name = "the very long name of a thing that nobody would ever want to read again in full. " * 5
     told = world(bodies=(body(name), body(name)), encounters=tuple(touch(name, 1, frame) for frame in range(9)))

@@ -191,7 +191,7 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
     assert table.recover(["frozen"]) == ["job"]
     found = table.find("job", None)
     assert found is not None
-    assert (found.job.status, found.job.position) == ("queued", 0)
+    assert (found.job.status, found.job.position, found.job.expected_wait) == ("queued", 0, 0.0)
     (new,) = table.take("light", "me", 1, None)
     assert not table.begin(old)
     assert not table.succeed(old, '{"by":"old"}', None, ())

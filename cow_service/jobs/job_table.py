@@ -436,10 +436,13 @@ class JobTable:
         before = sa.select(sa.func.count()).where(
             JOBS.c.queue == row.queue, JOBS.c.status == "queued", sa.tuple_(JOBS.c.turn, JOBS.c.created_at) < own
         )
+        works = sa.exists().where(JOBS.c.queue == row.queue, JOBS.c.executor.is_not(None), JOBS.c.status.in_(OPEN))
         ended = JOBS.c.queue == row.queue, JOBS.c.ended > now - RATE_SECONDS
-        query = sa.select(before.scalar_subquery(), sa.func.count(), sa.func.min(JOBS.c.ended)).where(*ended)
-        ((position, ends, first),) = self._database.read(query)
+        query = sa.select(before.scalar_subquery(), works, sa.func.count(), sa.func.min(JOBS.c.ended)).where(*ended)
+        ((position, is_busy, ends, first),) = self._database.read(query)
         wait = (position + 1) * (now - first) / ends if ends >= MIN_ENDS else None
+        if not position and not is_busy:  # nobody is waited for: the rate is that of callers, not of workers
+            wait = 0.0
         return {"position": position, "expected_wait": None if wait is None else round(wait, 1)}
 
 
