@@ -149,6 +149,12 @@ def test_a_port_that_is_taken_is_told_before_anything_is_loaded(tmp_path: Path) 
     assert not (tmp_path / "data").exists()
 
 
+def test_what_to_give_is_named_as_options(tmp_path: Path, picture: Path) -> None:
+    result = cow(tmp_path, "answer", str(picture), "Will it hit anything?")
+    assert "--point X,Y" in result.stdout.replace("\n", " ")
+    assert "grounding.point" not in result.stdout
+
+
 def test_json_and_overrides(tmp_path: Path, picture: Path) -> None:
     result = cow(
         tmp_path, "simulate", str(picture), "?", "--point", "150,200", "--object", "it", "--direction", "0,-1",

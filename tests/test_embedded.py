@@ -131,7 +131,7 @@ def test_a_verb_that_its_direction_contradicts_is_refused(words: str) -> None:
 
 def test_one_is_no_noun() -> None:
     image = ball(block(floor(), (430, 150, 520, 250), RED), (150, 200), 40, RED)
-    assert "either of 2" in refusal(CannotGround, Scene(jpeg(image)), "If the red one slides left, what happens?")
+    assert "any of 2" in refusal(CannotGround, Scene(jpeg(image)), "If the red one slides left, what happens?")
 
 
 def test_what_is_longer_than_high_is_the_vehicle() -> None:
@@ -233,8 +233,8 @@ def test_refusals_say_what_was_looked_for_what_was_seen_and_what_to_give() -> No
     told = refusal(CannotGround, drawn(), "Is this nice?")
     assert "does not say in words what moves" in told
     twins = Scene(jpeg(ball(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED), (300, 270), 30, BLUE)))
-    assert "may be either of 2: red at" in refusal(CannotGround, twins, "If the red ball moves left, what happens?")
-    told = "'red ball' may be either of 2: red at"
+    assert "may be any of 2: red at" in refusal(CannotGround, twins, "If the red ball moves left, what happens?")
+    told = "'red ball' may be any of 2: red at"
     assert told in refusal(CannotReadDirection, twins, "If the blue ball moves towards the red ball, what happens?")
     told = refusal(CannotReadDirection, drawn(False), "If the red ball moves along the arrow, will it hit the cube?")
     assert "no drawn arrow was found" in told

@@ -113,6 +113,10 @@ LEAVES = Asked(relation="leaves")
         ("ball", THROWN.model_copy(update={"outcome": outcome(HIT.model_copy(update={"within": 2.0}), 0.9, time=1.1)}),
          "The ball bounces once, rolls on and hits the white cube after about 1.1 s.",
          "Yes, it hits the white cube after about 1.1 s. 90 of 100 simulated versions agree."),
+        ("ball", world(bodies=(body("ball", "sphere"), body("vase")), ensemble=100, outcome=outcome(
+                           Asked(relation="covered", target="vase", partly=True, within=2.0), 0.9, "vase", time=1.1)),
+         "The ball rolls to the right and is partly hidden by the vase.",
+         "Yes, it is partly hidden by the vase within 2.0 s. 90 of 100 simulated versions agree."),
         ("ball", world(encounters=(occlusion("occluded-by", 0.6),)),
          "The ball rolls to the right, passes behind the vase (which hides 60% of it) from about 0.8 s on and "
          "hits nothing.",

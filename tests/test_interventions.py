@@ -133,6 +133,7 @@ def test_both_of_a_kind_are_taken_away() -> None:
         ("If the red ball is taken away and then rolls right, does it hit the blue cube?", "'red ball' away"),
         ("If the red ball is removed and it rolls right, does it hit the blue cube?", "'red ball' away"),
         ("If I put the red ball into itself, will it fit?", "into itself"),
+        ("If the three cubes are taken away and the red ball rolls right, will it hit anything?", "'three cubes'"),
     ],
 )
 def test_changes_that_cannot_be_are_refused_by_name(question: str, named: str) -> None:

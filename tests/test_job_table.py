@@ -191,7 +191,7 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
     assert table.recover(["frozen"]) == ["job"]
     found = table.find("job", None)
     assert found is not None
-    assert (found.job.status, found.job.position, found.job.expected_wait) == ("queued", 0, 0.0)
+    assert (found.job.status, found.job.position) == ("queued", 0)
     (new,) = table.take("light", "me", 1, None)
     assert not table.begin(old)
     assert not table.succeed(old, '{"by":"old"}', None, ())
@@ -203,6 +203,25 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
     assert not table.cancel("job")
     assert table.recover(["me", "frozen"]) == []
     assert ids(table.page(None, JobFilters(status=("succeeded",)), {}).jobs) == ["job"]
+
+
+def test_callers_that_are_slow_do_not_make_a_queue_slow(database: Database) -> None:
+    table = JobTable(database)
+
+    def waits(job: str) -> float | None:
+        add_job(database, job)
+        found = table.find(job, None)
+        assert found is not None
+        return found.job.expected_wait
+
+    for job in ("first", "second"):
+        add_job(database, job)
+        (taken,) = table.take("light", "me", 1, None)
+        assert table.begin(taken)
+        assert table.succeed(taken, "{}", None, ())
+    assert waits("third") is None, "how long it takes is not known: nobody works, and nothing is ahead of it"
+    table.take("light", "me", 1, None)
+    assert waits("fourth") is not None
 
 
 def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_without_it(database: Database) -> None:

@@ -17,9 +17,10 @@ from servers import BODY
 
 from cow_service.errors import ArtifactNotFound, ImageUrlNotAllowed, InvalidRequest
 from cow_service.media.images import decode_data_url
+from cow_service.media.share import Told
 from cow_service.pipeline import simulate
 from cow_service.records import Simulation
-from cow_service.requests import SimulateRequest
+from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.service import Service
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import MAX_REGIONS
@@ -275,6 +276,18 @@ def test_what_is_found_again_is_not_looked_for_in_the_image(service: Service, mo
     again = simulate(service.prepare(request, step=step))
     assert again.reused == ("grounding", "motion", "trajectory", "generation")
     assert again.frames == first.frames
+
+
+def test_under_another_answer_a_film_shows_what_the_simulation_says(service: Service) -> None:
+    request = AnswerRequest.model_validate(
+        {"image": {"artifact": service.keep_image(DRAWN).sha256}, "question": QUESTION}
+    )
+    answer = service.answer(request)
+    simulation = answer.simulation
+    assert simulation is not None
+    assert Told.of(answer, simulation, "").agreeing == simulation.narration.agreement != ""
+    other = answer.model_copy(update={"answer": "No", "reasoning": "It looks far away."})
+    assert Told.of(other, simulation, "").agreeing == simulation.narration.summary
 
 
 def test_the_world_is_the_same_whatever_a_question_names(service: Service) -> None:

@@ -440,9 +440,8 @@ class JobTable:
         ended = JOBS.c.queue == row.queue, JOBS.c.ended > now - RATE_SECONDS
         query = sa.select(before.scalar_subquery(), works, sa.func.count(), sa.func.min(JOBS.c.ended)).where(*ended)
         ((position, is_busy, ends, first),) = self._database.read(query)
-        wait = (position + 1) * (now - first) / ends if ends >= MIN_ENDS else None
-        if not position and not is_busy:  # nobody is waited for: the rate is that of callers, not of workers
-            wait = 0.0
+        is_pace = ends >= MIN_ENDS and (position or is_busy)  # where nobody is waited for, callers set the pace
+        wait = (position + 1) * (now - first) / ends if is_pace else None
         return {"position": position, "expected_wait": None if wait is None else round(wait, 1)}
 
 

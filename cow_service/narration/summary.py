@@ -206,7 +206,6 @@ class _Summary:
         is_split = asked.every and not does and meant and asked.relation not in OF_TARGET
         parts = [[each] for each in meant] if is_split else [meant]
         clauses = [self._clause(key, does, time, part) for part in parts]
-        clauses = clauses if time is not None else list(map(self._within, clauses))  # a time says it
         statements = [say("statement", subject=each, clause=clause) for each in subjects for clause in clauses]
         return say.joined(statements, "every-and" if asked.every == does else "either-or")
 
@@ -215,7 +214,7 @@ class _Summary:
         say, asked = self._say, self._given.asked
         placement = None if self._given.subject else self._trajectory.placement  # that of the mover
         if asked.relation == "inside" and placement is not None and (placement.result in _FITTING) == does:
-            return self.story.placed()
+            return self._within(self.story.placed())
         if asked.relation == "lands" and self.story.support():
             key, meant = key.replace("land", "fall-off"), self.story.support()
         if asked.partly and does and asked.relation in OF_COVERING:
@@ -226,8 +225,8 @@ class _Summary:
         last = "names-nor" if not does else "names-and" if asked.every else "names-or"
         name = say.names(meant, last) if meant else say("something")
         if time is None or not key.endswith("-at"):
-            return say(key.removesuffix("-at"), object=name)
-        return self.story.timed(key, time, object=name)
+            return self._within(say(key.removesuffix("-at"), object=name))
+        return self.story.timed(key, time, object=name)  # which says that it is within the time asked
 
     def _within(self, clause: str) -> str:
         within = self._given.asked.within

@@ -20,7 +20,7 @@ Range = tuple[float, float]
 
 # Natural logarithm, share of the hull, share of the width: so far off counts as 1.
 ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
-LESS_THAN_ROUND = 1.0  # misfit above which a ball is not seen whole; whole ones have next to none
+LESS_THAN_ROUND = 3.0  # misfit above which a ball shows less than two thirds of its height; whole ones have none
 CONTRADICTS = 6.0  # misfit above which an object is not the named one; whole objects under their own name reach 5.1
 UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
 FITS = 2.0  # misfit below which an outline is well described

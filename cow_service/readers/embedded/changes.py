@@ -6,6 +6,7 @@ from cow_service.errors import CannotGround
 from cow_service.narration.words import same_name
 from cow_service.readers.embedded.english.asked import read_asked
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
+from cow_service.readers.embedded.english.noun_phrases import kind_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.matching import best_matches, match_one, match_several, unclear
 from cow_service.readers.remedies import GIVE_OBJECT
@@ -66,7 +67,11 @@ def _one(
 
 
 def _both(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> list[LocatedObject]:
-    """ "Both cylinders", each under its colour."""
+    """ "Both cylinders", each under its colour. Raises `CannotGround` for another number."""
+    kind = kind_of(phrase.text)
+    if kind is not None and kind.count not in (None, 2):
+        told = f"The question changes '{phrase.text}' at once, and the embedded reader knows one or two: name each."
+        raise CannotGround(told, remedy=GIVE_OBJECT)
     found = match_several(regions, phrase, others, 2)
     return [_located(f"{region.colour} {phrase.head or 'object'}", region.bbox) for region in found]
 

@@ -254,7 +254,8 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
 def unclear(phrase: ObjectPhrase, fitting: Sequence[Region], regions: Sequence[Region]) -> str:
     """Why not one region is what a phrase names, for a message."""
     if len(fitting) > 1:
-        return f"'{phrase.text}' may be either of {len(fitting)}: {describe(fitting)}. Name its colour or its place"
+        what = "its place" if phrase.colour else "its colour or its place"
+        return f"'{phrase.text}' may be any of {len(fitting)}: {describe(fitting)}. Name {what}"
     return f"'{phrase.text}' was not found, or not for certain. Seen: {describe(regions)}"
 
 
