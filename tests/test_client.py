@@ -47,6 +47,8 @@ from cow_service.client.request import image_input
 from cow_service.records import Job
 from cow_service.requests import AnswerRequest, ImageArtifact, ImageUrl, ObjectRequest, SimulateRequest
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["connect"]  # a fixture
 
 PHOTO = EXAMPLES / "ball-and-mug" / "image.jpg"
