@@ -269,17 +269,11 @@ SECRET_SETTINGS = {
 }
 
 
-OF_CLIENTS = {"COW_BASE_URL", "COW_API_KEY"}
-
-
 def load_settings(**overrides: Any) -> Settings:
-    """Settings from the environment, with overrides that are not None.
-
-    Raises `SettingsError` for a bad value, and for a name that is nearly a setting's: a server without the keys that
-    its operator believes to have given is open to all.
-    """
-    names = {f"COW_{name.upper()}" for name in Settings.model_fields}
-    for name in sorted({name.upper() for name in os.environ if name.upper().startswith("COW_")} - names - OF_CLIENTS):
+    """Settings from the environment, with overrides that are not None. Raises `SettingsError`, naming what is wrong."""
+    # A misspelled setting is never passed over: a server might lack the keys that its operator means to have given.
+    names = {f"COW_{name.upper()}" for name in Settings.model_fields} | {"COW_BASE_URL", "COW_API_KEY"}  # of clients
+    for name in sorted({name.upper() for name in os.environ if name.upper().startswith("COW_")} - names):
         if close := difflib.get_close_matches(name, names, 1, cutoff=0.85):
             raise SettingsError(f"Bad settings: {name} is no setting; {close[0]} is. Correct its name, or remove it.")
     try:

@@ -76,7 +76,8 @@ def test_frames_are_those_nearest_in_time(toys: Service) -> None:
     assert len(asked) == 17
     for index, frame in enumerate(asked):
         near = own[min(24, int(index * 1.5 + 0.5))].astype(int)
-        assert np.abs(frame - near).max() <= 16, index  # the world has its own frames at each rate
+        # The world has its own frames at each rate: a pixel at an edge may fall on its other side.
+        assert np.count_nonzero(np.abs(frame - near) > 4) <= 3, index
         assert index < 4 or np.abs(frame - own[index].astype(int)).max() > 30, index
 
 

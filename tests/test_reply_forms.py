@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.readers.embedded.english.asked import read_asked
-from cow_service.readers.embedded.english.questions import parse
-from cow_service.readers.embedded.english.wording import without_reply_form
+from cow_service.readers.embedded.english.questions import parse, without_reply_form
 from cow_service.readers.options import Reply, reply_text
 
 LETTER = Reply("A", "Yes", "The ball meets the mug.", "question-letters")

@@ -66,12 +66,10 @@ async def _owner(request: Request) -> str | None:
     return owner_of(request)
 
 
-Engine = Annotated[JobEngine, from_app("engine")]
-Owner = Annotated[str | None, Depends(_owner)]
-
-
 # A tag such as de-AT, and its weight (RFC 9110, 12.4.2).
 _LANGUAGE_RANGE = re.compile(r"(?:^|,)\s*([a-z]+)(?:-[a-z0-9-]*)?\s*(?:;\s*q\s*=\s*([01](?:\.\d{0,3})?)\s*)?(?=,|$)")
+Engine = Annotated[JobEngine, from_app("engine")]
+Owner = Annotated[str | None, Depends(_owner)]
 
 
 def language_of(header: str) -> Language | None:

@@ -65,11 +65,7 @@ class JobSpec(Record):
         exclude_if=lambda until: until is None,  # earlier versions do not know it
         description="Unix time, s, after which a multimodal LLM that refuses is not asked again.",
     )
-    prefers_language: bool = Field(
-        default=False,
-        exclude_if=lambda prefers: not prefers,
-        description="The language of the request is that of a header, which may differ where a request is sent again.",
-    )
+    prefers_language: bool = Field(default=False, exclude_if=lambda prefers: not prefers)  # its language is a header's
     request_id: str | None = None
     traceparent: str | None = None
 
@@ -430,7 +426,7 @@ class JobTable:
         return row is not None
 
     def _place_in_queue(self, row: sa.Row[Any]) -> dict[str, float | None]:
-        """`position` and `expected_wait` of a queued job."""
+        """`position` and `expected_wait` of a queued job; how fast an idle queue would be, is not known."""
         now = time.time()
         own = sa.tuple_(sa.literal(row.turn), sa.literal(row.created_at))
         before = sa.select(sa.func.count()).where(
@@ -439,9 +435,8 @@ class JobTable:
         works = sa.exists().where(JOBS.c.queue == row.queue, JOBS.c.executor.is_not(None), JOBS.c.status.in_(OPEN))
         ended = JOBS.c.queue == row.queue, JOBS.c.ended > now - RATE_SECONDS
         query = sa.select(before.scalar_subquery(), works, sa.func.count(), sa.func.min(JOBS.c.ended)).where(*ended)
-        ((position, is_busy, ends, first),) = self._database.read(query)
-        is_pace = ends >= MIN_ENDS and (position or is_busy)  # where nobody is waited for, callers set the pace
-        wait = (position + 1) * (now - first) / ends if is_pace else None
+        ((position, busy, ends, first),) = self._database.read(query)
+        wait = (position + 1) * (now - first) / ends if ends >= MIN_ENDS and (position or busy) else None
         return {"position": position, "expected_wait": None if wait is None else round(wait, 1)}
 
 

@@ -79,9 +79,8 @@ async def tool_result(result: Simulation | Answer, client: AsyncClient, base_url
 
 def simulation_text(simulation: Simulation, video: str) -> str:
     """What moves, how, what it meets when; which picture is which; what to mind. `video` is where the clip is."""
-    narration = simulation.narration
-    said = narration.agreement if simulation.trajectory.outcome is None else narration.summary  # else of the story
-    lines = said, *_simulation_lines(simulation, video)
+    narration, is_asked = simulation.narration, simulation.trajectory.outcome is not None  # else it is the story
+    lines = narration.summary if is_asked else narration.agreement, *_simulation_lines(simulation, video)
     return _text(filter(None, lines), simulation.warnings, simulation.image.sha256)
 
 

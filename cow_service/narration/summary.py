@@ -13,6 +13,7 @@ from cow_service.records.results import Narration
 if TYPE_CHECKING:
     from cow_service.records import Doubt, Grounding, Language, Outcome, Trajectory
 
+ROUNDING = 1e-6  # of a count of versions, which is rounded down: one that was misread counts half
 LEANING = 2 / 3  # share of the simulated versions from which an answer that is not sure is called probable
 _UNSEEN: tuple[Doubt, ...] = ("identity", "outline", "faint")  # doubts of what is seen, which no simulation weighs
 _FITTING = ("inside", "on-top", "beside")  # results of a thing that ends as it was meant to
@@ -105,11 +106,6 @@ def label_of_changes(grounding: Grounding, trajectory: Trajectory, say: Phrases)
     return say("without", object=without) if without else say("with", object=having) if having else ""
 
 
-def _whole(count: float) -> int:
-    """A number of versions, of which one that was misread counts half."""
-    return math.floor(count + 1e-6)
-
-
 class _Summary:
     """The sentences about the outcome of one trajectory."""
 
@@ -154,12 +150,12 @@ class _Summary:
         if share is None or not total:
             return ""
         key = "agree-all" if share == 1 and total > 1 else "agree"
-        return self._say(key, count=str(_whole(share * total)), total=str(total))
+        return self._say(key, count=str(math.floor(share * total + ROUNDING)), total=str(total))
 
     def counted(self) -> str:
         """What most versions say, and how many of them, as a clause. There must be an outcome with a probability."""
         total, statement = self._trajectory.ensemble, self._statement(with_time=False)
-        count = str(_whole((self.share() or 0.0) * total))
+        count = str(math.floor((self.share() or 0.0) * total + ROUNDING))
         return self._say("in-versions", statement=statement, count=count, total=str(total))
 
     @property

@@ -200,11 +200,10 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
         said, region = None if thing is None else thing.prior, scene.region_of(seen.bbox)
         if carrier and same_name(seen.name, carried) and (said is None or said.stands_on is None):
             said = (said or ObjectPrior()).model_copy(update={"stands_on": carrier})
-        shape = None if region is None else shape_seen(region)
-        if situation.side_view is not None and shape != "sphere":
-            shape = "box"
-        if said is not None and said.shape is not None:
-            shape = said.shape
+        shape = None if said is None else said.shape
+        if shape is None:
+            shape = None if region is None else shape_seen(region)
+            shape = "box" if situation.side_view is not None and shape != "sphere" else shape
         body = SeenBody(
             name=seen.name,
             bbox=seen.bbox,

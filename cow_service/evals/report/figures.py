@@ -120,8 +120,7 @@ def draw_gains(findings: Findings) -> Figure | None:
     for heading, group in kept[1:] if len(kept) == 2 else kept:
         questions = max(gain.questions for _, gain in group)
         scenes = max(gain.scenes for _, gain in group)
-        counts = (f"{count} {name}{'s' * (count != 1)}" for count, name in ((questions, "question"), (scenes, "scene")))
-        rows.append((f"{heading} ({', '.join(counts)})", None, None))
+        rows.append((f"{heading} (questions: {questions}, scenes: {scenes})", None, None))
         rows += [(short(name), styles[name], gain) for name, gain in group]
 
     figure = Figure(figsize=(GAINS_WIDTH, GAIN_ROW * len(rows) + 1.1), layout="constrained")

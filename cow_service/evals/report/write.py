@@ -54,9 +54,8 @@ def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
         info = run.info
         asked.append(
             f"{info.mllm}, asked by {info.ask}: {len(run.items)} questions of {info.data}, arms "
-            f"{', '.join(info.arms)}, {info.repeats} repeat{'s' * (info.repeats > 1)}, seed {info.seed}, "
-            f"design {info.design_digest[:12]}, {info.versions.get('cow-service')} "
-            f"at commit {info.versions.get('commit')}."
+            f"{', '.join(info.arms)}, repeats {info.repeats}, seed {info.seed}, design {info.design_digest[:12]}, "
+            f"{info.versions.get('cow-service')} at commit {info.versions.get('commit')}."
         )
         failures = sorted({each.failure for each in run.observations if each.failure is not None})
         asked += [f"- {told}" for told in info.notes]

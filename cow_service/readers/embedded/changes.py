@@ -48,7 +48,7 @@ def find_removed(scene: Scene, question: Question, given: Sequence[LocatedObject
         one = None if _is_plural(phrase) else _one(left, phrase, others, given)
         found = _both(left, phrase, others) if _is_plural(phrase) else [] if one is None else [one]
         if not found:
-            raise _not_found(left, f"takes '{phrase.text}' away", phrase, others)
+            raise _not_found(left, f"takes '{phrase.text}' away", phrase)
         taken += found
     return tuple(Intervention(kind="remove", object=each) for each in taken)
 
@@ -70,8 +70,7 @@ def _both(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[Obje
     """ "Both cylinders", each under its colour. Raises `CannotGround` for another number."""
     kind = kind_of(phrase.text)
     if kind is not None and kind.count not in (None, 2):
-        told = f"The question changes '{phrase.text}' at once, and the embedded reader knows one or two: name each."
-        raise CannotGround(told, remedy=GIVE_OBJECT)
+        raise CannotGround(f"The question changes '{phrase.text}' at once: name each of them.", remedy=GIVE_OBJECT)
     found = match_several(regions, phrase, others, 2)
     return [_located(f"{region.colour} {phrase.head or 'object'}", region.bbox) for region in found]
 
@@ -106,7 +105,7 @@ def find_placed(
             thing = _one(free, phrase, names, given) if again is None else _located(phrase.text, again)
             if thing is None:
                 where = f"{change.relation} '{phrase.text}'" if found else "somewhere"
-                raise _not_found(free, f"{puts} {where}", phrase, names)
+                raise _not_found(free, f"{puts} {where}", phrase)
             found.append(thing)
             known.append((phrase, thing.bbox))
         if change.relation == "between" and len(found) != 3:
@@ -120,8 +119,6 @@ def _located(name: str, bbox: BBox) -> LocatedObject:
     return LocatedObject(object=name, bbox=bbox, source="embedded")
 
 
-def _not_found(
-    regions: Sequence[Region], told: str, phrase: ObjectPhrase, others: Sequence[ObjectPhrase] = ()
-) -> CannotGround:
-    why = unclear(phrase, best_matches(regions, phrase, others), regions)
+def _not_found(regions: Sequence[Region], told: str, phrase: ObjectPhrase) -> CannotGround:
+    why = unclear(phrase, best_matches(regions, phrase), regions)
     return CannotGround(f"The question {told}, and {why}.", remedy=GIVE_OBJECT)

@@ -253,10 +253,17 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
 
 def unclear(phrase: ObjectPhrase, fitting: Sequence[Region], regions: Sequence[Region]) -> str:
     """Why not one region is what a phrase names, for a message."""
+    if fitting and says_nothing(phrase, fitting):
+        return f"'{phrase.text}' names no colour and no shape that is known here. Seen: {describe(regions)}"
     if len(fitting) > 1:
         what = "its place" if phrase.colour else "its colour or its place"
         return f"'{phrase.text}' may be any of {len(fitting)}: {describe(fitting)}. Name {what}"
     return f"'{phrase.text}' was not found, or not for certain. Seen: {describe(regions)}"
+
+
+def says_nothing(phrase: ObjectPhrase, fitting: Sequence[Region]) -> bool:
+    """Whether a phrase fits regions because nothing is known of its noun, and it names no colour."""
+    return phrase.colour is None and not is_known(phrase) and phrase.noun not in fitting[0].called
 
 
 def match_several(

@@ -19,7 +19,6 @@ from cow_service.readers.embedded.english.lexicon import ARROWS, ObjectPhrase
 from cow_service.readers.embedded.english.motion import MotionWords
 from cow_service.readers.embedded.english.questions import Question, parse
 from cow_service.readers.embedded.facing import facing
-from cow_service.readers.embedded.matching import describe
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Source, Vector
@@ -210,16 +209,9 @@ def _mover(scene: Scene, regions: Sequence[Region], question: Question, phrase: 
     fitting = matching.best_matches(regions, phrase, question.others)
     if len(fitting) > 1 and question.mentions_arrow:
         fitting = scene.at_arrow(fitting) or fitting
-    if len(fitting) != 1:
+    if len(fitting) != 1 or (matching.says_nothing(phrase, fitting) and len(scene.regions) > 1):
         told = matching.unclear(phrase, fitting, scene.regions)
         raise CannotGround(f"What moves is not clear: {told}.", remedy=GIVE_PLACE)
-    says_nothing = phrase.colour is None and not matching.is_known(phrase) and phrase.noun not in fitting[0].called
-    if says_nothing and len(scene.regions) > 1:
-        raise CannotGround(
-            f"Looked for '{phrase.text}', which names no colour and no shape that the embedded reader knows. "
-            f"Seen: {describe(scene.regions)}.",
-            remedy=GIVE_PLACE,
-        )
     return fitting[0].bbox
 
 
