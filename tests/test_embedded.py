@@ -231,7 +231,7 @@ def test_refusals_say_what_was_looked_for_what_was_seen_and_what_to_give() -> No
     assert "red at (1" in told
     assert "grounding.point" in told
     told = refusal(CannotGround, drawn(), "If the dragon moves left, will it hit the cube?")
-    assert "'dragon' names no colour and no shape that is known here. Seen: red at" in told
+    assert "'dragon' names no colour and no shape that is known here. Seen: " in told
     told = refusal(CannotGround, drawn(), "Is this nice?")
     assert "does not say in words what moves" in told
     twins = Scene(jpeg(ball(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED), (300, 270), 30, BLUE)))
