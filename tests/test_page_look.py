@@ -10,7 +10,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import NARROW, WIDE, Point, Windows, ask, assert_fits, drag_in_picture, drop, in_window, result, said
 from conftest import Server
-from playwright.sync_api import Page, Request, expect
+from playwright.sync_api import Page, Request, Route, expect
 from servers import QUESTION, SEEING, Served, picture
 
 pytestmark = pytest.mark.slow
@@ -165,7 +165,13 @@ def test_a_server_that_forgets_the_picture_is_sent_it_again(served: Served, wind
     page.mouse.move(*seen.at(BARE))
     expect(page.get_by_text("No clear outline here: draw a box.")).to_be_visible()  # the picture is there
     uploads = len([body for path, body in seen.requests if path == "look" and not body])
-    page.route("**/look", lambda route: route.fulfill(status=404, body=json.dumps(forgets)), times=1)
+    replies = iter([json.dumps(forgets)])
+
+    def forget_once(route: Route) -> None:  # with `times=1` the next request may hang while its route is taken away
+        reply = next(replies, None)
+        route.continue_() if reply is None else route.fulfill(status=404, body=reply)
+
+    page.route("**/look", forget_once)
     page.mouse.move(*seen.at(BALL))
     expect(page.locator("image.lit")).to_have_count(1)
     assert len([body for path, body in seen.requests if path == "look" and not body]) == uploads + 1
