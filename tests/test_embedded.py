@@ -10,7 +10,7 @@ from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import Quantity, ReaderInput, StepReading
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.records import Grounding
+from cow_service.records import Grounding, ObjectPrior
 from cow_service.vision.masks import iou
 from cow_service.vision.scene import Scene
 
@@ -122,6 +122,21 @@ def test_falls_throws_and_rests() -> None:
     assert read(drawn(False), "If the red ball falls freely, will it land on the cube?")[1].kind == "fall"
     assert read(drawn(False), "If the red ball is thrown to the right, will it hit the cube?")[1].kind == "projectile"
     assert read(drawn(False), "If the red ball stays still, will it hit the cube?")[1].kind == "static"
+
+
+@pytest.mark.parametrize("words", ["tips over", "topples", "falls over", "falls over to the left", "is pushed over"])
+def test_what_falls_over_where_it_stands_is_not_dropped(words: str) -> None:
+    told = refusal(CannotReadDirection, drawn(False), f"If the blue cube {words}, will it hit the red ball?")
+    assert "what falls over where it stands is not simulated" in told
+    assert read(drawn(False), "If the red ball rolls over to the left, will it hit the cube?")[1].kind == "linear"
+
+
+def test_what_may_stand_is_not_dropped_unless_it_is_said_to_be_in_the_air() -> None:
+    told = "If the blue cube falls, will it hit the red ball?"
+    assert "whether it stands or is in the air" in refusal(CannotReadDirection, drawn(False), told)
+    grounding, _ = read(drawn(False), told.replace("falls", "moves left"))
+    hangs = grounding.model_copy(update={"prior": ObjectPrior(stands_on="air")})
+    assert reader.read_motion(ReaderInput(drawn(False), told), hangs, None).kind == "fall"
 
 
 @pytest.mark.parametrize("words", ["falls upwards", "rises downwards"])

@@ -395,21 +395,17 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         is_other = is_odd if own is not None else shape_of(head) != shape_of(looks or "")
         colour = None if phrase.colour else like_a_colour(phrase.text)
         if colour is not None:
-            warnings.append(f"'{phrase.text}' was taken for what is {place}: '{colour}' is no colour that is known.")
-            doubtful.add(bbox)
+            reason = f": '{colour}' is no colour that is known."
         elif elsewhere and _shape_ratio(region, phrase) <= CLEAR:  # a detector misses some
-            warnings.append(f"'{phrase.text}' was taken for what is {place}: the detector calls another thing so.")
-            doubtful.add(bbox)
+            reason = ": the detector calls another thing so."
         elif looks is not None and is_other and phrase.noun is not None and head not in _ANYTHING:
-            warnings.append(f"'{phrase.text}' was taken for what is {place}, which looks like a {looks}, not '{head}'.")
-            doubtful.add(bbox)
+            reason = f", which looks like a {looks}, not '{head}'."
         elif is_odd:
-            warnings.append(f"'{phrase.text}' was taken for what is {place}, which does not look like '{head}'.")
-            doubtful.add(bbox)
+            reason = f", which does not look like '{head}'."
         elif not is_known(phrase):
-            warnings.append(
-                f"'{phrase.text}' was taken for what is {place}: whether '{phrase.head}' is right, the embedded reader "
-                "cannot tell."
-            )
-            doubtful.add(bbox)
+            reason = f": whether '{phrase.head}' is right, the embedded reader cannot tell."
+        else:
+            continue
+        warnings.append(f"'{phrase.text}' was taken for what is {place}{reason}")
+        doubtful.add(bbox)
     return warnings, frozenset(doubtful)

@@ -97,11 +97,9 @@ def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[
 
 
 def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
-    if direction is None and depth:
-        return depth_motion(depth)
-    if direction is None:
+    if direction is None and not depth:
         raise CannotReadDirection("Which way a part of the motion goes was not understood.", remedy=GIVE_DIRECTION)
-    return direction, depth
+    return depth_motion(depth) if direction is None else (direction, depth)
 
 
 def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:

@@ -228,16 +228,21 @@ def _bbox_of(
 def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> MotionReading:
     words, name = question.motion, grounding.object
     kind = words.kind or "linear"
-    if kind == "static" and question.names_direction:
+    if words.contradictory or (kind == "static" and question.names_direction):
         raise CannotReadDirection(
-            f"The question says that the {name} does not move, and speaks of a direction all the same: "
-            f"which is meant was not understood.",
+            f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict each other: "
+            "which is meant was not understood.",
             remedy=GIVE_DIRECTION,
         )
-    if words.contradictory:
+    prior, region = grounding.prior or ObjectPrior(), scene.region_of(grounding.bbox)
+    is_ball = prior.shape == "sphere" or (prior.shape is None and region is not None and region.is_disc)
+    may_hang = is_ball or prior.stands_on is not None or scene.side_view is not None  # a ball's shadow tells how high
+    if words.topples or (kind == "fall" and not may_hang):
+        unseen = "the embedded reader cannot see whether it stands or is in the air"
+        unknown = "what falls over where it stands is not simulated" if words.topples else unseen
         raise CannotReadDirection(
-            f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict "
-            f"each other: which is meant was not understood.",
+            f"How the {name} would fall is not known: {unknown}. Ask what happens if it is pushed, or give its place "
+            "and `stands_on` (`air`, or what carries it).",
             remedy=GIVE_DIRECTION,
         )
     if kind not in DIRECTED_KINDS:
@@ -337,6 +342,4 @@ def _way_to(goal: LocatedObject, kind: MotionKind, grounding: Grounding) -> Vect
     """From the mover to a thing in the image: from foot to foot on the floor, else between the middles."""
     (x0, y0, x1, y1), (left, top, right, bottom) = goal.bbox, grounding.bbox
     across = (x0 + x1 - left - right) / 2
-    if kind == "linear" and (across, y1) != (0.0, bottom):
-        return across, y1 - bottom
-    return across, (y0 + y1 - top - bottom) / 2
+    return across, y1 - bottom if kind == "linear" and (across, y1) != (0.0, bottom) else (y0 + y1 - top - bottom) / 2

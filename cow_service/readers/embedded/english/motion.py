@@ -235,7 +235,7 @@ _MAX_TRIES = 16  # of one motion: each takes a part of a ms
 _FIRST_LEG_ONLY = frozenset({"along", "against", "towards", "forward", "backward"})
 _THEN = lex.words("then afterwards finally")
 _BEFORE_VERB = lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}
-_TIPPED = lex.words("knock push kick hit turn blow go")
+_TOPPLES, _OVER = lex.words("topple tip tumble collapse"), lex.words("knock push kick hit turn blow go fall drop")
 _RISING = lex.words("lift raise rise climb ascend")
 _SETS_GOING = lex.words("send start keep get")
 _FALLING = lex.words("fall drop release plummet plunge descend")
@@ -270,9 +270,9 @@ class MotionWords:
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty if no known verb of motion stands in the question. `towards` is the object that the motion aims at;
     the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
-    `contradictory`: two of its words are opposites, such as to fall upwards, or left and right in one leg.
-    `steps` are the legs behind the first, `others` what moves at the same time. `read` are the places in the text of
-    the items that were understood.
+    `contradictory`: two of its words are opposites, such as to fall upwards, or left and right in one leg. `topples`:
+    it falls over where it stands. `steps` are the legs behind the first, `others` what moves at the same time. `read`
+    are the places in the text of the items that were understood.
     """
 
     kind: MotionKind | None
@@ -286,6 +286,7 @@ class MotionWords:
     quantities: tuple[QuantityWords, ...] = ()
     steps: tuple[StepWords, ...] = ()
     contradictory: bool = False
+    topples: bool = False
     others: tuple[OtherWords, ...] = ()
     read: frozenset[int] = field(default_factory=frozenset[int], compare=False)
 
@@ -388,6 +389,8 @@ def read_motion(
                 leg = legs[-2]
             if later or aside or not leg.take(node, mover, asked or kind == "fall"):
                 continue
+            if leg.verb == "fall" and items[0].key == "over":  # "falls over to the left"
+                leg.marks.add("over")
         elif item.quantity is not None and item.quantity.within is not None:
             continue
         elif item.quantity is not None:
@@ -407,8 +410,8 @@ def _in_words(legs: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int
     lost = [leg.quantities.keys() for leg in rest if leg.way(None)[0] is None and not leg.depths]
     rest = [leg for leg in rest if leg.way(None)[0] is not None or leg.depths]
     comes_down = first.verb == "come" and any(y > 0 for _, y in first.ways)
-    if comes_down or (first.verb in _TIPPED and "over" in first.marks):
-        kind = "fall"
+    kind = "fall" if comes_down else kind
+    is_over = first.verb in _TOPPLES or (first.verb in _OVER and "over" in first.marks)
     sense, forward = next(iter(first.senses), None), next(iter(first.ahead), None)
     if forward is None and sense is None and first.verb == "reverse":
         forward = False
@@ -419,6 +422,7 @@ def _in_words(legs: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int
         first.towards, quantities=tuple(first.quantities.values()),
         steps=tuple(StepWords(*leg.way(None), tuple(leg.quantities.values())) for leg in rest),
         contradictory=any(leg.contradicts() for leg in (first, *rest)), read=read.difference(*lost),
+        topples=is_over and "off" not in first.marks and not any(y > 0 for _, y in first.ways),
     )  # fmt: skip
 
 
