@@ -47,7 +47,9 @@ settings.load_profile("cow")
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 SHARED_SCENES = ROOT.parent / "shared" / "scenes"
-FIRST = ("test_docs.py", "test_chaos.py")  # the longest files: begun last, they would keep one process alone at work
+# The longest files: begun last, they would keep one process alone at work.
+FIRST = ("test_docs.py", "test_chaos.py", "test_evals_run.py", "test_jobs.py", "test_wan_speed.py", "test_page.py")
+FIRST += ("test_client.py", "test_workers.py", "test_mcp.py", "test_slow_starts.py")
 
 
 @dataclass(frozen=True)

@@ -52,10 +52,14 @@ def words(path: Path) -> str:
     return " ".join("".join(each.itertext()) for each in ElementTree.parse(path).iter() if each.tag.endswith("text"))
 
 
-def test_every_plot_is_a_vector_and_a_picture(nine: Findings, tmp_path: Path) -> None:
-    paths = write_plots(tmp_path / "plots", nine)
-    assert [path.name for path in paths] == [f"{name}{suffix}" for name in PLOTS for suffix in (".svg", ".png")]
-    for path in paths:
+@pytest.fixture(scope="module")
+def plots(nine: Findings, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    return tuple(write_plots(tmp_path_factory.mktemp("plots"), nine))
+
+
+def test_every_plot_is_a_vector_and_a_picture(plots: tuple[Path, ...]) -> None:
+    assert [path.name for path in plots] == [f"{name}{suffix}" for name in PLOTS for suffix in (".svg", ".png")]
+    for path in plots:
         if path.suffix == ".png":
             with Image.open(path) as picture:
                 assert min(picture.size) > 300
@@ -71,9 +75,8 @@ def test_the_same_findings_make_the_same_bytes(tmp_path: Path) -> None:
     assert [a.name for a, b in vectors if a.read_bytes() != b.read_bytes()] == []
 
 
-def test_the_figures_stand_in_the_text(nine: Findings, tmp_path: Path) -> None:
-    write_plots(tmp_path, nine)
-    said = {name: words(tmp_path / f"{name}.svg") for name in PLOTS}
+def test_the_figures_stand_in_the_text(nine: Findings, plots: tuple[Path, ...]) -> None:
+    said = {path.stem: words(path) for path in plots if path.suffix == ".svg"}
     for each in nine.arms:
         assert f"{100 * each.rates.tpr.mean:.0f}" in said["rates"]
         assert all(each.name in said[name] for name in ("rates", "cost"))
@@ -114,6 +117,7 @@ def test_odd_names_of_models_are_drawn(tmp_path: Path) -> None:
     assert "72B-instruct, always" in said
 
 
+@pytest.mark.soak_only
 def test_matplotlib_is_imported_where_it_is_used() -> None:
     code = "import cow_service.evals.report.write, sys; print('matplotlib' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,7 +1,7 @@
 """`cow eval` as it is run: a real process, a real server in it, and an MLLM on loopback whose accuracy is known.
 
-Most processes are forked from one that has made the imports, which take most of a small run's time; those without an
-MLLM and of Inspect's own command begin from nothing.
+The processes are forked from one that has made the imports, which take most of a small run's time; that of Inspect's
+own command begins from nothing.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -387,16 +388,11 @@ def test_what_cannot_be_asked_is_refused_before_the_first_call(
     assert not list(tmp_path.glob("run-*/run.json")), "the folder stays free"
 
 
-def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path) -> None:
+def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path, imported: Template) -> None:
     scenes = Path(shutil.copytree(EXAMPLES, tmp_path / "scenes"))
     asked = scenes / "car-forward" / "meta.json"
     asked.write_text(asked.read_text().replace(" moves forward", " moves"))
-    program = [sys.executable, "-m", "cow_service.cli.main", *arguments_of(scenes, tmp_path / "run")]
-    done = checked(
-        subprocess.run(
-            program, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False, timeout=300
-        )
-    )
+    done = checked(imported.begin(arguments_of(scenes, tmp_path / "run"), tmp_path, environment()).done())
     run = read_run(tmp_path / "run")
     known = {(each.arm, each.item): each for each in run.observations}
     assert all(known["never", item].abstained for item in run.items), "it sees nothing in the image alone"
@@ -405,6 +401,13 @@ def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path) -> None:
     assert "| always" in done.stdout
 
 
+def test_inspect_is_told_of_the_task() -> None:
+    assert [each.load().causalspatial.__name__ for each in entry_points(group="inspect_ai", name="cow_service")] == [
+        "causalspatial"
+    ]
+
+
+@pytest.mark.soak_only  # it begins from nothing, which takes as long as everything else here
 def test_inspects_own_command_runs_the_task(tmp_path: Path, mllm: TruthMllm, items: list[Item]) -> None:
     given: dict[str, Any] = {"LOCAL_BASE_URL": mllm.address, "INSPECT_CACHE_DIR": str(tmp_path / "cache")}
     options = ("-T", f"data={SAMPLE}", "-T", "arm=always", "--limit", "2", "--epochs", "2", "--display", "none")

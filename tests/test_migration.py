@@ -31,7 +31,13 @@ def cow(*words: str, **settings: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("roles_first", [True, False], ids=["roles before tables", "tables before roles"])
+@pytest.mark.parametrize(
+    "roles_first",
+    [
+        pytest.param(True, id="roles before tables", marks=pytest.mark.soak_only),
+        pytest.param(False, id="tables before roles"),
+    ],
+)
 def test_a_server_runs_on_tables_that_it_may_not_create(tmp_path: Path, roles_first: bool) -> None:
     with postgres() as server:
         url = server.url

@@ -285,7 +285,7 @@ def test_one_failure_is_got_over(script, code, mllm: MllmServer, make) -> None:
         (say.slow(3), "mllm-unavailable", "in time"),
         (say.finished("", "content_filter"), "mllm-bad-reply", "content filter"),
         ("no idea", "mllm-bad-reply", "gave no usable reply"),
-        ("", "mllm-bad-reply", "gave no reply"),
+        ("", "mllm-bad-reply", "it was empty"),
     ],
     ids=lambda value: None,
 )

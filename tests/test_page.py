@@ -44,7 +44,7 @@ def answered(server: Server, windows: Windows, width: int, shift: int, **options
     return page
 
 
-@pytest.mark.parametrize(("width", "shift"), [(WIDE, 1), (NARROW, 2)])
+@pytest.mark.parametrize(("width", "shift"), [(WIDE, 1), pytest.param(NARROW, 2, marks=pytest.mark.soak_only)])
 def test_dragging_the_arrow_changes_path_and_answer(server: Server, windows: Windows, width: int, shift: int) -> None:
     page = answered(server, windows, width, shift)
     first, at_first = result(page), path(page)

@@ -197,7 +197,7 @@ def floor_of(page: Page) -> tuple[float, str]:
     )
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.soak_only)])
 def test_the_floor_is_dragged(server: Server, windows: Windows, scheme: str) -> None:
     seen = Seen(server.address, windows, bypass_csp=True, color_scheme=scheme)
     page = seen.page

@@ -44,6 +44,7 @@ def bad_starts(folder: Path, *starts: str, **settings: str) -> Served:
     return Served(folder, IMPATIENT, COW_WORKERS="true", **own, **settings)
 
 
+@pytest.mark.soak_only
 def test_a_worker_that_starts_slowly_is_waited_for(tmp_path: Path) -> None:
     with bad_starts(tmp_path, f"{1.2 * SILENCE}", COW_CONCURRENCY="1") as served:
         assert served.http.post("/simulate", json=BODY).status_code == 200

@@ -305,7 +305,7 @@ def test_dbcache_that_allows_no_change_is_exact():
 
 
 @with_cache_dit
-@pytest.mark.parametrize("order", [0, 1])
+@pytest.mark.parametrize("order", [pytest.param(0, marks=pytest.mark.soak_only), 1])
 def test_dbcache_keeps_nothing_between_clips(order: int):
     def kept() -> int:
         gc.collect()

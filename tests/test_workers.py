@@ -61,7 +61,9 @@ def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
     assert served.http.post("/simulate", json=slow(0.1, seed=102)).status_code == 200
 
 
-@pytest.mark.parametrize(("path", "seed"), [("/simulate", 120), ("/answer", 122)])
+@pytest.mark.parametrize(
+    ("path", "seed"), [("/simulate", 120), pytest.param("/answer", 122, marks=pytest.mark.soak_only)]
+)
 def test_a_worker_whose_device_fails_is_replaced(path: str, seed: int, served: Served) -> None:
     before = {one.pid for one in workers_of(served)}
     told = problem(served.http.post(path, json=poison("device", seed=seed)), 503, "device-failed")
