@@ -372,20 +372,16 @@ def test_failures_are_kept_with_their_reason_and_retried_on_request(
     assert [each.failure for each in read_run(tmp_path / "run").observations if each.failure] == []
 
 
+@pytest.mark.parametrize(("asked", "message"), [*REFUSED.items(), (("--ask", "prompt"), "name it with --mllm")])
 def test_what_cannot_be_asked_is_refused_before_the_first_call(
-    tmp_path: Path, mllm: TruthMllm, imported: Template
+    tmp_path: Path, mllm: TruthMllm, imported: Template, asked: tuple[str, ...], message: str
 ) -> None:
-    own = ["--mllm", MODEL, "--base-url", mllm.address]
-    asked = [[*([] if "--mllm" in arguments else own), *arguments] for arguments in REFUSED]
-    asked.append(["--ask", "prompt"])
-    expected = [*REFUSED.values(), "--ask prompt asks a multimodal LLM: name it with --mllm"]
-    for number, (arguments, message) in enumerate(zip(asked, expected, strict=True)):
-        out = tmp_path / f"run-{number}"
-        done = imported.begin(arguments_of(EXAMPLES, out, *arguments), tmp_path, environment()).done()
-        checked(done, 1)
-        assert message in done.stderr
+    own = [] if "--mllm" in asked or asked == ("--ask", "prompt") else ["--mllm", MODEL, "--base-url", mllm.address]
+    out = tmp_path / "run"
+    done = imported.begin(arguments_of(EXAMPLES, out, *own, *asked), tmp_path, environment()).done()
+    assert message in checked(done, 1).stderr
     assert not mllm.asked
-    assert not list(tmp_path.glob("run-*/run.json")), "the folder stays free"
+    assert not (out / "run.json").exists(), "the folder stays free"
 
 
 def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path, imported: Template) -> None:
