@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.soak, pytest.mark.timeout(1800)]
 # The first is that of CI. The others have shown faults, which were mended. `make chaos` draws a new one, too.
 SEEDS = (1, 21)
 # With a power cut or a crash of PostgreSQL, and with something else.
-WAVES = (1, 1) if SCALE == 1 else (2 * SCALE, 2 * SCALE)
+WAVES = 2 * SCALE, 2 * SCALE
 LONGEST = (
     2.0 if SCALE == 1 else 16.0
 )  # seconds that a fault lasts: processes that say nothing are given up after 8 or 15

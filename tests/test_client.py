@@ -818,7 +818,6 @@ client.answer("a.png", "What?", imagine="sometimes")  # pyright: ignore[reportAr
 
 
 @pytest.mark.slow
-@pytest.mark.soak_only
 def test_types_are_told(tmp_path: Path) -> None:
     (tmp_path / "use.py").write_text(USE)
     settings = {"typeCheckingMode": "strict", "pythonVersion": "3.11", "extraPaths": [str(ROOT)], "include": ["use.py"]}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import pytest
 from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
@@ -124,19 +126,37 @@ def test_falls_throws_and_rests() -> None:
     assert read(drawn(False), "If the red ball stays still, will it hit the cube?")[1].kind == "static"
 
 
-@pytest.mark.parametrize("words", ["tips over", "topples", "falls over", "falls over to the left", "is pushed over"])
+@pytest.mark.parametrize(
+    "words",
+    ["tips over", "topples", "falls over", "falls over to the left", "is pushed over", "is blown over to the left"],
+)
 def test_what_falls_over_where_it_stands_is_not_dropped(words: str) -> None:
-    told = refusal(CannotReadDirection, drawn(False), f"If the blue cube {words}, will it hit the red ball?")
-    assert "what falls over where it stands is not simulated" in told
-    assert read(drawn(False), "If the red ball rolls over to the left, will it hit the cube?")[1].kind == "linear"
+    for start in ("If", "If the red ball rolls left while", "If the red ball rolls left and"):
+        told = f"{start} the blue cube {words}, what happens?"
+        assert "fall over where it stands" in refusal(CannotReadDirection, drawn(False), told)
 
 
-def test_what_may_stand_is_not_dropped_unless_it_is_said_to_be_in_the_air() -> None:
-    told = "If the blue cube falls, will it hit the red ball?"
-    assert "whether it stands or is in the air" in refusal(CannotReadDirection, drawn(False), told)
-    grounding, _ = read(drawn(False), told.replace("falls", "moves left"))
-    hangs = grounding.model_copy(update={"prior": ObjectPrior(stands_on="air")})
-    assert reader.read_motion(ReaderInput(drawn(False), told), hangs, None).kind == "fall"
+def test_a_fall_is_that_of_a_ball_or_of_what_is_in_the_air() -> None:
+    def kind(words: str, **prior: Any) -> str:
+        scene, told = drawn(False), f"If the {words}, what happens?"
+        grounding, _ = read(scene, f"If the {' '.join(words.split()[:2])} moves left, what happens?")
+        known = grounding.model_copy(update={"prior": ObjectPrior(**prior)})
+        return reader.read_motion(ReaderInput(scene, told), known, None).kind
+
+    for words in ("falls", "falls over the edge of the table", "falls over the blue cube"):
+        assert kind(f"red ball {words}") == "fall"
+    assert kind("red ball rolls over to the left") == "linear"
+    for words in ("falls freely from its current position", "is dropped", "drops", "is let go"):
+        assert kind(f"blue cube {words}") == "fall"
+    assert kind("blue cube falls", stands_on="air") == "fall"
+    assert "fall over" in refusal(
+        CannotReadDirection, drawn(False), "If the blue cube moves left and topples, what then?"
+    )
+    for words in ("falls", "falls to the left", "tips off the shelf", "topples down"):
+        told = refusal(CannotReadDirection, drawn(False), f"If the blue cube {words}, what happens?")
+        assert "stands or is in the air is not seen" in told
+    with pytest.raises(CannotReadDirection):
+        kind("blue cube falls", stands_on="floor")
 
 
 @pytest.mark.parametrize("words", ["falls upwards", "rises downwards"])

@@ -397,10 +397,9 @@ def test_without_an_mllm_the_embedded_reader_answers(tmp_path: Path, imported: T
     assert "| always" in done.stdout
 
 
-def test_inspect_is_told_of_the_task() -> None:
-    assert [each.load().causalspatial.__name__ for each in entry_points(group="inspect_ai", name="cow_service")] == [
-        "causalspatial"
-    ]
+def test_inspect_finds_the_task() -> None:
+    (entry,) = entry_points(group="inspect_ai", name="cow_service")
+    assert len(entry.load().causalspatial(data=str(SAMPLE), arm="always").dataset) == 12
 
 
 @pytest.mark.soak_only  # it begins from nothing, which takes as long as everything else here

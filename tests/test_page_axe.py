@@ -46,7 +46,7 @@ def jobs(page: Page) -> None:
     expect(page.get_by_text("Reading the jobs…")).to_have_count(0)
 
 
-@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.soak_only)])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_nothing_serious(server: Server, windows: Windows, scheme: str) -> None:
     found: list[str] = []
     width = {"light": WIDE, "dark": NARROW}[scheme]

@@ -110,9 +110,9 @@ def test_the_list_of_jobs(served: Served, windows: Windows) -> None:
 
 
 def expect_pictures(page: Page, selector: str) -> None:
-    """There come to be two pictures or more, all of them decoded; with a key each is fetched for itself."""
-    widths = "all => all.map((img) => img.naturalWidth)"
-    eventually(lambda: len(found := page.locator(selector).evaluate_all(widths)) >= 2 and all(found))
+    """Waits until there are two pictures or more, and all are decoded; with a key each is fetched for itself."""
+    widths_of = "all => all.map((img) => img.naturalWidth)"
+    eventually(lambda: len(found := page.locator(selector).evaluate_all(widths_of)) >= 2 and all(found))
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_a_server_that_forgets_the_picture_is_sent_it_again(served: Served, wind
     uploads = len([body for path, body in seen.requests if path == "look" and not body])
     replies = iter([json.dumps(forgets)])
 
-    def forget_once(route: Route) -> None:  # with `times=1` the next request may hang while its route is taken away
+    def forget_once(route: Route) -> None:  # `times=1` can lose the request that comes while the route is removed
         reply = next(replies, None)
         route.continue_() if reply is None else route.fulfill(status=404, body=reply)
 

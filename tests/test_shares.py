@@ -59,7 +59,7 @@ class Caller:
         return order
 
 
-@pytest.fixture(scope="module", params=[pytest.param("sqlite", marks=pytest.mark.soak_only), "postgres"])
+@pytest.fixture(scope="module", params=["sqlite", "postgres"])
 def served(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     own = {
         "COW_API_KEYS": json.dumps(HASHES),

@@ -143,7 +143,6 @@ def process_of(loaded: WanGenerator) -> subprocess.Popen[bytes]:
     return group_of(loaded)._ranks[0]._spawned.process
 
 
-@pytest.mark.soak_only
 def test_a_rank_that_has_no_memory_says_so_once(alone: WanGenerator, shared: WanGenerator, tmp_path: Path) -> None:
     def run_out(loaded: WanGenerator) -> None:
         group_of(loaded)._ranks[0].error = GeneratorOutOfMemory("A share of a clip does not fit.")

@@ -211,7 +211,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Whole:
     return Whole(told.getvalue(), "", json.loads(file.read_text()))
 
 
-@pytest.mark.soak_only  # half a minute; how a budget is spent is planned and tested below
+@pytest.mark.soak_only  # half a minute; what a budget leaves out, and the plan, are tested below
 class TestABudget:
     def test_every_row_has_its_figures(self, parts: Whole) -> None:
         status = {result["name"]: result["status"] for result in parts.found["results"]}

@@ -130,9 +130,7 @@ PRESETS: dict[str, Preset] = {
         )
     ),
     # What frames are worth whose path is off by so much: for data with truth.
-    "dose": Preset(
-        ("never", "always", "placebo-still", *(f"oracle:error-{error:g}" for error in (0, 0.5, 1, 2, 4))),
-    ),
+    "dose": Preset(("never", "always", "placebo-still", *(f"oracle:error-{error:g}" for error in (0, 0.5, 1, 2, 4)))),
 }
 
 

@@ -12,14 +12,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from http import HTTPStatus
 
-from cow_service.errors import (
-    ArtifactNotFound,
-    IdempotencyKeyReused,
-    JobNotFound,
-    NotReady,
-    QueueFull,
-    ShuttingDown,
-)
+from cow_service.errors import ArtifactNotFound, IdempotencyKeyReused, JobNotFound, NotReady, QueueFull, ShuttingDown
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.attempts import Dispatcher, Runner
 from cow_service.jobs.calls import Calls

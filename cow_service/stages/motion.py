@@ -114,8 +114,9 @@ def _given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReadi
         x, y = next(point for point in (last, *path.points) if math.dist(point, (x0, y0)) > 1e-6)
         speed = Quantity(way * path.fps / (len(path.points) - 1), "px/s")
         return MotionReading("linear", (x - x0, y - y0), "request", speed=speed)
-    is_placed = grounding.source == "request" and placed_mover(grounding) is not None
-    return MotionReading("place", None, "request") if is_placed else None
+    if grounding.source == "request" and placed_mover(grounding) is not None:
+        return MotionReading("place", None, "request")
+    return None
 
 
 def _with_request(reading: MotionReading, given: MotionRequest, grounding: Grounding) -> MotionReading:

@@ -51,8 +51,9 @@ def fault_of(image: Image, mask: Mask) -> str | None:
         return f"only {on_edge:.0%} of the outline of what lies there can be seen"
     largest = outer_contour(inside)
     hull = cv2.contourArea(cv2.convexHull(largest))
-    is_ragged = hull <= 0 or cv2.contourArea(largest) / hull < LEAST_SOLIDITY
-    return "what lies there is ragged, and looks like a part of something" if is_ragged else None
+    if hull <= 0 or cv2.contourArea(largest) / hull < LEAST_SOLIDITY:
+        return "what lies there is ragged, and looks like a part of something"
+    return None
 
 
 def _crop_around(bbox: BBox, width: int, height: int) -> tuple[slice, slice]:

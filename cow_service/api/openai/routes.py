@@ -100,10 +100,7 @@ async def chat(request: Request, completer: ChatCompleter) -> Response:
         **documented(*FAILURES, errors.ModelNotFound),
         **UPSTREAM_ERRORS,
     },
-    openapi_extra={
-        "requestBody": _body_of(ResponsesRequest),
-        "parameters": [WAIT, *PREFERENCES[2:]],
-    },
+    openapi_extra={"requestBody": _body_of(ResponsesRequest), "parameters": [WAIT, *PREFERENCES[2:]]},
 )
 async def responses(request: Request, completer: ChatCompleter) -> Response:
     """Text and images in, without state: what needs it (`previous_response_id`, `store`...) is refused by name.

@@ -43,11 +43,7 @@ EXACT_BACKENDS: Mapping[str, AttentionBackend] = {
     "xformers": AttentionBackend(VOLTA),
 }
 # Distributions and the minimum versions that diffusers accepts.
-MINIMUM_VERSIONS: Mapping[str, str] = {
-    "cache-dit": "1.5.0",
-    "torchao": "0.15.0",
-    "triton": "3.0.0",
-}
+MINIMUM_VERSIONS: Mapping[str, str] = {"cache-dit": "1.5.0", "torchao": "0.15.0", "triton": "3.0.0"}
 
 
 class Capabilities(Record):

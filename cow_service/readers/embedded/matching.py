@@ -22,14 +22,7 @@ from cow_service.readers.embedded.english.noun_phrases import (
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, LocatedObject
-from cow_service.vision.forms import (
-    form_of,
-    is_cut,
-    is_other_kind,
-    is_unlike,
-    log_ratio,
-    looks_like,
-)
+from cow_service.vision.forms import form_of, is_cut, is_other_kind, is_unlike, log_ratio, looks_like
 from cow_service.vision.masks import is_same_object, mask_iou
 from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene

@@ -10,6 +10,7 @@ from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import QuantityWords
 from cow_service.readers.embedded.english.motion import MotionWords, OtherWords, StepWords
+from cow_service.readers.embedded.english.noun_phrases import shape_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.matching import best_matches, describe, match_one
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
@@ -73,7 +74,21 @@ def step_readings(steps: Sequence[StepWords], bbox: BBox) -> tuple[StepReading, 
     return tuple(readings)
 
 
-def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
+def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | LocatedObject) -> None:
+    """Raises `CannotReadDirection` for what falls over where it stands, and for a fall of what may stand."""
+    name, prior, region = thing.object, thing.prior, scene.region_of(thing.bbox)
+    is_ball = shape_of(name) == "sphere" or (region is not None and region.is_disc)  # its shadow tells how high it is
+    in_air = words.in_air or is_ball or scene.side_view is not None or (prior is not None and prior.stands_on == "air")
+    if words.topples and not is_ball:
+        fault = f"The {name} would fall over where it stands, which is not simulated. Ask what happens if it is pushed."
+    elif words.kind == "fall" and not in_air:
+        fault = f"Whether the {name} stands or is in the air is not seen. If it hangs, ask what happens if it drops."
+    else:
+        return
+    raise CannotReadDirection(fault, remedy=GIVE_DIRECTION)
+
+
+def other_readings(scene: Scene, others: Sequence[OtherWords], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
     """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
     readings: list[OtherMotionReading] = []
     for other in others:
@@ -81,6 +96,7 @@ def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[
         found = next((each for each in grounding.others if each.object == name), None)
         if found is None:
             raise CannotReadDirection(f"'{name}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
+        refuse_unclear_fall(scene, motion, found)
         way, goal = (None, 0.0), None
         if kind in DIRECTED_KINDS:
             direction = motion.direction
@@ -97,9 +113,11 @@ def other_readings(others: Sequence[OtherWords], grounding: Grounding) -> tuple[
 
 
 def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
-    if direction is None and not depth:
+    if direction is None and depth:
+        return depth_motion(depth)
+    if direction is None:
         raise CannotReadDirection("Which way a part of the motion goes was not understood.", remedy=GIVE_DIRECTION)
-    return depth_motion(depth) if direction is None else (direction, depth)
+    return direction, depth
 
 
 def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:

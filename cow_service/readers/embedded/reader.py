@@ -159,7 +159,7 @@ class EmbeddedReader:
             return replace(
                 reading,
                 steps=motions.step_readings(words.steps, grounding.bbox),
-                others=motions.other_readings(words.others, grounding),
+                others=motions.other_readings(scene, words.others, grounding),
                 **motions.quantities(words.quantities, None if way is None else math.hypot(*way), grounding.bbox),
             )
 
@@ -228,23 +228,19 @@ def _bbox_of(
 def _read_motion(scene: Scene, question: Question, grounding: Grounding) -> MotionReading:
     words, name = question.motion, grounding.object
     kind = words.kind or "linear"
-    if words.contradictory or (kind == "static" and question.names_direction):
+    if kind == "static" and question.names_direction:
         raise CannotReadDirection(
-            f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict each other: "
-            "which is meant was not understood.",
+            f"The question says that the {name} does not move, and speaks of a direction all the same: "
+            f"which is meant was not understood.",
             remedy=GIVE_DIRECTION,
         )
-    prior, region = grounding.prior or ObjectPrior(), scene.region_of(grounding.bbox)
-    is_ball = prior.shape == "sphere" or (prior.shape is None and region is not None and region.is_disc)
-    may_hang = is_ball or prior.stands_on is not None or scene.side_view is not None  # a ball's shadow tells how high
-    if words.topples or (kind == "fall" and not may_hang):
-        unseen = "the embedded reader cannot see whether it stands or is in the air"
-        unknown = "what falls over where it stands is not simulated" if words.topples else unseen
+    if words.contradictory:
         raise CannotReadDirection(
-            f"How the {name} would fall is not known: {unknown}. Ask what happens if it is pushed, or give its place "
-            "and `stands_on` (`air`, or what carries it).",
+            f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict "
+            f"each other: which is meant was not understood.",
             remedy=GIVE_DIRECTION,
         )
+    motions.refuse_unclear_fall(scene, words, grounding)
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
     if scene.side_view is not None and words.direction == (0.0, 1.0) and kind == "linear":
@@ -342,4 +338,6 @@ def _way_to(goal: LocatedObject, kind: MotionKind, grounding: Grounding) -> Vect
     """From the mover to a thing in the image: from foot to foot on the floor, else between the middles."""
     (x0, y0, x1, y1), (left, top, right, bottom) = goal.bbox, grounding.bbox
     across = (x0 + x1 - left - right) / 2
-    return across, y1 - bottom if kind == "linear" and (across, y1) != (0.0, bottom) else (y0 + y1 - top - bottom) / 2
+    if kind == "linear" and (across, y1) != (0.0, bottom):
+        return across, y1 - bottom
+    return across, (y0 + y1 - top - bottom) / 2

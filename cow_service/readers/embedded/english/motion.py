@@ -235,7 +235,8 @@ _MAX_TRIES = 16  # of one motion: each takes a part of a ms
 _FIRST_LEG_ONLY = frozenset({"along", "against", "towards", "forward", "backward"})
 _THEN = lex.words("then afterwards finally")
 _BEFORE_VERB = lex.MOVER_PRONOUNS | lex.BE | {"to", "let"}
-_TOPPLES, _OVER = lex.words("topple tip tumble collapse"), lex.words("knock push kick hit turn blow go fall drop")
+_TOPPLING = lex.words("topple tip collapse")
+_TOPPLING_WITH_OVER = lex.words("knock push kick hit turn blow go fall")
 _RISING = lex.words("lift raise rise climb ascend")
 _SETS_GOING = lex.words("send start keep get")
 _FALLING = lex.words("fall drop release plummet plunge descend")
@@ -270,9 +271,9 @@ class MotionWords:
     the camera, 1 away from it, and 0.71 of that where a direction in the image is named too. `verb` is in its base
     form, empty if no known verb of motion stands in the question. `towards` is the object that the motion aims at;
     the direction to it is for the caller to measure. `trail`: it goes on along the trail that is shown.
-    `contradictory`: two of its words are opposites, such as to fall upwards, or left and right in one leg. `topples`:
-    it falls over where it stands. `steps` are the legs behind the first, `others` what moves at the same time. `read`
-    are the places in the text of the items that were understood.
+    `contradictory`: two of its words are opposites, such as to fall upwards. `topples`: it falls over where it stands.
+    `in_air`: it is let go, or falls freely. `steps` are the legs behind the first, `others` what moves at the same
+    time. `read` are the places in the text of the items that were understood.
     """
 
     kind: MotionKind | None
@@ -287,6 +288,7 @@ class MotionWords:
     steps: tuple[StepWords, ...] = ()
     contradictory: bool = False
     topples: bool = False
+    in_air: bool = False
     others: tuple[OtherWords, ...] = ()
     read: frozenset[int] = field(default_factory=frozenset[int], compare=False)
 
@@ -387,10 +389,11 @@ def read_motion(
             later = len(legs) > 1 and node.name in _FIRST_LEG_ONLY
             if node.name == "stops" and len(legs) > 1 and not leg.says_more():
                 leg = legs[-2]
-            if later or aside or not leg.take(node, mover, asked or kind == "fall"):
+            is_above = node.name == "over" and kind == "fall" and after is not None and after.thing is not None
+            if later or aside or not (is_above or leg.take(node, mover, asked or kind == "fall")):
                 continue
-            if leg.verb == "fall" and items[0].key == "over":  # "falls over to the left"
-                leg.marks.add("over")
+            falls_over = item.key == "over" and leg.verb in {"fall", "knock", "turn", "blow"} and not is_above
+            leg.marks |= ({"over"} if falls_over else set()) | ({"freely"} & {each.key for each in items})
         elif item.quantity is not None and item.quantity.within is not None:
             continue
         elif item.quantity is not None:
@@ -402,16 +405,17 @@ def read_motion(
             if lex.VERBS[item.key].kind in {"fall", "projectile"} and leg.verb not in _FALLING:
                 continue
         read |= {item.start for item in items}
-    return _in_words(legs, kind, frozenset(read))
+    words = _in_words(legs, kind, frozenset(read))
+    later = (lex.lemma(each.key) for each in found[1:] if each.key in lex.VERBS)  # "moves left and tips over"
+    return replace(words, topples=words.topples or (not asked and not _TOPPLING.isdisjoint(later)))
 
 
 def _in_words(legs: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int]) -> MotionWords:
     first, *rest = legs
     lost = [leg.quantities.keys() for leg in rest if leg.way(None)[0] is None and not leg.depths]
     rest = [leg for leg in rest if leg.way(None)[0] is not None or leg.depths]
-    comes_down = first.verb == "come" and any(y > 0 for _, y in first.ways)
-    kind = "fall" if comes_down else kind
-    is_over = first.verb in _TOPPLES or (first.verb in _OVER and "over" in first.marks)
+    kind = "fall" if first.verb == "come" and any(y > 0 for _, y in first.ways) else kind
+    is_over = first.verb in _TOPPLING or (first.verb in _TOPPLING_WITH_OVER and "over" in first.marks)
     sense, forward = next(iter(first.senses), None), next(iter(first.ahead), None)
     if forward is None and sense is None and first.verb == "reverse":
         forward = False
@@ -422,7 +426,8 @@ def _in_words(legs: Sequence[_Leg], kind: MotionKind | None, read: frozenset[int
         first.towards, quantities=tuple(first.quantities.values()),
         steps=tuple(StepWords(*leg.way(None), tuple(leg.quantities.values())) for leg in rest),
         contradictory=any(leg.contradicts() for leg in (first, *rest)), read=read.difference(*lost),
-        topples=is_over and "off" not in first.marks and not any(y > 0 for _, y in first.ways),
+        topples=is_over and "off" not in first.marks and not any(y > 0 for _, y in first.ways),  # "off a shelf", "down"
+        in_air=first.verb in {"drop", "release", "detach", "let go"} or "freely" in first.marks,
     )  # fmt: skip
 
 
