@@ -48,8 +48,10 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 SHARED_SCENES = ROOT.parent / "shared" / "scenes"
 # The longest files: begun last, they would keep one process alone at work.
-FIRST = ("test_docs.py", "test_chaos.py", "test_evals_run.py", "test_jobs.py", "test_wan_speed.py", "test_page.py")
-FIRST += ("test_client.py", "test_workers.py", "test_mcp.py", "test_slow_starts.py")
+FIRST = (
+    *("test_docs.py", "test_chaos.py", "test_evals_run.py", "test_jobs.py", "test_workers.py"),
+    *("test_page.py", "test_client.py", "test_mcp.py", "test_slow_starts.py", "test_wan_speed.py"),
+)
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | Loc
     if words.topples and not is_ball:
         fault = f"The {name} would fall over where it stands, which is not simulated. Ask what happens if it is pushed."
     elif words.kind == "fall" and not in_air:
-        fault = f"Whether the {name} stands or is in the air is not seen. If it hangs, ask what happens if it drops."
+        fault = f"The reader cannot see whether the {name} stands or hangs. If it hangs, ask what happens if it drops."
     else:
         return
     raise CannotReadDirection(fault, remedy=GIVE_DIRECTION)

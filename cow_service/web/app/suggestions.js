@@ -14,7 +14,7 @@ export function suggestionsOf(bodies) {
   for (const mover of small) {
     const [x, y] = middleOf(mover.bbox);
     const others = named.filter((body) => body !== mover);
-    const isBall = mover.object.endsWith("ball"); // the embedded reader does not see whether other things stand
+    const isBall = mover.object.endsWith("ball"); // anything else more likely stands than hangs
     const below = isBall && others.find(({ bbox }) => bbox[0] < x && x < bbox[2] && bbox[1] > mover.bbox[3]);
     if (below) questions.push(`If the ${mover.object} falls freely, will it land on the ${below.object}?`);
     const beside = others

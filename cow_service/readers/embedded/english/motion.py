@@ -389,6 +389,7 @@ def read_motion(
             later = len(legs) > 1 and node.name in _FIRST_LEG_ONLY
             if node.name == "stops" and len(legs) > 1 and not leg.says_more():
                 leg = legs[-2]
+            # "Falls over to the left" is to topple; "dropped over the mug" says where.
             is_above = node.name == "over" and kind == "fall" and after is not None and after.thing is not None
             if later or aside or not (is_above or leg.take(node, mover, asked or kind == "fall")):
                 continue
