@@ -5,9 +5,9 @@ BIN := $(VENV)/bin
 # The tests start hundreds of processes; where bytecode is not kept, each would compile its libraries again.
 unexport PYTHONDONTWRITEBYTECODE
 # One process per core. A file stays in one process, which starts the file's servers once; the longest files come first.
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 60 --durations-min 3
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo serve test test-fast soak chaos lint openapi lock sbom bench pictures site clean
+.PHONY: demo serve test test-fast soak soak-part chaos lint openapi lock sbom bench pictures site clean
 
 # Tools that the project is not built with, apart from what they look at.
 TOOLS ?= .tools
@@ -23,19 +23,21 @@ demo: $(VENV)/.base ## run the main job on an example
 serve: $(VENV)/.base ## start the server on 127.0.0.1:8000
 	$(BIN)/cow serve
 
-test: $(VENV)/.test ## every test but those marked soak_only; of long tables every twelfth case
-	$(PYTEST)
+test: $(VENV)/.test ## every test but those marked soak
+	$(PYTEST) -m "not soak"
 
 test-fast: $(VENV)/.test ## of `make test` those not marked slow
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not soak and not slow"
 
-soak: $(VENV)/.test ## every test with every case; chaos, fuzz and state tests ten times as long; public harnesses
-	$(PYTEST) tests/test_inspect.py tests/test_docs.py
+soak: $(VENV)/.test ## every test with every case; chaos, fuzz and property tests ten times as long; public harnesses
 	COW_TEST_SCALE=10 $(PYTEST)
 	$(MAKE) -C cow-scenes test
 
+soak-part: $(VENV)/.test ## PART=K/N: the K-th of N parts of what `make soak` has and `make test` has not
+	COW_TEST_SCALE=10 $(PYTEST) -m "soak or scaled" --part $(PART)
+
 chaos: $(VENV)/.test ## strike servers, databases, networks and disks at random; COW_CHAOS_SEED=N repeats a schedule
-	COW_TEST_SCALE=10 $(BIN)/python -m pytest tests/test_chaos.py --numprocesses 2 -rA
+	COW_TEST_SCALE=10 $(BIN)/python -m pytest tests/jobs/test_chaos.py --numprocesses 2 -rA
 
 lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/ruff check .

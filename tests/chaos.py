@@ -21,19 +21,18 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
-from conftest import SLOWNESS
 from faults import Fault, Machine, Station, faults_of, faults_of_network, power_cut
 from object_store import serving
 from postgres import postgres
 from proxy import Proxy
-from servers import BODY, TERMINAL, Served, Worker, data_url, eventually, picture
+from servers import BODY, TERMINAL, Served, Worker, data_url, picture
+from waiting import eventually
 
 from cow_service.api.middleware.access import hash_of, new_key
 
 TENANTS = ("alice", "bob", "carol")
 PAUSE = (0.05, 0.3)  # seconds between two calls of a tenant
-CALL_SECONDS = 15.0 * SLOWNESS  # for an answer, whatever is struck but the server itself
-SETTLE_SECONDS = 240.0 * SLOWNESS  # for all jobs to end after the last fault
+CALL_SECONDS = 60.0  # for an answer, whatever is struck but the server itself
 OWN, OTHERS = (200, 202, 503), (404, 503)  # what callers may be told of their own jobs, and of those of others
 
 
@@ -253,10 +252,7 @@ class Laboratory:
                     cursor = {"cursor": page["next"]}
                 return [job["id"] for job in jobs] if all(job["status"] in TERMINAL for job in jobs) else []
 
-            return [
-                self._kept_job(tenant, ask(f"/jobs/{job_id}").json(), ask)
-                for job_id in eventually(listed, SETTLE_SECONDS)
-            ]
+            return [self._kept_job(tenant, ask(f"/jobs/{job_id}").json(), ask) for job_id in eventually(listed)]
 
     def _kept_job(self, tenant: str, job: dict[str, Any], ask: Callable[..., httpx.Response]) -> Kept:
         seed = ask(f"/jobs/{job['id']}/request").json()["request"]["seed"]

@@ -16,11 +16,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 import cv2
 import httpx
@@ -29,6 +31,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import settings
 from numpy.typing import NDArray
+from waiting import TIME_LIMIT
 
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -37,14 +40,14 @@ if TYPE_CHECKING:  # other tests do not need a browser
     from browser import Windows
     from playwright.sync_api import Browser
 
-# How much the chaos, fuzz and state-machine tests do: 1 in CI, 10 in `make soak`.
+# How much the chaos, fuzz and property tests do: 1 in CI, 10 in `make soak`.
 SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
-# On a machine that has other work to do, everything takes longer: time limits grow with its load when the tests begin.
-SLOWNESS = min(max(os.getloadavg()[0] / (os.cpu_count() or 1), 1.0), 6.0)
 settings.register_profile("cow", deadline=None, derandomize=True, database=None, max_examples=12 * SCALE)
 settings.load_profile("cow")
 
-ROOT = Path(__file__).resolve().parents[1]
+TESTS = Path(__file__).resolve().parent
+ROOT = TESTS.parent
+DATA = TESTS / "data"
 EXAMPLES = ROOT / "examples"
 SHARED_SCENES = ROOT.parent / "shared" / "scenes"
 # The longest files: begun last, they would keep one process alone at work.
@@ -52,6 +55,7 @@ FIRST = (
     *("test_docs.py", "test_chaos.py", "test_evals_run.py", "test_jobs.py", "test_workers.py"),
     *("test_page.py", "test_client.py", "test_mcp.py", "test_slow_starts.py", "test_wan_speed.py"),
 )
+SLOWEST = 10  # files that are listed at the end
 
 
 @dataclass(frozen=True)
@@ -92,47 +96,32 @@ def all_scenes() -> list[Path]:
     return folders + shared[:: max(1, 3 // SCALE)]
 
 
-LONG_TABLE = 8  # cases of one test; of longer ones every twelfth is run, all of them in `make soak`
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--part", metavar="K/N", help="run the K-th of N parts of the chosen tests, the first being 0")
 
 
-def is_thinned_out(config: pytest.Config) -> bool:
-    """Whether this run leaves cases out. What is chosen by name is run whole, with all its cases."""
-    return SCALE == 1 and config.args == config.getini("testpaths") and not config.option.keyword
-
-
-@pytest.hookimpl(tryfirst=True)  # before pytest-timeout reads the option
-def pytest_configure(config: pytest.Config) -> None:
-    if config.option.timeout is None:
-        config.option.timeout = float(config.getini("timeout")) * SLOWNESS
-
-
-def pytest_report_header(config: pytest.Config) -> str:
-    cases = "every twelfth case of long tables, no soak_only tests" if is_thinned_out(config) else "all cases"
-    return f"cow: {cases}; chaos, fuzz and state tests x{SCALE}; time limits x{SLOWNESS:.1f}"
-
-
-@pytest.hookimpl(tryfirst=True)
+@pytest.hookimpl(tryfirst=True)  # before pytest deselects by markers
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if is_thinned_out(config):
-        thin_out(config, items)
     for item in items:
-        limit = item.get_closest_marker("timeout")
-        if limit is not None:
-            item.add_marker(pytest.mark.timeout(limit.args[0] * SLOWNESS), append=False)
         if getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
-            item.add_marker(pytest.mark.soak)
+            item.add_marker(pytest.mark.scaled)
+    if part := config.getoption("--part"):
+        number, count = map(int, part.split("/"))
+        kept = [item for item in items if crc32(item.nodeid.encode()) % count == number]
+        config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+        items[:] = kept
     items.sort(key=lambda item: FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST))
 
 
-def thin_out(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leaves every twelfth case of long tables, and nothing that is for `make soak` alone."""
-    of_test: dict[str, list[pytest.Item]] = {}
-    for item in items:
-        of_test.setdefault(item.nodeid.partition("[")[0], []).append(item)
-    kept = (item for cases in of_test.values() for item in (cases[::12] if len(cases) > LONG_TABLE else cases))
-    left = {id(item) for item in kept if item.get_closest_marker("soak_only") is None}
-    config.hook.pytest_deselected(items=[item for item in items if id(item) not in left])
-    items[:] = [item for item in items if id(item) in left]
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """The files that took longest."""
+    seconds: Counter[str] = Counter()
+    for report in (one for reports in terminalreporter.stats.values() for one in reports):
+        if isinstance(report, pytest.TestReport):
+            seconds[report.location[0]] += report.duration
+    terminalreporter.section("slowest files")
+    for name, spent in seconds.most_common(SLOWEST):
+        terminalreporter.line(f"{spent:6.1f} s  {name}")
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
@@ -201,7 +190,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture
 def http(server: Server) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=server.address, timeout=110 * SLOWNESS) as client:
+    with httpx.Client(base_url=server.address, timeout=TIME_LIMIT) as client:
         yield client
 
 

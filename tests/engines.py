@@ -5,13 +5,12 @@ from __future__ import annotations
 import atexit
 import base64
 import tempfile
-import time
 from functools import cache
 from pathlib import Path
 
-from conftest import SLOWNESS
 from fastapi import FastAPI
 from job_rows import open_jobs
+from waiting import eventually
 
 from cow_service.api.app import create_app
 from cow_service.jobs.calls import Calls
@@ -71,14 +70,16 @@ def use_webhooks(settings: Settings, metrics: Metrics) -> None:
     engine.jobs._on_end = engine.calls.enqueue
 
 
-def end_jobs(engine: JobEngine, seconds: float = 30.0 * SLOWNESS) -> None:
+def end_jobs(engine: JobEngine) -> None:
     """Cancels the jobs that an earlier test left behind, and waits until no process works on them.
 
     Else they would go on with the next test's service, and ask its multimodal LLM about another image.
     """
-    until = time.monotonic() + seconds
-    while (left := open_jobs(engine.database)) or engine.active.runs():
+
+    def ended() -> bool:
+        left = open_jobs(engine.database)
         for job_id in left:
             engine.cancel(job_id, None)
-        assert time.monotonic() < until, "the work on an earlier test's job does not end"
-        time.sleep(0.01)
+        return not left and not engine.active.runs()
+
+    eventually(ended)

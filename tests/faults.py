@@ -15,7 +15,8 @@ from pathlib import Path
 import psutil
 import pytest
 from proxy import Proxy
-from servers import TIME_LIMIT, Program, send
+from servers import Program, send
+from waiting import TIME_LIMIT
 
 
 class Machine:

@@ -9,28 +9,24 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import httpx
 import psutil
-from conftest import SLOWNESS
 from drawn import ball, block, floor, png_bytes
+from waiting import TIME_LIMIT, eventually
 
 SLOW_GENERATOR = Path(__file__).resolve().parents[1] / "benchmarks" / "slow_generator"
 SEEING = {  # settings of a server that sees plain scenes
     "PYTHONPATH": f"{Path(__file__).parent / 'stand_in_models'}:{SLOW_GENERATOR}",
     "COW_PERCEPTION": "stand-in-segmenter,stand-in-detector",
 }
-TIME_LIMIT = 60.0 * SLOWNESS  # seconds for anything that must come about
 TERMINAL = ("succeeded", "failed", "canceled")
 ASYNC = {"Prefer": "respond-async"}
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
-
-Value = TypeVar("Value")
 
 
 def picture(shift: int = 0) -> bytes:
@@ -233,17 +229,6 @@ def send(processes: Iterable[psutil.Process], number: int) -> None:
     for one in processes:
         with suppress(psutil.NoSuchProcess):
             one.send_signal(number)
-
-
-def eventually(look: Callable[[], Value | None], within: float = TIME_LIMIT) -> Value:
-    """What `look` finds, asked again and again until it finds something."""
-    until = time.monotonic() + within
-    while True:
-        found = look()
-        if found:
-            return found
-        assert time.monotonic() < until, f"not within {within:g} s"
-        time.sleep(0.02)
 
 
 def problem(response: httpx.Response, status: int, code: str) -> dict[str, Any]:

@@ -1,0 +1,166 @@
+"""`GET /jobs/{id}/download`, asked of a real server: a job as a zip, as animated pictures and as a contact sheet."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from servers import BODY, IMAGE, Served, problem, slow
+from waiting import eventually
+
+from cow_service.client import Client
+from cow_service.media.share import Told, card
+from cow_service.media.video import frames_of, write_mp4
+
+ANSWERED: dict[str, Any] = {
+    **BODY,
+    "objects": [{"object": "blue cube", "bbox": [170, 60, 205, 98]}],
+    "interventions": [{"kind": "remove", "object": "blue cube"}],
+    "num_frames": 20,
+    "video": True,
+}
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with Served(tmp_path_factory.mktemp("served")) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def answered(served: Served) -> str:
+    """The id of an answer with all that there can be."""
+    job = served.ended(served.submit(ANSWERED, "/answer")["id"])
+    assert job["status"] == "succeeded", job
+    return job["id"]
+
+
+def test_a_zip_holds_what_the_sdk_saves_and_what_was_asked(served: Served, answered: str, tmp_path: Path) -> None:
+    response = served.http.get(f"/jobs/{answered}/download")
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == "application/zip"
+    assert response.headers["content-disposition"] == f'attachment; filename="cow-{answered}.zip"'
+    assert served.http.get(f"/jobs/{answered}/download?format=zip").content == response.content
+    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+        held = {name: archive.read(name) for name in archive.namelist()}
+    assert held.pop("image.png") == IMAGE
+    request = json.loads(held.pop("request.json"))
+    assert request == served.http.get(f"/jobs/{answered}/request").json()["request"]
+    with Client(str(served.http.base_url)) as client:
+        folder = client.job(answered).wait(60).save(tmp_path / "saved")
+    assert held == {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert {"answer.json", "simulation.json", "overlay.jpg", "video.mp4"} <= set(held)
+    of_each = [sorted(name[-7:] for name in held if name.startswith(kind)) for kind in ("frame_", "factual_")]
+    assert of_each[0] == of_each[1] != [], "the same frames of both worlds"
+    # Nothing is left of it on the server.
+    eventually(lambda: not list(served.data.rglob(".*.part")))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "name", "kind", "frames"),
+    [("gif", ".gif", "GIF", 20), ("webp", ".webp", "WEBP", 20), ("sheet", "-sheet.png", "PNG", 1)],
+)
+def test_the_video_as_pictures(served: Served, answered: str, wanted: str, name: str, kind: str, frames: int) -> None:
+    response = served.http.get(f"/jobs/{answered}/download", params={"format": wanted})
+    assert response.status_code == 200, response.text
+    assert response.headers["content-disposition"] == f'attachment; filename="cow-{answered}{name}"'
+    with Image.open(io.BytesIO(response.content)) as picture:
+        assert response.headers["content-type"] == Image.MIME[kind]
+        assert (picture.format, getattr(picture, "n_frames", 1)) == (kind, frames)
+        assert picture.size == ((240, 160) if frames > 1 else (4 * 240 + 3 * 4, 3 * 160 + 2 * 4))
+
+
+def test_where_there_is_no_such_file_the_problem_says_what_to_send(served: Served) -> None:
+    def told(job_id: str, wanted: str) -> str:
+        response = served.http.get(f"/jobs/{job_id}/download", params={"format": wanted})
+        return problem(response, 409, "download-unavailable")["detail"]
+
+    running = served.submit(slow(30))["id"]
+    assert "ask again when it has succeeded" in told(running, "zip")
+    served.http.post(f"/jobs/{running}/cancel")
+    assert "was canceled: GET" in told(running, "gif")
+    question = {"grounding": None, "motion": None, "question": "If the pink car turns, what happens?"}
+    failed = served.ended(served.submit({**BODY, **question})["id"])["id"]
+    assert "failed (cannot-ground): GET" in told(failed, "zip")
+    without = served.ended(served.submit(BODY)["id"])["id"]
+    assert "`video: true`" in told(without, "sheet")
+    seen = served.ended(served.submit({**BODY, "imagine": "never"}, "/answer")["id"])["id"]
+    assert "`imagine: always`" in told(seen, "webp")
+    with zipfile.ZipFile(io.BytesIO(served.http.get(f"/jobs/{seen}/download").content)) as archive:
+        assert set(archive.namelist()) == {"answer.json", "request.json", "image.png"}
+    problem(served.http.get("/jobs/x/download"), 404, "job-not-found")
+    problem(served.http.get(f"/jobs/{seen}/download?format=mp4"), 422, "invalid-request")
+
+
+def test_an_artifact_that_is_gone_is_a_problem_and_no_broken_zip(served: Served) -> None:
+    job = served.ended(served.submit({**BODY, "seed": 7, "fps": 9})["id"])
+    sha256 = job["result"]["overlay"]["sha256"]
+    (path,) = served.data.rglob(f"{sha256}.jpg")
+    path.unlink()
+    problem(served.http.get(f"/jobs/{job['id']}/download"), 404, "artifact-not-found")
+
+
+def test_a_film_tells_question_and_verdict_and_a_card_is_one_moment_of_it(served: Served, answered: str) -> None:
+    clip, fps = frames_of(served.http.get(f"/jobs/{answered}/download?format=gif").content)
+    film = served.http.get(f"/jobs/{answered}/download?format=film")
+    assert film.headers["content-type"] == "video/mp4"
+    assert len(film.content) < 3 * 1024**2
+    frames, rate = frames_of(film.content)
+    height, width = frames[0].shape[:2]
+    assert height / width > 1.2 * clip[0].shape[0] / clip[0].shape[1], "words above and below"
+    assert len(frames) / rate > len(clip) / fps + 1, "it begins with the futures and ends with the verdict"
+    words = slice(-height // 8, None)
+    assert (frames[-1][words] > 128).mean() > 2 * (frames[0][words] > 128).mean(), "the verdict comes last"
+    card = served.http.get(f"/jobs/{answered}/download?format=card")
+    with Image.open(io.BytesIO(card.content)) as picture:
+        assert (picture.format, picture.size) == ("JPEG", (1200, 630))
+
+
+def test_questions_in_any_letters_stand_in_a_film() -> None:
+    white = np.full((120, 200, 3), 255, np.uint8)
+    for question in ("如果球向右移动，" * 12, "Ob die Kugel wohl über den größten Würfel fällt? " * 4, "x" * 400):
+        told = Told(question, "Not sure", 0, "", None, (), ((0.1, 0.1), (0.2, 0.2)), 1.0, 0)
+        with Image.open(io.BytesIO(card(write(white), told))) as picture:
+            assert picture.size == (1200, 630)
+
+
+def write(frame: NDArray[np.uint8]) -> bytes:
+    """An mp4 of one frame, twice."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.mp4"
+        write_mp4([frame, frame], path, fps=16, width=frame.shape[1], height=frame.shape[0])
+        return path.read_bytes()
+
+
+def test_a_page_has_live_worlds_or_says_how_to_get_them(served: Served, answered: str) -> None:
+    refused = served.http.get(f"/jobs/{answered}/download?format=page")
+    assert refused.json()["type"].endswith("download-unavailable")
+    assert "`live: true`" in refused.json()["detail"]
+    named = {"object": "mug </SCRIPT><Script>alert(1)<!-- \u2028", "bbox": [170, 60, 205, 98]}
+    asked = {"live": True, "ensemble": 1, "question": "Will </script> <b>it</b> hit?", "objects": [named]}
+    job = served.ended(served.submit(BODY | asked)["id"])
+    page = served.http.get(f"/jobs/{job['id']}/download?format=page")
+    assert page.headers["content-disposition"] == f'attachment; filename="cow-{job["id"]}.html"'
+    assert "Will &lt;/script&gt; &lt;b&gt;it&lt;/b&gt; hit? (Asked of another direction: to the right.)" in page.text
+    text = page.text.lower()
+    assert text.count("</script") == text.count("<script ") == page.text.count("<script "), "no text ends its script"
+    (world,) = re.findall(r'id="world">(.*?)</script>', page.text)
+    assert json.loads(world)["bodies"][1]["name"] == named["object"]
+
+
+def test_lists_tell_answers_and_what_was_given(served: Served, answered: str) -> None:
+    job = next(each for each in served.http.get("/jobs").json()["jobs"] if each["id"] == answered)
+    found = served.http.get(f"/jobs/{answered}").json()
+    assert job["answer"] == (found["result"]["option"] or found["result"]["answer"] or "Not sure") == found["answer"]
+    assert job["given"] == ["grounding", "motion", "objects", "interventions"]

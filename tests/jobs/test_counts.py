@@ -1,0 +1,174 @@
+"""What one question costs, in counts that do not vary as times do: `data/counts.json` holds them.
+
+A change that raises a count has to change that table, where a reader of the change sees it. One that lowers a count
+lowers the table, too, or the next change could take it back unseen.
+"""
+
+from __future__ import annotations
+
+import base64
+import gc
+import json
+import math
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import BuiltinFunctionType
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rapier3d
+from conftest import DATA, example
+from fastapi.testclient import TestClient
+from servers import Served
+from waiting import eventually
+
+from cow_service.api.app import create_app
+from cow_service.jobs.engine import JobEngine
+from cow_service.pipeline import simulate
+from cow_service.requests import ImageArtifact, SimulateRequest
+from cow_service.service import Service
+from cow_service.settings import Settings
+
+TABLE: dict[str, float] = json.loads((DATA / "counts.json").read_text())
+# What depends on versions of libraries, or on a clock, is held less exactly.
+TOLERANCE = {"artifact_bytes": 0.02, "row_bytes": 0.02, "modules_of_a_server": 0.05, "wakeups_per_second": 0.5}
+BY_THE_CLOCK = ("cow-notifications", "cow-maintenance", "cow-clean-up", "cow-processes", "cow-dispatcher")
+BALL = example("ball-and-mug")
+HALF = math.prod(BALL.meta["image_size"]) / 2
+IDLE_SECONDS = 6
+QUIET_SOON = """
+from cow_service.jobs import active
+active.QUIET_SECONDS = 1.0
+from cow_service.cli.main import app
+app(["serve"])
+"""
+
+
+def hold(**counts: float) -> None:
+    """Fails where a count is not what the table says."""
+    off = {
+        name: {"now": count, "table": TABLE[name]}
+        for name, count in counts.items()
+        if abs(count - TABLE[name]) > TABLE[name] * TOLERANCE.get(name, 0)
+    }
+    assert not off, f"Other counts than in tests/data/counts.json: change the table, and say why. {off}"
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    engine = JobEngine(Service(Settings(data_dir=tmp_path, warmup=False, concurrency=1)))
+    with TestClient(create_app(engine)) as client:
+        yield client
+
+
+def ask(client: TestClient) -> dict[str, Any]:
+    image = "data:image/jpeg;base64," + base64.b64encode(BALL.image).decode()
+    answer = client.post("/simulate", json={"image": image, "question": BALL.meta["question"]})
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+@pytest.fixture
+def statements(client: TestClient) -> Counter[str]:
+    """How often each kind of statement is sent while a question is answered, but by the clock."""
+    said: Counter[str] = Counter()
+
+    def note(statement: str) -> None:
+        if not threading.current_thread().name.startswith(BY_THE_CLOCK):
+            said[statement.split(maxsplit=1)[0].upper()] += 1
+
+    pool = client.app.state.engine.database.engine  # type: ignore[attr-defined]
+    held = [pool.raw_connection() for _ in range(16)]  # all that it keeps
+    for one in held:
+        one.dbapi_connection.set_trace_callback(note)
+        one.close()
+    return said
+
+
+def test_a_question_in_the_database(client: TestClient, tmp_path: Path, statements: Counter[str]) -> None:
+    ask(client)
+    tables = ("cow_jobs", "cow_results", "cow_trajectories_of_jobs", "cow_references", "cow_stages_of_jobs")
+    with sqlite3.connect(tmp_path / "jobs.sqlite3") as database:
+        rows = [row for table in tables for row in database.execute(f"SELECT * FROM {table}")]
+    kept = sum(path.stat().st_size for path in (tmp_path / "artifacts").rglob("*") if path.is_file())
+    size = sum(len(value) if isinstance(value, str | bytes) else 8 for row in rows for value in row)
+    hold(statements=sum(statements.values()), commits=statements["COMMIT"], row_bytes=size, artifact_bytes=kept)
+
+
+def test_a_question_in_the_engine_and_in_pictures(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted: Counter[str] = Counter()
+    steps = rapier3d.PhysicsWorld.step
+
+    def step(world: rapier3d.PhysicsWorld) -> None:
+        counted["engine_steps"] += 1
+        steps(world)
+
+    monkeypatch.setattr(rapier3d.PhysicsWorld, "step", step)
+    for name, function in vars(cv2).items():
+        if name[0].islower() and isinstance(function, BuiltinFunctionType):
+            monkeypatch.setattr(cv2, name, passing(function, counted))
+    simulation = ask(client)
+    hold(worlds=simulation["trajectory"]["ensemble"], **counted)
+
+
+def passing(function: Callable[..., Any], counted: Counter[str]) -> Callable[..., Any]:
+    """The function, which counts its calls with an array of at least half the picture."""
+
+    def call(*arguments: Any, **named: Any) -> Any:
+        areas = [math.prod(each.shape[:2]) for each in arguments if isinstance(each, np.ndarray)]
+        counted["whole_passes"] += max(areas, default=0) >= HALF
+        return function(*arguments, **named)
+
+    return call
+
+
+def test_pixels_of_a_question_are_given_back_at_once(service: Service) -> None:
+    """A circle of references would hold a photograph, and all that was measured in it, until garbage is collected."""
+    image = ImageArtifact(artifact=service.keep_image(BALL.image).sha256)
+    request = SimulateRequest(image=image, question=BALL.meta["question"], video=False)
+    gc.disable()
+    try:
+        run = service.prepare(request)
+        simulate(run)
+        alive = weakref.ref(run), weakref.ref(run.scene)
+        del run
+        assert [each() for each in alive] == [None, None]
+    finally:
+        gc.enable()
+
+
+def test_modules_of_a_server() -> None:
+    code = "import sys, cow_service.server, cow_service.api.app; print(len(sys.modules))"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    hold(modules_of_a_server=int(told.stdout))
+
+
+def switches(served: Served) -> int:
+    """How often threads of a server have waited for something, so far."""
+    tasks = [Path(f"/proc/{one.pid}/task") for one in served.processes()]
+    lines = [line for folder in tasks for one in folder.iterdir() for line in (one / "status").read_text().splitlines()]
+    return sum(int(line.split()[1]) for line in lines if line.startswith("voluntary_ctxt_switches"))
+
+
+def workers_in(served: Served) -> list[dict[str, Any]]:
+    return served.http.get("/workers").json()["processes"][0]["workers"]
+
+
+@pytest.mark.slow
+def test_an_idle_server_sleeps(tmp_path: Path) -> None:
+    with Served(tmp_path, QUIET_SOON, COW_WORKERS="true", COW_CONCURRENCY="2") as served:
+        # The second worker starts when the first has loaded. Both have begun once they say what memory they take.
+        eventually(lambda: len([one for one in workers_in(served) if one["memory_mb"]]) == 2)
+        time.sleep(3)  # for it to load, and for the server to find that it is quiet
+        before = switches(served)
+        time.sleep(IDLE_SECONDS)
+        hold(wakeups_per_second=(switches(served) - before) / IDLE_SECONDS)

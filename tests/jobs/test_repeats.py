@@ -1,0 +1,368 @@
+"""Repeats: what is drawn afresh, what is reused, what that costs, and the gate of `imagine: auto`."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import random
+import statistics
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import httpx
+import mllm_server as say
+import pytest
+from conftest import SCALE, example
+from drawn import ball, floor, png_bytes
+from engines import app_for
+from job_rows import add_job
+from mllm_server import MllmServer
+from rich.console import Console
+from servers import data_url
+from typer.testing import CliRunner
+
+from cow_service.cli.batch import print_summary
+from cow_service.cli.console import answer_table
+from cow_service.cli.main import app as cli
+from cow_service.client.display import answer_html
+from cow_service.errors import MllmRefused, MllmUnavailable
+from cow_service.jobs.computing import KeyLocks, Outages, StoredStep
+from cow_service.jobs.database import Database
+from cow_service.mcp.results import answer_text
+from cow_service.pipeline import answer
+from cow_service.records import Answer, Usage
+from cow_service.requests import AnswerRequest, Stage
+from cow_service.service import Service
+from cow_service.settings import Settings
+from cow_service.stages.answering import gate_of
+from cow_service.stages.keys import FirstAnswers
+
+pytestmark = pytest.mark.slow
+
+REPEATS = 40 if SCALE == 1 else 200
+IMAGE = data_url(png_bytes(ball(floor(96, 64), (30, 40), 8, (210, 20, 20))))
+QUESTION = "If the red ball rolls to the right, will it leave the table? (A) Yes (B) No (C) Not sure"
+BODY: dict[str, Any] = {
+    "image": IMAGE,
+    "question": QUESTION,
+    "num_frames": 5,
+    "video": False,
+    "ensemble": 0,
+    "frames": {"count": 1, "max_side": 32},
+}
+GIVEN = {"grounding": {"bbox": [22, 32, 38, 48], "object": "red ball"}, "motion": {"direction": [1, 0]}}
+BALL = {"object": "red ball", "others": [], "kind": "linear", "sentence": "The red ball rolls."}
+PLACE = {"label": "red ball", "bbox_2d": [229, 500, 396, 750], "cue": "text", "direction": [300, 625, 900, 625]}
+SIMULATED = ["grounding", "motion", "trajectory", "generation"]
+COST = Usage(calls=1, input_tokens=100, output_tokens=10)  # of each call, as the server says
+
+
+@pytest.fixture(scope="module")
+def mllm() -> Iterator[MllmServer]:
+    with say.mllm_server() as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def service(mllm: MllmServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    data = tmp_path_factory.mktemp("data")
+    with Service(Settings(data_dir=data, mllm="qwen3-vl-8b", mllm_base_url=mllm.address, mllm_timeout=5)) as made:
+        yield made
+
+
+def draws(mllm: MllmServer, chances: dict[int, float], seed: int = 1) -> None:
+    """Has the server answer A with a chance that the number of pictures decides, else B; it grounds, too."""
+    chance = random.Random(seed)
+
+    def reply(handler: Any) -> None:
+        prompt, pictures = say.text_of(handler.body), len(say.images_of(handler.body))
+        said: dict[str, Any] = BALL if "sets in motion" in prompt else PLACE
+        if "`answer`" in prompt:
+            said = {"reasoning": "", "answer": "A" if chance.random() < chances[pictures] else "B"}
+        handler.send(200, say.completion(json.dumps(said)))
+
+    mllm.say(reply)
+
+
+def answers(mllm: MllmServer, alone: list[str], looking: str = "A") -> None:
+    """Has the server give these answers from the image alone, one after the other, and another one after looking."""
+    rest = list(alone)
+
+    def reply(handler: Any) -> None:
+        with mllm.lock:
+            said = rest.pop(0) if len(say.images_of(handler.body)) == 1 else looking
+        handler.send(200, say.completion(said if said.startswith("?") else json.dumps({"answer": said})))
+
+    mllm.say(reply)
+
+
+def asked(service: Service, times: int = 1, at_once: int = 4, headers: dict[str, str] | None = None, **body: Any):
+    """The answers to one request that is sent again and again, some of them at the same time."""
+
+    app = app_for(service)
+
+    async def calls() -> list[dict[str, Any]]:
+        transport, slots = httpx.ASGITransport(app), asyncio.Semaphore(at_once)
+        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60, headers=headers) as client:
+
+            async def call() -> dict[str, Any]:
+                async with slots:
+                    response = await client.post("/answer", json=BODY | body)
+                    assert response.status_code == 200, response.text
+                    return response.json()
+
+            return await asyncio.gather(*(call() for _ in range(times)))
+
+    return asyncio.run(calls())
+
+
+def told(service: Service, **body: Any) -> Answer:
+    """The answer without a job."""
+    return service.answer(AnswerRequest.model_validate(BODY | GIVEN | body))
+
+
+@pytest.mark.scaled
+@pytest.mark.parametrize(("imagine", "rate"), [("always", 0.7), ("never", 0.35)])
+def test_repeats_have_the_mean_and_the_variance_of_the_model(
+    imagine: str, rate: float, service: Service, mllm: MllmServer
+) -> None:
+    draws(mllm, {1: 0.35, 2: 0.7})
+    found = asked(service, REPEATS, imagine=imagine)
+    drawn = [float(each["answer"] == "A") for each in found]
+    variance = rate * (1 - rate)
+    fourth = variance * (1 - 3 * variance)  # the fourth central moment of a draw of 0 or 1
+    assert abs(statistics.mean(drawn) - rate) < 3 * (variance / REPEATS) ** 0.5
+    assert abs(statistics.variance(drawn) - variance) < 3 * ((fourth - variance**2) / REPEATS) ** 0.5
+    # One request imagined, the first one; the others used that, and each still drew its own answer. Of quick
+    # stages those that run at the same moment do not wait for each other.
+    reused = Counter(stage for each in found for stage in each["reused"])
+    assert reused.keys() == set(SIMULATED if imagine == "always" else [])
+    assert {reused[stage] for stage in ("grounding", "generation") if reused} <= {REPEATS - 1}
+    costs = Counter((each["usage"]["calls"], each["usage_total"]["calls"]) for each in found)
+    assert costs == ({(1, 3): REPEATS - 1, (3, 3): 1} if reused else {(1, 1): REPEATS})
+    assert len(mllm.asked) == sum(each["usage"]["calls"] for each in found)
+    looked = [call for call in mllm.asked if "`answer`" in say.text_of(call)]
+    assert len(looked) == REPEATS
+    assert len({json.dumps(call, sort_keys=True) for call in looked}) == 1
+    assert "seed" not in looked[0]
+
+
+def test_usage_is_what_it_cost_and_the_total_what_it_would_have_cost(service: Service, mllm: MllmServer) -> None:
+    draws(mllm, {1: 1, 2: 1})
+    body = {"question": QUESTION.replace("leave", "fall off"), "votes": 2, "baseline": True}
+    first, again = (Answer.model_validate(each) for each in asked(service, 2, at_once=1, **body))
+    (fresh,) = (Answer.model_validate(each) for each in asked(service, headers={"Cache-Control": "no-cache"}, **body))
+    assert first.simulation is not None
+    assert again.simulation is not None
+    assert (first.simulation.usage.calls, first.simulation.usage_total.calls) == (2, 2)
+    assert (again.simulation.usage, again.simulation.usage_total) == (Usage(), COST + COST)
+    assert first.usage == first.usage_total == sum([COST] * 6, Usage())
+    assert (again.usage, again.usage_total) == (sum([COST] * 4, Usage()), first.usage)
+    assert (fresh.usage, fresh.usage_total, fresh.reused) == (first.usage, first.usage, ())
+    old = json.loads(first.model_dump_json(exclude={"usage_total": True, "simulation": {"usage_total"}, "gate": True}))
+    assert Answer.model_validate(old).usage_total == first.usage
+
+
+@pytest.mark.parametrize(
+    ("alone", "given", "reason", "agreement", "final"),
+    [
+        ("AAA", {}, "agreed", 1, ("A", {"A": 3})),
+        ("AAB", {}, "disagreed", 2 / 3, ("B", {"B": 2})),
+        ("AAB", {"imagine_threshold": 0.66}, "agreed", 2 / 3, ("A", {"A": 2, "B": 1})),
+        ("AB", {"imagine_threshold": 0.5, "imagine_votes": 2}, "disagreed", 1 / 2, ("B", {"B": 2})),
+        ("CCC", {}, "not-sure", 1, ("B", {"B": 2})),
+        ("A", {"imagine_votes": 1}, "agreed", 1, ("A", {"A": 1})),
+    ],
+)
+def test_the_gate(
+    alone: str, given: dict[str, Any], reason: str, agreement: float, final: Any, service: Service, mllm: MllmServer
+) -> None:
+    answers(mllm, list(alone), looking="B")
+    found = told(service, imagine="auto", votes=2, baseline=True, **given)
+    imagined = reason != "agreed"
+    assert found.gate is not None
+    assert (found.gate.reason, found.gate.imagined, found.gate.asked) == (reason, imagined, len(alone))
+    assert found.gate.agreement == pytest.approx(agreement)
+    assert (found.simulation is not None) is imagined
+    assert (found.answer, found.votes) == final
+    assert found.baseline is not None
+    assert (found.baseline.votes, found.baseline.answer) == (found.gate.votes, found.gate.answer)
+    assert found.usage.calls == len(mllm.asked) == len(alone) + 2 * imagined  # no baseline besides
+    assert found.reader.stages == (("gating", "answering") if imagined else ("gating",))
+    assert not found.warnings
+    if found.simulation is not None:
+        assert found.simulation.usage == Usage()
+        assert set(found.simulation.timings) == set(SIMULATED)
+
+
+def test_votes_that_cannot_be_read_agree_with_nothing(service: Service, mllm: MllmServer) -> None:
+    answers(mllm, ["A", *"???????"], looking="B")  # each is asked for three times
+    found = told(service, imagine="auto", imagine_votes=2, imagine_threshold=0.6)
+    assert found.gate is not None
+    assert (found.gate.reason, found.gate.votes, found.gate.agreement) == ("disagreed", {"A": 1}, 0.5)
+    answers(mllm, ["?"] * 6, looking="B")
+    found = told(service, imagine="auto", imagine_votes=2)
+    assert found.gate is not None
+    assert (found.gate.reason, found.gate.answer, found.gate.votes, found.gate.agreement) == ("unreadable", None, {}, 0)
+    assert (found.answer, found.usage.calls) == ("B", 7)
+
+
+def test_where_imagining_fails_the_answer_of_the_gate_is_taken(service: Service, mllm: MllmServer) -> None:
+    answers(mllm, ["A", "B", "A"])
+    nowhere = {"grounding": {"point": [90, 5]}}  # where no outline can be seen
+    found = told(service, imagine="auto", **nowhere)
+    assert found.gate is not None
+    assert (found.gate.imagined, found.simulation) == (True, None)
+    assert found.simulation_problem is not None
+    assert (found.answer, found.votes, len(mllm.asked)) == ("A", {"A": 2, "B": 1}, 3)
+    assert "Nothing was imagined" in found.warnings[0]
+
+
+def test_a_model_that_cannot_be_asked_is_an_error_at_the_gate(service: Service, mllm: MllmServer) -> None:
+    for status, error in ((400, MllmRefused), (404, MllmUnavailable)):
+        mllm.say(say.status(status))
+        with pytest.raises(error):
+            told(service, imagine="auto")
+
+
+def test_the_embedded_reader_is_asked_once_before_it_looks(tmp_path: Path) -> None:
+    """Without looking it is never sure, so that it imagines; its answers are rules, and are shared."""
+    scene = example("ball-and-mug")
+    with Service(Settings(data_dir=tmp_path)) as embedded:
+        body = {"image": data_url(scene.image), "question": scene.meta["question"], "num_frames": 81, "ensemble": 20}
+        first, again = asked(embedded, 2, at_once=1, **body, imagine="auto", baseline=True)
+    assert first["gate"] == {
+        "answer": "C", "votes": {"C": 1}, "asked": 1, "agreement": 1, "threshold": 1, "imagined": True,
+        "reason": "not-sure",
+    }  # fmt: skip
+    assert (first["answer"], first["baseline"]["answer"], first["warnings"]) == ("A", "C", [])
+    assert again["reused"] == ["gating", *SIMULATED, "answering"]
+    assert {each["answer"] for each in (first, again)} == {"A"}
+
+
+def test_a_gate_of_no_votes_looks() -> None:
+    gate = gate_of(FirstAnswers(verdict=None, asked=3), 0.5)
+    assert (gate.imagined, gate.reason, gate.agreement) == (True, "unreadable", 0)
+
+
+def test_what_the_gate_saw_and_what_it_cost_is_shown_everywhere(
+    service: Service, mllm: MllmServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers(mllm, list("AAA"))
+    found = told(service, imagine="auto")
+    words = "A 3 of 3; agreed: not imagined"
+    assert f"before looking: {words}" in answer_html(found, lambda _: None)
+    assert f"Before looking: {words}." in answer_text(found, "")
+    reused = found.model_copy(update={"usage_total": found.usage + COST})
+    console = Console(width=200)
+    console.print(answer_table(reused))
+    printed = capsys.readouterr().out
+    assert words in printed
+    assert "3 calls, 300 tokens in, 30 out; without reuse 4 calls, 400 tokens in, 40 out" in printed
+    lines = [{"id": str(n), "status": "succeeded", "result": each.model_dump(mode="json")}
+             for n, each in enumerate((found, reused))]  # fmt: skip
+    (tmp_path / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert print_summary(tmp_path) == 0
+    said = "multimodal LLM: 6 calls, 600 tokens in, 60 out; without reuse 7 calls, 700 tokens in, 70 out"
+    assert said in capsys.readouterr().out
+
+
+def test_the_command_line_passes_the_gate_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COW_DATA_DIR", str(tmp_path))
+    image = tmp_path / "image.png"
+    image.write_bytes(base64.b64decode(IMAGE.partition(",")[2]))
+    command = ["answer", str(image), QUESTION, "--json", "--num-frames", "5", "--ensemble", "0"]
+    auto = ["--imagine", "auto", "--imagine-votes", "2", "--imagine-threshold", "0.5"]
+    for given, gated, imagined in ((auto, True, True), (["--no-imagine"], False, False)):
+        found = CliRunner().invoke(cli, [*command, *given])
+        assert found.exit_code == 0, found.output
+        told_there = Answer.model_validate_json(found.stdout)
+        assert (told_there.gate is not None, told_there.simulation is not None) == (gated, imagined)
+        assert told_there.gate is None or told_there.gate.threshold == 0.5
+
+
+def test_the_place_is_not_looked_for_again_where_the_motion_is_given(service: Service, mllm: MllmServer) -> None:
+    """What the model said of the motion, here of a trail, then changes nothing."""
+    image = floor(240, 160)
+    for x in (40, 100, 160):
+        image = ball(image, (x, 80), 15, (210, 20, 20))
+    scene, given = {"image": data_url(png_bytes(image))}, {"motion": {"direction": [0, -1]}}
+    place = {"label": "red ball", "bbox_2d": [604, 406, 729, 594], "cue": "trail", "direction": [167, 500, 667, 500]}
+
+    def reply(handler: Any) -> None:
+        prompt = say.text_of(handler.body)
+        said = BALL if "sets in motion" in prompt else place
+        handler.send(200, say.completion(json.dumps({"answer": "A"} if "`answer`" in prompt else said)))
+
+    mllm.say(reply)
+    (read,) = asked(service, **scene)
+    assert (read["simulation"]["motion"]["cue"], len(mllm.asked)) == ("trail", 3)
+    (kept,) = asked(service, **scene, **given)
+    assert (kept["reused"], kept["usage"]["calls"], len(mllm.asked)) == (["grounding"], 1, 4)
+    (fresh,) = asked(service, headers={"Cache-Control": "no-cache"}, **scene, **given)
+    assert (fresh["reused"], len(mllm.asked)) == ([], 7)
+    for part in ("grounding", "motion", "trajectory", "frames", "warnings"):
+        assert kept["simulation"][part] == fresh["simulation"][part], part
+
+
+def test_rules_do_not_look_again_either_where_the_motion_is_given(tmp_path: Path) -> None:
+    with Service(Settings(data_dir=tmp_path)) as service:
+        assert asked(service)[0]["reused"] == []
+        (kept,) = asked(service, motion={"direction": [0, -1]})
+        assert kept["reused"] == ["grounding"]
+        assert kept["simulation"]["motion"]["direction"] == [0, -1]
+
+
+class _Crash(BaseException):
+    """The process ends here."""
+
+
+@pytest.mark.parametrize(("ends_in", "drawn_again"), [("generation", False), ("answering", True)])
+def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
+    ends_in: Stage, drawn_again: bool, service: Service, mllm: MllmServer, tmp_path: Path
+) -> None:
+    """What was stored before the crash is taken; only an answer that was never delivered is drawn again."""
+    answers(mllm, list("ABA"), looking="B")
+    database = Database(Settings(data_dir=tmp_path))
+    database.create_tables()
+    for job in ("one", "two"):
+        add_job(database, job)
+    step = StoredStep(
+        "one",
+        None,
+        False,
+        database,
+        service.artifacts,
+        service.metrics.stage_cache,
+        KeyLocks().held,
+        Outages(0, lambda: None),
+    )
+    request = AnswerRequest.model_validate(BODY | GIVEN | {"imagine": "auto"})
+
+    def crash(stage: Stage | None, done: float) -> None:
+        if stage == ends_in and done == float(drawn_again):  # as it begins, or as it ends and nothing is stored yet
+            raise _Crash
+
+    def crashing(stage: Stage, key: Any, compute: Any) -> Any:
+        return step(stage, key, lambda: (compute(), crash(stage, 1.0))[0])
+
+    with pytest.raises(_Crash):
+        answer(service.prepare(request, crash, step=crashing, run_id="one"))
+    before = len(mllm.asked)
+    assert before == 3 + drawn_again
+    found = answer(service.prepare(request, step=step, run_id="one"))
+    assert len(mllm.asked) == before + 1
+    assert (found.answer, found.reused) == ("B", ())
+    assert found.gate is not None
+    assert found.gate.votes == {"A": 2, "B": 1}
+    assert found.usage == found.usage_total == sum([COST] * 4, Usage())
+    again = answer(service.prepare(request, step=step, run_id="one"))
+    assert (again.answer, len(mllm.asked)) == ("B", before + 1)
+    other = replace(step, job_id="two")
+    answers(mllm, list("AAA"))
+    others = answer(service.prepare(request, step=other, run_id="two"))
+    assert (others.answer, others.gate and others.gate.votes, others.reused) == ("A", {"A": 3}, ())

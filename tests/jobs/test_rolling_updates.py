@@ -1,0 +1,265 @@
+"""Two versions of COW on one job database, for as long as servers are replaced one by one; what cannot be is refused.
+
+The older version is that of `data/schema_1.sql`, whose rows are written here as it wrote them.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import psycopg
+import pytest
+import sqlalchemy as sa
+from conftest import DATA
+from job_rows import add_job
+from postgres import postgres_server
+from pydantic import SecretStr
+from servers import BODY, IMAGE, Served
+from test_migration import cow
+from waiting import eventually
+
+from cow_service.errors import StorageUnavailable
+from cow_service.jobs import schema
+from cow_service.jobs.database import Database
+from cow_service.jobs.job_table import JobTable
+from cow_service.jobs.packing import packed
+from cow_service.jobs.schema import METADATA, PROCESSES, SCHEMAS
+from cow_service.media.artifacts import DiskArtifacts
+from cow_service.settings import Settings
+from cow_service.stages.keys import FORMAT
+from cow_service.stages.run import now
+
+OLD_TABLES = (DATA / "schema_1.sql").read_text()
+OLD_RESULT = json.loads((DATA / "answer_of_format_2.json").read_text())["simulation"]
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
+def old(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+    """A database of the older version, without jobs."""
+    folder = tmp_path / "data"
+    folder.mkdir()
+    if request.param == "sqlite":
+        yield with_old_tables(Database(Settings(data_dir=folder)))
+        return
+    with postgres_server() as url:
+        yield with_old_tables(Database(Settings(data_dir=folder, database_url=SecretStr(url))))
+
+
+def with_old_tables(database: Database) -> Database:
+    text = OLD_TABLES if database.file is not None else OLD_TABLES.replace("BLOB", "BYTEA")
+    statements = "\n".join(line for line in text.splitlines() if not line.startswith("--")).split(";")
+    with database.transaction() as connection:
+        for statement in filter(None, map(str.strip, statements)):
+            connection.execute(sa.text(statement))
+    return database
+
+
+def write_old(database: Database, image: str, **values: Any) -> str:
+    """A job as the older version writes it: it knows no other column than these."""
+    job = str(uuid4())
+    asked = {name: value for name, value in BODY.items() if name != "image"} | {"image": {"artifact": image}}
+    spec = {"kind": "simulate", "request": asked, "reader": "embedded", "generator": "cutout", "created_at": now()}
+    row = {
+        "id": job, "kind": "simulate", "owner": None, "status": "queued", "created_at": spec["created_at"],
+        "ended": None, "version": "2", "queue": "light", "priority": "normal", "turn": 0, "executor": None, "run": None,
+        "starts": 0, "generator": "cutout", "question": BODY["question"], "image": image, "webhook": None,
+        "spec": zlib.compress(json.dumps(spec).encode()), "format": None, "result": None, "trajectory_key": None,
+        "error": None,
+    }  # fmt: skip
+    row |= values
+    insert = f"INSERT INTO cow_jobs ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})"
+    with database.transaction() as connection:
+        connection.execute(sa.text(insert), row)
+        reference = "INSERT INTO cow_references (sha256, job_id) VALUES (:image, :job)"
+        connection.execute(sa.text(reference), {"image": image, "job": job})
+    return job
+
+
+def read_old(database: Database, job: str) -> dict[str, Any] | None:
+    """The result of a job as the older version reads it."""
+    query = (
+        "SELECT j.status, j.result, j.format, t.trajectory FROM cow_jobs j LEFT JOIN cow_trajectories_of_jobs t "
+        "ON t.job_id = j.id AND t.key = j.trajectory_key WHERE j.id = :job"
+    )
+    (row,) = database.read(sa.text(query), {"job": job})
+    if row.status != "succeeded":
+        return None
+    result = json.loads(zlib.decompress(row.result))
+    return result | {"trajectory": json.loads(zlib.decompress(row.trajectory))} if row.trajectory else result
+
+
+def tell_of_a_process(database: Database, seconds_ago: float) -> None:
+    with database.transaction() as connection:
+        connection.execute(sa.delete(PROCESSES))
+        connection.execute(sa.insert(PROCESSES).values(executor="old", seen=time.time() - seconds_ago, info="{}"))
+
+
+def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
+    image = DiskArtifacts(tmp_path / "data" / "artifacts").put(IMAGE, "image/png").sha256
+    result = zlib.compress(json.dumps(OLD_RESULT).encode())
+    finished = write_old(old, image, status="succeeded", ended=time.time(), format=2, result=result)
+    waiting = write_old(old, image)
+    tell_of_a_process(old, 0.0)  # the older server runs
+    address = {} if old.file is not None else {"COW_DATABASE_URL": old.url}
+    with Served(tmp_path, **address) as new:
+        assert new.job(finished)["result"]["trajectory"]["law"] == "ballistic"
+        assert new.ended(waiting)["status"] == "succeeded"
+        assert old.read(sa.select(SCHEMAS.c.version, SCHEMAS.c.oldest_serving)) == [(schema.SCHEMA, 1)]
+        # The older server goes on: what it writes is served here, and what is computed here it can read.
+        later = write_old(old, image)
+        assert new.ended(later)["status"] == "succeeded"
+        own = new.submit(BODY)["id"]
+        read = eventually(lambda: read_old(old, own))
+        assert read["trajectory"] == new.job(own)["result"]["trajectory"]
+        # Work of another workflow version is left to servers that have it, and told of.
+        foreign = write_old(old, image, version="1")
+        told = eventually(lambda: new.http.get("/workers").json()["unserved"])
+        assert [(one["workflow_version"], one["reason"]) for one in told] == [("1", "version")]
+        assert new.job(foreign)["status"] == "queued"
+    old.close()
+
+
+def test_tables_only_gain_what_older_servers_do_not_notice(tmp_path: Path) -> None:
+    """Else `OLDEST_SERVING` is to be raised, and what follows from it."""
+    assert schema.OLDEST_SERVING == 1
+    with closing(sqlite3.connect(tmp_path / "old")) as database:
+        database.executescript(OLD_TABLES)
+    there = sa.inspect(sa.create_engine(f"sqlite:///{tmp_path / 'old'}"))
+    for name in there.get_table_names():
+        known = {column["name"]: column for column in there.get_columns(name)}
+        table = METADATA.tables[name]
+        assert known.keys() <= set(table.columns.keys())
+        for column in table.columns:
+            was = known.get(column.name)
+            assert column.nullable if was is None else column.nullable == was["nullable"], column
+            assert was is None or str(column.type) == str(was["type"]), column
+
+
+def test_a_column_that_an_older_version_lacks_is_added(old: Database) -> None:
+    write_old(old, "0" * 64)
+    with old.transaction() as connection:
+        connection.execute(sa.text("ALTER TABLE cow_jobs DROP COLUMN webhook"))
+    assert old.schema() == 1
+    old.create_tables()
+    assert old.read(sa.text("SELECT webhook FROM cow_jobs")) == [(None,)]
+    assert old.schema() == schema.SCHEMA
+    old.close()
+
+
+def indexes_of(database: Database) -> dict[str, bool]:
+    """Those of the table of jobs, and whether they are used."""
+    if database.file is not None:
+        return {str(one["name"]): True for one in sa.inspect(database.engine).get_indexes("cow_jobs")}
+    joined = "pg_index JOIN pg_class ON pg_class.oid = indexrelid"
+    query = f"SELECT relname, indisvalid FROM {joined} WHERE relname ~ '^cow_jobs_[^p]'"
+    return {row.relname: row.indisvalid for row in database.read(sa.text(query))}
+
+
+def test_indexes_that_an_older_version_lacks_are_added(old: Database) -> None:
+    wanted = {str(index.name): True for index in schema.JOBS.indexes}
+    assert indexes_of(old).items() < wanted.items()
+    old.create_tables()
+    assert indexes_of(old) == wanted
+    if old.file is None:  # the making of one was interrupted
+        with old.transaction() as connection:
+            broken = "UPDATE pg_index SET indisvalid = false WHERE indexrelid = 'cow_jobs_of_kind'::regclass"
+            connection.execute(sa.text(broken))
+        assert indexes_of(old) != wanted
+        old.create_tables()
+        assert indexes_of(old) == wanted
+    old.close()
+
+
+def hurry(connection: psycopg.Connection[Any], _: object) -> None:
+    connection.execute("SET lock_timeout = '100ms'")
+    connection.commit()
+
+
+@pytest.mark.slow
+def test_an_index_that_must_wait_for_too_long_keeps_no_server_from_starting(tmp_path: Path) -> None:
+    with postgres_server() as url, closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))) as old:
+        with_old_tables(old)
+        with old.transaction() as connection:  # a new column has to wait for a backup, and the server with it
+            connection.execute(sa.text("ALTER TABLE cow_jobs ADD COLUMN answer TEXT, ADD COLUMN given TEXT"))
+        with old.engine.connect() as backup:
+            backup.execution_options(isolation_level="REPEATABLE READ").execute(sa.text("SELECT * FROM cow_jobs"))
+            other = Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))
+            sa.event.listen(other.engine, "connect", hurry)
+            other.create_tables()
+            other.close()
+            assert old.schema() == schema.SCHEMA
+            assert not all(indexes_of(old).values())
+        old.create_tables()
+        assert all(indexes_of(old).values())
+
+
+def test_a_change_that_others_do_not_bear_waits_for_their_end(old: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schema, "OLDEST_SERVING", 2)
+    tell_of_a_process(old, 0.0)
+    with pytest.raises(StorageUnavailable, match="stop all of them first"):
+        old.create_tables()
+    assert old.schema() == 1, "nothing was changed"
+    tell_of_a_process(old, schema.ALIVE_SECONDS + 1)
+    old.create_tables()
+    assert old.schema() == schema.SCHEMA
+    old.close()
+
+
+def set_schema(database: Database, version: int, oldest_serving: int) -> None:
+    with database.transaction() as connection:
+        connection.execute(sa.update(SCHEMAS).values(version=version, oldest_serving=oldest_serving))
+
+
+def test_tables_of_a_later_version_stay_as_they_are(tmp_path: Path) -> None:
+    with closing(Database(Settings(data_dir=tmp_path))) as database:
+        database.create_tables()
+        set_schema(database, schema.SCHEMA + 1, schema.SCHEMA)
+        with database.transaction() as connection:
+            connection.execute(sa.text("DROP TABLE cow_stages_of_jobs"))
+        database.create_tables()
+        assert "cow_stages_of_jobs" not in sa.inspect(database.engine).get_table_names()
+        assert database.schema() == schema.SCHEMA + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("migrate", ["true", "false"])
+def test_a_server_that_is_too_old_says_so(tmp_path: Path, migrate: str) -> None:
+    own = {"COW_DATA_DIR": str(tmp_path), "COW_MIGRATE": migrate, "COW_WORKERS": "false"}
+    with closing(Database(Settings(data_dir=tmp_path))) as database:
+        database.create_tables()
+        set_schema(database, 9, 8)
+        told = cow("serve", "--port", "0", **own)
+        assert told.returncode == 1
+        assert f"(schema 9), on whose tables this one (schema {schema.SCHEMA}) cannot serve" in told.stderr
+        assert "Traceback" not in told.stderr
+        assert "dbos_migrations" not in sa.inspect(database.engine).get_table_names()
+
+
+def test_tables_that_are_too_old_are_refused(tmp_path: Path) -> None:
+    with closing(Database(Settings(data_dir=tmp_path))) as database:
+        with database.transaction() as connection:
+            connection.execute(sa.text("CREATE TABLE cow_holds (sha256 TEXT)"))
+        with pytest.raises(StorageUnavailable, match="cannot take over"):
+            database.create_tables()
+        assert sa.inspect(database.engine).get_table_names() == ["cow_holds"]
+
+
+def test_a_result_of_a_later_version_is_handed_on_as_it_is(tmp_path: Path) -> None:
+    with closing(Database(Settings(data_dir=tmp_path))) as database:
+        database.create_tables()
+        add_job(database, "job")
+        written = {"of a later version": 1}
+        with database.transaction() as connection:
+            values = {"status": "succeeded", "format": FORMAT + 1, "result": packed(json.dumps(written))}
+            connection.execute(sa.update(schema.JOBS).values(**values))
+        found = JobTable(database).find("job", None)
+        assert found is not None
+        assert found.content == written

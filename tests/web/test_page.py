@@ -1,0 +1,231 @@
+"""The page in a real browser: ask, see, correct by dragging and by keyboard, draw what was not found."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import httpx
+import pytest
+from browser import (
+    NARROW,
+    WIDE,
+    Windows,
+    arrow_tip,
+    ask,
+    assert_fits,
+    drag_in_picture,
+    drop,
+    in_window,
+    path,
+    result,
+    said,
+    stage,
+    touch_in_picture,
+)
+from conftest import Server
+from drawn import clutter, png_bytes
+from PIL import Image
+from playwright.sync_api import Page, Request, expect
+from servers import QUESTION, picture
+
+pytestmark = pytest.mark.slow
+
+FIRST_VIEW_BYTES = 150_000
+FROM_MOTION_ON = ("motion", "trajectory", "generation", "answering")
+
+
+def answered(server: Server, windows: Windows, width: int, shift: int, **options: str) -> Page:
+    """A page on which the answer to a question about a picture of its own is shown."""
+    page = windows.open(server.address, width, **options)
+    drop(page, picture(shift))
+    ask(page, QUESTION)
+    result(page)
+    return page
+
+
+@pytest.mark.parametrize(("width", "shift"), [(WIDE, 1), pytest.param(NARROW, 2, marks=pytest.mark.soak)])
+def test_dragging_the_arrow_changes_path_and_answer(server: Server, windows: Windows, width: int, shift: int) -> None:
+    page = answered(server, windows, width, shift)
+    first, at_first = result(page), path(page)
+    assert said(page) == "Yes"
+    assert_fits(page)
+
+    drag_in_picture(page, arrow_tip(page), (60 + shift, 10))
+    dragged = result(page, before=first)
+    assert said(page) == "No"
+    assert path(page) != at_first
+    assert stage(page, "grounding") == "kept"
+    assert {name: stage(page, name) for name in FROM_MOTION_ON} == dict.fromkeys(FROM_MOTION_ON, "done")
+
+    page.get_by_role("button", name="Undo").click()
+    result(page, before=dragged)
+    assert said(page) == "Yes"
+    assert path(page) == at_first
+    assert {stage(page, name) for name in FROM_MOTION_ON} == {"kept"}
+    page.get_by_role("button", name="Redo").click()
+    expect(page.locator(".verdict.looked .said")).to_have_text("No")
+
+
+def test_everything_is_corrected_by_touch(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address, NARROW, has_touch=True, is_mobile=True)
+    drop(page, picture(41))
+    ask(page, QUESTION)
+    first, at_first = result(page), path(page)
+    assert said(page) == "Yes"
+    knob = page.locator(".handle.waypoint .knob").last
+    way = float(knob.get_attribute("cx") or 0), float(knob.get_attribute("cy") or 0)
+    in_window(page, way)
+    scrolled = page.evaluate("scrollY")
+    touch_in_picture(page, (way, (way[0], way[1] + 40)))
+    second = result(page, before=first)
+    assert path(page) != at_first
+    expect(page.get_by_text("You changed the path.")).to_be_attached()
+
+    touch_in_picture(page, (arrow_tip(page), (101, 10)))
+    third = result(page, before=second)
+    assert said(page) == "No"
+    assert page.evaluate("scrollY") == scrolled
+
+    page.get_by_role("button", name="What moves", exact=True).tap()
+    touch_in_picture(page, ((165, 55), (210, 102)))
+    result(page, before=third)
+    touch_in_picture(page, ((225, 150), (225, 60)))
+    assert page.evaluate("scrollY") > scrolled, "beside handles the page scrolls"
+    touch_in_picture(page, ((110, 140), (20, 140)), ((130, 140), (230, 140)))
+    assert page.evaluate("visualViewport.scale") > 1.2, "two fingers zoom"
+
+
+def test_a_question_is_built_of_what_was_found(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, picture(7))
+    page.get_by_text("Build a question").click()
+    builder = page.locator(".builder")
+    builder.get_by_label("If the").select_option("red object")
+    builder.get_by_label("does what?").select_option("is thrown")
+    builder.get_by_label("which way?").select_option("towards the blue object")
+    builder.get_by_role("button", name="Take this question").click()
+    asked = "If the red object is thrown towards the blue object, will it hit the blue object?"
+    expect(page.locator("#question")).to_have_value(asked)
+    page.get_by_role("button", name="Ask", exact=True).click()
+    result(page)
+    assert said(page) in ("Yes", "Not sure")  # how steeply and fast it is thrown is open
+
+
+def test_what_is_not_understood_is_told_with_questions_that_would_be(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, picture(8))
+    expect(page.get_by_role("list", name="Suggestions")).to_be_visible()
+    ask(page, "Wird der rote Ball den Würfel treffen?")
+    notice = page.locator(".notice.problem")
+    expect(notice).to_contain_text("it reads English")
+    expect(notice).not_to_contain_text("grounding")
+    instead = page.get_by_role("list", name="Suggested questions").get_by_role("button")
+    expect(instead.first).to_contain_text("If the ")
+    instead.first.click()
+    result(page)
+    expect(notice).to_have_count(0)
+
+
+@pytest.mark.parametrize(("kind", "side"), [("BMP", 0), ("GIF", 0), ("PNG", 7000)])
+def test_pictures_that_the_server_does_not_take_are_sent_as_jpeg(
+    server: Server, windows: Windows, kind: str, side: int
+) -> None:
+    made = io.BytesIO()
+    with Image.open(io.BytesIO(picture(43))) as opened:
+        shown = opened if not side else opened.resize((side, side * opened.height // opened.width))
+        shown.save(made, kind)
+    page = windows.open(server.address)
+    drop(page, made.getvalue(), f"picture.{kind.lower()}", f"image/{kind.lower()}")
+    ask(page, QUESTION)
+    job = httpx.get(f"{server.address}/jobs/{result(page)}").json()
+    image = job["result"]["image"]
+    assert image["width"] * image["height"] <= 12e6
+    sent = httpx.get(f"{server.address}/artifacts/{image['sha256']}")
+    assert sent.headers["content-type"] == "image/jpeg"
+    assert said(page) in ("Yes", "Not sure")
+
+
+@pytest.mark.slow
+def test_what_was_not_found_is_drawn(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    drop(page, png_bytes(clutter(400, 300)), "photo.png")
+    ask(page, "If the toy car moves, will it hit the wooden crate?")
+    notice = page.locator(".notice.problem")
+    expect(notice).to_contain_text("toy car")
+    expect(notice).not_to_contain_text("grounding")
+    assert page.locator(".mark").count() == 0
+
+    notice.get_by_role("button", name="Draw its box").click()
+    drag_in_picture(page, (40, 120), (90, 170))
+    expect(notice).to_contain_text("direction")
+    page.get_by_role("button", name="Another object", exact=True).click()
+    drag_in_picture(page, (150, 90), (230, 175))
+    page.get_by_label("What is in the box?").fill("wooden crate")
+    page.keyboard.press("Enter")
+    expect(page.get_by_label("What wooden crate is")).to_have_value("target")
+    notice.get_by_role("button", name="Draw the direction").click()
+    drag_in_picture(page, (65, 145), (165, 145))
+
+    met = page.locator(".mark.touches")
+    expect(met).to_have_attribute("title", re.compile("hits wooden crate"))
+    expect(notice).to_have_count(0)
+    assert said(page) == "Yes"
+
+
+def test_the_film_plays_in_step_with_its_overlay(server: Server, windows: Windows) -> None:
+    page = answered(server, windows, WIDE, 3, reduced_motion="no-preference")
+    slider = page.get_by_label("Frame of the clip")
+    expect(slider).to_have_value(re.compile(r"^([5-9]|[1-6]\d)$"))
+    page.get_by_role("button", name="Pause").click()
+    expect(page.locator(".handle.tip")).to_be_visible()  # what can be corrected is shown while the film stands still
+    frame = int(slider.input_value())
+    trajectory = httpx.get(f"{server.address}/jobs/{result(page)}").json()["result"]["simulation"]["trajectory"]
+    now = page.locator("circle.now").first
+    shown = float(now.get_attribute("cx") or 0), float(now.get_attribute("cy") or 0)
+    assert shown == pytest.approx(trajectory["paths"][0]["points"][frame])
+
+    page.locator(".mark.touches").first.click()
+    first_touch = min(met["first_frame"] for met in trajectory["encounters"])
+    expect(slider).to_have_value(str(first_touch))
+    film = page.locator(".scene video")
+    assert int(film.evaluate("film => film.currentTime") * trajectory["fps"]) == first_touch
+
+
+def test_keyboard_alone(server: Server, windows: Windows) -> None:
+    page = windows.open(server.address)
+    page.get_by_role("button", name=re.compile("yellow ball")).wait_for()
+    tab_to(page, ".examples button")
+    page.keyboard.press("Enter")
+    expect(page.locator("#question")).to_be_focused()
+    page.keyboard.press("Enter")
+    first = result(page)
+    aimed = arrow_tip(page)
+    tab_to(page, ".handle.tip")
+    for _ in range(3):
+        page.keyboard.press("Shift+ArrowUp")
+    result(page, before=first)
+    assert arrow_tip(page)[1] < aimed[1] - 20
+    assert (stage(page, "grounding"), stage(page, "trajectory")) == ("kept", "done")
+
+
+def tab_to(page: Page, selector: str) -> None:
+    """Presses Tab until an element of these has the focus."""
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        if page.evaluate("selector => document.activeElement.matches(selector)", selector):
+            return
+    pytest.fail(f"The Tab key does not reach {selector}.")
+
+
+def test_the_first_view_is_light(server: Server, windows: Windows) -> None:
+    page = windows.open("about:blank")
+    requests: list[Request] = []
+    page.on("requestfinished", lambda request: requests.append(request))  # noqa: PLW0108 (it takes no builtin)
+    page.goto(server.address, wait_until="networkidle")
+    sizes = [request.sizes() for request in requests]
+    parts = ("requestHeadersSize", "requestBodySize", "responseHeadersSize", "responseBodySize")
+    sent = {request.url: sum(size[part] for part in parts) for request, size in zip(requests, sizes, strict=True)}
+    assert len([url for url in sent if url.startswith(server.address)]) > 10
+    assert sum(sent.values()) <= FIRST_VIEW_BYTES, sent
+    assert {url for url in sent if not url.startswith(server.address)} == set()
