@@ -6,14 +6,17 @@ import hashlib
 import random
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from drawn import ball, floor, png_bytes
 
 from cow_service.evals.design import arm_of
 from cow_service.evals.items import Item, Observation, Task
-from cow_service.evals.plan import RunInfo
-from cow_service.evals.runs import EvalRun
 from cow_service.records import AnswerOption
+
+if TYPE_CHECKING:  # they take seconds to import
+    from cow_service.evals.plan import RunInfo
+    from cow_service.evals.runs import EvalRun
 
 LETTERS = "ABCD"
 LEVELS = {"collision": ("L1", "L2"), "trajectory": ("L1", "L2", "real"), "compatibility": ("?",), "occlusion": ("L1",)}
@@ -98,6 +101,8 @@ def observation(of: Item, arm: str, repeat: int, frames: Sequence[str] = (), rep
 
 def info(arms: Sequence[str], repeats: int, items: Sequence[Item], mllm: str = "openai/small") -> RunInfo:
     """What such a run says of itself."""
+    from cow_service.evals.plan import RunInfo
+
     keys = [f"{each.task} {each.level}" for each in items]
     return RunInfo(
         data="questions.jsonl",
@@ -126,6 +131,8 @@ def run(
     reply_length: int = 40,
 ) -> EvalRun:
     """Asked about `count` items of these tasks in turn."""
+    from cow_service.evals.runs import EvalRun
+
     items: list[Item] = []
     observations: list[Observation] = []
     frames = [picture(folder, 1000 + each) for each in range(4)]

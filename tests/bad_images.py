@@ -88,27 +88,6 @@ def saved(image: Image.Image, kind: str = "PNG", **options) -> bytes:
     return file.getvalue()
 
 
-# How an upright picture is stored so that each EXIF orientation shows it upright again (EXIF 2.3, section 4.6.4).
-STORED = {
-    1: None,
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}
-
-
-def turned(upright: Image.Image, orientation: int) -> bytes:
-    """A JPEG as a camera held another way writes it."""
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    turn = STORED[orientation]
-    return saved(upright if turn is None else upright.transpose(turn), "JPEG", quality=95, exif=exif)
-
-
 def located(upright: Image.Image, secret: str) -> bytes:
     """A JPEG with a place, an owner and a comment in its EXIF block, XMP and comment segment."""
     exif = Image.Exif()

@@ -8,10 +8,13 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Response, expect, sync_playwright
+from waiting import TIME_LIMIT
+
+if TYPE_CHECKING:  # playwright takes long to import: only tests that open a page do
+    from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Response
 
 REQUIRED = "COW_TEST_BROWSER"  # set where a missing browser is a fault and not a reason to skip
 HOW_TO_GET_IT = "chromium is not installed: apt-get install --no-install-recommends chromium"
@@ -22,7 +25,7 @@ FAILED_REQUEST = "Failed to load resource"  # how chromium tells of a response t
 TELL_VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
     console.error(`Content-Security-Policy: ${event.violatedDirective} ${event.blockedURI} ${event.sample}`));"""
 
-WAIT = 30_000  # ms for anything that must come about
+WAIT = int(1000 * TIME_LIMIT)  # ms
 Point = tuple[float, float]
 
 
@@ -34,11 +37,29 @@ def launched() -> Iterator[Browser]:
         if os.environ.get(REQUIRED) or os.environ.get("CI") == "true":
             pytest.fail(HOW_TO_GET_IT)
         pytest.skip(HOW_TO_GET_IT)
+    from playwright.sync_api import expect, sync_playwright
+
     expect.set_options(timeout=WAIT)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield browser
         browser.close()
+
+
+def expect(seen: Any) -> Any:
+    """Playwright's assertions on a page or an element, which wait until they hold."""
+    from playwright.sync_api import expect
+
+    return expect(seen)
+
+
+def faults_for_some(page: Page) -> list[tuple[str, list[str]]]:
+    """What axe-core finds serious or worse. Its script is put into the page: open that with `bypass_csp`."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    violations = Axe().run(page).response["violations"]
+    serious = [each for each in violations if each["impact"] in ("serious", "critical")]
+    return [(each["id"], [node["html"][:200] for node in each["nodes"]]) for each in serious]
 
 
 class Windows:
@@ -147,7 +168,7 @@ def touch_in_picture(page: Page, *fingers: tuple[Point, Point]) -> None:
             for number, (start, end) in enumerate(ends)
         ]
         session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [] if kind == "touchEnd" else points})
-        page.wait_for_timeout(30)
+        page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     send("touchStart", 0.0)
     for step in range(1, 7):

@@ -22,7 +22,6 @@ from urllib.parse import urlsplit
 
 import httpx
 from faults import Fault, Machine, Station, faults_of, faults_of_network, power_cut
-from object_store import serving
 from postgres import postgres
 from proxy import Proxy
 from servers import BODY, TERMINAL, Served, Worker, data_url, picture
@@ -392,6 +391,8 @@ def fleet(folder: Path) -> Generator[tuple[Laboratory, Fault, list[Fault]]]:
     """Two servers, one of them without computing, and a worker; PostgreSQL and an object store. A crash of PostgreSQL,
     and all other faults, those of networks among them.
     """
+    from object_store import serving
+
     settings, keys = tenants()
     with ExitStack() as ending:
         database, store = ending.enter_context(postgres()), ending.enter_context(serving())

@@ -44,12 +44,16 @@ class TrueCamera:
         position = self.positions(places)
         return position[:, :2] * self.focal / position[:, 2:] + np.array(self.size) / 2
 
-    def on_floor(self, point: tuple[float, float]) -> tuple[float, float] | None:
-        """Where on the floor (right, ahead) an image point (px) lies; None above the horizon and far away."""
-        u, v = (np.array(point) - np.array(self.size) / 2) / self.focal
+    def _rays(self, x: Floats | float, y: Floats | float) -> tuple[Floats, Floats, Floats]:
+        """How far to the right, down and ahead the rays of image points (px) go, per metre of depth."""
+        u, v = (x - self.size[0] / 2) / self.focal, (y - self.size[1] / 2) / self.focal
         roll, pitch = np.radians(self.roll), np.radians(self.pitch)
         right, down = u * np.cos(roll) - v * np.sin(roll), u * np.sin(roll) + v * np.cos(roll)
-        sink, ahead = down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - down * np.sin(pitch)
+        return right, down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - down * np.sin(pitch)
+
+    def on_floor(self, point: tuple[float, float]) -> tuple[float, float] | None:
+        """Where on the floor (right, ahead) an image point (px) lies; None above the horizon and far away."""
+        right, sink, ahead = self._rays(*point)
         if sink < 0.12:
             return None
         return float(right / sink * self.height), float(ahead / sink * self.height)
@@ -60,17 +64,31 @@ class TrueCamera:
         A board (px) faces the camera and stands at the middle of its lower edge.
         """
         width, height = self.size
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        u, v = (x - width / 2) / self.focal, (y - height / 2) / self.focal
-        pitch, roll = np.radians(self.pitch), np.radians(self.roll)
-        down = u * np.sin(roll) + v * np.cos(roll)
-        sink, ahead = down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) - down * np.sin(pitch)
+        _, sink, ahead = self._rays(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
         depth = np.where(sink > 0.02, self.height / np.where(sink > 0.02, sink, 1.0), np.nan)
         for x0, y0, x1, y1 in ((round(edge) for edge in box) for box in boxes):
             at = min(height - 1, y1), min(width - 1, (x0 + x1) // 2)
             board = slice(y0, y1), slice(x0, x1)
             depth[board] = depth[at] * ahead[at] / ahead[board]
         return depth
+
+    def floor_places(self) -> Floats:
+        """Where on the floor [H, W, 3] each pixel looks; nan above the horizon."""
+        depth, (width, height) = self.depth(), self.size
+        right, _, ahead = self._rays(*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
+        return np.stack([right * depth, 0 * depth, ahead * depth], axis=-1)
+
+    def shadow_rim(self, ball: tuple[float, float, float], light: tuple[float, float]) -> Floats:
+        """Image points [360, 2] (px) around the shadow of a ball of radius 1, lit from far away.
+
+        `light`: how far a shadow goes right and ahead per unit of height.
+        """
+        slant, turns = np.array(light), np.linspace(0, 2 * np.pi, 360, endpoint=False)
+        circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        along = slant / max(float(np.hypot(*slant)), 1e-9)
+        rim = circle + np.outer(circle @ along, along) * (math.sqrt(1 + slant @ slant) - 1)
+        rim += np.array([ball[0], ball[2]]) + ball[1] * slant
+        return self.seen(np.column_stack([rim[:, 0], np.zeros(len(rim)), rim[:, 1]]))
 
     def away(self, place: tuple[float, float]) -> float:
         """Distance (m) of a place on the floor from the camera."""

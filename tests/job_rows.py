@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
+from pydantic import SecretStr
 
 from cow_service.jobs.database import OPEN, Database
 from cow_service.jobs.job_table import JobSpec, JobTable, TakenJob
 from cow_service.jobs.schema import JOBS
+from cow_service.settings import Settings
 from cow_service.stages.run import now
 
 STEP = 100
+
+
+def open_database(folder: Path, url: SecretStr | None = None) -> Database:
+    """A database with all tables: in a file of the folder, or that of the URL."""
+    database = Database(Settings(data_dir=folder, database_url=url))
+    database.create_tables()
+    return database
 
 
 def add_job(database: Database, job_id: str, owner: str | None = None, **more: Any) -> bool:

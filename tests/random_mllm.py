@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
+from waiting import TIME_LIMIT
+
 RATE = 0.3  # of "A"; else "B"
 USAGE: dict[str, Any] = {
     "prompt_tokens": 21,
@@ -105,14 +107,32 @@ def reply_to(asked: dict[str, Any], letter: str) -> str:
     return f"It rolls on.\n\nANSWER: {letter}"
 
 
-class _Handler(BaseHTTPRequestHandler):
+class JsonHandler(BaseHTTPRequestHandler):
+    """Sends JSON, and logs nothing."""
+
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True
-    mllm: RandomMllm
-    asked: dict[str, Any]
 
     def log_message(self, format: str, *args: object) -> None:
         pass
+
+    def send(self, status: int, body: object, content_type: str = "application/json", **headers: str) -> bool:
+        """Whether the caller was still there."""
+        data = body if isinstance(body, bytes) else json.dumps(body, indent=1).encode()
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        self.send_response(status)
+        for name, value in {"content-type": content_type, "content-length": str(len(data)), **named}.items():
+            self.send_header(name, value)
+        with suppress(OSError):
+            self.end_headers()
+            self.wfile.write(data)
+            return True
+        return False
+
+
+class _Handler(JsonHandler):
+    mllm: RandomMllm
+    asked: dict[str, Any]
 
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers["content-length"]))
@@ -127,16 +147,6 @@ class _Handler(BaseHTTPRequestHandler):
             self.stream(True)
         else:
             self.send(200, self.mllm.completion(self.asked))
-
-    def send(self, status: int, body: object, content_type: str = "application/json", **headers: str) -> None:
-        data = body if isinstance(body, bytes) else json.dumps(body, indent=1).encode()
-        self.send_response(status)
-        named = {name.replace("_", "-"): value for name, value in headers.items()}
-        for name, value in {"content-type": content_type, "content-length": str(len(data)), **named}.items():
-            self.send_header(name, value)
-        self.end_headers()
-        with suppress(OSError):
-            self.wfile.write(data)
 
     def stream(self, whole: bool) -> None:
         self.send_response(200)
@@ -163,7 +173,7 @@ def cut(handler: _Handler) -> None:
 
 def silent(handler: _Handler) -> None:
     """Nothing, until the caller goes away."""
-    handler.connection.settimeout(30)
+    handler.connection.settimeout(TIME_LIMIT)
     with suppress(OSError):
         if handler.connection.recv(1) == b"":
             handler.mllm.left.set()
@@ -183,18 +193,24 @@ class _Quiet(ThreadingHTTPServer):
     request_queue_size = 64
 
     def handle_error(self, request: object, client_address: object) -> None:
-        pass  # callers that give up are what some tests are about
+        pass  # callers that give up or are killed are what some tests are about
+
+
+@contextmanager
+def serving(handler: type[JsonHandler], port: int = 0) -> Iterator[str]:
+    """Serves until the block ends, at any free port if 0; the base URL."""
+    with _Quiet(("127.0.0.1", port), handler) as server:
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/v1"
+        server.shutdown()
 
 
 @contextmanager
 def random_mllm(port: int = 0) -> Iterator[RandomMllm]:
     """Serves until the block ends; at any free port if 0."""
     mllm = RandomMllm()
-    with _Quiet(("127.0.0.1", port), type("Handler", (_Handler,), {"mllm": mllm})) as server:
-        mllm.address = f"http://127.0.0.1:{server.server_port}/v1"
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    with serving(type("Handler", (_Handler,), {"mllm": mllm}), port) as mllm.address:
         yield mllm
-        server.shutdown()
 
 
 if __name__ == "__main__":  # for trying `cow eval` without an MLLM

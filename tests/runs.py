@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.media.artifacts import DiskArtifacts
-from cow_service.media.images import DecodedImage, encode_png
+from cow_service.media.images import DecodedImage
 from cow_service.perception.base import Perception
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import ImageInfo
@@ -29,7 +29,7 @@ def unexpected() -> Any:
 
 def run_of(pixels: NDArray[np.uint8], reader=unexpected, generator=unexpected, **request: Any) -> Run:
     """A run of a request on an image [H, W, 3]."""
-    sha256 = hashlib.sha256(encode_png(pixels)).hexdigest()
+    sha256 = hashlib.sha256(pixels.tobytes()).hexdigest()
     image = DecodedImage(pixels, ImageInfo(width=pixels.shape[1], height=pixels.shape[0], sha256=sha256), "image/png")
     cpu = PrioritySemaphore(1)
     artifacts, perception = DiskArtifacts(Path(_FOLDER.name)), Perception(Settings())

@@ -1,154 +1,78 @@
-"""What tests of the SDK share: both clients called in the same way, and a server with scripted answers."""
+"""What tests of the SDK share: clients that are quickly made and never pause, and a server with scripted answers."""
 
 from __future__ import annotations
 
-import asyncio
-import inspect
+import atexit
 import json
 import socketserver
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import httpx
 import pytest
+from servers import Served
 
-from cow_service.client import (
-    AsyncAnswer,
-    AsyncClient,
-    AsyncJobHandle,
-    AsyncSimulation,
-    Client,
-    async_io,
-    sync_io,
-)
-
-Kind = Literal["sync", "async"]
-KINDS: tuple[Kind, ...] = ("sync", "async")
-
-
-class Blocking:
-    """An object of `AsyncClient`'s world, called as one of `Client`'s."""
-
-    def __init__(self, inner: Any, runner: asyncio.Runner) -> None:
-        self._inner, self._runner = inner, runner
-
-    def __repr__(self) -> str:
-        return repr(self._inner)
-
-    def __getattr__(self, name: str) -> Any:
-        value = getattr(self._inner, name)
-        if not inspect.ismethod(value):
-            return self._plain(value)
-        return lambda *args, **named: self._plain(value(*args, **named))
-
-    def _plain(self, value: Any) -> Any:
-        if inspect.iscoroutine(value):
-            value = self._runner.run(value)
-        if isinstance(value, AsyncIterator):
-            return self._each(value)
-        ours = isinstance(value, AsyncJobHandle | AsyncSimulation | AsyncAnswer)
-        return Blocking(value, self._runner) if ours else value
-
-    def _each(self, values: Any) -> Iterator[Any]:
-        try:
-            while True:
-                try:
-                    value = self._runner.run(_next(values))
-                except StopAsyncIteration:
-                    return
-                yield self._plain(value)
-        finally:
-            self._runner.run(values.aclose())
-
-
-async def _next(values: AsyncIterator[Any]) -> Any:
-    return await anext(values)
+from cow_service.client import Client
+from cow_service.client.sync_io import BlockingIO
 
 
 class Connect:
-    """Makes clients of one kind, and closes them at the end. They share one HTTP client: each takes long to make."""
+    """Makes clients. They share one HTTP client, which takes long to make."""
 
-    def __init__(self, kind: Kind) -> None:
-        self.kind = kind
+    def __init__(self, http: httpx.Client) -> None:
         self.slept: list[float] = []
-        self._runner = asyncio.Runner() if kind == "async" else None
-        self._made: list[Any] = []
-        self._shared = self.http()
+        self.now = time.monotonic()
+        self._http = http
 
-    def __call__(self, base_url: str | None = None, **named: Any) -> Any:
-        """A client, and what it returns, without `await`. With `http_client=None` it makes its own, as it does else."""
-        named.setdefault("http_client", self._shared)
-        if self._runner is None:
-            client: Any = Client(base_url, **named)
-        else:
-            client = Blocking(AsyncClient(base_url, **named), self._runner)
-        self._made.append(client)
-        return client
+    def __call__(self, base_url: str | None = None, **named: Any) -> Client:
+        return Client(base_url, **{"http_client": self._http} | named)
 
-    def http(self, **named: Any) -> Any:
-        """An HTTP client of the kind that these clients take."""
-        http = httpx.Client(**named) if self.kind == "sync" else httpx.AsyncClient(**named)
-        self._made.append(http if self._runner is None else Blocking(_Closing(http), self._runner))
-        return http
-
-    def seen(self) -> tuple[Any, list[str]]:
-        """An HTTP client, and the list in which it writes down every request: method and path."""
-        told: list[str] = []
-
-        def write(request: httpx.Request) -> None:
-            told.append(f"{request.method} {request.url.path}")
-
-        async def write_async(request: httpx.Request) -> None:
-            write(request)
-
-        return self.http(event_hooks={"request": [write if self.kind == "sync" else write_async]}), told
-
-    def close(self) -> None:
-        """Closes all that was made here."""
-        for made in reversed(self._made):
-            made.close()
-        if self._runner is not None:
-            self._runner.close()
+    async def sleep(self, seconds: float) -> None:
+        """Only remembers the pause, by which the clock goes on."""
+        self.slept.append(seconds)
+        self.now += seconds
 
 
-@dataclass
-class _Closing:
-    http: Any
-
-    async def close(self) -> None:
-        await self.http.aclose()
+_served: list[Served] = []
 
 
-@pytest.fixture(params=KINDS, scope="module")
-def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
-    """Makes clients of either kind: every test with it says the same of both."""
-    one = Connect(request.param)
-    yield one
-    one.close()
+@pytest.fixture(scope="session")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Served:
+    """A real server with the slow generator: one for all files that import this fixture."""
+    if not _served:
+        _served.append(Served(tmp_path_factory.mktemp("sdk"), COW_MAX_BODY_MB="3"))
+        _served[0].start()
+        atexit.register(_served[0].kill)
+    return _served[0]
 
 
-class Hurried:
-    """A clock module whose sleeps return at once and are recorded."""
+@pytest.fixture(scope="module")
+def connect() -> Iterator[Connect]:
+    with httpx.Client() as http:
+        yield Connect(http)
 
-    def __init__(self, module: Any, slept: list[float]) -> None:
-        self._module, self._slept = module, slept
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._module, name)
+@pytest.fixture
+def address(served: Served) -> str:
+    """Of the server with the slow generator."""
+    return str(served.http.base_url).rstrip("/")
 
-    def sleep(self, seconds: float) -> Any:
-        self._slept.append(seconds)
-        return asyncio.sleep(0) if self._module is asyncio else None
+
+@pytest.fixture
+def client(connect: Connect, address: str) -> Client:
+    """Asks that server."""
+    return connect(address)
 
 
 @pytest.fixture
 def hurried(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> Connect:
-    """The same, and no client sleeps: `slept` has what each pause would have been."""
+    """The same, and no client sleeps: `slept` has each pause, and `now` is the time on their clock."""
     connect.slept.clear()
-    monkeypatch.setattr(sync_io, "time", Hurried(sync_io.time, connect.slept))
-    monkeypatch.setattr(async_io, "asyncio", Hurried(asyncio, connect.slept))
+    monkeypatch.setattr(BlockingIO, "sleep", lambda _, seconds: connect.sleep(seconds))
+    monkeypatch.setattr(time, "monotonic", lambda: connect.now)
     return connect
 
 

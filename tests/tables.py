@@ -6,10 +6,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pytest
-from _pytest.mark import ParameterSet
 
 
-def rows(core: Mapping[str, Any], rest: Iterable[Any] = ()) -> list[ParameterSet]:
+def rows(core: Mapping[str, Any], rest: Iterable[Any] = ()) -> list[Any]:
     """Cases for `pytest.mark.parametrize`.
 
     `core` maps the reason why a case must always run, which is its id, to its value: a tuple where the test takes

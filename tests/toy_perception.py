@@ -1,16 +1,24 @@
-"""Checkpoints of the vision models, at toy size: real classes, seeded random weights, files as they are published."""
+"""The vision models at toy size: real classes, seeded random weights, files as they are published.
+
+To be imported in fixtures: it loads torch and transformers.
+"""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 import transformers
+from safetensors.torch import load_file, save_file
 from transformers import BertConfig, BertTokenizer, Dinov2Config, Sam2HieraDetConfig, Sam2VisionConfig, SwinConfig
 
-from cow_service.perception import moge
+from cow_service.perception import depth, dino, moge, sam
+from cow_service.perception.loading import LoadedModel, load, load_pretrained
+from cow_service.settings import Settings
 
+__all__ = ["load_file", "save_file", "torch"]  # for tests that may not import them
 SIDE = 128  # px: what the toy segmenter sees
 MOGE_BACKBONE = {"toy": (32, 2, 2)}  # to be added to `moge.BACKBONES`
 WORDS = ("blue", "mug", "ball", "yellow", "table", "red", "a")
@@ -98,3 +106,26 @@ MAKERS = {
     "sam2-tiny": make_sam, "grounding-dino-tiny": make_dino, "depth-anything-indoor": make_depth_anything,
     "moge-2-small": make_moge,
 }  # fmt: skip
+
+FACTORIES = {
+    "sam2-tiny": sam.create_sam2_tiny, "grounding-dino-tiny": dino.create_dino_tiny,
+    "depth-anything-indoor": depth.create_depth_anything_indoor, "moge-2-small": depth.create_moge_2_small,
+}  # fmt: skip
+CALLS = {
+    "sam2-tiny": lambda toy, image: toy.embed(image),
+    "grounding-dino-tiny": lambda toy, image: toy.detect(image, ["ball"]),
+    "depth-anything-indoor": lambda toy, image: toy.estimate(image, None),
+    "moge-2-small": lambda toy, image: toy.estimate(image, None),
+}
+
+
+def networks(settings: Settings) -> tuple[dict[str, LoadedModel], Any]:
+    """The networks inside of the models and the detector's tokenizer, for tests that listen to them."""
+    builders = {
+        "sam2-tiny": partial(load_pretrained, transformers.Sam2Model),
+        "grounding-dino-tiny": partial(load_pretrained, transformers.GroundingDinoForObjectDetection),
+        "depth-anything-indoor": partial(load_pretrained, transformers.DepthAnythingForDepthEstimation),
+        "moge-2-small": moge.load_moge,
+    }
+    loaded = {name: load(name, settings, partial(build, name)) for name, build in builders.items()}
+    return loaded, transformers.AutoTokenizer.from_pretrained(loaded["grounding-dino-tiny"].folder)

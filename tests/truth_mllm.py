@@ -11,13 +11,13 @@ import json
 import math
 import random
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+
+from random_mllm import JsonHandler, serving
 
 from cow_service.evals.items import Item
 from cow_service.readers.options import split_options
@@ -33,15 +33,13 @@ class TruthMllm:
     without: float = 0.5  # how often it is right of the image alone
     with_frames: float = 0.8
     seed: int = 0
-    seconds: float = 0.0  # that a reply takes
+    left: float = math.inf  # replies until it holds further ones back
     counted: bool = False
     address: str = ""
     asked: Counter[str] = field(default_factory=Counter)
-    done: list[tuple[str, float, float]] = field(default_factory=list)  # what was asked, when, and when it was sent
-    texts: list[str] = field(default_factory=list)
-    images: list[int] = field(default_factory=list)
+    waiting: Counter[str] = field(default_factory=Counter)  # what was asked and not replied to
     refuses: str = ""  # questions with this in them
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    lock: threading.Condition = field(default_factory=threading.Condition)
 
     def reply(self, body: dict[str, Any]) -> tuple[str, str]:
         """The question, as a key, and the reply."""
@@ -51,8 +49,7 @@ class TruthMllm:
         key = hashlib.sha256("\n".join([text, *pictures]).encode()).hexdigest()
         with self.lock:
             self.asked[key] += 1
-            self.texts.append(text)
-            self.images.append(len(pictures))
+            self.waiting[key] += 1
             number = self.asked[key] if self.counted else 0
         draws = random.Random(f"{self.seed} {key} {number}")
         looked = len(set(pictures[1:])) > 1
@@ -64,46 +61,32 @@ class TruthMllm:
             letter = draws.choice(others)
         return key, f"{{'Reasoning': 'It moves on.', 'Answer': '({letter})'}}"
 
+    def hold_after(self, replies: float) -> None:
+        """Sends so many more replies, those that it holds back among them."""
+        with self.lock:
+            self.left = replies
+            self.lock.notify_all()
 
-class _Handler(BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"
-    disable_nagle_algorithm = True
+    def await_turn(self, key: str) -> None:
+        with self.lock:
+            self.lock.wait_for(lambda: self.left > 0)
+            self.left -= 1
+            self.waiting[key] -= 1
+
+
+class _Handler(JsonHandler):
     mllm: TruthMllm
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
 
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["content-length"])))
         if self.mllm.refuses and self.mllm.refuses in json.dumps(body):
             self.send(400, {"error": {"message": "The model is away.", "type": "invalid_request_error"}})
             return
-        begun = time.monotonic()
         key, text = self.mllm.reply(body)
-        time.sleep(self.mllm.seconds)
+        self.mllm.await_turn(key)
         choice = {"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": text}}
         head = {"id": "x", "object": "chat.completion", "created": 0, "model": body["model"]}
-        sent = math.inf  # if the caller has left
-        with suppress(OSError):
-            self.send(200, {**head, "choices": [choice], "usage": TOKENS})
-            sent = time.monotonic()
-        self.mllm.done.append((key, begun, sent))
-
-    def send(self, status: int, body: object) -> None:
-        data = json.dumps(body).encode()
-        self.send_response(status)
-        self.send_header("content-type", "application/json")
-        self.send_header("content-length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-
-class _Quiet(ThreadingHTTPServer):
-    daemon_threads = True
-    request_queue_size = 64
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        pass  # callers that are killed are what some tests are about
+        self.send(200, {**head, "choices": [choice], "usage": TOKENS})
 
 
 def truth_of(items: list[Item]) -> dict[str, str]:
@@ -117,8 +100,5 @@ def truth_of(items: list[Item]) -> dict[str, str]:
 def truth_mllm(items: list[Item], **known: Any) -> Iterator[TruthMllm]:
     """Serves until the block ends."""
     mllm = TruthMllm(truth_of(items), **known)
-    with _Quiet(("127.0.0.1", 0), type("Handler", (_Handler,), {"mllm": mllm})) as server:
-        mllm.address = f"http://127.0.0.1:{server.server_port}/v1"
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    with serving(type("Handler", (_Handler,), {"mllm": mllm})) as mllm.address:
         yield mllm
-        server.shutdown()

@@ -175,7 +175,7 @@ class StoredStep:
 class EngineParts:
     """What all parts of a job engine share."""
 
-    service: Service  # only tests exchange it
+    service: Service
     database: Database
     jobs: JobTable
     active: ActiveJobs

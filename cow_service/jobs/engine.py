@@ -42,7 +42,7 @@ class JobEngine:
 
     def __init__(self, service: Service, computer: Computer | None = None, role: ProcessRole | None = None) -> None:
         """`computer`: computes the jobs; by default in this process. `role`: by default that of the settings."""
-        self.database, self.active = Database(service.settings), ActiveJobs()
+        self.service, self.database, self.active = service, Database(service.settings), ActiveJobs()
         self.calls = Calls()
         if service.settings.webhook_secret is not None:
             from cow_service.jobs.webhooks import Webhooks  # noqa: PLC0415 # DBOS takes long to import
@@ -63,16 +63,11 @@ class JobEngine:
         self._dispatcher = Dispatcher(self._parts, self._computer.capacity, self._runner.start, self._tell_queued)
         self._maintenance = Maintenance(self._parts, self.calls, self._lease, self.remove, self._offer)
         self.processes = Processes(self._parts, self._computer, role)
-        self.storage = StorageCheck(lambda: self.service.artifacts)
+        self.storage = StorageCheck(service.artifacts)
         self.is_running = False
         self._stopping = False
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
         self._submitting = threading.Lock()
-
-    @property
-    def service(self) -> Service:
-        """The service that does the work."""
-        return self._parts.service
 
     def wait_for_database(self, stop: threading.Event) -> None:
         """Waits until the database can be reached, or until `stop` is set, and logs that it waits."""

@@ -87,7 +87,7 @@ class Readiness:
 class StorageCheck:
     """Looks at most every two seconds, however many ask. Safe to use from every thread."""
 
-    def __init__(self, artifacts: Callable[[], ArtifactStore]) -> None:
+    def __init__(self, artifacts: ArtifactStore) -> None:
         self._artifacts = artifacts
         self._lock = threading.Lock()
         self._looked = -MAX_AGE_SECONDS
@@ -99,7 +99,7 @@ class StorageCheck:
             if time.monotonic() - self._looked > MAX_AGE_SECONDS:
                 self._fault = None
                 try:
-                    self._artifacts().check()
+                    self._artifacts.check()
                 except StorageUnavailable as error:
                     self._fault = error.detail
                 self._looked = time.monotonic()

@@ -57,7 +57,8 @@ class Webhooks(Calls):
 
     def __init__(self, settings: Settings, metrics: Metrics, database: Database) -> None:
         assert settings.webhook_secret is not None, "else there are no calls"
-        self._secret, self._metrics, self._egress = settings.webhook_secret, metrics, Egress(None)
+        self._secret, self._metrics = settings.webhook_secret, metrics
+        self.egress = Egress(None)  # decides which addresses may be called
         self._database, self._jobs = database, JobTable(database, self.enqueue)
         # Unlike DBOS itself, its client can be told to raise where the database is away.
         self.client = DBOSClient(
@@ -71,7 +72,7 @@ class Webhooks(Calls):
     def check(self, url: str) -> None:
         """As the base class says."""
         try:
-            self._egress.check(url)
+            self.egress.check(url)
         except NotAllowed as error:
             raise WebhookNotAllowed(f"`webhook`: {error}") from error
 
@@ -177,7 +178,7 @@ class Webhooks(Calls):
             "webhook-signature": " ".join(sign(each, message, moment, body) for each in secrets),
         }
         try:
-            status = self._egress.post(url, body, headers)
+            status = self.egress.post(url, body, headers)
         except NotAllowed as error:
             log.warning("webhook of job %s: %s", job.id, error)
             self._metrics.webhooks.labels("not-allowed").inc()

@@ -136,7 +136,7 @@ class Story:
     def _told(self, body: int) -> list[Encounter]:
         """The encounters of a body that are named, in their order: what is asked about, then the first ones."""
         own = [each for each in self._trajectory.encounters if each.subject == body]
-        asked = [self._asked] if self._asked is not None and body == self._subject else []
+        asked = [self._asked] if self._asked is not None and body == self._asked.subject else []
         touched = {each.object for each in own if each.kind == "touches"}
         rest = [each for each in own if each.kind == "touches" or each.object not in touched]
         ordered = sorted(rest, key=lambda each: (each.kind != "touches", each.first_frame))

@@ -141,7 +141,7 @@ def _run_until_settled(
         worlds = [_observed(*each, rows[:count]) for each in zip(given, run, strict=True)]
         decided = _decide(queries, worlds, rows[:count])
         verdicts = [each for each in decided if each is not None]
-        if len(verdicts) == len(decided) and all(_is_settled(each, queries[0], count, len(rows)) for each in verdicts):
+        if len(verdicts) == len(decided) and all(is_settled(each, queries[0], count, len(rows)) for each in verdicts):
             break
     return worlds, decided
 
@@ -167,7 +167,7 @@ def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], d
     return decided
 
 
-def _is_settled(decided: Decided, query: Query | None, count: int, size: int) -> bool:
+def is_settled(decided: Decided, query: Query | None, count: int, size: int) -> bool:
     """Whether the worlds run so far, drawn from `size`, most likely give the same answer as all of them.
 
     The worlds that agree are hypergeometrically distributed; what all of them would say differs where they cross a

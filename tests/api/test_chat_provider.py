@@ -11,23 +11,19 @@ from typing import Any
 import httpx
 import mllm_server as say
 import pytest
+from asgi import ask
+from chats import COW, HELLO, chunks_of, content_of, image, text, user
 from engines import app_for
 from fastapi import FastAPI
 from hypothesis import given
 from hypothesis import strategies as st
 from mllm_server import MllmServer
-from pydantic_ai.exceptions import UserError
-from pydantic_ai.models.test import TestModel
-from servers import BODY, QUESTION, data_url, picture, problem
+from refusals import refused
+from servers import QUESTION, problem
 
 from cow_service.api.body import read_object
 from cow_service.api.openai.chats import as_json
-from cow_service.errors import InvalidRequest
 from cow_service.readers.chat import Upstream
-from cow_service.readers.mllm.chat import prepare_chat
-from cow_service.readers.mllm.client import MllmClient
-from cow_service.readers.mllm.models import ConfiguredModel, mllm_manifests
-from cow_service.readers.mllm.reader import create
 from cow_service.service import Service
 from cow_service.settings import Settings
 from cow_service.weights.manifests import load_families
@@ -35,8 +31,6 @@ from cow_service.weights.manifests import load_families
 pytestmark = pytest.mark.slow
 
 NAME = "cow/anthropic:claude-x"
-IMAGE = {"type": "image_url", "image_url": {"url": data_url(picture())}}
-COW = {name: BODY[name] for name in ("grounding", "motion", "num_frames", "frames")}
 
 
 def reply(*content: dict[str, Any], stop: str = "end_turn") -> say.Reply:
@@ -54,19 +48,16 @@ def mllm() -> Iterator[MllmServer]:
         yield server
 
 
-@pytest.fixture
-def app(tmp_path: Path, mllm: MllmServer) -> FastAPI:
-    base_url = mllm.address.removesuffix("/v1")
-    settings = Settings(data_dir=tmp_path, mllm="anthropic:claude-x", mllm_base_url=base_url, mllm_api_key="k")
+@pytest.fixture(scope="module")
+def app(tmp_path_factory: pytest.TempPathFactory, mllm: MllmServer) -> FastAPI:
+    own = {"mllm_base_url": mllm.address.removesuffix("/v1"), "mllm_api_key": "k"}
+    settings = Settings(data_dir=tmp_path_factory.mktemp("provider"), mllm="anthropic:claude-x", **own)
     return app_for(Service(settings))
 
 
 def post(app: FastAPI, body: dict[str, Any], path: str = "chat/completions") -> httpx.Response:
-    async def ask() -> httpx.Response:
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://cow", timeout=60) as client:
-            return await client.post(f"/v1/{path}", json=body)
-
-    return asyncio.run(ask())
+    headers = {"Content-Type": "application/json"}
+    return ask(app, ("POST", f"/v1/{path}", headers, json.dumps(body)))[0]
 
 
 def test_a_chat_through_another_protocol(app: FastAPI, mllm: MllmServer) -> None:
@@ -75,7 +66,7 @@ def test_a_chat_through_another_protocol(app: FastAPI, mllm: MllmServer) -> None
         {"role": "system", "content": "Be terse."},
         {"role": "user", "content": "hello"},
         {"role": "assistant", "content": "Hi."},
-        {"role": "user", "content": [IMAGE, {"type": "text", "text": QUESTION}]},
+        user(image(), text(QUESTION)),
     ]
     body = {"model": NAME, "messages": messages, "cow": COW, "temperature": 0.5, "max_tokens": 99, "stop": "END",
             "n": 2, "logprobs": True, "enable_thinking": False, "top_p": None}  # fmt: skip
@@ -85,7 +76,7 @@ def test_a_chat_through_another_protocol(app: FastAPI, mllm: MllmServer) -> None
     assert choice["message"]["reasoning_content"] == "It rolls."
     assert told["usage"] == {"prompt_tokens": 12, "completion_tokens": 3, "total_tokens": 15}
     assert told["cow"]["imagined"]
-    assert "Not sent: `n`, `logprobs`, `enable_thinking`." in told["cow"]["warnings"][-1]
+    assert "`n`, `logprobs`, `enable_thinking`" in told["cow"]["warnings"][-1]  # those were not sent
     sent = mllm.asked[-1]
     assert (sent["temperature"], sent["max_tokens"], sent["stop_sequences"]) == (0.5, 99, ["END"])
     assert "Be terse." in json.dumps(sent["system"])
@@ -97,42 +88,40 @@ def test_a_chat_through_another_protocol(app: FastAPI, mllm: MllmServer) -> None
 def test_tools_and_streams_through_another_protocol(app: FastAPI, mllm: MllmServer) -> None:
     tool = {"type": "function", "function": {"name": "submit", "parameters": {"type": "object", "properties": {}}}}
     mllm.say(reply({"type": "tool_use", "id": "t1", "name": "submit", "input": {"letter": "A"}}, stop="tool_use"))
-    asked = {"model": NAME, "messages": [{"role": "user", "content": "hello"}], "tools": [tool]}
+    asked = {"model": NAME, "messages": HELLO, "tools": [tool]}
     message = post(app, asked).json()["choices"][0]["message"]
     assert json.loads(message["tool_calls"][0]["function"]["arguments"]) == {"letter": "A"}
     mllm.say(reply(SAID))
     result = {"role": "tool", "tool_call_id": "t1", "content": "right"}
     response = post(app, {**asked, "messages": [*asked["messages"], message, result], "stream": True})
     assert mllm.asked[-1]["messages"][2]["content"][0]["type"] == "tool_result"
-    *events, end = [block.removeprefix("data: ") for block in response.text.split("\n\n") if block.strip()]
-    chunks = [json.loads(event) for event in events]
-    assert end == "[DONE]"
+    chunks = chunks_of(response)
     assert chunks[0]["cow"]["reason"] == "no-image"
-    assert "".join(chunk["choices"][0]["delta"].get("content", "") for chunk in chunks) == "ANSWER: A"
+    assert content_of(chunks) == "ANSWER: A"
     told = post(app, {"model": NAME, "input": "hello"}, "responses").json()
     assert told["output"][0]["content"][0]["text"] == "ANSWER: A"
 
 
 def test_what_another_protocol_refuses_or_cannot_be_sent(app: FastAPI, mllm: MllmServer) -> None:
     mllm.say(say.status(429, retry_after="7"))
-    hello = [{"role": "user", "content": "hello"}]
-    response = post(app, {"model": NAME, "messages": hello})
+    response = post(app, {"model": NAME, "messages": HELLO})
     assert (response.status_code, response.headers["retry-after"]) == (429, "7")
     assert response.json()["error"]["code"] == "429"
     assert len(mllm.asked) == 1  # no retries
     for message, param in (
-        ({"role": "user", "content": [{"type": "video_url", "video_url": {}}]}, "messages[0].content[0]"),
-        ({"role": "user", "content": [{"type": "image_url", "image_url": {"url": "https://x.org/a.png"}}]},
-         "messages[0].content[0]"),
+        (user({"type": "video_url", "video_url": {}}), "messages[0].content[0]"),
+        (user(image("https://x.org/a.png")), "messages[0].content[0]"),
         ({"role": "narrator", "content": "x"}, "messages[0].role"),
         ("x", "messages[0]"),
-    ):  # fmt: skip
+    ):
         told = problem(post(app, {"model": NAME, "messages": [message]}), 422, "invalid-request")
         assert told["error"]["param"] == param
     assert len(mllm.asked) == 1
 
 
 def test_where_chats_go_on_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from cow_service.readers.mllm.reader import create
+
     monkeypatch.setenv("OPENAI_API_KEY", "of-the-environment")
 
     def upstream(mllm: str, **settings: Any) -> Upstream | None:
@@ -149,24 +138,31 @@ def test_where_chats_go_on_as_they_are(tmp_path: Path, monkeypatch: pytest.Monke
     assert "of-the-environment" not in repr(upstream("openai:gpt-5"))
 
 
-class Refusing(TestModel):
-    """As a model in the process, which takes fewer settings, and no tools."""
-
-    unsupported_settings = frozenset({"frequency_penalty"})
-
-    async def request(self, *_: Any) -> Any:
-        raise UserError("no tools here")
-
-
 def test_what_a_model_in_the_process_does_not_take() -> None:
-    asked = {"messages": [{"role": "user", "content": "hello"}], "frequency_penalty": 1, "temperature": 0}
+    from pydantic_ai.exceptions import UserError
+    from pydantic_ai.models.test import TestModel
+
+    from cow_service.readers.mllm.chat import prepare_chat
+    from cow_service.readers.mllm.client import MllmClient
+    from cow_service.readers.mllm.models import ConfiguredModel, mllm_manifests
+
+    class Refusing(TestModel):
+        """As a model in the process, which takes fewer settings, and no tools."""
+
+        unsupported_settings = frozenset({"frequency_penalty"})
+
+        async def request(self, *_: Any) -> Any:
+            raise UserError("no tools here")
+
+    asked = {"messages": HELLO, "frequency_penalty": 1, "temperature": 0}
     chat = prepare_chat(asked, Refusing())
     assert chat.settings == {"temperature": 0}
-    assert chat.warnings[0].startswith("Not sent: `frequency_penalty`.")
-    manifest = mllm_manifests()["generic"]
-    client = MllmClient(ConfiguredModel(Refusing(), "toy", manifest, load_families()["generic"]), Settings())
-    with pytest.raises(InvalidRequest, match="no tools here"):
+    assert "`frequency_penalty`" in chat.warnings[0]
+    configured = ConfiguredModel(Refusing(), "toy", mllm_manifests()["generic"], load_families()["generic"])
+    client = MllmClient(configured, Settings())
+    with refused("invalid-request") as caught:
         asyncio.run(client.chat(asked))
+    assert "no tools here" in caught.value.detail
     client.close()
 
 

@@ -1,10 +1,11 @@
 """Taking requests: what is refused costs others nothing, no picture is decoded where requests are taken, and no key has
-all the room for bodies and fetches."""
+all the room for bodies and fetches. Connections that say nothing are closed, and lock nobody out."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import resource
 import select
 import socket
 import threading
@@ -15,7 +16,7 @@ from typing import Any
 
 import pytest
 from servers import ASYNC, BODY, QUESTION, Served, data_url, picture, problem
-from waiting import eventually
+from waiting import TIME_LIMIT, eventually
 
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.api.submission import MAX_CONCURRENT_FETCHES
@@ -23,12 +24,17 @@ from cow_service.api.submission import MAX_CONCURRENT_FETCHES
 pytestmark = pytest.mark.slow
 
 KEYS = {name: new_key() for name in ("busy", "quiet")}
-# A decoder that runs where requests are taken ends that process. Images may be fetched from this machine.
-SERVE = """
+FILES = 1024  # that the server may have open
+# A decoder that runs where requests are taken ends that process. Images may be fetched from this machine. The headers
+# of a request must be there after 2 s.
+SERVE = f"""
 import os
+import resource
 from PIL.ImageFile import ImageFile
-from cow_service import net
+from cow_service import net, server
 
+resource.setrlimit(resource.RLIMIT_NOFILE, ({FILES}, {FILES}))
+server.REQUEST_SECONDS = 2.0
 ImageFile.load = lambda self: os._exit(9)
 listed = net.Egress.__post_init__
 
@@ -69,7 +75,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if self.path == "/slow":
             self.server.waiting += 1
-            self.server.released.wait(60)
+            self.server.released.wait(TIME_LIMIT)
         self.send_response(200)
         self.send_header("Content-Length", str(len(self.server.data)))
         self.end_headers()
@@ -150,7 +156,7 @@ def test_no_decoder_runs_where_requests_are_taken(served: Served) -> None:
 
 def sent(served: Served, stack: ExitStack, key: str, body: bytes, size: int) -> socket.socket:
     """A request with a part of its body."""
-    one = stack.enter_context(socket.create_connection(served.host_and_port, timeout=30))
+    one = stack.enter_context(socket.create_connection(served.host_and_port, timeout=TIME_LIMIT))
     head = f"POST /simulate HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {KEYS[key]}\r\nContent-Type: application/json"
     one.sendall(f"{head}\r\nContent-Length: {size}\r\n\r\n".encode() + body)
     return one
@@ -160,11 +166,19 @@ def test_the_bodies_of_one_key_leave_room_for_others(served: Served) -> None:
     unfinished = b"[" + b" " * 900_000
     with ExitStack() as stack:
         held = [sent(served, stack, "busy", unfinished, 950_000) for _ in range(2)]
-        (refused,), _, _ = select.select(held, [], [], 30)
+        (refused,), _, _ = select.select(held, [], [], TIME_LIMIT)
         assert b" 503 " in refused.recv(65536).split(b"\r\n")[0]
         padded = json.dumps(BODY).encode() + b" " * 900_000
-        response = served.http.post("/simulate", content=padded, headers={"Content-Type": "application/json"})
-        assert response.status_code == 200, response.text
+        for key in ("quiet", "quiet"):  # what was read is no longer counted
+            assert submitted(served, key, padded) == 200
+        assert submitted(served, "busy", json.dumps(BODY).encode()) == 200, "a small one fits beside the other"
+    # As soon as the server has seen that the others are gone.
+    eventually(lambda: submitted(served, "busy", padded) == 200)
+
+
+def submitted(served: Served, key: str, body: bytes) -> int:
+    headers = {"Content-Type": "application/json", "Authorization": f"Bearer {KEYS[key]}"}
+    return served.http.post("/simulate", content=body, headers=headers).status_code
 
 
 def test_slow_image_urls_of_one_key_hold_up_no_other(served: Served, site: Site) -> None:
@@ -177,3 +191,45 @@ def test_slow_image_urls_of_one_key_hold_up_no_other(served: Served, site: Site)
         quick = {**BODY, "image": {"url": f"http://{site.host}/quick"}}
         assert served.http.post("/simulate", json=quick).status_code == 200
         assert not select.select(waiting, [], [], 0)[0], "it did not wait for any of them"
+
+
+# --- connections ---
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET /livez HTTP/1.1\r\nHost: x\r\n", b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\nG"]
+)
+def test_a_connection_without_a_whole_request_is_closed(served: Served, sent: bytes) -> None:
+    with socket.create_connection(served.host_and_port, timeout=0.3) as one:
+        one.sendall(sent)
+
+        def is_closed() -> bool:
+            try:
+                return not one.recv(65536)
+            except TimeoutError:
+                if sent:
+                    one.send(b"x")  # slow bytes give no new time
+            except OSError:
+                return True
+            return False
+
+        eventually(is_closed)
+
+
+def test_more_idle_connections_than_files_lock_nobody_out(served: Served) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 2 * FILES + 100)), hard))
+    with ExitStack() as stack:
+        for _ in range(2 * FILES):  # all at once
+            one = stack.enter_context(socket.socket())
+            one.setblocking(False)
+            one.connect_ex(served.host_and_port)
+        for _ in range(40):
+            assert served.http.get("/livez").status_code == 200
+    assert "Too many open files" not in served.log()
+
+
+def test_headers_of_more_than_64_kb_are_refused(served: Served) -> None:
+    with socket.create_connection(served.host_and_port, timeout=TIME_LIMIT) as one:
+        one.sendall(b"GET /livez HTTP/1.1\r\nHost: x\r\n" + b"X: " + b"a" * 70_000)
+        assert b" 400 " in one.recv(65536).split(b"\r\n")[0]

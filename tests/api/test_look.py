@@ -11,7 +11,6 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from conftest import Server
 from servers import IMAGE, QUESTION, SEEING, Served, data_url, problem
 
 BALL, CUBE, FACE = [42, 62, 78, 98], [170, 60, 205, 98], [170, 69, 205, 98]
@@ -69,8 +68,7 @@ def test_an_image_is_named_by_its_digest_until_the_server_forgets_it(served: Ser
     served.stop()
     served.start()
     for place in ({"point": [60, 80]}, {"question": QUESTION}):
-        told = problem(look(served, image, **place), 404, "artifact-not-found")
-        assert "send the image again" in told["detail"]
+        problem(look(served, image, **place), 404, "artifact-not-found")
     problem(look(served, {"artifact": "0" * 64}), 404, "artifact-not-found")
 
 
@@ -82,16 +80,12 @@ def test_a_form(served: Served) -> None:
     assert [each["name"] for each in things(response)] == ["ball", "cube"]
 
 
-@pytest.mark.parametrize("what", [{"point": [240.5, 80]}, {"bbox": [100, 100, 90, 120]}, {"bbox": [-1, 0, 90, 120]}])
-def test_places_outside_the_image_are_refused(served: Served, what: dict[str, Any]) -> None:
-    told = problem(look(served, **what), 422, "invalid-request")
-    assert told["errors"][0]["pointer"] == f"/{next(iter(what))}"
-
-
-def test_two_places_are_refused(served: Served) -> None:
-    problem(look(served, point=[60, 80], question=QUESTION), 422, "invalid-request")
-
-
-def test_a_server_without_a_segmenter_says_so(server: Server) -> None:
-    response = httpx.post(f"{server.address}/look", json={"image": data_url(IMAGE), "point": [60, 80]})
-    assert "COW_PERCEPTION" in problem(response, 503, "perception-unavailable")["detail"]
+def test_places_outside_the_image_and_two_places_are_refused(served: Served) -> None:
+    for what, pointer in (
+        ({"point": [240.5, 80]}, "/point"),
+        ({"bbox": [100, 100, 90, 120]}, "/bbox"),
+        ({"bbox": [-1, 0, 90, 120]}, "/bbox"),
+        ({"point": [60, 80], "question": QUESTION}, ""),
+    ):
+        (error,) = problem(look(served, **what), 422, "invalid-request")["errors"]
+        assert error["pointer"] == pointer

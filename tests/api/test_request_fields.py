@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,19 +12,17 @@ import pytest
 from drawn import Image, ball, block, floor, png_bytes
 from floors import TrueCamera, depth_png
 from pydantic import BaseModel
+from servers import data_url
 
-from cow_service.records import Answer, Simulation
+from cow_service.records import Answer, Estimate, ObjectPrior, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.requests.simulation import PlaceRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
 
 RED, BLUE, GREEN = (200, 30, 30), (40, 60, 200), (40, 160, 60)
 BALL, BLOCK, POST = (40, 105, 66, 131), (150, 95, 185, 131), (220, 75, 240, 115)
 PICTURE = ball(block(block(floor(320, 200), POST, GREEN), BLOCK, BLUE), (53, 118), 13, RED)
-
-
-def data_url(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
 def sent(image: Image) -> str:
@@ -41,7 +38,7 @@ def mask_of(bbox: tuple[int, int, int, int]) -> str:
 
 BASE: dict[str, Any] = {
     "image": sent(PICTURE), "question": "If the red ball rolls to the right, will it hit the blue block?",
-    "num_frames": 9, "ensemble": 6, "frames": {"count": 1}, "video": False,
+    "num_frames": 9, "ensemble": 2, "frames": {"count": 1}, "video": False,
 }  # fmt: skip
 CAMERA = TrueCamera(focal=320, size=(320, 200))
 DEPTH = {"map": data_url(depth_png(CAMERA.depth([BALL, BLOCK, POST]))), "scale": 0.001, "focal": 320}
@@ -125,7 +122,7 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "depth.scale": ({"depth": DEPTH}, 0.001, 0.01),
     "depth.focal": ({"depth": DEPTH}, 320, 400),
     "depth.deviation": ({"depth": DEPTH}, 0.01, 0.1),
-    "ensemble": ({}, 0, 6),
+    "ensemble": ({}, 0, 2),
     "num_frames": ({}, 9, 12),
     "fps": ({}, 16, 24),
     "language": ({}, "en", "ja"),
@@ -196,6 +193,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 def test_every_field_of_a_request_is_tried() -> None:
     assert set(leaves(AnswerRequest)) == CHANGES.keys() | ELSEWHERE
     assert set(leaves(SimulateRequest)) < set(leaves(AnswerRequest))
+
+
+def test_what_a_request_says_of_an_object_is_exact() -> None:
+    assert PlaceRequest(bbox=BALL).prior is None
+    told = PlaceRequest(bbox=BALL, size=0.2, stands_on="air").prior
+    assert told == ObjectPrior(shape=None, size=Estimate(value=0.2, deviation=0), stands_on="air")
 
 
 @pytest.mark.parametrize("path", CHANGES)

@@ -6,26 +6,18 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
-from engines import app_for
-from fastapi.testclient import TestClient
 from servers import BODY
 from typer.testing import CliRunner
 
 from cow_service.cli.main import app as cli
 from cow_service.records import Answer, Simulation
-from cow_service.service import Service
-from cow_service.settings import Settings
 
+pytestmark = pytest.mark.slow
 MINIMAL = {"Prefer": "return=minimal"}
 LISTS = {"states", "scale", "rotation", "turns", "band", "futures", "tracks", "tracks_visible"}
 REMOVES = "If the blue cube is removed and the red ball moves to the right, will it leave the image? (A) Yes (B) No"
-
-
-@pytest.fixture(scope="module")
-def http(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    with Service(Settings(data_dir=tmp_path_factory.mktemp("data"))) as service, TestClient(app_for(service)) as client:
-        yield client
 
 
 def without_lists(trajectory: dict[str, Any]) -> dict[str, Any]:
@@ -36,7 +28,7 @@ def without_lists(trajectory: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("question", [BODY["question"], REMOVES])
-def test_the_lists_alone_are_left_out_and_the_job_keeps_them(http: TestClient, question: str) -> None:
+def test_the_lists_alone_are_left_out_and_the_job_keeps_them(http: httpx.Client, question: str) -> None:
     removed = {"interventions": [{"kind": "remove", "object": "blue cube"}]} if question == REMOVES else {}
     cube = {"object": "blue cube", "bbox": [170, 60, 205, 98]}
     body = BODY | {"question": question, "num_frames": 81, "objects": [cube]} | removed
@@ -55,7 +47,7 @@ def test_the_lists_alone_are_left_out_and_the_job_keeps_them(http: TestClient, q
     assert lean.json() == kept.json() | {"result": told}
 
 
-def test_answers_with_a_simulation_and_without_one(http: TestClient) -> None:
+def test_answers_with_a_simulation_and_without_one(http: httpx.Client) -> None:
     for imagine in ("always", "never"):
         body = BODY | {"imagine": imagine}
         told = http.post("/answer", json=body, headers=MINIMAL).json()
@@ -68,17 +60,21 @@ def test_answers_with_a_simulation_and_without_one(http: TestClient) -> None:
         assert "preference-applied" not in http.post("/answer", json=body).headers
 
 
-def test_a_job_without_a_result_and_a_preference_that_is_none(http: TestClient) -> None:
+def test_a_job_without_a_result_and_a_preference_that_is_none(http: httpx.Client) -> None:
     failed = http.post("/simulate", json=BODY | {"grounding": {"point": [5, 5]}}, headers=MINIMAL)
     assert failed.status_code == 422
-    job = next(one for one in http.get("/jobs").json()["jobs"] if one["status"] == "failed")
+    job = http.get("/jobs", params={"status": "failed"}).json()["jobs"][0]
     assert http.get(f"/jobs/{job['id']}", headers=MINIMAL).json()["problem"]["status"] == 422
     assert "trajectory" in http.post("/simulate", json=BODY, headers={"Prefer": "return=representation"}).json()
 
 
-def test_tracks_of_a_minimal_result_are_refused(http: TestClient, tmp_path: Path) -> None:
+def test_tracks_of_a_minimal_result_are_refused(http: httpx.Client, tmp_path: Path) -> None:
     file = tmp_path / "simulation.json"
     file.write_text(http.post("/simulate", json=BODY, headers=MINIMAL).text)
     found = CliRunner().invoke(cli, ["tracks", str(file), "--out", str(tmp_path / "tracks.npz")])
     assert found.exit_code == 1
-    assert "minimal result" in found.output
+    assert "invalid-request: " in found.stderr
+    file.write_text("{}")
+    found = CliRunner().invoke(cli, ["tracks", str(file), "--out", str(tmp_path / "tracks.npz")])
+    assert found.exit_code == 1
+    assert "simulation.json is not a simulation" in found.stderr

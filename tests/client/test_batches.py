@@ -1,4 +1,4 @@
-"""Batches: questions by id, a folder that survives kills, outcomes of both clients, and `cow batch` itself."""
+"""Batches: questions by id, a folder that survives kills, and what comes of each question, by both clients."""
 
 from __future__ import annotations
 
@@ -6,10 +6,6 @@ import asyncio
 import errno
 import json
 import os
-import random
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,37 +16,27 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from conftest import SCALE, Server
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
+from sdk import JOB, SIMULATION, Connect, address, client, connect, hurried, served, told
 from servers import BODY, IMAGE, QUESTION, Served
-from typer.testing import CliRunner
 from waiting import eventually
 
-from cow_service.cli.main import app
 from cow_service.client import AsyncClient, Client, errors
 from cow_service.client.batches import OutageTimer, Question, questions
 from cow_service.client.journal import Journal
-from cow_service.client.progress import BatchProgress, describe_load
+from cow_service.client.progress import BatchProgress, describe_load, progress_shown
 from cow_service.records import ProcessInfo, QueueInfo, WorkerInfo, WorkerLoad, Workers
 
-pytestmark = pytest.mark.slow
+__all__ = ["address", "client", "connect", "hurried", "served"]  # fixtures
 
-COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
 
 
 def asked(count: int, **others: Any) -> list[dict[str, Any]]:
     """Questions that differ in their seeds, which take milliseconds each."""
     return [{"id": f"q{n}", "image": IMAGE, "question": QUESTION, **GIVEN, "seed": n, **others} for n in range(count)]
-
-
-def written(folder: Path, items: list[dict[str, Any]]) -> Path:
-    """A file of questions, and the picture that they name in the same folder."""
-    (folder / "ball.png").write_bytes(IMAGE)
-    path = folder / "questions.jsonl"
-    path.write_text("".join(json.dumps({**item, "image": "ball.png"}) + "\n" for item in items))
-    return path
 
 
 def lines_of(out: Path) -> list[dict[str, Any]]:
@@ -92,18 +78,32 @@ def test_what_decides_is_in_the_fingerprint() -> None:
 
 
 @pytest.mark.parametrize(
-    ("items", "says"),
+    ("items", "pointer"),
     [
-        ([{"question": "?"}], "Question 1: `image`"),
-        ([{"image": "a.png"}], "Question 1: `question`"),
-        ([{"image": "a.png", "question": 5}], "must be a text, got int"),
-        ([{"id": "", "image": "a.png", "question": "?"}], "0 characters"),
-        ([{"id": "x", "image": "a.png", "question": "?"}] * 2, "Question 2: `id` 'x' stands before"),
+        ([{"question": "?"}], "/0/image"),
+        ([{"image": "a.png"}], "/0/question"),
+        ([{"image": "a.png", "question": 5}], "/0/question"),
+        ([{"id": "", "image": "a.png", "question": "?"}], "/0/id"),
+        ([{"id": "x" * 201, "image": "a.png", "question": "?"}], "/0/id"),
+        ([{"id": "x" * 200, "image": "a.png", "question": "?"}] * 2, "/1/id"),
+        # What cannot be written down is refused before it is asked.
+        ([{"image": "a.png", "question": "?", "id": "\ud800"}], "/0/id"),
+        ([{"image": "a.png", "question": "\ud800"}], "/0/question"),
+        ([{"image": "a.png", "question": "?", "meta": object()}], "/0/meta"),
+        ([{"image": "a.png", "question": "?", "law": "contact", "motion": {"law": "ballistic"}}], "/motion/law"),
     ],
 )
-def test_questions_that_are_none(items: list[Any], says: str) -> None:
-    with pytest.raises(errors.InvalidRequest, match=says):
+def test_questions_that_are_none(items: list[Any], pointer: str) -> None:
+    with refused("invalid-request", pointer):
         list(questions(items))
+
+
+def test_no_question_is_something_else_and_defaults_are_of_the_request_alone() -> None:
+    nothing: list[Any] = ["a.png"]
+    with refused("invalid-request"):
+        list(questions(nothing))
+    with refused("invalid-request"):
+        list(questions([], {"image": "a.png", "question": "?"}))
 
 
 @given(st.text(min_size=1, max_size=200))
@@ -120,6 +120,8 @@ def test_questions_are_taken_as_they_are_and_completed() -> None:
     assert asked.fingerprint != own.fingerprint
     assert own.fingerprint != Question("scene/1", "a.png", "!", {"votes": 3}).fingerprint
     assert asked.folder not in ("", Question("scene:1", "a.png", "?").folder)
+    (asked,) = questions([("a.png", "?")], {"law": "contact", "motion": {"kind": "fall"}})
+    assert asked.options == {"motion": {"kind": "fall", "law": "contact"}}
 
 
 def test_a_question_is_the_same_from_wherever_its_file_is_looked_at(tmp_path: Path) -> None:
@@ -127,20 +129,6 @@ def test_a_question_is_the_same_from_wherever_its_file_is_looked_at(tmp_path: Pa
     here, there = (next(questions([item], None, folder)) for folder in (tmp_path, Path("elsewhere")))
     assert here.image != there.image
     assert (here.id, here.fingerprint) == (there.id, there.fingerprint)
-
-
-@pytest.mark.parametrize(
-    ("item", "name"),
-    [({"id": "\ud800"}, "id"), ({"question": "\ud800"}, "question"), ({"meta": object()}, "meta")],
-)
-def test_what_cannot_be_written_down_is_refused_before_it_is_asked(item: dict[str, Any], name: str) -> None:
-    with pytest.raises(errors.InvalidRequest, match=f"Question 1: `{name}` cannot be written"):
-        list(questions([{"image": "a.png", "question": "?", **item}]))
-
-
-def test_defaults_are_of_the_request_alone() -> None:
-    with pytest.raises(errors.InvalidRequest, match="`image` and `question`"):
-        list(questions([], {"image": "a.png", "question": "?"}))
 
 
 # The folder
@@ -177,25 +165,18 @@ def test_keys_differ_by_batch_question_and_body(tmp_path: Path) -> None:
         assert len(keys | {a.key(a_question(), b"y"), a.key(a_question(), b"x", fresh=True)}) == 5
 
 
-def test_what_goes_with_a_question_may_be_numpys(tmp_path: Path) -> None:
-    (question,) = questions([{"image": "a.png", "question": "?", "meta": {"truth": np.int64(3)}}])
-    with closing(Journal(tmp_path, "answer")) as journal:
-        journal.append(question, line())
-    assert lines_of(tmp_path)[0]["meta"] == {"truth": 3}
-
-
-def test_a_folder_may_be_let_go_in_another_thread(tmp_path: Path) -> None:
+def test_a_line_is_what_came_and_a_folder_may_be_let_go_in_another_thread(tmp_path: Path) -> None:
+    (question,) = questions([{"id": "q", "image": "a.png", "question": "?", "meta": {"truth": np.int64(3)}}])
     journal = Journal(tmp_path, "answer")
-    closing = threading.Thread(target=journal.close)
-    closing.start()
-    closing.join()
+    journal.append(question, line())
+    (kept,) = lines_of(tmp_path)
+    assert kept == {"id": "q", **line(), "meta": {"truth": 3}, "attempt": 0, "fingerprint": question.fingerprint}
+    thread = threading.Thread(target=journal.close)
+    thread.start()
+    thread.join()
+    journal.append(question, line())  # the batch has ended
+    assert lines_of(tmp_path) == [kept]
     Journal(tmp_path, "answer").close()
-
-
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "batch.json").write_text("{}")
-    with pytest.raises(errors.InvalidRequest, match="not that of a batch"):
-        Journal(tmp_path, "answer")
 
 
 def test_a_failure_is_asked_again_under_another_key_and_only_when_told(tmp_path: Path) -> None:
@@ -239,35 +220,39 @@ def test_a_full_disk_leaves_whole_lines(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_folder_is_for_one_batch_at_a_time_and_of_one_kind(tmp_path: Path) -> None:
     with closing(Journal(tmp_path, "answer")) as journal:
         journal.append(a_question(), line())
-        with pytest.raises(errors.InvalidRequest, match="in use"):
+        with refused("invalid-request"):  # in use
             Journal(tmp_path, "answer")
-        with pytest.raises(errors.InvalidRequest, match="another question with the id 'q'"):
+        with refused("invalid-request"):
             journal.has(a_question(question="other"))
-    with pytest.raises(errors.InvalidRequest, match="of kind 'answer'"):
+    with refused("invalid-request"):
         Journal(tmp_path, "simulate")
     (tmp_path / "results.jsonl").write_bytes(b"{}x\n")
-    with pytest.raises(errors.InvalidRequest, match="damaged in line 1"):
+    with refused("invalid-request"):
         Journal(tmp_path, "answer")
     (tmp_path / "results.jsonl").unlink()
     Journal(tmp_path, "answer").close()
+    (tmp_path / "batch.json").write_text("{}")
+    with refused("invalid-request"):
+        Journal(tmp_path, "answer")
 
 
 # Both clients
 
 
-def test_outcomes_of_both_clients_are_the_same(server: Server) -> None:
+@pytest.mark.slow
+def test_outcomes_of_both_clients_are_the_same(address: str) -> None:
     items = [*asked(4), {**asked(5)[4], "question": "hello", "grounding": None, "imagine": "always"}]
     items.append({"id": "missing", "image": "/nowhere/image.png", "question": QUESTION})
     items.append({"id": "none", "image": b"no image", "question": QUESTION})
 
     def plain(outcome: Any) -> Any:
-        return outcome.id, outcome.result and outcome.result.answer, outcome.error and (outcome.error.code)
+        return outcome.id, outcome.result and outcome.result.answer, outcome.error and outcome.error.code
 
-    with Client(server.address) as client:
+    with Client(address) as client:
         came = {plain(outcome) for outcome in client.map(items, concurrency=3)}
 
     async def others() -> set[Any]:
-        async with AsyncClient(server.address) as client:
+        async with AsyncClient(address) as client:
             return {plain(outcome) async for outcome in client.map(items, concurrency=3)}
 
     assert asyncio.run(others()) == came
@@ -275,70 +260,96 @@ def test_outcomes_of_both_clients_are_the_same(server: Server) -> None:
     assert {error for _, _, error in came if error} == {"image-unreadable", "image-type-unsupported"}
 
 
-def test_a_second_call_finds_everything(server: Server, http: httpx.Client, tmp_path: Path) -> None:
-    items = asked(6, meta={"truth": "Yes"})
+@pytest.mark.slow
+def test_a_second_call_finds_everything(served: Served, client: Client, tmp_path: Path) -> None:
+    items = [*asked(6, meta={"truth": "Yes"}), {"id": "gone", "image": "/nowhere.png", "question": QUESTION}]
     out = tmp_path / "out"
-    with Client(server.address) as client:
-        first = {
-            o.id: o.result.model_dump() for o in client.map(items, out=out, kind="simulate", save=True) if o.result
-        }
-        before = job_count(http)
-        again = {o.id: o.result.model_dump() for o in client.map(items, out=out, kind="simulate") if o.result}
-        assert list(client.map(items, out=out, kind="simulate", only_new=True)) == []
-        assert job_count(http) == before
-    assert again == first
-    assert len(first) == 6
-    assert {entry["meta"]["truth"] for entry in lines_of(out)} == {"Yes"}
+    first = {o.id: o for o in client.map(items, out=out, kind="simulate", save=True)}
+    before = job_count(served.http)
+    again = {o.id: o for o in client.map(items, out=out, kind="simulate")}
+    assert list(client.map(items, out=out, kind="simulate", only_new=True)) == []
+    assert job_count(served.http) == before
+    assert [again[f"q{n}"].result.model_dump() for n in range(6)] == [
+        first[f"q{n}"].result.model_dump() for n in range(6)
+    ]
+    assert again["gone"].error.code == first["gone"].error.code == "image-unreadable"
+    lines = {entry["id"]: entry for entry in lines_of(out)}
+    assert lines.keys() == first.keys()
+    assert (lines["q0"]["meta"], lines["q0"]["folder"]) == ({"truth": "Yes"}, "items/q0")
+    assert "folder" not in lines["gone"]
     assert sorted(path.name for path in (out / "items").iterdir()) == [f"q{n}" for n in range(6)]
     assert (out / "items" / "q0" / "overlay.jpg").read_bytes().startswith(b"\xff\xd8")
 
 
-@pytest.mark.soak
 @pytest.mark.slow
-def test_an_async_batch_that_is_canceled_leaves_its_jobs_to_the_next(tmp_path: Path) -> None:
-    items = asked(4, generator="slow", generator_options={"seconds": 2.0}, num_frames=80)
-    with Served(tmp_path) as served:
-        address = str(served.http.base_url)
+def test_a_batch_that_is_left_ends_its_jobs_unless_its_folder_finds_them_again(
+    served: Served, address: str, tmp_path: Path
+) -> None:
+    slow = {"generator": "slow", "generator_options": {"seconds": 60.0}, "num_frames": 80, "frames": {"count": 40}}
+    gone = {"image": "/nowhere.png", "question": QUESTION}  # fails here, and at once
+    items = [gone, *asked(2, **slow)]
 
-        async def canceled() -> None:
-            async with AsyncClient(address) as client:
-                async with asyncio.timeout(1.5):
-                    async for _ in client.map(items, kind="simulate", out=tmp_path / "out"):
-                        pass
+    def newest() -> set[str]:
+        return {job["status"] for job in served.http.get("/jobs").json()["jobs"][:2]}
 
-        with pytest.raises(TimeoutError):
-            asyncio.run(canceled())
-        with Client(address) as client:
-            assert all(o.succeeded for o in client.map(items, kind="simulate", out=tmp_path / "out"))
-        assert sorted(served.clips()) == [0, 1, 2, 3], "a job was begun twice"
-        assert job_count(served.http) == 4
+    def begun() -> bool:
+        return newest() <= {"queued", "running"}
+
+    with Client(address, timeout=4) as client:
+        outcomes = client.map(items, kind="simulate")
+        next(outcomes)
+        eventually(begun)
+        outcomes.close()  # as `break` and the end of the function do
+        eventually(lambda: newest() == {"canceled"})
+
+    async def left(**how: Any) -> None:
+        async with AsyncClient(address) as client, aclosing(client.map(items, kind="simulate", **how)) as outcomes:
+            async for _ in outcomes:
+                await asyncio.to_thread(eventually, begun)
+                break
+
+    asyncio.run(left())
+    eventually(lambda: newest() == {"canceled"})
+    for _ in range(2):
+        asyncio.run(left(out=tmp_path))
+        assert begun()
+        count = job_count(served.http)
+    asyncio.run(left(out=tmp_path))
+    assert job_count(served.http) == count, "it found its own jobs"
+    for job in served.http.get("/jobs").json()["jobs"][:2]:
+        served.http.post(f"/jobs/{job['id']}/cancel").raise_for_status()
 
 
-def test_arguments_that_do_not_fit(tmp_path: Path) -> None:
+def test_arguments_that_do_not_fit() -> None:
     with Client("http://127.0.0.1:1") as client:
         for wrong in ({"concurrency": 0}, {"save": True}, {"retry_failed": True}):
             with pytest.raises(ValueError, match=next(iter(wrong))):
                 list(client.map([], **wrong))
 
 
-def test_what_all_questions_would_meet_ends_the_batch(server: Server, tmp_path: Path) -> None:
-    with Client(server.address + "/elsewhere") as client, pytest.raises(errors.NotFound):
-        list(client.map(asked(3), out=tmp_path))
+# A server that is scripted
+
+
+def answering(answer: Callable[[httpx.Request], httpx.Response]) -> httpx.Client:
+    return httpx.Client(transport=httpx.MockTransport(answer))
+
+
+def refusal(code: str, status: int) -> httpx.Response:
+    reply = told(code, status)
+    return httpx.Response(status, json=reply.body, headers=reply.headers | {"retry-after": "0"})
+
+
+def test_what_all_questions_would_meet_ends_the_batch(connect: Connect, tmp_path: Path) -> None:
+    with answering(lambda _: refusal("not-found", 404)) as http, refused("not-found"):
+        list(connect("http://x", http_client=http).map(asked(3), out=tmp_path))
     assert lines_of(tmp_path) == [], "no question failed: the batch did"
-
-
-@pytest.mark.parametrize(
-    "kind", [errors.QueueFull, errors.ShuttingDown, errors.StorageUnavailable, errors.RateLimited, errors.BodyTooSlow]
-)
-def test_what_passes_is_no_failure_of_a_question(kind: type[errors.CowError]) -> None:
-    assert OutageTimer(60).pause_after(kind("not now")) is not None
 
 
 class Crowded:
     """A server that answers a limited number of requests at once, and refuses others as a full queue does."""
 
-    def __init__(self, accepts: int, answer: dict[str, Any]) -> None:
-        self.accepts, self.answer = accepts, answer
+    def __init__(self, accepts: int) -> None:
+        self.accepts = accepts
         self.at_once = self.most_at_once = self.refused = 0
         self._lock = threading.Lock()
 
@@ -351,13 +362,11 @@ class Crowded:
             return accepted
 
     def end(self, accepted: bool) -> httpx.Response:
-        if accepted:
-            with self._lock:
-                self.at_once -= 1
-            return httpx.Response(200, json=self.answer)
-        problem = {"type": "urn:cow:problem:queue-full", "title": "", "status": 503, "detail": "full"}
-        headers = {"content-type": "application/problem+json", "retry-after": "0"}
-        return httpx.Response(503, json=problem, headers=headers)
+        if not accepted:
+            return refusal("queue-full", 503)
+        with self._lock:
+            self.at_once -= 1
+        return httpx.Response(200, json=SIMULATION)
 
     def blocking(self, request: httpx.Request) -> httpx.Response:
         if accepted := self.begin():
@@ -371,335 +380,170 @@ class Crowded:
 
 
 @pytest.mark.parametrize("blocking", [True, False])
-def test_as_many_questions_are_asked_at_once_as_the_server_takes(server: Server, blocking: bool) -> None:
-    with Client(server.address) as client:
-        (first,) = client.map(asked(1))
-    crowded, many = Crowded(20, first.result.model_dump(mode="json")), 400
+def test_as_many_questions_are_asked_at_once_as_the_server_takes(connect: Connect, blocking: bool) -> None:
+    crowded, many = Crowded(20), 200
+    items = asked(many)
 
     async def awaited() -> int:
         transport = httpx.MockTransport(crowded.awaited)
         async with httpx.AsyncClient(transport=transport) as http, AsyncClient("http://x", http_client=http) as client:
-            return sum([outcome.succeeded async for outcome in client.map(asked(many))])
+            return sum([outcome.succeeded async for outcome in client.map(items, kind="simulate")])
 
     if blocking:
-        http = httpx.Client(transport=httpx.MockTransport(crowded.blocking))
-        with http, Client("http://x", http_client=http) as client:
-            assert sum(outcome.succeeded for outcome in client.map(asked(many))) == many
+        with answering(crowded.blocking) as http:
+            outcomes = connect("http://x", http_client=http).map(items, kind="simulate")
+            assert sum(outcome.succeeded for outcome in outcomes) == many
     else:
         assert asyncio.run(awaited()) == many
-    assert crowded.most_at_once > 12
-    assert crowded.refused < 0.1 * many  # replies this quick leave little time to hear of a refusal
+    assert crowded.most_at_once > 8, "it begins with so many, and tries more"
+    assert crowded.refused < many / 4
 
 
 def test_what_limits_a_batch_is_shown(
-    server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    connect: Connect, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("cow_service.client.progress.LOOK_SECONDS", 0.0)
     monkeypatch.setattr("cow_service.client.progress.LINE_SECONDS", 0.0)
-    told = httpx.get(server.address + "/workers").json()
-    worker = {"name": "w", "queue": None, "memory_mb": 1, "jobs_done": 0}
-    worker["load"] = {"cpu_waiting": 2, "mllm_calls": 5, "mllm_limit": 6, "mllm_waiting": 3}
-    process = {"executor_id": "x", "seen_at": "", "role": "all", "version": "1", "workflow_version": "1"}
-    told["processes"] = [process | {"workers": [worker]}]
+    workers = load(mllm_calls=5, mllm_limit=6, mllm_waiting=3).model_dump()
 
-    def between(request: httpx.Request) -> httpx.Response:
-        if request.url.path == "/workers":
-            return httpx.Response(200, json=told)
-        return httpx.request(request.method, str(request.url), headers=request.headers, content=request.read())
+    def answer(request: httpx.Request) -> httpx.Response:
+        return httpx.Response(200, json=workers if request.url.path == "/workers" else SIMULATION)
 
-    http = httpx.Client(transport=httpx.MockTransport(between))
-    with http, Client(server.address, http_client=http) as client:
-        list(client.map(asked(2), progress=True))
+    with answering(answer) as http:
+        list(connect("http://x", http_client=http).map(asked(2), kind="simulate", progress=True))
     assert "; limited by the server's MLLM: 8 calls wait for it, of 6 at once" in capsys.readouterr().err
 
 
+def load(queued: int = 0, **load: int) -> Workers:
+    queue = QueueInfo(name="light", queued=queued, running=0, capacity=1, jobs_per_minute=0)
+    none = {"cpu_waiting": 0, "mllm_calls": 0, "mllm_limit": 0, "mllm_waiting": 0}
+    worker = WorkerInfo(name="w", queue=None, memory_mb=1, jobs_done=0, load=WorkerLoad(**none | load))
+    about = {"executor_id": "x", "seen_at": "", "role": "all", "version": "1", "workflow_version": "1"}
+    return Workers(processes=(ProcessInfo(**about, workers=(worker,)),), queues=(queue,))
+
+
 def test_what_most_jobs_wait_for() -> None:
-    def limit(queued: int = 0, **load: int) -> str:
-        queue = QueueInfo(name="light", queued=queued, running=0, capacity=1, jobs_per_minute=0)
-        none = {"cpu_waiting": 0, "mllm_calls": 0, "mllm_limit": 0, "mllm_waiting": 0}
-        worker = WorkerInfo(name="w", queue=None, memory_mb=1, jobs_done=0, load=WorkerLoad(**none | load))
-        process = ProcessInfo(
-            executor_id="x", seen_at="", role="all", version="1", workflow_version="1", workers=(worker,)
-        )
-        return describe_load(Workers(processes=(process,), queues=(queue,)))
-
-    assert limit() == ""
-    assert limit(queued=3) == "limited by the server: 3 jobs are queued"
-    assert limit(queued=3, cpu_waiting=4, mllm_calls=3) == "limited by the server's CPU: 4 jobs wait for it"
-    assert "MLLM: 9 calls" in limit(cpu_waiting=4, mllm_calls=8, mllm_limit=8, mllm_waiting=1)
+    assert describe_load(load()) == ""
+    assert describe_load(load(queued=3)) == "limited by the server: 3 jobs are queued"
+    cpu = load(queued=3, cpu_waiting=4, mllm_calls=3)
+    assert describe_load(cpu) == "limited by the server's CPU: 4 jobs wait for it"
+    assert "MLLM: 9 calls" in describe_load(load(cpu_waiting=9, mllm_calls=8, mllm_limit=8, mllm_waiting=1))
 
 
-def scripted(*, cancel: int = 200) -> Callable[[httpx.Request], httpx.Response]:
+def running(cancel: int = 200) -> Callable[[httpx.Request], httpx.Response]:
     """A server on which every job runs for ever."""
-    job = {"id": "j", "kind": "simulate", "status": "running", "progress": 0, "created_at": "now", "generator": "x"}
 
     def answer(request: httpx.Request) -> httpx.Response:
         if request.url.path.endswith("/cancel") and cancel != 200:
-            problem = {"type": "urn:cow:problem:job-not-found", "title": "", "status": 404, "detail": "gone"}
-            return httpx.Response(cancel, json=problem, headers={"content-type": "application/problem+json"})
-        return httpx.Response(202 if request.method == "POST" else 200, json=job)
+            return refusal("job-not-found", cancel)
+        return httpx.Response(202 if request.method == "POST" else 200, json=JOB)
 
     return answer
 
 
 @pytest.mark.parametrize("cancel", [200, 404])
-def test_a_question_that_takes_too_long_fails_alone(tmp_path: Path, cancel: int) -> None:
+def test_a_question_that_takes_too_long_fails_alone(hurried: Connect, tmp_path: Path, cancel: int) -> None:
     def plain(outcome: Any) -> Any:
         return outcome.id, outcome.error.code, outcome.error.job_id
 
-    http = httpx.Client(transport=httpx.MockTransport(scripted(cancel=cancel)))
-    with http, Client("http://x", http_client=http) as client:
-        came = [plain(o) for o in client.map(asked(2), kind="simulate", timeout=0.2, out=tmp_path / "a")]
-        again = [plain(o) for o in client.map(asked(2), kind="simulate", timeout=0.2, out=tmp_path / "a")]
-
-    async def others() -> list[Any]:
-        transport = httpx.MockTransport(scripted(cancel=cancel))
-        async with httpx.AsyncClient(transport=transport) as http, AsyncClient("http://x", http_client=http) as client:
-            return [plain(o) async for o in client.map(asked(2), kind="simulate", timeout=0.2)]
-
-    assert sorted(came) == sorted(again) == sorted(asyncio.run(others()))
-    assert sorted(came) == [("q0", "wait-timeout", "j"), ("q1", "wait-timeout", "j")]
+    with answering(running(cancel)) as http:
+        client = hurried("http://x", http_client=http)
+        came = [plain(o) for o in client.map(asked(2), kind="simulate", timeout=0.2, out=tmp_path)]
+        again = [plain(o) for o in client.map(asked(2), kind="simulate", timeout=0.2, out=tmp_path)]
+    assert sorted(came) == sorted(again) == [("q0", "wait-timeout", "j-1"), ("q1", "wait-timeout", "j-1")]
 
 
-def test_looks_at_jobs_are_words_of_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_looks_at_jobs_are_words_of_the_server(hurried: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[int] = []
     monkeypatch.setattr(OutageTimer, "reset", lambda _: heard.append(1))
-    http = httpx.Client(transport=httpx.MockTransport(scripted()))
-    with http, Client("http://x", http_client=http) as client:
-        list(client.map(asked(1), kind="simulate", timeout=0.5))
-    assert len(heard) > 2, "only the end of the question was heard"
+    with answering(running()) as http:
+        list(hurried("http://x", http_client=http).map(asked(1), kind="simulate", timeout=0.5))
+    assert len(heard) > 4, "only the end of the question was heard"
 
 
-@pytest.mark.soak
-@pytest.mark.slow
-def test_a_batch_without_a_folder_that_is_left_ends_its_jobs(tmp_path: Path) -> None:
-    quick = {**asked(1)[0], "id": "quick", "seed": 99}
-    items = [quick, *asked(3, generator="slow", generator_options={"seconds": 20.0}, num_frames=80)]
-    with Served(tmp_path) as served:
-        address = str(served.http.base_url)
+def test_pictures_that_cannot_be_saved_lose_no_answer(connect: Connect, tmp_path: Path) -> None:
+    def answer(request: httpx.Request) -> httpx.Response:
+        is_picture = "/artifacts/" in request.url.path
+        return httpx.Response(200, content=b"damaged") if is_picture else httpx.Response(200, json=SIMULATION)
 
-        def ended() -> bool:
-            jobs = served.http.get("/jobs").json()["jobs"]
-            return len(jobs) >= 2 and all(job["status"] in ("succeeded", "canceled") for job in jobs)
-
-        with Client(address, timeout=4) as client:
-            outcomes = client.map(items, kind="simulate", concurrency=4)
-            next(outcomes)
-            outcomes.close()  # as `break` and the end of the function do
-            eventually(ended)
-
-        async def left() -> None:
-            async with (
-                AsyncClient(address, timeout=4) as client,
-                aclosing(client.map(items, kind="simulate", concurrency=4, fresh=True)) as outcomes,
-            ):
-                async for _ in outcomes:
-                    break
-
-        asyncio.run(left())
-        eventually(ended)
-
-
-def test_pictures_that_cannot_be_saved_lose_no_answer(tmp_path: Path, server: Server) -> None:
-    def broken(request: httpx.Request) -> httpx.Response:
-        if "/artifacts/" in request.url.path:
-            return httpx.Response(200, content=b"damaged")
-        return http.send(
-            http.build_request(request.method, request.url, headers=request.headers, content=request.read())
-        )
-
-    between = httpx.Client(transport=httpx.MockTransport(broken))
-    with httpx.Client() as http, between, Client(server.address, http_client=between) as client:
-        (outcome,) = client.map(asked(1), kind="simulate", out=tmp_path, save=True)
+    with answering(answer) as http:
+        batch = connect("http://x", http_client=http).map(asked(1), kind="simulate", out=tmp_path, save=True)
+        (outcome,) = batch
     assert outcome.succeeded
     assert outcome.unsaved.code == "bad-response"
     (kept,) = lines_of(tmp_path)
-    assert kept["status"] == "succeeded"
-    assert "damaged" in kept["unsaved"]
+    assert (kept["status"], kept["unsaved"]) == ("succeeded", outcome.unsaved.detail)
 
 
-def test_the_callers_iterator_is_used_where_it_lives(server: Server) -> None:
+def test_the_callers_iterator_is_used_where_it_lives(connect: Connect) -> None:
     def items() -> Iterator[dict[str, Any]]:
         for item in asked(12):
             assert threading.current_thread() is threading.main_thread()
             yield item
 
-    with Client(server.address) as client:
-        assert sum(o.succeeded for o in client.map(items(), kind="simulate", concurrency=2)) == 12
+    with answering(lambda _: httpx.Response(200, json=SIMULATION)) as http:
+        outcomes = connect("http://x", http_client=http).map(items(), kind="simulate", concurrency=2)
+        assert sum(o.succeeded for o in outcomes) == 12
 
 
-def test_patience_with_a_server_that_takes_nothing() -> None:
-    assert OutageTimer(60).pause_after(errors.CannotGround("no")) is None
-    with pytest.raises(errors.QueueFull):
-        OutageTimer(-1).pause_after(errors.QueueFull("full"))
+# Patience and progress
+
+
+def test_patience_with_a_server_that_takes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
     told: list[str | None] = []
-    timer = OutageTimer(60, lambda error: told.append(error and error.code))
-    with pytest.raises(errors.ServerUnreachable):
-        timer.pause_after(errors.ServerUnreachable("there never was one"))
-    timer.reset()
-    assert timer.pause_after(errors.ServerUnreachable("it is away for a moment")) is not None
+    timer = OutageTimer(on_change=lambda error: told.append(error and error.code))
+    assert timer.pause_after(errors.CannotGround("no")) is None
+    with refused("server-unreachable"):
+        OutageTimer().pause_after(errors.ServerUnreachable("there never was one"))
+    for kind in (errors.QueueFull, errors.ShuttingDown, errors.StorageUnavailable, errors.RateLimited):
+        assert OutageTimer().pause_after(kind("not now")) == 2.0
+    assert timer.pause_after(errors.ServerUnreachable("it is away for a moment")) == 2.0
     assert told == [None, "server-unreachable"]
-    with pytest.raises(errors.Unauthorized):
-        OutageTimer(60).pause_after(errors.Unauthorized("no key"))
+    for status, passes in ((299, None), (300, False), (499, False), (500, True)):
+        proxy = errors.BadResponse("a page")
+        proxy.status = status
+        if passes is False:
+            with refused("bad-response"):
+                timer.pause_after(proxy)
+        else:
+            assert timer.pause_after(proxy) == (2.0 if passes else None)
+    with refused("unauthorized"):
+        timer.pause_after(errors.Unauthorized("no key"))
+    now += 300
+    assert timer.pause_after(errors.QueueFull("full")) == 2.0
+    now += 1
+    with refused("queue-full"):
+        timer.pause_after(errors.QueueFull("full for too long"))
 
 
-def test_progress_in_words() -> None:
-    progress = BatchProgress(100, began=time.monotonic() - 10)
+def test_progress_in_words(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    now = 1010.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    progress = BatchProgress(100, began=now - 10, looked_at=now)
     for _ in range(50):
         progress.count(True, earlier=True)
     for _ in range(20):
         progress.count(True)
     progress.count(False)
     assert str(progress) == "71/100 done, 1 failed, 126/min, 0:00:14 left"
-
-
-# The command
-
-
-def run(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    own = {name: value for name, value in os.environ.items() if not name.startswith("COW_")} | environment
-    return subprocess.run([*COMMAND, *map(str, arguments)], env=own, capture_output=True, text=True, check=False)
-
-
-def test_the_command_tells_by_its_exit_code(server: Server, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    path = written(tmp_path, asked(5))
-    result = run(path, "-o", out, COW_BASE_URL=server.address)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout == f"5 succeeded, 0 failed: {out / 'results.jsonl'}\n"
-    assert len(lines_of(out)) == 5
-
-    wrong = {"id": "red", "image": "ball.png", "question": "hello", "video": False, "num_frames": 5}
-    path.write_text(
-        path.read_text() + json.dumps(wrong) + "\n" + json.dumps({**wrong, "id": "gone", "image": "no.png"})
-    )
-    for _ in range(2):
-        result = run(path, "-o", out, "--url", server.address, "--kind", "answer")
-        assert result.returncode == 3
-        assert "image-unreadable 1" in result.stderr
-        assert "gone: image-unreadable: " in result.stderr
-    assert len(lines_of(out)) == 7
-    (tmp_path / "no.png").write_bytes(IMAGE)
-    result = run(path, "-o", out, "--url", server.address, "--retry-failed")
-    assert result.returncode == 0, result.stderr
-    assert len(lines_of(out)) == 7
-
-
-@pytest.mark.parametrize(
-    ("text", "options", "says"),
-    [
-        ("", (), "holds no questions"),
-        ("{", (), "questions.jsonl, line 1: it is not JSON"),
-        ("\n[]", (), "line 2: it must be an object, got list"),
-        ('{"image": "a.png", "question": "?", "votes": 99}', (), "line 1: /votes: "),
-        ('{"question": "?"}\n\n{"image": "a.png"}', (), "line 3: `question` is missing"),
-        ('{"image": "a.png", "question": "?", "vote": 1}', (), "/vote: there is no such field"),
-        ('{"image": "a.png", "question": "?"}', ("--request", '{"num_frames": 1}'), "/num_frames"),
-        ('{"image": "a.png", "question": "?"}', ("--request", "[]"), "--request must be an object"),
-        ('{"image": "a.png", "question": "?", "baseline": true}', ("--kind", "simulate"), "/baseline"),
-    ],
-)
-def test_a_file_that_cannot_be_asked_is_refused_before_anything_is_sent(
-    tmp_path: Path, text: str, options: tuple[str, ...], says: str
-) -> None:
-    path = tmp_path / "questions.jsonl"
-    path.write_text(text)
-    result = CliRunner().invoke(
-        app, ["batch", str(path), "-o", str(tmp_path / "out"), "--url", "http://127.0.0.1:1", *options]
-    )
-    assert result.exit_code == 1
-    assert isinstance(result.exception, SystemExit)
-    assert says in result.stderr
-    assert "Traceback" not in result.stderr
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (("--url", "127.0.0.1:8000"), "must begin with http://"),
-        (("--url", "http://127.0.0.1:1"), "server-unreachable"),
-        (("--out", "questions.jsonl"), "Cannot write to 'questions.jsonl'"),
-    ],
-)
-def test_what_keeps_a_batch_from_beginning_is_told_at_once(
-    server: Server, tmp_path: Path, options: tuple[str, ...], says: str
-) -> None:
-    path = written(tmp_path, asked(20))
-    began = time.monotonic()
-    command = [*COMMAND, str(path), "--out", str(tmp_path / "out"), "--url", server.address, *options]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert result.returncode == 1
-    assert says in result.stderr
-    assert "Traceback" not in result.stderr
-    assert time.monotonic() - began < 20
-
-
-@pytest.mark.slow
-def test_an_interrupt_ends_at_once_and_loses_nothing(tmp_path: Path) -> None:
-    items = asked(3, generator="slow", generator_options={"seconds": 2.0}, num_frames=80)
-    path, out = written(tmp_path, items), tmp_path / "out"
-    with Served(tmp_path) as served:
-        command = [*COMMAND, str(path), "-o", str(out), "--url", str(served.http.base_url)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-            eventually(lambda: job_count(served.http) == 3)
-            process.send_signal(signal.SIGINT)
-            began = time.monotonic()
-            _, said = process.communicate(timeout=20)
-        assert process.returncode == 130
-        assert "Run the same command again to resume." in said
-        assert "Traceback" not in said
-        assert time.monotonic() - began < 3, "it waited for jobs"
-        result = run(path, "-o", out, "--url", str(served.http.base_url))
-        assert result.returncode == 0, result.stderr
-        assert sorted(served.clips()) == [0, 1, 2]
-        assert job_count(served.http) == 3
-
-
-@pytest.fixture
-def fast(tmp_path: Path) -> Iterator[Served]:
-    with Served(tmp_path) as served:
-        yield served
-
-
-@pytest.mark.soak
-@pytest.mark.slow
-@pytest.mark.scaled
-@pytest.mark.timeout(600)
-def test_a_long_batch_that_is_killed_three_times(fast: Served, tmp_path: Path) -> None:
-    """60 results (1,000 in `make soak`), none twice, and the server was asked for no finished one again."""
-    many = 60 if SCALE == 1 else 100 * SCALE
-    # Most are answered from the image alone: what is looked at is who is asked how often.
-    items = [{**item, "imagine": "never" if n % 10 else "always"} for n, item in enumerate(asked(many))]
-    path, out = written(tmp_path, items), tmp_path / "out"
-    concurrency = 8
-    how = ("-o", str(out), "--url", str(fast.http.base_url), "--concurrency", str(concurrency))
-    draw = random.Random()
-    # One in each of three parts; the last leaves room, as more results come while a process is being killed.
-    moments = [draw.randrange(part * many // 10, (part + 1) * many // 10) for part in (1, 3, 5)]
-    print("killed at", moments)  # pytest shows it when the test fails
-
-    def count() -> int:
-        results = out / "results.jsonl"
-        return results.read_bytes().count(b"\n") if results.exists() else 0
-
-    for moment in moments:
-        with subprocess.Popen([*COMMAND, str(path), *how], stderr=subprocess.PIPE) as process:
-            eventually(lambda: count() >= moment or process.poll() is not None)  # noqa: B023
-            assert process.poll() is None, process.stderr and process.stderr.read()
-            process.kill()
-    finished = count()
-    result = run(path, *how)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith(f"{many} succeeded ({many - many // 10} without a simulation), 0 failed")
-    outcomes = lines_of(out)
-    assert [entry["status"] for entry in outcomes] == ["succeeded"] * many
-    assert {entry["id"] for entry in outcomes} == {f"q{n}" for n in range(many)}
-    assert finished < many
-    # The server's own count: one job a question, and no more requests than questions and those cut off in the middle.
-    assert job_count(fast.http) == many
-    metrics = fast.http.get("/metrics").text.splitlines()
-    posts = sum(float(m.split()[-1]) for m in metrics if m.startswith("cow_http_requests_total") and '"/answer"' in m)
-    print("requests", posts)
-    assert many <= posts <= many + 3 * concurrency
+    assert str(BatchProgress(None)) == "0 done, 0 failed, 0/min"
+    assert not progress.is_look_due()
+    with progress_shown(progress, True) as show:
+        now += 10
+        assert [progress.is_look_due(), progress.is_look_due()] == [True, False]
+        show()
+        assert capsys.readouterr().err == ""
+        now += 20
+        show()
+        assert capsys.readouterr().err == "71/100 done, 1 failed, 31.5/min, 0:00:55 left\n"
+        progress.note = "waiting"
+        show()
+        assert capsys.readouterr().err.endswith("; waiting\n")
+        show()
+        assert capsys.readouterr().err == ""
+    with progress_shown(progress, False) as show:
+        now += 100
+        show()
+    assert capsys.readouterr().err == ""

@@ -5,25 +5,22 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import subprocess
 import sys
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from conftest import EXAMPLES, ROOT
 from drawn import png_bytes
 from hub import Blob, running
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
-from cow_service.errors import InvalidRequest
-from cow_service.evals.asking import order_of
-from cow_service.evals.items import Pictures, appended_wording, listed_wording, question_text
+from cow_service.evals.items import Item, Pictures, appended_wording, listed_wording, question_text
 from cow_service.evals.loaders import load
 from cow_service.evals.loaders.rows import Collected
 from cow_service.readers.options import split_options
@@ -35,6 +32,7 @@ ASKED = "If it moves forward, will it hit the vase? Answer by (A) Yes, (B) No or
 WITHOUT_ABSTAIN = "What will be hidden when it has passed? (A) The red cup, (B) the mug or (C) the ball."
 # Rows of the published subsets, and their flaws: see the docstring of `causalspatial`.
 ROWS = {"collision": 826, "physics": 311, "compatibility": 99, "occlusion": 189, "realworld": 116}
+TASKS = {"collision", "trajectory", "compatibility", "occlusion"}
 SHARED_ID, NO_ABSTAIN, NO_ABSTAIN_C_RIGHT = 192, 54, 11
 
 
@@ -50,18 +48,22 @@ def pictures(tmp_path: Path) -> Pictures:
     return Pictures(tmp_path / "pictures")
 
 
+def write_parquet(path: Path, *rows: dict[str, Any]) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(pyarrow.Table.from_pylist(rows), path)
+
+
 def published(folder: Path) -> Path:
     """A folder in the published layout: as many rows, with the same flaws, in shards of 300."""
     number = 0
     for subset, count in ROWS.items():
-        rows: list[dict[str, Any]] = []
-        for place in range(count):
-            number += 1
-            rows.append(row_of(subset, place, number))
+        rows = [row_of(subset, place, number + place + 1) for place in range(count)]
+        number += count
         for shard, begin in enumerate(range(0, count, 300)):
-            path = folder / subset / f"train-{shard:05}.parquet"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pq.write_table(pa.Table.from_pylist(rows[begin : begin + 300]), path)
+            write_parquet(folder / subset / f"train-{shard:05}.parquet", *rows[begin : begin + 300])
     return folder
 
 
@@ -90,73 +92,65 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Collected:
     return load(str(published(folder)), Pictures(folder / "pictures"))
 
 
-def test_of_the_published_data_no_row_is_lost_and_no_id_collides(found: Collected) -> None:
-    assert len(found.items) == sum(ROWS.values()) - 1
-    assert len({item.id for item in found.items}) == len(found.items)
-    by_subset = Counter(item.id.partition("/")[0] for item in found.items)
-    assert by_subset == {**ROWS, "compatibility": ROWS["compatibility"] - 1}
-    assert {item.level for item in found.items if not item.id.startswith("realworld")} == {"L1", "L2"}
-    assert {(item.task, item.level) for item in found.items if item.id.startswith("realworld")} == {
-        (task, "real") for task in ("collision", "occlusion", "compatibility", "trajectory")
-    }
-    assert {item.task for item in found.items if item.id.startswith("physics")} == {"trajectory"}
+def test_of_the_published_data_no_row_is_lost_and_its_flaws_are_told(found: Collected) -> None:
+    by_subset: dict[str, list[Item]] = {subset: [] for subset in ROWS}
+    for item in found.items:
+        by_subset[item.id.partition("/")[0]].append(item)
+    assert len({item.id for item in found.items}) == len(found.items) == sum(ROWS.values()) - 1
+    assert {name: len(items) for name, items in by_subset.items()} == ROWS | {"compatibility": 98}
+    real = by_subset.pop("realworld")
+    assert {item.level for items in by_subset.values() for item in items} == {"L1", "L2"}
+    assert {(item.task, item.level) for item in real} == {(task, "real") for task in TASKS}
+    assert {item.task for item in by_subset["physics"]} == {"trajectory"}
 
-
-def test_the_flaws_of_the_published_data_are_counted_and_named(found: Collected) -> None:
     (fault,) = found.faults
-    assert fault.startswith("compatibility/train-00000.parquet, row 7: the image cannot be used")
-    told = " ".join(found.notes)
-    assert f"physics: {SHARED_ID} rows share their id" in told
-    assert f"occlusion: {NO_ABSTAIN} rows have no option that abstains" in told
-    assert f"in {NO_ABSTAIN_C_RIGHT} of them that option is the right answer" in told
+    assert fault.startswith("compatibility/train-00000.parquet, row 7: ")
+    told = {note.partition(":")[0]: re.findall(r"\d+", note) for note in found.notes}
+    assert told["physics"][0] == str(SHARED_ID)
+    assert told["occlusion"][:2] == [str(NO_ABSTAIN), str(NO_ABSTAIN_C_RIGHT)]
 
 
-def test_the_option_that_abstains_is_found_by_its_text(found: Collected) -> None:
-    without = [item for item in found.items if item.abstain is None]
-    assert sum(item.id.startswith("occlusion") for item in without) == NO_ABSTAIN
-    right = [item for item in without if item.id.startswith("occlusion") and item.answer == "C"]
-    assert len(right) == NO_ABSTAIN_C_RIGHT
-    (first,) = (item for item in found.items if item.id == "collision/0/0")
+def test_the_option_that_abstains_is_found_by_its_text_and_answers_get_their_letter(found: Collected) -> None:
+    items = {item.id: item for item in found.items}
+    without = [item for item in items.values() if item.abstain is None and item.id.startswith("occlusion")]
+    assert (len(without), sum(item.answer == "C" for item in without)) == (NO_ABSTAIN, NO_ABSTAIN_C_RIGHT)
+    first = items["collision/0/0"]
     assert (first.abstain, first.answer, question_text(first)) == ("C", "A", ASKED)
-
-
-def test_answers_given_as_text_get_their_letter(found: Collected) -> None:
-    real = {item.source_id: item for item in found.items if item.id.startswith("realworld")}
+    real = {item.source_id: item for item in items.values() if item.id.startswith("realworld")}
     assert question_text(real["1"]) == "What will it hit?\n\n(A) Yes\n(B) No"
     assert (real["1"].answer, real["1"].abstain) == ("B", None)
     assert (real["2"].answer, real["2"].abstain) == ("C", "C")
 
 
-def test_subsets_are_chosen_and_unknown_ones_refused(tmp_path: Path, pictures: Pictures) -> None:
-    pq.write_table(pa.Table.from_pylist([row_of("occlusion", 60, 1)]), file_in(tmp_path / "occlusion"))
-    pq.write_table(pa.Table.from_pylist([row_of("collision", 1, 2)]), file_in(tmp_path / "collision"))
+def test_subsets_are_chosen_and_unknown_ones_and_cut_shards_refused(tmp_path: Path, pictures: Pictures) -> None:
+    """Rows of the published layout with other faults are left out: of a shard it is unknown how many are missing."""
+    for subset in ("collision", "occlusion"):
+        write_parquet(tmp_path / subset / "train.parquet", row_of(subset, 60, 1))
     assert [item.task for item in load(str(tmp_path), pictures, subsets=["occlusion"]).items] == ["occlusion"]
-    with pytest.raises(InvalidRequest, match="no subset 'fysics'"):
-        load(str(tmp_path), pictures, subsets=["fysics"])
-
-
-def file_in(folder: Path) -> Path:
-    folder.mkdir()
-    return folder / "train.parquet"
+    for subsets in (["fysics"], ["occlusion", "physics"]):
+        with refused("invalid-request") as caught:
+            load(str(tmp_path), pictures, subsets=subsets)
+        assert subsets[-1] in str(caught.value)
+    shard = tmp_path / "collision" / "train.parquet"
+    shard.write_bytes(shard.read_bytes()[:-20])
+    for skip_faulty in (False, True):
+        with refused("invalid-request") as caught:
+            load(str(tmp_path), pictures, skip_faulty=skip_faulty)
+        assert "collision/train.parquet" in str(caught.value)
 
 
 def test_made_scenes_have_their_truth_and_both_levels(pictures: Pictures) -> None:
     items = load(str(SAMPLE), pictures).items
-    assert len(items) == 12
+    others = load(str(ROOT / "cow-scenes" / "sample_other"), pictures).items  # of the second family
+    assert (len(items), len(others)) == (12, 10)
     for item in items:
         assert item.truth is not None
         assert [moment for moment, _ in item.truth.pictures] == [0.4, 1.2]
         assert (len(item.truth.track), len(item.truth.scale), item.truth.scale[0]) == (61, 61, 1.0)
         assert item.truth.object in item.truth.boxes
     assert {item.level for item in items} == {"L1", "L2"}
-    assert {item.task for item in items} == {"collision", "trajectory", "compatibility", "occlusion"}
-
-
-def test_scenes_of_the_second_family_are_read_alike(pictures: Pictures) -> None:
-    items = load(str(ROOT / "cow-scenes" / "sample_other"), pictures).items
-    assert len(items) == 10
-    assert all(item.truth is not None and item.truth.shows(drawn=True) for item in items)
-    assert {item.task for item in items} == {"collision", "trajectory", "compatibility", "occlusion"}
+    assert all(item.truth is not None and item.truth.shows(drawn=True) for item in others)
+    assert {item.task for item in items} == {item.task for item in others} == TASKS
 
 
 def test_scenes_with_truth_are_read(pictures: Pictures) -> None:
@@ -188,7 +182,7 @@ def written(folder: Path, form: str) -> Path:
         head = "index\timage\tquestion\tA\tB\tC\tanswer\tcategory\tl2-category"
         path.write_text(f"{head}\nq1\t{coded}\t{question}\tYes\tNo\tNot sure\tB\tcollision\tx\n")
     else:
-        pq.write_table(pa.Table.from_pylist([{**ROW, "image": {"bytes": image, "path": None}}]), path)
+        write_parquet(path, {**ROW, "image": {"bytes": image, "path": None}})
     return path
 
 
@@ -201,61 +195,56 @@ def test_tables_of_every_form_hold_the_same_question(form: str, tmp_path: Path, 
     assert question_text(item).startswith("If it moves forward, will it hit the vase?")
 
 
-FAULTS: dict[str, tuple[str, str]] = {
-    "missing image": (
-        json.dumps({**ROW, "image": "2.png"}),
-        r"line 2: the image '2.png' is not there: a path starts at the folder",
-    ),
-    "no image": (json.dumps(ROW), "line 2: has no `image`"),
-    "an address": (json.dumps({**ROW, "image": "http://x/1.png"}), "line 2: `image` must not be an address"),
-    "no picture": (json.dumps({**ROW, "image": base64.b64encode(b"no").decode()}), "line 2: the image cannot be used"),
-    "unknown column": (json.dumps({**ROW, "image": "1.png", "anwser": "A"}), "column `anwser`: did you mean `answer`"),
-    "no such option": (json.dumps({**ROW, "image": "1.png", "answer": "D"}), "not one of the options: 'D'"),
-    "other text": (json.dumps({**ROW, "image": "1.png", "answer": "(A) No"}), r"not one of the options: '\(A\) No'"),
-    "the same id": (json.dumps({**ROW, "image": "1.png", "question": "Other? (A) a (B) b"}), "the id 'q1' stands in"),
-    "the same row": (
-        json.dumps({**ROW, "id": "q2", "image": "1.png"}),
-        "line 2: asks the same as questions.jsonl, line 1",
-    ),
-    "another answer": (
-        json.dumps({**ROW, "id": "q2", "image": "1.png", "answer": "A"}),
-        r"asks the same as questions.jsonl, line 1 with another answer, \(B\)",
-    ),
-    "no options": (json.dumps({**ROW, "id": "q2", "image": "1.png", "question": "What?"}), "lists no options"),
-    "half a line": (json.dumps({**ROW, "image": "1.png"})[:30], "line 2: not complete JSON .* was the file written"),
-    "no object": ("[1]", "line 2: must be an object, got list"),
+# What is wrong with a second line, and what the refusal names besides the line.
+FAULTS: dict[str, str | dict[str, Any]] = {
+    "2.png": {"image": "2.png"},
+    "`image`": {"image": None},
+    "an address": {"image": "http://x/1.png"},
+    "cannot be used": {"image": base64.b64encode(b"no").decode()},
+    "`anwser`: did you mean `answer`": {"anwser": "A"},
+    "'D'": {"answer": "D"},
+    "'(A) No'": {"answer": "(A) No"},
+    "'q1'": {"question": "Other? (A) a (B) b"},
+    "questions.jsonl, line 1": {"id": "q2"},
+    "(B)": {"id": "q2", "answer": "A"},
+    "options": {"id": "q2", "question": "What?"},
+    "JSON": json.dumps({**ROW, "image": "1.png"})[:30],
+    "list": "[1]",
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_what_cannot_be_asked_is_named_by_its_row_or_left_out(fault: str, tmp_path: Path, pictures: Pictures) -> None:
-    line, message = FAULTS[fault]
+@pytest.mark.parametrize("named", FAULTS)
+def test_what_cannot_be_asked_is_named_by_its_row_or_left_out(named: str, tmp_path: Path, pictures: Pictures) -> None:
+    fault = FAULTS[named]
+    line = fault if isinstance(fault, str) else json.dumps({**ROW, "image": "1.png", **fault})
     path = written(tmp_path, "jsonl")
     path.write_text(path.read_text().strip() + "\n" + line)
-    with pytest.raises(InvalidRequest, match=message):
+    with refused("invalid-request") as caught:
         load(str(path), pictures)
+    assert named in str(caught.value)
+    assert "line 2: " in str(caught.value) or "anwser" in named, "a column is of no line"
     found = load(str(path), pictures, skip_faulty=True)
-    assert [item.id for item in found.items][:1] == ["q1"]
-    assert fault == "unknown column" or len(found.faults) == 1
+    assert found.items[0].id == "q1"
+    assert "anwser" in named or len(found.faults) == 1
 
 
 def test_files_that_were_not_written_to_their_end_are_named(tmp_path: Path, pictures: Pictures) -> None:
-    for form, message in (("csv", "row 2: has 3 cells for 6 columns"), ("parquet", "not a complete Parquet file")):
-        path = written(tmp_path, form)
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // (2 if form == "csv" else 3)])
-        if form == "csv":
-            path.write_text("id,image,question,answer,task,level\nq1,1.png,What")
-        with pytest.raises(InvalidRequest, match=message):
+    csv, tsv, parquet = (written(tmp_path, form) for form in ("csv", "tsv", "parquet"))
+    csv.write_text("id,image,question,answer,task,level\nq1,1.png,What")
+    tsv.write_text(tsv.read_text().replace("\tNo\t", "\t\t"))
+    parquet.write_bytes(parquet.read_bytes()[: parquet.stat().st_size // 3])
+    scene = tmp_path / "scenes" / "one" / "meta.json"
+    scene.parent.mkdir(parents=True)
+    scene.write_text('{"question": "Wil')
+    named = {csv: "row 2: has 3 cells for 6", tsv: "row 2: the options A, C", parquet: "Parquet"}
+    for path, words in {**named, scene.parents[1]: "one/meta.json", ROOT / "README.md": "", tmp_path / "x": ""}.items():
+        with refused("invalid-request") as caught:
             load(str(path), pictures)
-    scene = tmp_path / "scenes" / "one"
-    scene.mkdir(parents=True)
-    (scene / "meta.json").write_text('{"question": "Wil')
-    with pytest.raises(InvalidRequest, match=r"one/meta.json: not complete JSON"):
-        load(str(scene.parent), pictures)
+        assert words in str(caught.value)
 
 
 def test_a_data_set_of_the_hub_is_downloaded_and_read(tmp_path: Path) -> None:
-    pq.write_table(pa.Table.from_pylist([row_of("occlusion", 60, 1)]), file_in(tmp_path / "occlusion"))
+    write_parquet(tmp_path / "occlusion" / "train.parquet", row_of("occlusion", 60, 1))
     shard = (tmp_path / "occlusion" / "train.parquet").read_bytes()
     program = (
         "import sys; from pathlib import Path; from cow_service.evals.loaders import load;"
@@ -272,33 +261,8 @@ def test_a_data_set_of_the_hub_is_downloaded_and_read(tmp_path: Path) -> None:
         )
         assert done.stdout == "['occlusion/0/0']\n", done.stderr
         assert one.downloads() == ["occlusion/train.parquet"], "only what is read"
-    assert "The data set 'someone/nothing' is not a folder, and could not be downloaded" in unknown.stderr
-
-
-def test_a_shard_that_was_cut_off_is_refused_always(tmp_path: Path, pictures: Pictures) -> None:
-    """Rows of the published layout with other faults are left out: here it is unknown how many are missing."""
-    for subset in ("collision", "occlusion"):
-        pq.write_table(pa.Table.from_pylist([row_of(subset, 60, 1)]), file_in(tmp_path / subset))
-    shard = tmp_path / "collision" / "train.parquet"
-    shard.write_bytes(shard.read_bytes()[:-20])
-    for skip_faulty in (False, True):
-        with pytest.raises(InvalidRequest, match=r"collision/train.parquet: not a complete Parquet file"):
-            load(str(tmp_path), pictures, skip_faulty=skip_faulty)
-    with pytest.raises(InvalidRequest, match="has no subset 'physics'"):
-        load(str(tmp_path), pictures, subsets=["occlusion", "physics"])
-
-
-def test_columns_of_options_leave_no_letter_out(tmp_path: Path, pictures: Pictures) -> None:
-    path = written(tmp_path, "tsv")
-    path.write_text(path.read_text().replace("\tNo\t", "\t\t"))
-    with pytest.raises(InvalidRequest, match="row 2: the options A, C leave a letter out"):
-        load(str(path), pictures)
-
-
-@pytest.mark.parametrize("data", ["nothing/here/at-all", "README.md"])
-def test_what_is_no_data_set_is_refused_with_what_is_one(data: str, pictures: Pictures) -> None:
-    with pytest.raises(InvalidRequest, match="CausalSpatial's layout"):
-        load(str(ROOT / data), pictures)
+    assert "InvalidRequest" in unknown.stderr
+    assert "'someone/nothing'" in unknown.stderr
 
 
 WORDS = st.text(st.characters(categories=("L",)), min_size=2, max_size=8)
@@ -319,6 +283,8 @@ def test_options_are_shown_in_any_order_and_read_back(texts: list[str], draws: A
 
 
 def test_the_order_of_options_is_fixed_by_seed_item_and_repeat(pictures: Pictures) -> None:
+    from cow_service.evals.asking import order_of
+
     items = load(str(EXAMPLES), pictures).items
     orders = [order_of(item, "shuffled", 0, repeat) for item in items for repeat in range(1, 13)]
     assert len(set(orders)) == 6

@@ -6,21 +6,16 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from asked_runs import HOSTILE, picture, run
-from axe_playwright_python.sync_playwright import Axe
-from browser import NARROW, WIDE, Windows, assert_fits
-from playwright.sync_api import Page, expect
+from browser import NARROW, WIDE, Windows, assert_fits, expect, faults_for_some
 
-pytest.importorskip("matplotlib")
-pytest.importorskip("scipy")
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
-from cow_service.evals.report.page import script_json, write_page
-from cow_service.evals.report.summary import summarize
-from cow_service.evals.report.tables import contrasts
-from cow_service.evals.report.write import write_plots
-from cow_service.evals.runs import EvalRun
+    from cow_service.evals.runs import EvalRun
 
 pytestmark = pytest.mark.slow
 
@@ -56,6 +51,10 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> EvalRun:
 
 @pytest.fixture(scope="module")
 def report(asked: EvalRun) -> Path:
+    from cow_service.evals.report.page import write_page
+    from cow_service.evals.report.summary import summarize
+    from cow_service.evals.report.write import write_plots
+
     folder, summaries = asked.folder / "report", summarize([asked])
     return write_page(folder, [asked], summaries, write_plots(folder, summaries), [("By hand", "Said <b>plainly</b>.")])
 
@@ -136,27 +135,31 @@ def test_what_others_wrote_is_text(report: Path, windows: Windows) -> None:
     expect(page.get_by_text("Said <b>plainly</b>.")).to_be_visible()
 
 
-def test_a_report_elsewhere_finds_its_pictures(asked: EvalRun, tmp_path: Path, windows: Windows) -> None:
-    path = write_page(tmp_path / "else where", [asked], summarize([asked]))
-    page = windows.open(f"{path.as_uri()}#item=collision-0")
+def page_of(folder: Path, *runs: EvalRun) -> str:
+    """The address of a report of runs, without plots."""
+    from cow_service.evals.report.page import write_page
+    from cow_service.evals.report.summary import summarize
+
+    return write_page(folder, runs, summarize(runs)).as_uri()
+
+
+def test_reports_elsewhere_of_two_runs_and_without_pictures(asked: EvalRun, tmp_path: Path, windows: Windows) -> None:
+    page = windows.open(f"{page_of(tmp_path / 'else where', asked)}#item=collision-0")
     page.wait_for_function("document.images.length === 6 && [...document.images].every((each) => each.naturalWidth)")
-
-
-def test_two_runs_of_the_same_questions_share_cards(asked: EvalRun, tmp_path: Path, windows: Windows) -> None:
     other = replace(asked, info=asked.info.model_copy(update={"mllm": "other/model"}))
-    page = windows.open(write_page(tmp_path, [asked, other], summarize([asked, other])).as_uri())
+    page.goto(page_of(tmp_path / "two", asked, other))
     expect(page.locator(".card")).to_have_count(6)
     expect(page.locator(".card").first.locator(".arm")).to_have_count(6)
-
-
-def test_a_run_without_pictures_has_a_page(asked: EvalRun, tmp_path: Path, windows: Windows) -> None:
-    lost = replace(asked, folder=tmp_path / "lost")
-    page = windows.open(write_page(tmp_path, [lost], summarize([lost])).as_uri())
+    page.goto(page_of(tmp_path / "lost", replace(asked, folder=tmp_path / "lost")))
     expect(page.locator(".card")).to_have_count(6)
     expect(page.get_by_text("the file is missing").first).to_be_visible()
 
 
 def test_over_an_arm_that_always_abstains_no_table_has_a_p(asked: EvalRun, tmp_path: Path) -> None:
+    from cow_service.evals.report.page import write_page
+    from cow_service.evals.report.summary import summarize
+    from cow_service.evals.report.tables import contrasts
+
     silent = [
         each.model_copy(update={"read": each.abstain}) if each.arm == "never" else each for each in asked.observations
     ]
@@ -168,6 +171,8 @@ def test_over_an_arm_that_always_abstains_no_table_has_a_p(asked: EvalRun, tmp_p
 
 
 def test_data_cannot_end_its_element() -> None:
+    from cow_service.evals.report.page import script_json
+
     said = script_json([HOSTILE, "<!--", "\u2029"])
     assert not set("<>&\u2028\u2029") & set(said)
     assert json.loads(said) == [HOSTILE, "<!--", "\u2029"]
@@ -183,6 +188,4 @@ def test_nothing_serious(report: Path, windows: Windows, scheme: str) -> None:
     expect(page.locator(".reply").first).to_be_attached()
     assert_fits(page)
     page.add_style_tag(content=".card { content-visibility: visible !important; }")  # else axe leaves out what is below
-    violations = Axe().run(page).response["violations"]
-    serious = [each for each in violations if each["impact"] in ("serious", "critical")]
-    assert [(each["id"], [node["html"][:200] for node in each["nodes"]]) for each in serious] == []
+    assert faults_for_some(page) == []

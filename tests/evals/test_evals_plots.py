@@ -6,110 +6,89 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import pytest
 from asked_runs import run
 from PIL import Image
 
-pytest.importorskip("matplotlib")
-pytest.importorskip("scipy")
+from cow_service.evals.items import Task
 
-from cow_service.evals.report.page import TITLES as PLOTS
-from cow_service.evals.report.summary import Findings, Price, summarize
-from cow_service.evals.report.write import write_plots
+if TYPE_CHECKING:
+    from cow_service.evals.report.summary import Findings
 
 pytestmark = pytest.mark.slow
 
-ARMS = (
-    "never",
-    "always",
-    "auto",
-    "always:vote-3",
-    "placebo-still",
-    "placebo-direction",
-    "encounters",
-    "frames-only",
-    "oracle:error-0",
-    "oracle:error-2",
-)
+PLOTS = ["gains", "doses", "rates", "calibration", "cost"]
+ARMS = ("never", "always", "always:vote-3", "placebo-still", "encounters", "oracle:error-0", "oracle:error-2")
 TASKS = ("collision", "trajectory", "compatibility", "occlusion")
 LONG = "hf/a-multimodal-model-with-a-very-long-name-and-a-suffix-72B-instruct"
 ODD = ("_hidden", "a/$x$ <b> & 模型\n\x07", LONG)
 
 
-@pytest.fixture(scope="module")
-def nine(tmp_path_factory: pytest.TempPathFactory) -> Findings:
-    found = run(tmp_path_factory.mktemp("nine"), 48, ARMS, 3, TASKS)
-    return summarize([found], {"openai/small": Price(input=0.2, output=0.8)})
+def found(folder: Path, count: int, arms: Sequence[str], repeats: int, tasks: Sequence[Task] = TASKS) -> Findings:
+    from cow_service.evals.report.summary import Price, summarize
+
+    return summarize([run(folder, count, arms, repeats, tasks)], {"openai/small": Price(input=0.2, output=0.8)})
 
 
-def names(paths: Sequence[Path]) -> set[str]:
-    return {path.stem for path in paths}
+def drawn(folder: Path, findings: Findings) -> list[Path]:
+    from cow_service.evals.report.write import write_plots
+
+    return list(write_plots(folder, findings))
 
 
 def words(path: Path) -> str:
     return " ".join("".join(each.itertext()) for each in ElementTree.parse(path).iter() if each.tag.endswith("text"))
 
 
-@pytest.fixture(scope="module")
-def plots(nine: Findings, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
-    return tuple(write_plots(tmp_path_factory.mktemp("plots"), nine))
-
-
-def test_every_plot_is_a_vector_and_a_picture(plots: tuple[Path, ...]) -> None:
+def test_every_plot_is_a_vector_and_a_picture_with_its_figures_in_the_text(tmp_path: Path) -> None:
+    findings = found(tmp_path, 48, ARMS, 3)
+    plots = drawn(tmp_path / "plots", findings)
     assert [path.name for path in plots] == [f"{name}{suffix}" for name in PLOTS for suffix in (".svg", ".png")]
-    for path in plots:
-        if path.suffix == ".png":
-            with Image.open(path) as picture:
-                assert min(picture.size) > 300
-                assert round(picture.info["dpi"][0]) == 150
-        else:
-            assert ElementTree.parse(path).getroot().tag == "{http://www.w3.org/2000/svg}svg"
-
-
-def test_the_same_findings_make_the_same_bytes(tmp_path: Path) -> None:
-    found = summarize([run(tmp_path, 6, ("never", "always", "oracle:error-0", "oracle:error-2"), 2, TASKS[:1])])
-    one, other = write_plots(tmp_path / "a", found), write_plots(tmp_path / "b", found)
-    vectors = [(a, b) for a, b in zip(one, other, strict=True) if a.suffix == ".svg"]
-    assert [a.name for a, b in vectors if a.read_bytes() != b.read_bytes()] == []
-
-
-def test_the_figures_stand_in_the_text(nine: Findings, plots: tuple[Path, ...]) -> None:
-    said = {path.stem: words(path) for path in plots if path.suffix == ".svg"}
-    for each in nine.arms:
+    for path in plots[1::2]:
+        with Image.open(path) as picture:
+            assert min(picture.size) > 300
+            assert round(picture.info["dpi"][0]) == 150
+    assert {ElementTree.parse(path).getroot().tag for path in plots[::2]} == {"{http://www.w3.org/2000/svg}svg"}
+    said = {path.stem: words(path) for path in plots[::2]}
+    for each in findings.arms:
         assert f"{100 * each.rates.tpr.mean:.0f}" in said["rates"]
         assert all(each.name in said[name] for name in ("rates", "cost"))
         if each.gain is not None:
             assert f"{100 * each.gain.gain:+.1f}".replace("-", "−") in said["gains"]
-    told = next(each.calibration for each in nine.arms if each.calibration)
+    told = next(each.calibration for each in findings.arms if each.calibration)
     assert f"Brier score {told.brier:.3f}" in said["calibration"]
     assert f"n = {told.count}" in said["calibration"]
     assert "Money per question" in said["cost"]
     assert "Error of the path shown" in said["doses"]
 
 
-def test_one_arm_has_no_gains_and_no_calibration(tmp_path: Path) -> None:
+def test_the_same_findings_make_the_same_bytes_and_one_scene_has_no_interval(tmp_path: Path) -> None:
+    findings = found(tmp_path, 2, ("never", "always"), 1, ("compatibility",))
+    one, other = drawn(tmp_path / "a", findings), drawn(tmp_path / "b", findings)
+    assert [a.read_bytes() for a in one[::2]] == [b.read_bytes() for b in other[::2]]
+    assert "one scene: no interval" in words(tmp_path / "a" / "gains.svg")
+
+
+def test_one_arm_has_no_gains_and_no_calibration_and_nothing_asked_draws_nothing(tmp_path: Path) -> None:
+    from cow_service.evals.report.summary import summarize
+
     (tmp_path / "gains.svg").write_text("of an earlier report")
-    paths = write_plots(tmp_path, summarize([run(tmp_path, 6, ("never",), 1, ("collision",))]))
-    assert names(paths) == {"rates", "cost"}
+    paths = drawn(tmp_path, found(tmp_path, 6, ("never",), 1, ("collision",)))
+    assert {path.stem for path in paths} == {"rates", "cost"}
     assert not (tmp_path / "gains.svg").exists()
     assert "one repeat, so no SD" in words(tmp_path / "rates.svg")
-
-
-def test_one_scene_has_no_interval(tmp_path: Path) -> None:
-    write_plots(tmp_path, summarize([run(tmp_path, 2, ("never", "always"), 1, ("compatibility",))]))
-    assert "one scene: no interval" in words(tmp_path / "gains.svg")
-
-
-def test_nothing_asked_draws_nothing(tmp_path: Path) -> None:
-    assert write_plots(tmp_path, summarize([])) == ()
+    assert drawn(tmp_path, summarize([])) == []
 
 
 @pytest.mark.soak  # twelve seconds of drawing
 def test_odd_names_of_models_are_drawn(tmp_path: Path) -> None:
+    from cow_service.evals.report.summary import summarize
+
     runs = [run(tmp_path / str(place), 12, ("never", "always"), 2, mllm=name) for place, name in enumerate(ODD)]
-    assert names(write_plots(tmp_path, summarize(runs))) == set(PLOTS) - {"doses"}
+    assert {path.stem for path in drawn(tmp_path, summarize(runs))} == set(PLOTS) - {"doses"}
     said = words(tmp_path / "rates.svg")
     assert "_hidden, always" in said
     assert "a/$x$ <b> & 模型 , always" in said

@@ -6,20 +6,19 @@ import csv
 import io
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from asked_runs import HOSTILE, run
 from conftest import ROOT
 
-from cow_service.evals.report.summary import Findings, read_prices, summarize
-from cow_service.evals.report.tables import Table, csv_text, latex, markdown, replies, tables
-from cow_service.evals.report.write import write_report
-from cow_service.evals.runs import EvalRun
+if TYPE_CHECKING:
+    from cow_service.evals.report.summary import Findings
+    from cow_service.evals.runs import EvalRun
 
 pytestmark = pytest.mark.slow
 
 GOLDEN = ROOT / "tests" / "data" / "evals"
-FORMS = {"md": markdown, "csv": csv_text, "tex": latex}
 TASKS = ("collision", "trajectory", "compatibility", "occlusion")
 
 
@@ -30,38 +29,44 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> EvalRun:
 
 @pytest.fixture(scope="module")
 def summaries(asked: EvalRun, tmp_path_factory: pytest.TempPathFactory) -> Findings:
+    from cow_service.evals.report.summary import read_prices, summarize
+
     prices = tmp_path_factory.mktemp("prices") / "prices.yaml"
     prices.write_text("openai/small: {input: 2, output: 10}\n")
     return summarize([asked], read_prices(prices))
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_tables_are_as_they_were(form: str, summaries: Findings) -> None:
+def test_tables_are_as_they_were(summaries: Findings) -> None:
     """A wanted change: write the reported text into tests/data/evals."""
-    told = "\n".join(f"{table.title}\n{FORMS[form](table)}" for table in tables(summaries, published=True))
-    assert told == (GOLDEN / f"tables.{form}").read_text(encoding="utf-8")
+    from cow_service.evals.report.tables import csv_text, latex, markdown, tables
+
+    for form, write in {"md": markdown, "csv": csv_text, "tex": latex}.items():
+        told = "\n".join(f"{table.title}\n{write(table)}" for table in tables(summaries, published=True))
+        assert told == (GOLDEN / f"tables.{form}").read_text(encoding="utf-8")
 
 
-def test_the_figures_of_a_table_are_those_of_the_replies(asked: EvalRun, summaries: Findings) -> None:
-    by_name = {table.name: table for table in tables(summaries, published=True)}
-    rows = {(row[0], row[1]): dict(zip(by_name["levels"].header, row, strict=True)) for row in by_name["levels"].rows}
+def test_the_figures_of_a_table_are_those_of_the_replies_and_each_reply_has_a_row(
+    asked: EvalRun, summaries: Findings
+) -> None:
+    from cow_service.evals.report.tables import csv_text, replies, tables
+
+    (levels,) = (table for table in tables(summaries, published=True) if table.name == "levels")
+    rows = {(row[0], row[1]): dict(zip(levels.header, row, strict=True)) for row in levels.rows}
     for arm in asked.info.arms:
-        replies = [each for each in asked.of_arm(arm) if each.failure is None]
-        share = sum(each.right for each in replies) / len(replies)
-        assert rows[arm, "TPR"]["all"].startswith(f"{100 * share:.2f} ± ")
+        right = [each.right for each in asked.of_arm(arm) if each.failure is None]
+        assert rows[arm, "TPR"]["all"].startswith(f"{100 * sum(right) / len(right):.2f} ± ")
     assert rows["GPT-5 (paper)", "TPR"]["all"] == "54.17"
 
-
-def test_every_reply_has_a_row_of_its_own(asked: EvalRun) -> None:
-    rows = list(csv.DictReader(io.StringIO(csv_text(replies([asked])))))
     replied = [each for each in asked.observations if each.failure is None]
-    assert len(rows) == len(replied) > 24
-    for row, each in zip(rows, replied, strict=True):
+    assert len(replied) > 24
+    for row, each in zip(csv.DictReader(io.StringIO(csv_text(replies([asked])))), replied, strict=True):
         assert (row["item"], row["arm"], row["repeat"]) == (each.item, each.arm, str(each.repeat))
         assert (row["chosen"], row["right"]) == (each.read or "", str(int(each.right)))
 
 
 def test_text_that_means_something_to_a_format_is_text_in_it() -> None:
+    from cow_service.evals.report.tables import Table, csv_text, latex, markdown
+
     table = Table("x", "100% of \\ & _", ("a|b", "c"), ((HOSTILE.replace("\u2028", " "), "50% & 3_4"),))
     assert markdown(table).splitlines()[0].count("|") == 4
     assert list(csv.reader(io.StringIO(csv_text(table))))[1][1] == "50% & 3_4"
@@ -71,6 +76,9 @@ def test_text_that_means_something_to_a_format_is_text_in_it() -> None:
 
 
 def test_runs_of_two_models_are_compared_each_with_its_own_baseline(tmp_path: Path) -> None:
+    from cow_service.evals.report.summary import summarize
+    from cow_service.evals.report.write import write_report
+
     large = run(tmp_path / "large", mllm="openai/large", arms=("never",), repeats=2)
     more = run(tmp_path / "more", mllm="openai/large", arms=("always",), repeats=2)
     small = run(tmp_path / "small", arms=("never", "always"), repeats=2)

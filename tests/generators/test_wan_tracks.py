@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from refusals import refused
 
-from cow_service.errors import InvalidRequest
-from cow_service.generators.wan.conditioning import ati_condition, wan_move_latent
 from cow_service.generators.wan.profiles import WanLimits
 from cow_service.generators.wan.tracks import (
     FILE_SAMPLES,
@@ -30,6 +28,7 @@ from cow_service.generators.wan.tracks import (
 from cow_service.physics.tracks import at_rate
 from cow_service.records import Trajectory
 
+pytest_plugins = "toy_fixtures"
 sides = st.integers(8, 4000)
 lengths = st.integers(2, MAX_FRAMES)
 coordinates = st.floats(-1e6, 1e6, width=32)
@@ -81,12 +80,6 @@ def test_straight_motion_keeps_its_clock(fps: float, frames: int) -> None:
     rest = file[:, int(1.5 * frames) :, :2]
     np.testing.assert_allclose(rest, np.broadcast_to(some.points[-1][:, None], rest.shape))
     assert (file[..., 2] == 1).all()
-
-
-def test_the_image_corners_are_where_the_model_has_them() -> None:
-    corners = Tracks(np.array([[[0, 0], [832, 480], [416, 240]]] * 2, np.float32), np.ones((2, 3), bool))
-    tensor = to_ati_tensor(to_ati_file(corners), 832, 480)
-    np.testing.assert_allclose(tensor[0, :, 1:3], [[-832 / 480, -1], [832 / 480, 1], [0, 0]], atol=1e-6)
 
 
 @given(st.integers(2, 400), st.sampled_from([1.0, 8.0, 15.0, 16.0, 24.0, 30.0, 59.94]), st.sampled_from([16.0, 24.0]))
@@ -155,82 +148,12 @@ def test_every_body_that_moves_has_tracks_the_mover_first() -> None:
     assert (many.points[:, 0] == found.points[:, 0]).all()
 
 
-def test_no_tracks_at_all() -> None:
-    none = tracks_of(trajectory([(1, 1), (2, 2)], [True, True], tracks=[], anchors=[]), 10, 10)
-    assert none.points.shape == (2, 0, 2)
-    condition = torch.randn(20, 1 + 1, 4, 6)
-    changed = ati_condition(condition, torch.from_numpy(to_ati_tensor(to_ati_file(none), 10, 10)))
-    assert torch.equal(changed[4:], condition[4:])
-    assert (changed[:4, 0] == 1).all()
-    assert not changed[:4, 1].any()
-    assert torch.equal(
-        wan_move_latent(condition[4:], *map(torch.from_numpy, (none.points, none.visible))), condition[4:]
-    )
-
-
-@given(
-    tracks(st.sampled_from([5, 9, 13])),
-    st.integers(1, 7),
-    st.integers(1, 9),
-    st.sampled_from([torch.float32, torch.bfloat16]),
-)
-def test_ati_is_what_its_definition_says(some: Tracks, h: int, w: int, dtype: torch.dtype) -> None:
-    """Cell for cell and track for track, without any of the vector arithmetic."""
-    frames = (some.num_frames - 1) // 4 + 1
-    condition = torch.randn(6, frames, h, w, generator=torch.Generator().manual_seed(h * w)).to(dtype)
-    tensor = to_ati_tensor(to_ati_file(some), 100, 60)
-    found = ati_condition(condition, torch.from_numpy(tensor))
-    assert found.dtype == dtype
-    wanted = by_definition(condition.double().numpy(), tensor.astype(np.float64))
-    tolerance = 1e-4 if dtype == torch.float32 else 3e-2
-    np.testing.assert_allclose(found.double().numpy(), wanted, atol=tolerance, rtol=tolerance)
-
-
-def by_definition(condition: np.ndarray, tracks: np.ndarray) -> np.ndarray:
-    _, frames, h, w = condition.shape
-    m, latent = min(h, w), condition[4:]
-    xs, ys = np.linspace(-w / m, w / m, w), np.linspace(-h / m, h / m, h)
-    out = condition.copy()
-    out[:4] = 0
-    out[:4, 0] = 1
-    for t in range(1, frames):
-        part = tracks[4 * t - 3 : 4 * t + 1]
-        seen = (part[..., 3] + 1) / 2
-        count = seen.sum(0)
-        centre = (seen[..., None] * part[..., 1:3]).sum(0) / (count + 1e-5)[:, None]
-        for y in range(h):
-            for x in range(w):
-                gaps = (centre[:, 0] - xs[x]) ** 2 + (centre[:, 1] - ys[y]) ** 2
-                weights = np.exp(-220 * gaps) * np.minimum(count, 1)
-                best = np.argsort(-weights, kind="stable")[:2]
-                total = weights[best].sum()
-                carried = sum(
-                    (weights[n] * feature(latent[:, 0], tracks[0, n, 1:3]) for n in best), np.zeros(len(latent))
-                )
-                out[4:, t, y, x] = carried + latent[:, t, y, x] * (1 - min(total, 1))
-                out[:4, t, y, x] = total
-    return out
-
-
-def feature(image: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Bilinear between cell centres, zero beyond the edge."""
-    _, h, w = image.shape
-    m = min(h, w)
-    x = (np.clip(place[0] / (w / m), -1, 1) + 1) / 2 * w - 0.5
-    y = (np.clip(place[1] / (h / m), -1, 1) + 1) / 2 * h - 0.5
-    total = np.zeros(len(image))
-    for row in (int(np.floor(y)), int(np.floor(y)) + 1):
-        for column in (int(np.floor(x)), int(np.floor(x)) + 1):
-            if 0 <= row < h and 0 <= column < w:
-                total += image[:, row, column] * max(0, 1 - abs(x - column)) * max(0, 1 - abs(y - row))
-    return total
-
-
+@pytest.mark.slow  # it imports PyTorch
 @given(tracks(st.sampled_from([5, 9, 13])), st.integers(1, 7), st.integers(1, 9))
-def test_wan_move_is_what_its_definition_says(some: Tracks, h: int, w: int) -> None:
+def test_wan_move_is_what_its_definition_says(toys, some: Tracks, h: int, w: int) -> None:
     near = Tracks(np.mod(some.points, 120).astype(np.float32) - 20, some.visible)
     frames = (near.num_frames - 1) // 4 + 1
-    latent = torch.randn(3, frames, h, w, generator=torch.Generator().manual_seed(h + w))
+    latent = toys.torch.randn(3, frames, h, w, generator=toys.torch.Generator().manual_seed(h + w))
     wanted = latent.clone()
     inside = near.visible & (near.points >= 0).all(-1) & (near.points[..., 0] < 8 * w) & (near.points[..., 1] < 8 * h)
     for t in range(1, frames):
@@ -238,20 +161,22 @@ def test_wan_move_is_what_its_definition_says(some: Tracks, h: int, w: int) -> N
             if inside[0, n] and inside[4 * t, n]:
                 (x0, y0), (x, y) = (near.points[0, n] // 8).astype(int), (near.points[4 * t, n] // 8).astype(int)
                 wanted[:, t, y, x] = latent[:, 0, y0, x0]
-    found = wan_move_latent(latent, torch.from_numpy(near.points), torch.from_numpy(near.visible))
-    assert torch.equal(found, wanted)
+    found = toys.wan_move_latent(latent, toys.torch.from_numpy(near.points), toys.torch.from_numpy(near.visible))
+    assert toys.torch.equal(found, wanted)
 
 
-def test_the_files_are_what_ati_and_wan_move_read(tmp_path: Path) -> None:
+@pytest.mark.slow  # it imports PyTorch
+def test_the_files_are_what_ati_and_wan_move_read(toys, tmp_path: Path) -> None:
     some = straight(17)
     write_tracks(some, tmp_path / "a.pth")
-    saved = torch.load(tmp_path / "a.pth", weights_only=True)  # the bytes of an .npz file
+    saved = toys.torch.load(tmp_path / "a.pth", weights_only=True)  # the bytes of an .npz file
     with np.load(io.BytesIO(saved)) as opened:
         np.testing.assert_array_equal(opened["array"], to_ati_file(some))
     positions, visibility = write_tracks(some, tmp_path / "a.npy")
     np.testing.assert_array_equal(np.load(positions), some.points[None])
     assert np.load(visibility).shape == (1, 17, 1)
-    with pytest.raises(InvalidRequest, match="suffix"):
-        write_tracks(some, tmp_path / "a.csv")
-    with pytest.raises(InvalidRequest, match="81"):
-        write_tracks(straight(161), tmp_path / "a.npz")
+    write_tracks(straight(81), tmp_path / "a.npz")
+    for wrong, file, named in ((some, "a.csv", ".csv"), (straight(161), "a.npz", "81")):
+        with refused("invalid-request") as caught:
+            write_tracks(wrong, tmp_path / file)
+        assert named in caught.value.detail

@@ -12,43 +12,42 @@ from typing import Any
 
 import pytest
 from conftest import example
-from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
-from golden import original_weights
 from hub import Blob, Hub, running
-from safetensors.torch import save
+from refusals import refused
 
-from cow_service.errors import CheckpointInvalid, WeightsUnavailable
-from cow_service.generators.wan.loading import create_ati
-from cow_service.generators.wan.tiny import make_tiny
 from cow_service.records import Simulation
-from cow_service.settings import Settings
 from cow_service.weights.manifests import load_manifests
+from cow_service.weights.repositories import download, resolve
 
+pytest_plugins = "toy_fixtures"
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 BALL = example("ball-and-mug")
 TOY = load_manifests()["tiny-ati"].architecture
 ATI = load_manifests()["ati"]
+SHARD = "diffusion_pytorch_model-00002-of-00002.safetensors"
 
 
 def original_form() -> dict[str, Blob]:
     """The toy transformer as ATI's repository lays it out: original names, two shards."""
-    names: dict[str, Any] = convert_wan_transformer_to_diffusers({name: name for name in original_weights()})
-    weights = make_tiny(TOY).transformer.state_dict()
+    import toys
+
+    names: dict[str, Any] = toys.convert_wan_transformer_to_diffusers({name: name for name in toys.original_weights()})
+    weights = toys.make_tiny(TOY).transformer.state_dict()
     held = {original: weights[ours].contiguous() for ours, original in names.items()}
     assert len(held) == len(weights)
     order = sorted(held)
     files = {
-        f"diffusion_pytorch_model-0000{i + 1}-of-00002.safetensors": Blob(save({n: held[n] for n in order[i::2]}))
+        f"diffusion_pytorch_model-0000{i + 1}-of-00002.safetensors": Blob(toys.save({n: held[n] for n in order[i::2]}))
         for i in range(2)
     }
     return files | {"config.json": Blob(json.dumps(TOY | {"_class_name": "WanModel"}).encode(), lfs=False)}
 
 
 @pytest.fixture(scope="module")
-def hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
+def hub(toys, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
     base = tmp_path_factory.mktemp("base")
-    make_tiny(TOY).save_pretrained(base)
+    toys.make_tiny(TOY).save_pretrained(base)
     parts = {
         str(path.relative_to(base)): Blob(path.read_bytes(), lfs=path.suffix == ".safetensors")
         for path in base.rglob("*")
@@ -63,70 +62,71 @@ def hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("home")
-    (folder / "image.jpg").write_bytes(BALL.image)
+def pulled(tmp_path_factory: pytest.TempPathFactory, hub: Hub) -> Path:
+    """A data folder with the weights."""
+    folder = tmp_path_factory.mktemp("data")
+    for source in ATI.sources.values():
+        download([resolve(source, folder / "models", endpoint=hub.address)], folder / "models", endpoint=hub.address)
     return folder
 
 
-def cow(home: Path, hub: Hub, *arguments: str) -> subprocess.CompletedProcess[str]:
+@pytest.mark.soak  # five processes with the models' libraries
+def test_pulled_checked_loaded_and_used_by_commands(tmp_path: Path, hub: Hub) -> None:
     environment = {
-        "COW_DATA_DIR": str(home / "data"), "COW_PROFILE": "portable", "COW_DEVICE": "cpu", "HF_ENDPOINT": hub.address,
-        "HF_HOME": str(home / "hub"), "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb",
+        "COW_DATA_DIR": str(tmp_path / "data"), "COW_PROFILE": "portable", "COW_DEVICE": "cpu",
+        "HF_ENDPOINT": hub.address, "HF_HOME": str(tmp_path / "hub"), "NO_COLOR": "1",
     }  # fmt: skip
-    command = [sys.executable, "-m", "cow_service.cli.main", *arguments]
-    return subprocess.run(command, env=os.environ | environment, cwd=home, capture_output=True, text=True, check=False)
 
+    def cow(*arguments: str, fails: bool = False) -> str:
+        command = [sys.executable, "-m", "cow_service.cli.main", *arguments]
+        settings = {"env": os.environ | environment, "cwd": tmp_path, "capture_output": True, "text": True}
+        done = subprocess.run(command, check=False, **settings)
+        assert (done.returncode != 0) == fails, done.stderr
+        return done.stdout
 
-def settings(home: Path, **given: Any) -> Settings:
-    """Those of the server that `cow` is."""
-    return Settings(data_dir=home / "data", profile="portable", device="cpu", **given)
-
-
-@pytest.mark.soak
-def test_pulled_checked_loaded_and_used(home: Path, hub: Hub) -> None:
-    before = cow(home, hub, "models", "check", "ati")
-    assert before.returncode == 1
-    assert "bytedance-research/ATI" in before.stdout
-    pulled = cow(home, hub, "models", "pull", "ati")
-    assert pulled.returncode == 0, pulled.stderr
-    assert cow(home, hub, "models", "check", "ati").returncode == 0
-    models = json.loads(cow(home, hub, "models", "--json").stdout)["generators"]
+    (tmp_path / "image.jpg").write_bytes(BALL.image)
+    assert "bytedance-research/ATI" in cow("models", "check", "ati", fails=True)
+    cow("models", "pull", "ati")
+    cow("models", "check", "ati")
+    models = json.loads(cow("models", "--json"))["generators"]
     assert [(m["ready"], m["pull"]) for m in models if m["name"] == "ati"] == [(True, None)]
     options = ("--generator", "ati", "--num-frames", "5", "--no-video", "--out", "out", "--option", "steps=2")
-    done = cow(home, hub, "simulate", "image.jpg", BALL.meta["question"], *options)
-    assert done.returncode == 0, done.stderr
-    found = Simulation.model_validate_json((home / "out" / "simulation.json").read_bytes())
+    cow("simulate", "image.jpg", BALL.meta["question"], *options)
+    made_by = Simulation.model_validate_json((tmp_path / "out" / "simulation.json").read_bytes()).generator
     repository = ATI.sources["transformer"].repository
-    assert found.generator.model == repository
-    assert found.generator.revision == hub.main[repository]
-    assert found.generator.steps == 2
-    assert found.generator.options["shift"] == 5.0
-    assert str(found.generator.options["negative_prompt"]).startswith("镜头晃动")
+    assert (made_by.model, made_by.revision, made_by.steps) == (repository, hub.main[repository], 2)
 
 
-def test_damaged_weights_are_not_loaded(home: Path, hub: Hub) -> None:
-    assert cow(home, hub, "models", "pull", "ati").returncode == 0  # of what is there already it loads nothing
-    file = next((home / "data" / "models").rglob("diffusion_pytorch_model-00002-of-00002.safetensors"))
+def test_what_was_pulled_is_loaded_and_named(toys, pulled: Path, hub: Hub) -> None:
+    made = toys.model("ati", pulled, profile="portable")
+    wanted, ours = (dict(each.transformer.named_parameters()) for each in (toys.make_tiny(TOY), made.pipeline))
+    assert ours.keys() == wanted.keys()
+    assert toys.same(list(ours.values()), [weight.to(ours[name].dtype) for name, weight in wanted.items()])
+    assert made.device == toys.CPU
+    assert made.revisions == {part: hub.main[ATI.sources[part].repository] for part in ("base", "transformer")}
+    again = toys.model("ati", pulled, profile="portable")
+    assert again.fingerprint == made.fingerprint
+
+
+def test_damaged_weights_are_not_loaded(toys, pulled: Path) -> None:
+    file = next((pulled / "models").rglob(SHARD))
     whole = file.read_bytes()
     try:
         file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-        with pytest.raises(WeightsUnavailable) as refused:
-            create_ati(settings(home))
-        assert "diffusion_pytorch_model-00002-of-00002.safetensors" in refused.value.detail
-        assert "cow models pull ati" in refused.value.detail
+        with refused("weights-unavailable") as caught:
+            toys.model("ati", pulled, profile="portable")
+        assert SHARD in caught.value.detail
+        assert "cow models pull ati" in caught.value.detail
     finally:
         file.write_bytes(whole)
 
 
-def test_a_checkpoint_of_ones_own(home: Path, hub: Hub, tmp_path: Path) -> None:
+def test_a_checkpoint_of_ones_own(toys, pulled: Path, tmp_path: Path) -> None:
     """One file in place of the pulled transformer; what is wrong with it is named, and no path of this machine."""
-    assert cow(home, hub, "models", "pull", "ati").returncode == 0
-    with pytest.raises(CheckpointInvalid, match=r"There is no checkpoint 'absent.safetensors'"):
-        create_ati(settings(home, checkpoints={"ati": tmp_path / "absent.safetensors"}))
-    (tmp_path / "mine.safetensors").write_bytes(
-        save({"blocks.0.self_attn.q.weight": original_weights()["head.head.bias"]})
-    )
-    with pytest.raises(CheckpointInvalid, match="missing: ") as refused:
-        create_ati(settings(home, checkpoints={"ati": tmp_path / "mine.safetensors"}))
-    assert str(tmp_path) not in refused.value.detail
+    bias = {"blocks.0.self_attn.q.weight": toys.original_weights()["head.head.bias"]}
+    (tmp_path / "mine.safetensors").write_bytes(toys.save(bias))
+    for name, named in (("absent.safetensors", "absent.safetensors"), ("mine.safetensors", "missing")):
+        with refused("checkpoint-invalid") as caught:
+            toys.model("ati", pulled, profile="portable", checkpoints={"ati": tmp_path / name})
+        assert named in caught.value.detail
+        assert str(tmp_path) not in caught.value.detail

@@ -13,42 +13,41 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import engines
 import pytest
 import sqlalchemy as sa
-from dbos import DBOS
-from engines import running_engine
-from job_rows import add_job, take_new_job
-from postgres import postgres_server
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from job_rows import add_job, open_database, take_new_job
+from postgres import PostgresServer, postgres
 from pydantic import SecretStr
-from waiting import eventually
+from refusals import refused
+from waiting import TIME_LIMIT, eventually
 
-from cow_service.errors import Canceled, InternalError, InvalidRequest
-from cow_service.jobs import webhooks
+from cow_service.errors import Canceled, InternalError
+from cow_service.jobs import maintenance
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.attempts import Dispatcher
+from cow_service.jobs.attempts import Dispatcher, Runner
+from cow_service.jobs.calls import Calls
+from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import Database, StoredResult
-from cow_service.jobs.job_table import MAX_STARTS, JobFilters, JobTable
-from cow_service.jobs.maintenance import Maintenance
+from cow_service.jobs.job_table import MAX_LISTED, MAX_STARTS, VERSION, JobFilters, JobTable
 from cow_service.jobs.schema import JOBS
 from cow_service.settings import Settings
 
 
 @pytest.fixture(scope="module")
-def postgres() -> Iterator[SecretStr]:
-    with postgres_server() as url:
-        yield SecretStr(url)
+def server() -> Iterator[PostgresServer]:
+    with postgres() as server:
+        yield server
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
-    url = request.getfixturevalue("postgres") if request.param == "postgres" else None
-    database = Database(Settings(data_dir=tmp_path, database_url=url))
-    database.create_tables()
-    yield database
-    with database.transaction() as connection:
-        connection.execute(sa.delete(JOBS))
-    database.close()
+    url = SecretStr(request.getfixturevalue("server").url) if request.param == "postgres" else None
+    with closing(open_database(tmp_path, url)) as database:
+        yield database
+        with database.transaction() as connection:
+            connection.execute(sa.delete(JOBS))
 
 
 def ids(jobs: list[Any]) -> list[str]:
@@ -72,9 +71,8 @@ def test_jobs_are_taken_in_their_turns_and_once(database: Database) -> None:
 
 
 LISTS = [
-    {"kind": "answer"},
-    {"kind": "answer", "status": ["failed"]},
     {"kind": "answer", "status": ["queued", "failed", "failed"]},
+    {"kind": "answer"},
     {"kind": "simulate", "status": ["running"]},
     {"status": ["failed", "canceled"]},
     {},
@@ -82,12 +80,12 @@ LISTS = [
 
 
 def fill(database: Database, count: int) -> None:
-    """Jobs of two keys: of a hundred one is an answer that failed, and 19 are simulations that did."""
+    """Jobs of two keys: of a hundred one is an answer that failed, and 19 are simulations that did; ten are of alice."""
     add_job(database, "first", "alice")
     columns = [column.name for column in JOBS.columns]
     values = {
         "id": "'job-' || n",
-        "owner": "CASE n % 2 WHEN 0 THEN 'alice' ELSE 'bob' END",
+        "owner": "CASE n % 10 WHEN 0 THEN 'alice' ELSE 'bob' END",
         "kind": "CASE n % 100 WHEN 0 THEN 'answer' ELSE 'simulate' END",
         "status": "CASE WHEN n % 100 < 20 THEN 'failed' ELSE 'succeeded' END",
         "created_at": "'2026-01-01T00:00:' || (10 + n % 50) || '.000Z'",  # many have equal times
@@ -103,58 +101,113 @@ def fill(database: Database, count: int) -> None:
 
 
 @pytest.mark.parametrize("owner", [None, "alice"])
-@pytest.mark.parametrize("wanted", LISTS, ids=str)
-def test_lists_have_what_is_wanted_once(database: Database, owner: str | None, wanted: dict[str, Any]) -> None:
+def test_lists_have_what_is_wanted_once(database: Database, owner: str | None) -> None:
     fill(database, 600)
     rows = database.read(sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.kind, JOBS.c.status, JOBS.c.created_at))
-    expected = [
-        row.id
-        for row in sorted(rows, key=lambda row: (row.created_at, row.id), reverse=True)
-        if row.owner == (owner or row.owner)
-        and row.kind == wanted.get("kind", row.kind)
-        and row.status in wanted.get("status", [row.status])
-    ]
-    table, found, cursor = JobTable(database), [], None
-    while found == [] or cursor is not None:
-        page = table.page(owner, JobFilters(limit=100, cursor=cursor, **wanted), {})
-        found += ids([*page.jobs])
-        cursor = page.next
-        if not page.jobs:
+    newest = sorted(rows, key=lambda row: (row.created_at, row.id), reverse=True)
+    table = JobTable(database)
+    for wanted in LISTS:
+        expected = [
+            row.id
+            for row in newest
+            if row.owner == (owner or row.owner)
+            and row.kind == wanted.get("kind", row.kind)
+            and row.status in wanted.get("status", [row.status])
+        ]
+        page = table.page(owner, JobFilters(limit=25, **wanted), {})
+        listed = ids(page.jobs)
+        while page.next is not None:
+            assert len(page.jobs) == 25
+            page = table.page(owner, JobFilters(limit=25, cursor=page.next, **wanted), {})
+            listed += ids(page.jobs)
+        assert listed == expected
+
+
+def test_times_are_included_to_the_millisecond(database: Database) -> None:
+    for number in range(4):
+        add_job(database, str(number), created_at=f"2026-01-01T00:00:00.00{number}Z")
+
+    def found(**times: str) -> str:
+        return "".join(ids(JobTable(database).page(None, JobFilters.model_validate(times), {}).jobs))
+
+    day = "2026-01-01T00:00:00"
+    assert found(created_after=f"{day}.001Z", created_before=f"{day}.002Z") == "21"
+    assert found(created_after="2026-01-01T09:00:00.002+09:00") == "32"
+    assert (found(created_after=f"{day}.001001Z"), found(created_before=f"{day}.001999Z")) == ("32", "10")
+    for moment in ("0001-01-01T00:00:00+14:00", "1969-12-31T23:59:59Z", "9999-12-31T23:59:59-14:00"):
+        ends = (found(created_after=moment), found(created_before=moment))
+        assert ends == (("3210", "") if moment < "2000" else ("", "3210"))
+
+
+SHARED_FIXTURE = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@SHARED_FIXTURE
+@given(data=st.data(), limit=st.integers(1, 6), count=st.integers(1, 12))
+def test_jobs_that_come_and_go_between_pages_hide_no_others(
+    database: Database, data: st.DataObject, limit: int, count: int
+) -> None:
+    """Nor do those of the same millisecond."""
+    table = JobTable(database)
+    table.delete([row.id for row in database.read(sa.select(JOBS.c.id))])
+    names = [f"{number:02}" for number in range(count)]
+    for number, name in enumerate(names):
+        add_job(database, name, created_at=f"2026-01-01T00:00:00.{number // 3:03}Z")
+    listed: list[str] = []
+    left, cursor, later = {*names}, None, 0
+    while True:
+        page = table.page(None, JobFilters(limit=limit, cursor=cursor), {})
+        assert len(page.jobs) == limit or page.next is None
+        listed += ids(page.jobs)
+        if (cursor := page.next) is None:
             break
-    assert found == expected
+        gone = data.draw(st.sets(st.sampled_from(sorted(left)), max_size=2)) if left else set[str]()
+        table.delete(sorted(gone))
+        left -= gone
+        add_job(database, f"later-{(later := later + 1)}", created_at="2026-01-01T00:00:01.000Z")
+    assert left <= {*listed}
+    assert listed == sorted({*listed}, reverse=True)
+
+
+@SHARED_FIXTURE
+@given(st.text(st.characters(codec="utf-8"), min_size=1, max_size=60))
+@example("W10")  # []
+@example("WzEsMl0")  # [1,2]
+@example("WzFlMzAwLFtdXQ")  # [1e300,[]]
+@example("W05hTixbXV0")  # [NaN,[]]
+@example("é")
+def test_what_is_no_cursor_is_refused(database: Database, cursor: str) -> None:
+    with refused("invalid-request", "/cursor"):
+        JobTable(database).page(None, JobFilters.model_construct(cursor=cursor), {})
 
 
 @pytest.mark.parametrize("owner", [None, "alice"])
-@pytest.mark.parametrize("wanted", LISTS, ids=str)
-def test_no_list_looks_at_other_jobs(database: Database, owner: str | None, wanted: dict[str, Any]) -> None:
+def test_no_list_looks_at_other_jobs(database: Database, owner: str | None) -> None:
     """Each is answered from ranges of an index that hold nothing else."""
     fill(database, 20_000)
+    if database.file is None:
+        with database.engine.connect() as connection:
+            connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("VACUUM ANALYZE cow_jobs")
     asked: list[tuple[str, Any]] = []
-
-    def note(_connection: Any, _cursor: Any, statement: str, values: Any, *_: Any) -> None:
-        asked.append((statement, values))
-
-    sa.event.listen(database.engine, "before_cursor_execute", note)
-    JobTable(database).page(owner, JobFilters(**wanted), {})
-    sa.event.remove(database.engine, "before_cursor_execute", note)
-    ((statement, values),) = asked
-    with database.engine.connect() as connection:
-        if database.file is None:
-            connection.exec_driver_sql("ANALYZE cow_jobs")
-            (plan,) = connection.exec_driver_sql(f"EXPLAIN (ANALYZE, FORMAT JSON) {statement}", values).scalars()
-            used = re.findall(r'"(?:Index|Relation) Name": "(cow_jobs\w*)"', json.dumps(plan))
-            assert used.count("cow_jobs") * 2 == len(used), "a table is read without an index"
-            removed = re.findall(r'"Rows Removed by Filter": (\d+)', json.dumps(plan))
-            assert sum(map(int, removed)) <= 1, "of a status that one job has any index is as good"
-        else:
+    sa.event.listen(database.engine, "before_cursor_execute", lambda *event: asked.append(event[2:4]))
+    for wanted in LISTS:
+        asked.clear()
+        JobTable(database).page(owner, JobFilters(**wanted), {})
+        ((statement, values),) = tuple(asked)
+        with database.engine.connect() as connection:
+            if database.file is None:
+                (plan,) = connection.exec_driver_sql(f"EXPLAIN (ANALYZE, FORMAT JSON) {statement}", values).scalars()
+                used = re.findall(r'"(?:Index|Relation) Name": "(cow_jobs\w*)"', json.dumps(plan))
+                assert used.count("cow_jobs") * 2 == len(used), "a table is read without an index"
+                removed = re.findall(r'"Rows Removed by Filter": (\d+)', json.dumps(plan))
+                assert sum(map(int, removed)) <= 1, wanted  # of a status that one job has any index is as good
+                continue
             steps = [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values)]
             used = [name for step in steps for name in re.findall(r"cow_jobs\w*", step)]
             assert not [step for step in steps if re.match(r"SCAN cow_jobs(?! USING)", step)]
-            of_kind, plain = (
-                {"cow_jobs_of_kind", "cow_jobs_of_owner_and_kind"},
-                {"cow_jobs_of_time", "cow_jobs_of_owner"},
-            )
-            assert set() < {*used} - {"cow_jobs"} <= (of_kind if wanted else plain)
+            of_kind = {"cow_jobs_of_kind", "cow_jobs_of_owner_and_kind"}
+            allowed = of_kind if wanted else {"cow_jobs_of_time", "cow_jobs_of_owner"}
+            assert set() < {*used} - {"cow_jobs"} <= allowed
 
 
 def test_no_owner_has_more_taken_jobs_than_they_may_have(database: Database) -> None:
@@ -205,23 +258,35 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
     assert ids(table.page(None, JobFilters(status=("succeeded",)), {}).jobs) == ["job"]
 
 
-def test_callers_that_are_slow_do_not_make_a_queue_slow(database: Database) -> None:
+def test_a_queued_job_says_how_long_it_will_wait(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the pace of the last ends; that of an idle queue, whose callers are slow, is not known."""
+    clock = [1e9]
+    monkeypatch.setattr("cow_service.jobs.job_table.time", SimpleNamespace(time=lambda: clock[0]))
     table = JobTable(database)
 
-    def waits(job: str) -> float | None:
-        add_job(database, job)
+    def place(job: str) -> tuple[int | None, float | None]:
         found = table.find(job, None)
         assert found is not None
-        return found.job.expected_wait
+        return found.job.position, found.job.expected_wait
 
-    for job in ("first", "second"):
-        add_job(database, job)
-        (taken,) = table.take("light", "me", 1, None)
-        assert table.begin(taken)
-        assert table.succeed(taken, "{}", None, ())
-    assert waits("third") is None, "how long it takes is not known: nobody works, and nothing is ahead of it"
-    table.take("light", "me", 1, None)
-    assert waits("fourth") is not None
+    for number in range(4):
+        job = take_new_job(database, f"ended-{number}", "me")
+        assert table.begin(job)
+        assert table.succeed(job, "{}", None, ())
+        clock[0] += 10
+    assert table.ended_lately() == {"light": 4}
+    add_job(database, "first")
+    assert place("first") == (0, None), "nobody works, and nothing is ahead of it"
+    add_job(database, "second")
+    assert place("second") == (1, 20.0)
+    (first,) = table.take("light", "me", 1, None)
+    assert table.begin(first)
+    assert place("second") == (0, 10.0)
+    clock[0] += 285  # three of the ends are more than five minutes ago
+    assert table.ended_lately() == {"light": 1}
+    assert place("second") == (0, None)
+    counts = {(one.state, one.jobs, one.workflow_version) for one in table.open_counts()}
+    assert counts == {("running", 1, VERSION), ("queued", 1, VERSION)}
 
 
 def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_without_it(database: Database) -> None:
@@ -245,20 +310,21 @@ def test_results_of_a_deleted_job_lock_nobody_out(database: Database, tmp_path: 
     assert held
 
 
-def test_after_jobs_connections_are_closed(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
-    active = ActiveJobs()
-    parts: Any = SimpleNamespace(active=active, database=database, jobs=JobTable(database), executor="me")
-    calls: Any = SimpleNamespace(busy_executors=set)
-    tidying = Maintenance(parts, calls, SimpleNamespace(), lambda jobs, since: None, lambda: None)  # type: ignore[arg-type]
+def test_after_jobs_connections_are_closed(database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cow_service.jobs.active.QUIET_SECONDS", 0.5)
-    held = [database.engine.connect() for _ in range(5)]
-    for one in held:
+    monkeypatch.setattr(maintenance, "QUIET_POLL_SECONDS", 0.05)
+    service: Any = SimpleNamespace(settings=Settings())
+    parts = EngineParts(service, database, JobTable(database), ActiveJobs(), "me")
+    lease = maintenance.FolderLease(tmp_path)
+    thread = maintenance.Maintenance(parts, Calls(), lease, lambda jobs, since: None, lambda: None)
+    for one in [database.engine.connect() for _ in range(5)]:
         one.close()
-    tidying._close_idle_connections()
-    assert database.engine.pool.checkedin() == 5  # type: ignore[attr-defined]
-    eventually(lambda: active.is_quiet)
-    tidying._close_idle_connections()
-    assert database.engine.pool.checkedin() == 0  # type: ignore[attr-defined]
+    with parts.active.running("job", "simulate"):
+        thread.start()
+        pool: Any = database.engine.pool
+        assert pool.checkedin() >= 4
+    eventually(lambda: pool.checkedin() <= 1)
+    thread.stop()
     database.check()
 
 
@@ -284,25 +350,29 @@ def test_a_job_that_ends_its_process_each_time_fails(database: Database) -> None
     assert found is not None
     assert (found.job.status, ended) == ("failed", ["https://call.test"])
     assert isinstance(found.error, InternalError)
-    assert "ended repeatedly" in found.error.detail
 
 
-def test_pages_show_each_job_once(database: Database) -> None:
-    table = JobTable(database)
-    for number in range(25):  # some at the same time
-        add_job(database, f"{number:02}", created_at=f"2026-01-01T00:00:00.{number // 3:03}Z")
-    shown: list[str] = []
-    cursor = None
-    while True:
-        page = table.page(None, JobFilters(limit=4, cursor=cursor), {})
-        shown += ids(list(page.jobs))
-        cursor = page.next
-        if cursor is None:
-            break
-    assert shown == [f"{number:02}" for number in range(24, -1, -1)]
-    for wrong in ("", "x", "W10", "WzEsMl0", "é"):
-        with pytest.raises(InvalidRequest, match="cursor"):
-            table.page(None, JobFilters.model_construct(cursor=wrong), {})
+def test_long_answers_are_listed_in_short(database: Database) -> None:
+    for length in (MAX_LISTED, MAX_LISTED + 1):
+        job = take_new_job(database, f"job-{length}", "me")
+        assert JobTable(database).succeed(job, "{}", None, (), answer="x" * length)
+    shown = {job.id: job.answer for job in JobTable(database).page(None, JobFilters(), {}).jobs}
+    assert shown == {"job-200": "x" * 200, "job-201": "x" * 199 + "…"}
+
+
+def test_a_job_that_the_system_gives_no_thread_for_is_left_to_maintenance(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    ends: list[tuple[str, bool]] = []
+    parts: Any = SimpleNamespace(jobs=JobTable(database), active=ActiveJobs())
+    runner = Runner(parts, Computer(), None, lambda job, has_ended: ends.append((job.id, has_ended)))  # type: ignore[arg-type]
+    job = take_new_job(database, "job", "me")
+    monkeypatch.setattr(threading.Thread, "start", fail)
+    runner.start(job)
+    assert ends == [("job", False)]
 
 
 @pytest.mark.parametrize("capacity", [0, 3])
@@ -327,29 +397,7 @@ def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
         eventually(lambda: len(started) == capacity + 1)
     assert not told.is_set(), "jobs that were not new here are told by those who took them in"
     dispatcher.wake("light")
-    assert told.wait(30), "others may have a place for a new job"
+    assert told.wait(TIME_LIMIT), "others may have a place for a new job"
     dispatcher.stop()
     assert dispatcher.free_places("light") == dispatcher.free_places("other") == 0
     assert len(waiting) + len(started) == 8
-
-
-def test_calls_of_webhooks_that_a_process_left_are_made_by_another() -> None:
-    """By the public interface of DBOS: what was left pending goes back to its queue, and nothing else is touched."""
-    engine = running_engine()
-    hooks = engines.webhooks()
-    table = sa.Table("workflow_status", sa.MetaData(), autoload_with=engine.database.engine)
-    left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, "job")}
-    with engine.database.transaction() as connection:
-        for name, workflow in left.items():
-            connection.execute(
-                sa.insert(table).values(
-                    workflow_uuid=workflow, status="PENDING", name=name, executor_id="ended", application_version="none"
-                )
-            )
-    assert "ended" in hooks.busy_executors()
-    hooks.recover(["ended"])
-    webhook = DBOS.get_workflow_status(left[webhooks.WORKFLOW])
-    assert webhook is not None
-    assert (webhook.status, webhook.queue_name) == ("ENQUEUED", webhooks.QUEUE)
-    assert DBOS.get_workflow_status(left["job"]) is None
-    hooks.client.delete_workflows([left[webhooks.WORKFLOW]])

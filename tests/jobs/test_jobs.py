@@ -6,12 +6,10 @@ import json
 import re
 import socket
 import sqlite3
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
-from datetime import datetime, timedelta
-from itertools import groupby
+from datetime import datetime, timedelta, timezone
 from typing import Any
 from uuid import uuid4
 
@@ -19,11 +17,8 @@ import cv2
 import httpx
 import numpy as np
 import pytest
-from conftest import SCALE
+from callers import as_caller, new_keys
 from drawn import png_bytes
-from hypothesis import HealthCheck, given
-from hypothesis import settings as trying
-from hypothesis import strategies as st
 from servers import (
     ASYNC,
     BODY,
@@ -46,24 +41,39 @@ from cow_service.records import Job, JobPage, Simulation
 STAGES = ["grounding", "motion", "trajectory", "generation"]
 LOST = {**BODY, "grounding": None, "motion": None, "question": "If the pink car turns, what happens?"}
 FRESH = {"Cache-Control": "no-cache"}
+ENDLESS = 100.0  # seconds that no test waits for; it can be ended after each fortieth of them
+SETTINGS, KEYS = new_keys("main", "many")
+PINGING = """
+from cow_service.api.routes import jobs
+jobs.PING_SECONDS = 1
+from cow_service.cli.main import app
+app(["serve"])
+"""
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with Served(tmp_path_factory.mktemp("served"), COW_WORKERS="true") as one:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server for all who ask and change nothing, each with a key."""
+    with Served(tmp_path_factory.mktemp("served"), COW_CONCURRENCY="4", **SETTINGS) as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def served(shared: Served) -> Iterator[Served]:
+    with as_caller(shared, KEYS["main"]) as one:
         yield one
 
 
 @pytest.fixture(scope="module")
 def tight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """One clip at a time, two jobs at hand, three in all."""
+    """One clip at a time, two jobs at hand, three in all; a comment after each second of silence."""
     own = {
         "COW_CONCURRENCY": "1",
         "COW_MLLM_CONCURRENCY": "1",
         "COW_GENERATOR_CONCURRENCY": '{"slow": 1}',
         "COW_QUEUE_LIMIT": "3",
     }
-    with Served(tmp_path_factory.mktemp("tight"), **own) as one:
+    with Served(tmp_path_factory.mktemp("tight"), code=PINGING, **own) as one:
         yield one
 
 
@@ -75,20 +85,22 @@ def emptied(tight: Served) -> Iterator[Served]:
         tight.http.post(f"/jobs/{job['id']}/cancel")
 
 
-def new_key() -> str:
-    return uuid4().hex
-
-
 def ids(page: httpx.Response) -> list[str]:
     assert page.status_code == 200, page.text
-    return [job["id"] for job in JobPage.model_validate(page.json()).model_dump()["jobs"]]
+    return [job.id for job in JobPage.model_validate(page.json()).jobs]
+
+
+def cancel(served: Served, job: dict[str, Any]) -> dict[str, Any]:
+    response = served.http.post(f"/jobs/{job['id']}/cancel")
+    assert response.status_code == 200, response.text
+    return response.json()
 
 
 # --- Prefer ---
 
 
-def test_respond_async(served: Served) -> None:
-    response = served.http.post("/simulate", json=BODY, headers=ASYNC)
+def test_a_job_is_accepted_and_ends(served: Served) -> None:
+    response = served.http.post("/simulate", json=BODY, headers=ASYNC | FRESH)
     assert response.status_code == 202
     job = Job.model_validate(response.json())
     assert response.headers["location"] == f"/jobs/{job.id}"
@@ -97,59 +109,45 @@ def test_respond_async(served: Served) -> None:
     assert (job.kind, job.generator, job.problem) == ("simulate", "cutout", None)
     done = served.ended(job.id)
     assert (done["status"], done["progress"], done["stage"]) == ("succeeded", 1, None)
-    Job.model_validate(done)
     assert done["result"]["id"] == job.id
-    assert done["result"]["created_at"] == done["created_at"] == job.created_at
+    assert done["result"]["created_at"] == done["created_at"] == job.created_at <= done["finished_at"]
+    waited = served.http.post("/simulate", json=BODY, headers=FRESH | {"Prefer": "respond-async, wait=50"})
+    assert waited.status_code == 200
+    assert plain(waited.json()) == plain(done["result"])
+    Simulation.model_validate(waited.json())
+    assert cancel(served, done) == served.job(job.id) == done, "it has ended"
 
 
-def test_the_result_of_a_job_is_what_a_caller_who_waits_gets(served: Served) -> None:
-    job = served.ended(served.submit(BODY, **FRESH)["id"])
-    response = served.http.post("/simulate", json=BODY, headers=FRESH)
-    assert response.status_code == 200
-    assert plain(response.json()) == plain(job["result"])
-    Simulation.model_validate(job["result"])
-
-
-def test_wait_is_long_enough(served: Served) -> None:
-    response = served.http.post("/simulate", json=BODY, headers={"Prefer": "respond-async, wait=50"})
-    assert response.status_code == 200
-    assert response.json()["frames"]
-
-
-@pytest.mark.slow
-def test_wait_is_too_short(served: Served) -> None:
-    response = served.http.post("/simulate", json=slow(30, seed=1), headers={"Prefer": "wait=1"})
+def test_a_caller_who_waits_too_short_gets_the_job(served: Served) -> None:
+    response = served.http.post("/simulate", json=slow(ENDLESS, seed=1), headers={"Prefer": "wait=1"})
     assert response.status_code == 202
     assert response.headers["preference-applied"] == "wait=1"
-    job = response.json()
-    assert response.headers["location"] == f"/jobs/{job['id']}"
-    assert job["status"] in ("queued", "running")
-    assert served.http.post(f"/jobs/{job['id']}/cancel").json()["status"] == "canceled"
+    assert response.headers["location"] == f"/jobs/{response.json()['id']}"
+    assert response.json()["status"] == "running"
+    assert cancel(served, response.json())["status"] == "canceled"
 
 
 @pytest.mark.parametrize(
-    "prefer", ["wait=0", "respond-async; x=1, wait=0", "handling=strict, respond-async", 'wait="0"']
+    ("prefer", "applied"),
+    [
+        (["wait=0"], "wait=0"),
+        (["handling=strict, respond-async"], "respond-async"),
+        (['wait="0"'], "wait=0"),
+        (["respond-async; x=1, wait=0", "wait=100, respond-async"], "respond-async, wait=0"),
+    ],
+    ids=["no wait", "beside another", "quoted", "the first of a name counts"],
 )
-def test_not_waiting_at_all(served: Served, prefer: str) -> None:
-    response = served.http.post("/simulate", json=slow(0.01, seed=2), headers={"Prefer": prefer})
-    assert response.status_code == 202
+def test_a_caller_who_does_not_wait(served: Served, prefer: list[str], applied: str) -> None:
+    response = served.http.post("/simulate", json=BODY, headers=[("Prefer", one) for one in prefer])
+    assert (response.status_code, response.headers["preference-applied"]) == (202, applied)
     assert served.ended(response.json()["id"])["status"] == "succeeded"
 
 
-@pytest.mark.parametrize(
-    "prefer", ["wait=", "wait=soon", "wait=-1", "wait=1.5", "=", ",;,", "respondasync", "wait=٣", "a" * 5000]
-)
-def test_a_preference_that_is_none_is_ignored(served: Served, prefer: str) -> None:
-    response = served.http.post("/simulate", json=BODY, headers={"Prefer": prefer.encode()})  # type: ignore[dict-item]
-    assert response.status_code == 200
-    assert "preference-applied" not in response.headers
-
-
-def test_two_headers_are_one_list_and_the_first_of_a_name_counts(served: Served) -> None:
-    headers = [("Prefer", "wait=0"), ("Prefer", "wait=100, respond-async")]
-    response = served.http.post("/simulate", json=BODY, headers=headers)
-    assert response.status_code == 202
-    assert response.headers["preference-applied"] == "respond-async, wait=0"
+def test_a_preference_that_is_none_is_ignored(served: Served) -> None:
+    for prefer in ("wait=", "wait=soon", "wait=-1", "wait=1.5", "=", ",;,", "respondasync", "wait=٣", "a" * 5000):
+        response = served.http.post("/simulate", json=BODY, headers=[(b"Prefer", prefer.encode())])
+        assert response.status_code == 200, prefer
+        assert "preference-applied" not in response.headers
 
 
 # --- a job's way ---
@@ -157,61 +155,49 @@ def test_two_headers_are_one_list_and_the_first_of_a_name_counts(served: Served)
 
 @pytest.mark.slow
 def test_a_job_goes_its_way_in_order(emptied: Served) -> None:
-    first = [emptied.submit(slow(1, seed=seed))["id"] for seed in (10, 11)]
-    last = emptied.submit(slow(0.5, seed=12, image=data_url(picture(3))))
+    first = emptied.submit(slow(1, seed=10))
+    last = emptied.submit(slow(1, seed=12, image=data_url(picture(3))))
     assert (last["status"], last["stage"], last["progress"]) == ("queued", None, 0)
-    seen: list[tuple[str, str | None, float]] = []
+    seen: list[dict[str, Any]] = []
 
     def look() -> bool:
-        job = emptied.job(last["id"])
-        seen.append((job["status"], job["stage"], job["progress"]))
-        return job["status"] in TERMINAL
+        seen.append(emptied.job(last["id"]))
+        return seen[-1]["status"] in TERMINAL
 
     eventually(look)
-    statuses = [status for status, _, _ in seen]
-    assert [status for status, _ in groupby(statuses)] == ["queued", "running", "succeeded"]
-    stages = [stage for status, stage, _ in seen if status == "running"]
+    order = ["queued", "running", "succeeded"]
+    assert [job["status"] for job in seen] == sorted((job["status"] for job in seen), key=order.index)
+    stages = [job["stage"] for job in seen if job["stage"] is not None]
     assert stages == sorted(stages, key=STAGES.index)
-    assert "generation" in stages
-    progress = [done for _, _, done in seen]
+    progress = [job["progress"] for job in seen]
     assert progress == sorted(progress)
-    assert progress[0] == 0
     assert progress[-1] == 1
-    assert [emptied.ended(job)["status"] for job in first] == ["succeeded"] * 2
-
-
-def test_a_job_is_never_done_before_it_came(served: Served) -> None:
-    for _ in range(3):
-        job = served.ended(served.submit(BODY)["id"])
-        assert job["created_at"] <= job["finished_at"]
+    assert emptied.job(first["id"])["status"] == "succeeded"
 
 
 def test_a_failed_job_keeps_its_problem(served: Served) -> None:
-    response = served.http.post("/simulate", json=LOST)
-    told = problem(response, 422, "cannot-ground")
+    told = problem(served.http.post("/simulate", json=LOST), 422, "cannot-ground")
     job = served.ended(served.submit(LOST)["id"])
     Job.model_validate(job)
-    assert (job["status"], job["result"]) == ("failed", None)
-    assert job["problem"] == told
-    (listed,) = [
-        one for one in served.http.get("/jobs", params={"status": "failed"}).json()["jobs"] if one["id"] == job["id"]
-    ]
-    assert listed["problem"] == told
-    key, replayed = new_key(), []
-    for _ in range(2):
-        again = served.http.post("/simulate", json=LOST, headers={"Idempotency-Key": key})
-        replayed.append(again.headers.get("idempotent-replayed"))
-        assert problem(again, 422, "cannot-ground") == told
-    assert replayed == [None, "true"]
+    assert (job["status"], job["result"], job["problem"]) == ("failed", None, told)
+    assert cancel(served, job) == job
+    last = events_of(served.http.get(f"/jobs/{job['id']}/events"))[-1]
+    assert (last["event"], last["id"], last["data"]["problem"]) == ("failed", "100", told)
+    listed = served.http.get("/jobs", params={"status": "failed"}).json()["jobs"]
+    assert [one["problem"] for one in listed if one["id"] == job["id"]] == [told]
+    key = {"Idempotency-Key": "lost"}
+    first, again = (served.http.post("/simulate", json=LOST, headers=key) for _ in range(2))
+    assert problem(first, 422, "cannot-ground") == problem(again, 422, "cannot-ground") == told
+    assert [one.headers.get("idempotent-replayed") for one in (first, again)] == [None, "true"]
 
 
 def test_what_can_be_told_at_once_makes_no_job(served: Served) -> None:
-    before = ids(served.http.get("/jobs", params={"limit": 500}))
+    before = served.http.get("/jobs", params={"limit": 500}).json()
     bad = {**BODY, "generator_options": {"clean_cues": "perhaps"}}
     problem(served.http.post("/simulate", json=bad, headers=ASYNC), 422, "invalid-request")
     gone = {**BODY, "image": {"artifact": "0" * 64}}
     problem(served.http.post("/simulate", json=gone, headers=ASYNC), 404, "artifact-not-found")
-    assert ids(served.http.get("/jobs", params={"limit": 500})) == before
+    assert served.http.get("/jobs", params={"limit": 500}).json() == before
 
 
 @pytest.mark.parametrize(
@@ -220,8 +206,7 @@ def test_what_can_be_told_at_once_makes_no_job(served: Served) -> None:
 )
 def test_there_is_no_such_job(served: Served, call: str) -> None:
     method, path = call.split()
-    for name in (str(uuid4()), "x", "0" * 64):
-        problem(served.http.request(method, path.format(name)), 404, "job-not-found")
+    problem(served.http.request(method, path.format(uuid4())), 404, "job-not-found")
     for name in ("a" * 65, "a_b", "%C3%A4", f"{uuid4()}.webhook.1"):
         problem(served.http.request(method, path.format(name)), 422, "invalid-request")
 
@@ -233,9 +218,9 @@ def test_the_request_of_a_job_can_be_sent_again(served: Served) -> None:
     body = {**BODY, "objects": [{**cube, "mask": data_url(png_bytes(mask))}], "priority": "low", "question": "?" * 300}
     job = served.ended(served.submit(body)["id"])
     assert (job["question"], job["image"]) == (body["question"], job["result"]["image"]["sha256"])
-    assert served.http.get("/jobs", params={"limit": 1}).json()["jobs"][0] | {"result": job["result"]} == job | {
-        "question": "?" * 199 + "…"
-    }
+    assert job["given"] == ["grounding", "motion", "objects"]
+    listed = served.http.get("/jobs", params={"limit": 1}).json()["jobs"][0]
+    assert listed == job | {"question": "?" * 199 + "…", "result": None}
     told = served.http.get(f"/jobs/{job['id']}/request").json()
     digest = told["request"]["objects"][0]["mask"]["artifact"]
     artifacts = {"image": {"artifact": job["image"]}, "objects": [{**cube, "mask": {"artifact": digest}}]}
@@ -250,194 +235,54 @@ def test_the_request_of_a_job_can_be_sent_again(served: Served) -> None:
 
 
 @pytest.fixture(scope="module")
-def many(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Served, list[dict[str, Any]]]]:
-    """A server with 24 jobs of every sort, and these, oldest first."""
-    with Served(tmp_path_factory.mktemp("many")) as one:
-        made = []
-        for number in range(24):
-            sort = number % 4
-            body = (BODY, LOST, {**BODY, "question": f"{QUESTION} A) Yes B) No"}, slow(600, seed=number))[sort]
-            job = one.submit(body, path="/answer" if sort == 2 else "/simulate")
-            made.append(job)
-            if sort == 3:
-                one.http.post(f"/jobs/{job['id']}/cancel")
+def many(shared: Served) -> Iterator[tuple[Served, list[dict[str, Any]]]]:
+    """A caller with a job of every sort, twice, and these, oldest first."""
+    bodies = {"/simulate": [BODY, LOST, slow(ENDLESS)], "/answer": [{**BODY, "question": f"{QUESTION} A) Yes B) No"}]}
+    with as_caller(shared, KEYS["many"]) as one:
+        made = [one.submit(body, path=path) for _ in range(2) for path, some in bodies.items() for body in some]
+        for job in made[2::4]:
+            cancel(one, job)
         yield one, [one.ended(job["id"]) for job in made]
 
 
 def test_jobs_are_listed_newest_first_as_they_are(many: tuple[Served, list[dict[str, Any]]]) -> None:
     served, made = many
-    listed = served.http.get("/jobs").json()
-    assert listed["next"] is None
-    assert listed["jobs"] == [{**job, "result": None} for job in reversed(made)]
+    listed = [{**job, "result": None} for job in reversed(made)]
+    assert [job["status"] for job in made[:4]] == ["succeeded", "failed", "canceled", "succeeded"]
+    assert served.http.get("/jobs").json() == {"jobs": listed, "next": None}
+    page = served.http.get("/jobs", params={"limit": 5}).json()
+    rest = served.http.get("/jobs", params={"limit": 5, "cursor": page["next"]}).json()
+    assert (page["jobs"], rest) == (listed[:5], {"jobs": listed[5:], "next": None})
+    for asked, wanted in (
+        ({"status": ["failed", "canceled"]}, [6, 5, 2, 1]),
+        ({"kind": "answer"}, [7, 3]),
+        ({"kind": "simulate", "status": "succeeded"}, [4, 0]),
+        ({"created_after": in_tokyo(made[4]), "created_before": in_tokyo(made[6])}, [6, 5, 4]),
+    ):
+        assert ids(served.http.get("/jobs", params=asked)) == [made[place]["id"] for place in wanted]
+
+
+def in_tokyo(job: dict[str, Any]) -> str:
+    return datetime.fromisoformat(job["created_at"]).astimezone(timezone(timedelta(hours=9))).isoformat()
 
 
 @pytest.mark.parametrize(
     "asked",
     [
-        {"status": "succeeded"},
-        {"status": ["failed", "canceled"]},
-        {"status": ["queued", "running"]},
-        {"kind": "answer"},
-        {"kind": "simulate", "status": "succeeded"},
-        {"status": ["succeeded", "succeeded"], "kind": "answer", "limit": 500},
-    ],
-)
-def test_filters(many: tuple[Served, list[dict[str, Any]]], asked: dict[str, Any]) -> None:
-    served, made = many
-    statuses = asked.get("status", TERMINAL)
-    wanted = [
-        job["id"]
-        for job in reversed(made)
-        if job["status"] in statuses and asked.get("kind", job["kind"]) == job["kind"]
-    ]
-    assert ids(served.http.get("/jobs", params=asked)) == wanted
-    assert all_pages(served, {**asked, "limit": 2}) == wanted
-
-
-def test_times_are_included_to_the_millisecond(many: tuple[Served, list[dict[str, Any]]]) -> None:
-    served, made = many
-    for first, last in ((0, 23), (5, 5), (3, 17), (12, 12), (22, 23)):
-        after, before = made[first]["created_at"], made[last]["created_at"]
-        wanted = [job["id"] for job in reversed(made) if after <= job["created_at"] <= before]
-        asked = {"created_after": after, "created_before": before}
-        assert ids(served.http.get("/jobs", params=asked)) == wanted
-        assert all_pages(served, {**asked, "limit": 3}) == wanted
-        elsewhere = {"created_after": in_tokyo(after), "created_before": in_tokyo(before)}
-        assert ids(served.http.get("/jobs", params=elsewhere)) == wanted
-    just_after = in_tokyo(made[7]["created_at"], milliseconds=1)
-    assert ids(served.http.get("/jobs", params={"created_after": just_after})) == [
-        job["id"] for job in reversed(made) if job["created_at"] > made[7]["created_at"]
-    ]
-
-
-def in_tokyo(moment: str, **later: int) -> str:
-    return (datetime.fromisoformat(moment) + timedelta(**later)).isoformat().replace("+00:00", "Z")
-
-
-@pytest.mark.parametrize(
-    "moment",
-    [
-        "0001-01-01T00:00:00+14:00",
-        "9999-12-31T23:59:59-14:00",
-        "1969-12-31T23:59:59Z",
-        "1970-01-01T00:00:00Z",
-        "2500-01-01T00:00:00Z",
-    ],
-)
-def test_times_at_the_ends_of_the_calendar(many: tuple[Served, list[dict[str, Any]]], moment: str) -> None:
-    served, made = many
-    everything = [job["id"] for job in reversed(made)]
-    early = moment < "2000"
-    assert ids(served.http.get("/jobs", params={"created_after": moment})) == (everything if early else [])
-    assert ids(served.http.get("/jobs", params={"created_before": moment})) == ([] if early else everything)
-    if not early:
-        assert all_pages(served, {"created_before": moment, "limit": 10}) == everything
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"status": "done"},
         {"status": ["queued", ""]},
         {"kind": "dream"},
         {"limit": 0},
         {"limit": 501},
-        {"limit": "all"},
         {"created_after": "yesterday"},
         {"created_before": "2026-01-01T00:00:00"},  # where?
-        {"cursor": ""},
         {"cursor": "x" * 40_001},
         {"cursor": "W10"},  # []
-        {"cursor": "WzEsMl0"},  # [1,2]
-        {"cursor": "WzFlMzAwLFtdXQ"},  # [1e300,[]]
-        {"cursor": "Wy0xZTE4LFtdXQ"},  # [-1e18,[]]
-        {"cursor": "W05hTixbXV0"},  # [NaN,[]]
         {"cursor": "Ä"},
     ],
+    ids=lambda asked: ascii(asked)[:40],
 )
-def test_bad_questions(many: tuple[Served, list[dict[str, Any]]], asked: dict[str, Any]) -> None:
-    problem(many[0].http.get("/jobs", params=asked), 422, "invalid-request")
-
-
-def test_a_cursor_and_a_time_together(many: tuple[Served, list[dict[str, Any]]]) -> None:
-    served, made = many
-    page = served.http.get("/jobs", params={"limit": 4}).json()
-    asked = {"cursor": page["next"], "created_before": made[10]["created_at"], "limit": 100}
-    assert ids(served.http.get("/jobs", params=asked)) == [
-        job["id"] for job in reversed(made) if job["created_at"] <= made[10]["created_at"]
-    ]
-
-
-def test_random_cursors_are_refused(many: tuple[Served, list[dict[str, Any]]]) -> None:
-    http = many[0].http
-    known = http.get("/jobs", params={"limit": 4}).json()["next"]
-    places = st.integers(0, len(known) - 1)
-    damaged = st.builds(lambda at, new: known[:at] + new + known[at + 1 :], places, st.characters(codec="utf-8"))
-
-    @given(cursor=st.one_of(st.text(st.characters(codec="utf-8"), min_size=1, max_size=60), damaged))
-    @trying(max_examples=60, suppress_health_check=list(HealthCheck))
-    def check(cursor: str) -> None:
-        response = http.get("/jobs", params={"cursor": cursor})
-        if response.status_code != 200:  # by chance it may be one that can be read
-            problem(response, 422, "invalid-request")
-
-    check()
-
-
-def all_pages(
-    served: Served, asked: dict[str, Any], between: Callable[[list[str]], None] = lambda _: None
-) -> list[str]:
-    """The ids of all pages together."""
-    listed: list[str] = []
-    cursor: dict[str, str] = {}
-    while True:
-        response = served.http.get("/jobs", params={**asked, **cursor})
-        shown = ids(response)
-        assert len(shown) <= asked["limit"]
-        listed += shown
-        if response.json()["next"] is None:
-            return listed
-        assert len(shown) == asked["limit"]
-        cursor = {"cursor": response.json()["next"]}
-        between(listed)
-
-
-@pytest.mark.parametrize("limit", [1, 3, 5, 24, 25])
-def test_all_pages_together_list_every_job_once_in_order(many: tuple[Served, list[dict[str, Any]]], limit: int) -> None:
-    served, made = many
-    assert all_pages(served, {"limit": limit}) == [job["id"] for job in reversed(made)]
-
-
-@pytest.mark.slow
-def test_jobs_that_come_and_go_between_pages_hide_no_others(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with Served(tmp_path_factory.mktemp("coming")) as one:
-
-        @given(data=st.data(), limit=st.integers(1, 6), count=st.integers(1, 12))
-        @trying(max_examples=6 * SCALE, suppress_health_check=list(HealthCheck))
-        def check(data: st.DataObject, limit: int, count: int) -> None:
-            made = [one.submit(BODY)["id"] for _ in range(count)]
-            for job in made:
-                one.ended(job)
-            deleted: set[str] = set()
-
-            def between(listed: list[str]) -> None:
-                left = [job for job in made if job not in deleted]
-                for job in data.draw(st.lists(st.sampled_from(left), max_size=2, unique=True)) if left else []:
-                    assert one.http.delete(f"/jobs/{job}").status_code == 204
-                    deleted.add(job)
-                if data.draw(st.booleans()):
-                    one.submit(BODY)
-
-            listed = [job for job in all_pages(one, {"limit": limit}, between) if job in made]
-            assert len(set(listed)) == len(listed)
-            assert set(made) - deleted <= set(listed)
-            order = [job for job in reversed(made) if job in listed]
-            assert listed == order
-            for job in ids(one.http.get("/jobs", params={"limit": 500})):
-                one.ended(job)
-                one.http.delete(f"/jobs/{job}")
-
-        check()
+def test_bad_questions(served: Served, asked: dict[str, Any]) -> None:
+    problem(served.http.get("/jobs", params=asked), 422, "invalid-request")
 
 
 # --- events ---
@@ -454,57 +299,30 @@ def lasting(events: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 @pytest.mark.slow
 def test_the_events_of_a_job(served: Served) -> None:
-    job = served.submit(slow(0.6, seed=20, image=data_url(picture(5))))
-    events = events_of(served.http.get(f"/jobs/{job['id']}/events"))
-    names = [event["event"] for event in lasting(events)]
-    stages = [event["data"]["stage"] for event in events if event["event"] == "stage"]
-    assert names == ["queued", "running", *["stage"] * len(stages), "succeeded"]
-    assert numbers(events) == [*range(1, len(names)), 100]
-    assert stages == sorted(stages, key=STAGES.index)
-    assert stages[-1] == "generation"
-    told = [event["data"]["progress"] for event in events if event["event"] == "progress"]
-    assert told
-    assert told == sorted(told)
+    job = served.submit(slow(1, seed=20, image=data_url(picture(5))))
+    url = f"/jobs/{job['id']}/events"
+    events = events_of(served.http.get(url))
+    told = [(event["event"], event["data"]["stage"]) for event in lasting(events)]
+    stages = [("stage", "grounding"), ("stage", "generation")]
+    assert told == [("queued", None), ("running", None), *stages, ("succeeded", None)]
+    assert numbers(events) == [1, 2, 3, 4, 100]
+    progress = [event["data"]["progress"] for event in events if event["event"] == "progress"]
+    assert progress
+    assert progress == sorted(progress)
     for event in events:
         Job.model_validate(event["data"])
-        assert event["data"]["id"] == job["id"]
-        assert event["data"]["result"] is None
+        assert (event["data"]["id"], event["data"]["result"]) == (job["id"], None)
         assert (event["data"]["finished_at"] is None) == (event["event"] != "succeeded")
-    again = events_of(served.http.get(f"/jobs/{job['id']}/events"))
-    assert [(event["id"], event["event"]) for event in again] == [
-        (event["id"], event["event"]) for event in lasting(events)
-    ]
-    assert {event["data"]["finished_at"] for event in again[:-1]} == {None}
-
-
-@pytest.mark.parametrize("after", [0, 1, 2, 3, 4, 5, 6, 99])
-def test_events_go_on_after_the_last_that_was_heard(served: Served, after: int) -> None:
-    job = served.ended(served.submit(BODY)["id"])
-    url = f"/jobs/{job['id']}/events"
-    whole = events_of(served.http.get(url))
-    rest = events_of(served.http.get(url, headers={"Last-Event-ID": str(after)}))
-    assert rest == [event for event in whole if int(event["id"]) > after]
-
-
-@pytest.mark.parametrize("after", ["", "x", "-1", "1.5", "٣", "9" * 5000])
-def test_a_last_event_that_is_none_is_the_beginning(served: Served, after: str) -> None:
-    job = served.ended(served.submit(BODY)["id"])
-    url = f"/jobs/{job['id']}/events"
-    told = served.http.get(url, headers={"Last-Event-ID": after.encode()})  # type: ignore[dict-item]
-    assert numbers(events_of(told))[0] == 1
-
-
-def test_who_has_heard_everything_need_not_come_back(served: Served) -> None:
-    job = served.ended(served.submit(BODY)["id"])
-    response = served.http.get(f"/jobs/{job['id']}/events", headers={"Last-Event-ID": "100"})
-    assert (response.status_code, response.content) == (204, b"")
-
-
-def test_a_failed_job_says_so_at_the_end_of_its_events(served: Served) -> None:
-    job = served.submit(LOST)
-    last = events_of(served.http.get(f"/jobs/{job['id']}/events"))[-1]
-    assert (last["event"], last["id"]) == ("failed", "100")
-    assert last["data"]["problem"]["type"] == "urn:cow:problem:cannot-ground"
+    again = events_of(served.http.get(url))
+    assert [(event["event"], event["data"]["stage"]) for event in again] == told
+    for after in (0, 1, 3, 4, 99):  # the last that was heard
+        rest = events_of(served.http.get(url, headers={"Last-Event-ID": str(after)}))
+        assert rest == [event for event in again if int(event["id"]) > after]
+    for none in ("", "x", "-1", "1.5", "٣", "9" * 5000):
+        rest = events_of(served.http.get(url, headers=[(b"Last-Event-ID", none.encode())]))
+        assert numbers(rest)[0] == 1
+    heard_all = served.http.get(url, headers={"Last-Event-ID": "100"})
+    assert (heard_all.status_code, heard_all.content) == (204, b""), "nobody need come back"
 
 
 @pytest.mark.slow
@@ -512,208 +330,167 @@ def test_a_failed_job_says_so_at_the_end_of_its_events(served: Served) -> None:
     ("method", "path", "ends"), [("POST", "/cancel", {"canceled"}), ("DELETE", "", {"canceled", "deleted"})]
 )
 def test_whoever_follows_hears_of_the_end(served: Served, method: str, path: str, ends: set[str]) -> None:
-    job = served.submit(slow(30, seed=21))
+    job = served.submit(slow(ENDLESS, seed=21))
     with served.http.stream("GET", f"/jobs/{job['id']}/events") as response, ThreadPoolExecutor(1) as pool:
         served.rendering(job["id"])
         pool.submit(served.http.request, method, f"/jobs/{job['id']}{path}")
         events = events_of(response)
     assert events[-1]["event"] in ends
-    assert events[-1]["id"] == "100"
-    assert numbers(events) == sorted(numbers(events))
+    assert numbers(events) == [*sorted(numbers(events)[:-1]), 100]
     if method == "POST":
-        again = events_of(served.http.get(f"/jobs/{job['id']}/events"))
-        assert numbers(again) == numbers(events)
+        assert numbers(events_of(served.http.get(f"/jobs/{job['id']}/events"))) == numbers(events)
 
 
 @pytest.mark.slow
-def test_silence_is_filled_with_comments(tmp_path_factory: pytest.TempPathFactory) -> None:
-    code = (
-        "from cow_service.api.routes import jobs; jobs.PING_SECONDS = 1; "
-        "from cow_service.cli.main import app; app(['serve'])"
-    )
-    with Served(tmp_path_factory.mktemp("pings"), code=code, COW_GENERATOR_CONCURRENCY='{"slow": 1}') as one:
-        before = one.submit(slow(30, seed=22))
-        waits = one.submit(slow(30, seed=23))
-        one.rendering(before["id"])
-        with one.http.stream("GET", f"/jobs/{waits['id']}/events") as response:
-            lines, comments = [], 0
-            for line in response.iter_lines():
-                lines.append(line)
-                comments += line.startswith(":")
-                if comments == 2:
-                    one.http.post(f"/jobs/{waits['id']}/cancel")
-        assert comments >= 2
-        assert parsed("\n".join(lines).strip().split("\n\n")[-1])["event"] == "canceled"
+def test_silence_is_filled_with_comments(emptied: Served) -> None:
+    emptied.rendering(emptied.submit(slow(ENDLESS, seed=22))["id"])
+    waits = emptied.submit(slow(ENDLESS, seed=23))
+    with emptied.http.stream("GET", f"/jobs/{waits['id']}/events") as response:
+        lines, comments = [], 0
+        for line in response.iter_lines():
+            lines.append(line)
+            comments += line.startswith(":")
+            if comments == 2:
+                cancel(emptied, waits)
+    assert comments >= 2
+    assert parsed("\n".join(lines).strip().split("\n\n")[-1])["event"] == "canceled"
 
 
 # --- cancel and delete ---
 
 
 @pytest.mark.slow
-def test_a_running_job_is_canceled_and_its_place_is_free_at_once(emptied: Served) -> None:
-    job = emptied.submit(slow(30, seed=30))
+def test_the_place_of_a_running_job_that_is_ended_is_free_at_once(emptied: Served) -> None:
+    job = emptied.submit(slow(ENDLESS, seed=30))
     emptied.rendering(job["id"])
-    canceled = emptied.http.post(f"/jobs/{job['id']}/cancel")
-    assert canceled.status_code == 200
-    assert (canceled.json()["status"], canceled.json()["result"]) == ("canceled", None)
-    started = time.monotonic()
+    canceled = cancel(emptied, job)
+    assert (canceled["status"], canceled["result"]) == ("canceled", None)
     assert emptied.http.post("/simulate", json=slow(0.1, seed=31)).status_code == 200
-    assert time.monotonic() - started < 15  # of 30
-    assert emptied.job(job["id"]) == canceled.json()
+    assert cancel(emptied, job) == emptied.job(job["id"]) == canceled, "canceling again changes nothing"
+    deleted = emptied.submit(slow(ENDLESS, seed=32))
+    emptied.rendering(deleted["id"])
+    assert emptied.http.delete(f"/jobs/{deleted['id']}").status_code == 204
+    problem(emptied.http.get(f"/jobs/{deleted['id']}"), 404, "job-not-found")
+    assert emptied.http.post("/simulate", json=slow(0.1, seed=33)).status_code == 200
+    assert deleted["id"] not in ids(emptied.http.get("/jobs"))
 
 
 @pytest.mark.slow
 def test_a_queued_job_is_canceled_and_never_begins(emptied: Served) -> None:
-    first, second, queued = [emptied.submit(slow(30, seed=seed)) for seed in (32, 33, 34)]
+    first, second, queued = [emptied.submit(slow(ENDLESS, seed=seed)) for seed in (34, 35, 36)]
     assert queued["status"] == "queued"
     for job in (queued, first, second):
-        assert emptied.http.post(f"/jobs/{job['id']}/cancel").json()["status"] == "canceled"
-    assert emptied.http.post("/simulate", json=slow(0.1, seed=35)).status_code == 200
-    assert 34 not in emptied.clips()
-
-
-@pytest.mark.slow
-def test_canceling_again_changes_nothing(served: Served) -> None:
-    job = served.submit(slow(30, seed=36))
-    first = served.http.post(f"/jobs/{job['id']}/cancel").json()
-    time.sleep(1.1)  # times may be whole seconds
-    assert served.http.post(f"/jobs/{job['id']}/cancel").json() == first
-    assert served.job(job["id"]) == first
-
-
-@pytest.mark.parametrize("body", [BODY, LOST])
-def test_a_job_that_has_ended_is_not_canceled(served: Served, body: dict[str, Any]) -> None:
-    job = served.ended(served.submit(body)["id"])
-    assert served.http.post(f"/jobs/{job['id']}/cancel").json() == job
-    assert served.job(job["id"]) == job
+        assert cancel(emptied, job)["status"] == "canceled"
+    assert emptied.http.post("/simulate", json=slow(0.1, seed=37)).status_code == 200
+    assert 36 not in emptied.clips()
 
 
 def test_cancel_by_many_at_the_same_time(served: Served) -> None:
-    job = served.submit(slow(30, seed=37))
+    job = served.submit(slow(ENDLESS, seed=38))
     with ThreadPoolExecutor(6) as pool:
         calls = [("POST", f"/jobs/{job['id']}/cancel")] * 5 + [("DELETE", f"/jobs/{job['id']}")]
         statuses = [one.status_code for one in pool.map(lambda call: served.http.request(*call), calls)]
-    assert set(statuses) <= {200, 204, 404}
-    assert 204 in statuses
+    assert set(statuses[:5]) <= {200, 404}
+    assert statuses[5] == 204
     problem(served.http.get(f"/jobs/{job['id']}"), 404, "job-not-found")
 
 
 @pytest.mark.slow
 def test_whoever_waits_for_a_canceled_job_is_told(served: Served) -> None:
-    key = new_key()
+    key = {"Idempotency-Key": "canceled"}
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(served.http.post, "/simulate", json=slow(30, seed=38), headers={"Idempotency-Key": key})
+        waiting = pool.submit(served.http.post, "/simulate", json=slow(ENDLESS, seed=39), headers=key)
         job = eventually(lambda: served.http.get("/jobs", params={"status": "running"}).json()["jobs"])[0]
         served.rendering(job["id"])
-        served.http.post(f"/jobs/{job['id']}/cancel")
+        cancel(served, job)
         problem(waiting.result(), 409, "canceled")
-    again = served.http.post("/simulate", json=slow(30, seed=38), headers={"Idempotency-Key": key})
-    problem(again, 409, "canceled")
+    problem(served.http.post("/simulate", json=slow(ENDLESS, seed=39), headers=key), 409, "canceled")
+
+
+def shown(result: dict[str, Any]) -> set[str]:
+    """The artifacts of a result."""
+    return {
+        one["sha256"] for one in (*result["frames"], result["overlay"], result["grounding"]["mask"], result["image"])
+    }
+
+
+def found(served: Served, artifacts: set[str]) -> set[int]:
+    """The statuses with which some artifacts are answered."""
+    return {served.http.get(f"/artifacts/{sha256}").status_code for sha256 in artifacts}
 
 
 def test_a_deleted_job_is_gone_with_what_only_it_holds(served: Served) -> None:
     mine = data_url(picture(11))
-    kept = served.ended(served.submit({**BODY, "image": mine})["id"])["result"]
-    other = served.ended(served.submit({**BODY, "image": mine, "frames": {"count": 3}})["id"])["result"]
+    kept = served.http.post("/simulate", json={**BODY, "image": mine}).json()
+    other = served.http.post("/simulate", json={**BODY, "image": mine, "frames": {"count": 3}}).json()
     assert "grounding" in other["reused"]
-    own = {frame["sha256"] for frame in other["frames"]} - {frame["sha256"] for frame in kept["frames"]}
+    own = shown(other) - shown(kept)
     assert own
-    shared = {kept["image"]["sha256"], kept["grounding"]["mask"]["sha256"], kept["overlay"]["sha256"]}
-    shared |= {frame["sha256"] for frame in kept["frames"]}
     response = served.http.delete(f"/jobs/{other['id']}")
     assert (response.status_code, response.content) == (204, b"")
     problem(served.http.get(f"/jobs/{other['id']}"), 404, "job-not-found")
-    problem(served.http.delete(f"/jobs/{other['id']}"), 404, "job-not-found")
-    assert {served.http.get(f"/artifacts/{sha256}").status_code for sha256 in own} == {404}
-    assert {served.http.get(f"/artifacts/{sha256}").status_code for sha256 in shared} == {200}
+    assert (found(served, own), found(served, shown(kept))) == ({404}, {200})
 
 
 def test_the_job_that_made_what_others_reuse_may_go(served: Served) -> None:
-    mine = data_url(picture(12))
-    maker = served.ended(served.submit({**BODY, "image": mine})["id"])["result"]
-    user = served.ended(served.submit({**BODY, "image": mine})["id"])["result"]
+    body = {**BODY, "image": data_url(picture(12))}
+    maker = served.http.post("/simulate", json=body).json()
+    user = served.http.post("/simulate", json=body).json()
     assert user["reused"] == STAGES
     served.http.delete(f"/jobs/{maker['id']}")
-    for artifact in (*user["frames"], user["overlay"], user["grounding"]["mask"], user["image"]):
-        assert served.http.get(f"/artifacts/{artifact['sha256']}").status_code == 200
-    anew = served.http.post("/simulate", json={**BODY, "image": {"artifact": user["image"]["sha256"]}}).json()
-    assert plain(anew) == plain(user)
-    for job in (user, anew):
+    assert found(served, shown(user)) == {200}
+    again = served.http.post("/simulate", json={**body, "image": {"artifact": user["image"]["sha256"]}}).json()
+    assert plain(again) == plain(user)
+    for job in (user, again):
         served.http.delete(f"/jobs/{job['id']}")
-    for artifact in (*user["frames"], user["overlay"], user["grounding"]["mask"], user["image"]):
-        problem(served.http.get(f"/artifacts/{artifact['sha256']}"), 404, "artifact-not-found")
-
-
-def test_after_its_job_is_deleted_a_result_is_made_anew(served: Served) -> None:
-    body = {**BODY, "image": data_url(picture(13))}
-    first = served.ended(served.submit(body)["id"])["result"]
-    served.http.delete(f"/jobs/{first['id']}")
-    again = served.http.post("/simulate", json=body).json()
-    assert again["reused"] == []
-    assert plain(again) == plain(first)
-    for frame in again["frames"]:
-        assert served.http.get(f"/artifacts/{frame['sha256']}").status_code == 200
-
-
-@pytest.mark.slow
-def test_deleting_a_running_job_ends_it(emptied: Served) -> None:
-    job = emptied.submit(slow(30, seed=39))
-    emptied.rendering(job["id"])
-    assert emptied.http.delete(f"/jobs/{job['id']}").status_code == 204
-    problem(emptied.http.get(f"/jobs/{job['id']}"), 404, "job-not-found")
-    assert emptied.http.post("/simulate", json=slow(0.1, seed=40)).status_code == 200
-    assert job["id"] not in ids(emptied.http.get("/jobs"))
+    assert found(served, shown(user)) == {404}
+    anew = served.http.post("/simulate", json=body).json()
+    assert (anew["reused"], plain(anew)) == ([], plain(maker))
+    assert found(served, shown(anew)) == {200}
 
 
 # --- Idempotency-Key ---
 
 
-@pytest.mark.parametrize("key", ["", "a b", "x" * 256, "ä", "a\tb", "\x7f", "ключ"], ids=lambda key: ascii(key)[:20])
-def test_keys_that_are_none(served: Served, key: str) -> None:
-    headers = {"Idempotency-Key": key.encode()}
-    problem(served.http.post("/simulate", json=BODY, headers=headers), 422, "invalid-request")  # type: ignore[arg-type]
+def test_keys_that_are_none(served: Served) -> None:
+    for key in ("", "a b", "x" * 256, "ä", "a\tb", "\x7f"):
+        headers = [(b"Idempotency-Key", key.encode())]
+        problem(served.http.post("/simulate", json=BODY, headers=headers), 422, "invalid-request")
 
 
-@pytest.mark.parametrize("key", ["x", "x" * 255, "!\"#$%&'()*+,-./:;<=>?@[]^_`{|}~"])
+@pytest.mark.parametrize("key", ["x" * 255, "!\"#$%&'()*+,-./:;<=>?@[]^_`{|}~"], ids=["longest", "all signs"])
 def test_the_same_key_and_body_are_the_same_job(served: Served, key: str) -> None:
     headers = {"Idempotency-Key": key}
     first = served.submit(BODY, **headers)
     done = served.ended(first["id"])
     second = served.http.post("/simulate", json=BODY, headers=headers)
-    assert second.status_code == 200
-    assert second.json() == done["result"]
+    assert (second.status_code, second.json()) == (200, done["result"])
     assert served.submit(BODY, **headers) == done
     # The same request in other words.
-    form = {
-        "question": QUESTION,
-        "request": json.dumps({k: v for k, v in BODY.items() if k not in ("image", "question")}),
-    }
+    rest = {name: value for name, value in BODY.items() if name not in ("image", "question")}
+    form = {"question": QUESTION, "request": json.dumps(rest)}
     third = served.http.post("/simulate", data=form, files={"image": ("a.png", IMAGE)}, headers=headers)
     assert third.json() == done["result"]
-    assert served.http.delete(f"/jobs/{first['id']}").status_code == 204
 
 
 def test_a_key_is_for_one_request(served: Served) -> None:
-    key = {"Idempotency-Key": new_key()}
+    key = {"Idempotency-Key": "one"}
     job = served.submit(BODY, **key)
     for path, body, others in (
         ("/simulate", {**BODY, "seed": 1}, {}),
-        ("/simulate", {**BODY, "image": data_url(picture(1))}, {}),
+        ("/simulate", {**BODY, "image": data_url(picture(1))}, ASYNC),
         ("/answer", BODY, {}),
         ("/simulate", BODY, FRESH),
     ):
-        for prefer in ({}, ASYNC):
-            response = served.http.post(path, json=body, headers=key | others | prefer)
-            problem(response, 422, "idempotency-key-reused")
+        problem(served.http.post(path, json=body, headers=key | others), 422, "idempotency-key-reused")
     served.ended(job["id"])
     served.http.delete(f"/jobs/{job['id']}")
     free = served.http.post("/simulate", json={**BODY, "seed": 1}, headers=key)
-    assert free.status_code == 200
-    assert free.json()["generator"]["seed"] == 1
+    assert (free.status_code, free.json()["generator"]["seed"]) == (200, 1)
 
 
 def test_the_same_key_from_many_at_the_same_time(served: Served) -> None:
-    key = {"Idempotency-Key": new_key()}
+    key = {"Idempotency-Key": "many"}
 
     def send(number: int) -> str:
         if number % 2:
@@ -727,33 +504,28 @@ def test_the_same_key_from_many_at_the_same_time(served: Served) -> None:
 
 @pytest.mark.slow
 def test_one_key_with_many_bodies_at_the_same_time_is_one_of_them(served: Served) -> None:
-    for turn in range(3):
-        key = {"Idempotency-Key": new_key()}
-        bodies = [{**BODY, "image": data_url(picture(20 + number)), "seed": turn} for number in range(6)]
-        with ThreadPoolExecutor(6) as pool:
-            answers = list(
-                pool.map(lambda body, key=key: served.http.post("/simulate", json=body, headers=key), bodies)
-            )
-        assert sorted(answer.status_code for answer in answers) == [200] + [422] * 5
-        for answer, body in zip(answers, bodies, strict=True):
-            if answer.status_code == 200:
-                alone = served.http.post("/simulate", json=body, headers=FRESH)
-                assert plain(answer.json()) == plain(alone.json())
-            else:
-                problem(answer, 422, "idempotency-key-reused")
+    key = {"Idempotency-Key": "bodies"}
+    bodies = [{**BODY, "image": data_url(picture(20 + number))} for number in range(6)]
+    with ThreadPoolExecutor(6) as pool:
+        answers = list(pool.map(lambda body: served.http.post("/simulate", json=body, headers=key), bodies))
+    assert sorted(answer.status_code for answer in answers) == [200] + [422] * 5
+    for answer, body in zip(answers, bodies, strict=True):
+        if answer.status_code == 200:
+            assert plain(answer.json()) == plain(served.http.post("/simulate", json=body, headers=FRESH).json())
+        else:
+            problem(answer, 422, "idempotency-key-reused")
 
 
 @pytest.mark.slow
 def test_a_key_is_free_as_soon_as_its_running_job_is_deleted(served: Served) -> None:
     """The end of the old job does not notify callers who wait for the new one."""
-    key = {"Idempotency-Key": new_key()}
-    old = served.submit(slow(20, seed=51), **key)
+    key = {"Idempotency-Key": "free"}
+    old = served.submit(slow(ENDLESS, seed=51), **key)
     served.rendering(old["id"])
     assert served.http.delete(f"/jobs/{old['id']}").status_code == 204
     new = served.http.post("/simulate", json=slow(2, seed=52), headers=key)
     assert new.status_code == 200, new.text
-    assert new.json()["id"] == old["id"]
-    assert new.json()["generator"]["seed"] == 52
+    assert (new.json()["id"], new.json()["generator"]["seed"]) == (old["id"], 52)
     assert served.job(old["id"])["result"] == new.json()
 
 
@@ -761,19 +533,21 @@ def test_a_key_is_free_as_soon_as_its_running_job_is_deleted(served: Served) -> 
 
 
 def test_the_same_request_again_is_not_worked_on(served: Served) -> None:
-    first = served.http.post("/simulate", json={**BODY, "image": data_url(picture(30))}).json()
-    second = served.http.post("/simulate", json={**BODY, "image": data_url(picture(30))}).json()
+    body = {**BODY, "image": data_url(picture(30))}
+    first, second = (served.http.post("/simulate", json=body).json() for _ in range(2))
     assert (first["reused"], second["reused"]) == ([], STAGES)
     assert plain(first) == plain(second)
     assert first["id"] != second["id"]
+    for said in ("no-cache", "No-Store", "max-age=0, no-cache"):
+        job = served.ended(served.submit(body, **{"Cache-Control": said})["id"])
+        assert job["result"]["reused"] == [], said
 
 
 def test_another_seed_is_another_clip_only(served: Served) -> None:
     body = slow(0, seed=60, image=data_url(picture(31)), grounding={"point": [91, 80]})
     assert served.http.post("/simulate", json=body).json()["reused"] == []
     other = served.http.post("/simulate", json={**body, "seed": 61}).json()
-    assert other["reused"] == STAGES[:3]
-    assert other["generator"]["seed"] == 61
+    assert (other["reused"], other["generator"]["seed"]) == (STAGES[:3], 61)
 
 
 def test_a_clip_is_the_same_whether_its_object_was_found_before_or_not(served: Served) -> None:
@@ -782,30 +556,18 @@ def test_a_clip_is_the_same_whether_its_object_was_found_before_or_not(served: S
     body = {**BODY, "image": data_url(picture(33)), "grounding": {"mask": mask}}
     first = served.http.post("/simulate", json=body).json()
     other = served.http.post("/simulate", json={**body, "seed": 1}).json()  # which this generator ignores
-    assert other["reused"] == STAGES[:3]
-    assert other["frames"] == first["frames"]
+    assert (other["reused"], other["frames"]) == (STAGES[:3], first["frames"])
     more = served.http.post("/simulate", json={**body, "num_frames": 6}, headers=FRESH).json()
-    again = served.http.post("/simulate", json={**body, "num_frames": 6}).json()
-    assert plain(again) == plain(more)
+    assert plain(served.http.post("/simulate", json={**body, "num_frames": 6}).json()) == plain(more)
 
 
 def test_an_answer_takes_what_a_simulation_came_to(served: Served) -> None:
     body = {**BODY, "image": data_url(picture(32)), "grounding": {"point": [92, 80]}}
     simulation = served.http.post("/simulate", json=body).json()
-    answer = served.http.post("/answer", json=body).json()
-    assert answer["reused"] == STAGES
+    answer, again = (served.http.post("/answer", json=body).json() for _ in range(2))
+    assert (answer["reused"], again["reused"]) == (STAGES, [*STAGES, "answering"])
     assert plain(answer["simulation"]) == plain(simulation)
-    again = served.http.post("/answer", json=body).json()
-    assert again["reused"] == [*STAGES, "answering"]
     assert again["simulation"]["id"] != answer["simulation"]["id"]
-
-
-@pytest.mark.parametrize("said", ["no-cache", "No-Store", "max-age=0, no-cache"])
-def test_no_cache_takes_nothing_of_others(served: Served, said: str) -> None:
-    assert served.http.post("/simulate", json=BODY).status_code == 200
-    assert served.http.post("/simulate", json=BODY, headers={"Cache-Control": said}).json()["reused"] == []
-    job = served.ended(served.submit(BODY, **{"Cache-Control": said})["id"])
-    assert job["result"]["reused"] == []
 
 
 @pytest.mark.slow
@@ -819,12 +581,13 @@ def test_two_of_the_same_at_the_same_time_are_rendered_once(served: Served) -> N
 
 @pytest.mark.slow
 def test_whoever_waits_for_the_same_goes_on_when_the_first_is_canceled(served: Served) -> None:
-    first = served.submit(slow(4, seed=63))
-    served.rendering(first["id"])
-    second = served.submit(slow(4, seed=63))
-    served.http.post(f"/jobs/{first['id']}/cancel")
-    assert served.ended(second["id"])["status"] == "succeeded"
-    assert served.clips().count(63) == 2
+    first, second = (served.submit(slow(ENDLESS, seed=63)) for _ in range(2))
+    eventually(lambda: 63 in served.clips())
+    served.until(second["id"], "running")
+    cancel(served, first)
+    eventually(lambda: served.clips().count(63) == 2)
+    assert served.job(second["id"])["stage"] == "generation"
+    cancel(served, second)
 
 
 # --- how many ---
@@ -832,29 +595,22 @@ def test_whoever_waits_for_the_same_goes_on_when_the_first_is_canceled(served: S
 
 @pytest.mark.slow
 def test_a_full_queue_takes_no_more(emptied: Served) -> None:
-    jobs = [emptied.submit(slow(30, seed=seed)) for seed in (70, 71, 72)]
-    for headers in (ASYNC, {}, {"Idempotency-Key": new_key()}):
+    key = {"Idempotency-Key": "full"}
+    jobs = [emptied.submit(slow(ENDLESS, seed=70), **key)]
+    jobs += [emptied.submit(slow(ENDLESS, seed=seed)) for seed in (71, 72)]
+    for headers in (ASYNC, {}, {"Idempotency-Key": "another"}):
         response = emptied.http.post("/simulate", json=slow(1, seed=73), headers=headers)
-        told = problem(response, 503, "queue-full")
-        assert "COW_QUEUE_LIMIT" in told["detail"]
+        assert "COW_QUEUE_LIMIT" in problem(response, 503, "queue-full")["detail"]
         assert int(response.headers["retry-after"]) >= 1
-    with socket.create_connection(emptied.host_and_port, timeout=20) as raw:
+    assert emptied.submit(slow(ENDLESS, seed=70), **key)["id"] == jobs[0]["id"], "a key finds its job all the same"
+    with socket.create_connection(emptied.host_and_port) as raw:
         raw.sendall(post(b"x" * 100, length=30_000_000))  # the rest of it is never sent
         answer = raw.makefile("rb").read()  # to its end: an unread body would close the connection
     assert answer.startswith(b"HTTP/1.1 503 ")
     assert b"urn:cow:problem:queue-full" in answer
-    emptied.http.post(f"/jobs/{jobs[0]['id']}/cancel")
-    assert emptied.submit(slow(30, seed=74))["status"] in ("queued", "running")
+    cancel(emptied, jobs[0])
+    assert emptied.submit(slow(ENDLESS, seed=74))["status"] in ("queued", "running")
     assert 73 not in emptied.clips()
-
-
-@pytest.mark.slow
-def test_a_key_finds_its_job_though_the_queue_is_full(emptied: Served) -> None:
-    key = {"Idempotency-Key": new_key()}
-    job = emptied.submit(slow(30, seed=75), **key)
-    for seed in (76, 77):
-        emptied.submit(slow(30, seed=seed))
-    assert emptied.submit(slow(30, seed=75), **key)["id"] == job["id"]
 
 
 # --- callers who leave ---
@@ -866,54 +622,34 @@ def post(body: bytes, length: int | None = None, **headers: str) -> bytes:
     return f"POST /simulate HTTP/1.1\r\n{head}\r\n".encode() + body
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("headers", "status"),
-    [
-        ({}, "canceled"),
-        (FRESH, "canceled"),
-        ({"Prefer": "wait=50"}, "running"),
-        ({"Idempotency-Key": "left"}, "running"),
-    ],
-)
-def test_a_caller_who_leaves(served: Served, headers: dict[str, str], status: str) -> None:
-    known = ids(served.http.get("/jobs", params={"limit": 500}))
+def left(served: Served, seed: int, **headers: str) -> str:
+    """The job of a caller who leaves while its clip is made."""
+    key = {"Authorization": f"Bearer {KEYS['main']}"}
     with socket.create_connection(served.host_and_port) as raw:
-        raw.sendall(post(json.dumps(slow(30, seed=80)).encode(), **headers))
-        job = eventually(lambda: [one for one in ids(served.http.get("/jobs")) if one not in known])[0]
-        served.rendering(job)
-    if status == "canceled":
-        served.until(job, "canceled")
-    else:
-        time.sleep(1)
+        raw.sendall(post(json.dumps(slow(ENDLESS, seed=seed)).encode(), **headers | key))
+        eventually(lambda: seed in served.clips())
+        return ids(served.http.get("/jobs"))[0]
+
+
+@pytest.mark.slow
+def test_the_job_of_a_caller_who_leaves_ends_unless_they_can_come_back(served: Served) -> None:
+    for seed, stays, ends in ((80, {"Prefer": "wait=50"}, {}), (82, {"Idempotency-Key": "left"}, FRESH)):
+        job = left(served, seed, **stays)
+        served.until(left(served, seed + 1, **ends), "canceled")  # whose caller left after the other
         assert served.job(job)["status"] == "running"
-        served.http.post(f"/jobs/{job}/cancel")
+        cancel(served, {"id": job})
 
 
 # --- stops and crashes ---
 
 
 @pytest.mark.slow
-def test_a_stop_waits_for_what_is_nearly_done(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with Served(tmp_path_factory.mktemp("nearly"), COW_SHUTDOWN_GRACE="20") as one, ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(one.http.post, "/simulate", json=slow(2, seed=90))
-        alone = one.submit(slow(2, seed=91))
-        one.rendering(alone["id"])
-        eventually(lambda: 90 in one.clips())
-        one.stop()
-        assert waiting.result().status_code == 200
-        one.start()
-        assert one.job(alone["id"])["status"] == "succeeded"
-        assert sorted(one.clips()) == [90, 91]
-
-
-@pytest.mark.slow
 def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: pytest.TempPathFactory) -> None:
     own = {"COW_SHUTDOWN_GRACE": "0.5", "COW_CONCURRENCY": "1", "COW_MLLM_CONCURRENCY": "1"}
     with Served(tmp_path_factory.mktemp("longer"), **own) as one, ThreadPoolExecutor(4) as pool:
-        keys = [{"Idempotency-Key": str(seed)} for seed in (92, 93, 94)]
-        # One clip is made at a time: those behind the first wait, however short they are.
-        bodies = [slow(3.5, seed=92), slow(0.2, seed=93), slow(0.2, seed=94)]
+        keys = [{"Idempotency-Key": str(seed)} for seed in (92, 93)]
+        # One clip is made at a time: the one behind the first waits, however short it is.
+        bodies = [slow(ENDLESS, seed=92), slow(0.2, seed=93)]
         waiting: list[Future[httpx.Response]] = []
         for body, key in zip(bodies, keys, strict=True):
             waiting.append(pool.submit(one.http.post, "/simulate", json=body, headers=key))
@@ -922,9 +658,7 @@ def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: py
         heard: list[str] = []
         follower = pool.submit(hear_until_cut, one, alone["id"], heard)
         eventually(lambda: heard)
-        started = time.monotonic()
         one.stop()
-        assert time.monotonic() - started < 30
         follower.result()
         assert heard[0].startswith("id: 1\nevent: queued\n")
         for answer in (one.result() for one in waiting):
@@ -932,14 +666,12 @@ def test_a_stop_hands_back_what_takes_longer_and_it_goes_on(tmp_path_factory: py
             assert re.fullmatch("/jobs/[0-9a-f-]{36}", answer.headers["location"])
             assert int(answer.headers["retry-after"]) >= 1
         one.start()
-        for answer in (one.result() for one in waiting):
-            job = one.ended(answer.headers["location"].removeprefix("/jobs/"))
-            assert job["status"] == "succeeded", job
-        assert one.ended(alone["id"])["status"] == "succeeded"
-        for place, key in enumerate(keys):
-            again = one.http.post("/simulate", json=bodies[place], headers=key)
-            assert again.status_code == 200
-            assert again.json()["generator"]["seed"] == 92 + place
+        first, second = (answer.result().headers["location"].removeprefix("/jobs/") for answer in waiting)
+        eventually(lambda: one.clips().count(92) == 2)  # it goes on
+        cancel(one, {"id": first})
+        assert [one.ended(job)["status"] for job in (second, alone["id"])] == ["succeeded"] * 2
+        again = one.http.post("/simulate", json=bodies[1], headers=keys[1])
+        assert (again.status_code, again.json()["generator"]["seed"]) == (200, 93)
 
 
 def hear_until_cut(served: Served, job_id: str, heard: list[str]) -> None:
@@ -949,44 +681,37 @@ def hear_until_cut(served: Served, job_id: str, heard: list[str]) -> None:
 
 
 @pytest.mark.slow
-def test_after_a_crash_jobs_go_on_where_they_were(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with Served(tmp_path_factory.mktemp("crash"), COW_WORKERS="true") as one:
-        key = {"Idempotency-Key": "crash"}
-        done = one.ended(one.submit({**BODY, "image": data_url(picture(7))})["id"])
-        job = one.submit(slow(3, seed=96), **key)
-        one.rendering(job["id"])
-        heard = events_until(one, job["id"], "grounding")
-        assert numbers(heard) == [1, 2, 3]
-        before = stage_results(one, job["id"])
-        assert {"grounding", "motion"} <= set(before)
+def test_a_stop_waits_for_what_is_nearly_done_and_after_a_crash_jobs_go_on_where_they_were(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    key = {"Idempotency-Key": "crash"}
+    with Served(tmp_path_factory.mktemp("crash"), COW_SHUTDOWN_GRACE="100") as one, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(one.http.post, "/simulate", json=slow(2, seed=90))
+        alone = one.submit(slow(2, seed=91))
+        eventually(lambda: {*one.clips()} == {90, 91})
+        one.stop()
+        assert waiting.result().status_code == 200
+        one.start()
+        done = one.job(alone["id"])
+        assert (done["status"], sorted(one.clips())) == ("succeeded", [90, 91])
+        body = slow(6, seed=96, image=data_url(picture(7)))
+        job = one.submit(body, **key)
+        eventually(lambda: 96 in one.clips())
+        before = stage_results(one, job["id"])  # what was done is stored before a clip is begun
+        assert set(before) == {"grounding", "motion", "trajectory"}
         one.kill()
         one.start()
         assert one.job(done["id"]) == done
         rest = events_of(one.http.get(f"/jobs/{job['id']}/events", headers={"Last-Event-ID": "3"}))
-        assert (rest[-1]["event"], lasting(rest)[-2]["data"]["stage"]) == ("succeeded", "generation")
-        assert numbers(rest) == [*range(4, 3 + len(lasting(rest))), 100]
+        ends = [("stage", "generation"), ("succeeded", None)]
+        assert [(event["event"], event["data"]["stage"]) for event in lasting(rest)] == ends
+        assert numbers(rest) == [4, 100]
         after = one.ended(job["id"])
-        assert after["status"] == "succeeded"
-        assert after["result"]["generator"]["seed"] == 96
-        assert after["result"]["reused"] == []
+        assert (after["result"]["generator"]["seed"], after["result"]["reused"]) == (96, [])
         assert one.clips().count(96) == 2
         results = stage_results(one, job["id"])
         assert {stage: results[stage] for stage in before} == before  # not made again
-        assert one.http.post("/simulate", json=slow(3, seed=96), headers=key).json() == after["result"]
-
-
-def events_until(served: Served, job_id: str, stage: str) -> list[dict[str, Any]]:
-    """The numbered events of a job that still runs, up to the one that says that a stage is done."""
-    found: list[dict[str, Any]] = []
-    with served.http.stream("GET", f"/jobs/{job_id}/events") as response:
-        text = ""
-        for part in response.iter_text():
-            text += part
-            *blocks, text = text.split("\n\n")
-            found += [parsed(block) for block in blocks if not block.startswith(":")]
-            if any(event["event"] == "stage" and event["data"]["stage"] == stage for event in found):
-                break
-    return lasting(found)
+        assert one.http.post("/simulate", json=body, headers=key).json() == after["result"]
 
 
 def stage_results(served: Served, job_id: str) -> dict[str, float]:
@@ -1001,12 +726,11 @@ def stage_results(served: Served, job_id: str) -> dict[str, float]:
 def test_two_servers_on_one_data_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("two")
     with Served(folder) as one, Served(folder, log="second") as two:
-        job = one.submit(slow(30, seed=97))
+        job = one.submit(slow(ENDLESS, seed=97))
         one.rendering(job["id"])
-        assert two.http.post(f"/jobs/{job['id']}/cancel").json()["status"] == "canceled"
-        assert one.job(job["id"])["status"] == "canceled"
+        assert cancel(two, job)["status"] == one.job(job["id"])["status"] == "canceled"
         assert one.http.post("/simulate", json=slow(0.1, seed=98)).status_code == 200
-        left = one.submit(slow(3, seed=99))
+        left = one.submit(slow(6, seed=99))
         one.rendering(left["id"])
         with two.http.stream("GET", f"/jobs/{left['id']}/events") as response:
             one.kill()

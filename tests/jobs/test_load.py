@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import base64
-import os
 import re
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,22 +13,20 @@ import httpx
 import mllm_server as say
 import numpy as np
 import pytest
+from conftest import SCALE
 from engines import app_for
-from fastapi import FastAPI
 from mllm_server import MllmServer
 from numpy.typing import NDArray
-from servers import BODY, data_url
+from servers import data_url
+from waiting import TIME_LIMIT, eventually_async
 
-from cow_service.api.submission import MAX_CONCURRENT_BODIES
 from cow_service.jobs.active import ActiveJobs
 from cow_service.media.images import encode_png
-from cow_service.net import ImageUrls
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.scaled]
 
-SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))  # 1 in CI, 10 for a soak test
 REQUESTS = 24 * SCALE
 BITS = 12
 WIDTH, HEIGHT = 16 * BITS, 96
@@ -55,11 +50,13 @@ class Witness:
 
     def __init__(self, server: MllmServer) -> None:
         self.wrong: list[tuple[int, list[int]]] = []
-        self.delay = 0.0  # seconds
+        self.is_asked, self.may_answer = threading.Event(), threading.Event()
+        self.may_answer.set()
         server.say(self.reply)
 
     def reply(self, handler: Any) -> None:
-        time.sleep(self.delay)
+        self.is_asked.set()
+        self.may_answer.wait(TIME_LIMIT)
         asked = int(re.findall(r"picture (\d+)", say.text_of(handler.body))[-1])
         seen = [number_in(pixels) for pixels in say.images_of(handler.body)]
         if seen != [asked]:
@@ -67,33 +64,8 @@ class Witness:
         handler.send(200, say.completion(f'{{"reasoning": "", "answer": "{seen[0]}"}}'))
 
 
-def test_slow_image_urls_hold_up_nobody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """More of them than bodies are decoded at the same time."""
-    arrive, begun = threading.Event(), threading.Semaphore(0)
-
-    def fetched(_: object, url: str) -> bytes:
-        begun.release()
-        assert arrive.wait(30)
-        return base64.b64decode(BODY["image"].partition(",")[2])
-
-    monkeypatch.setattr(ImageUrls, "fetch", fetched)
-
-    async def calls(app: FastAPI) -> None:
-        transport = httpx.ASGITransport(app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=30) as client:
-            asked = [
-                BODY | {"image": f"https://slow.test/{n}.png", "seed": n} for n in range(MAX_CONCURRENT_BODIES + 2)
-            ]
-            slow = [asyncio.create_task(client.post("/simulate", json=body)) for body in asked]
-            for _ in slow:
-                assert await asyncio.to_thread(begun.acquire, timeout=10)
-            assert (await client.post("/simulate", json=BODY)).status_code == 200
-            assert not any(task.done() for task in slow)
-            arrive.set()
-            assert [(await task).status_code for task in slow] == [200] * len(slow)
-
-    with Service(Settings(data_dir=tmp_path)) as service:
-        asyncio.run(calls(app_for(service)))
+def connected(service: Service) -> httpx.AsyncClient:
+    return httpx.AsyncClient(transport=httpx.ASGITransport(app_for(service)), base_url="http://cow", timeout=TIME_LIMIT)
 
 
 @pytest.fixture
@@ -110,7 +82,6 @@ def body(number: int, **others: Any) -> dict[str, Any]:
 
 def test_no_request_gets_the_picture_or_the_answer_of_another(served: tuple[Service, Witness]) -> None:
     service, witness = served
-    transport = httpx.ASGITransport(app_for(service))
 
     async def ask(client: httpx.AsyncClient, number: int) -> tuple[int, Any]:
         """In the ways in which a job's image can get to it: at once or from the queue, alone, in votes, again."""
@@ -130,11 +101,10 @@ def test_no_request_gets_the_picture_or_the_answer_of_another(served: tuple[Serv
         return number, told.json()["answer"]
 
     async def all_at_once() -> list[tuple[int, Any]]:
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=110) as client:
+        async with connected(service) as client:
             return await asyncio.gather(*(ask(client, number) for number in range(REQUESTS)))
 
-    answers = asyncio.run(all_at_once())
-    assert answers == [(number, str(number)) for number in range(REQUESTS)]
+    assert asyncio.run(all_at_once()) == [(number, str(number)) for number in range(REQUESTS)]
     assert witness.wrong == []
 
 
@@ -143,25 +113,33 @@ def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
 ) -> None:
     """A key that is used again after a deletion has the same job id: what is said of the first job may come late."""
     service, witness = served
-    transport = httpx.ASGITransport(app_for(service))
-    announce, is_first, held = ActiveJobs.notify_ended, threading.Lock(), threading.Event()
+    announce, is_first, held, told = ActiveJobs.notify_ended, threading.Lock(), threading.Event(), threading.Event()
 
     def late(active: ActiveJobs, job_id: str, *refusal: Any) -> None:
-        if is_first.acquire(blocking=False):
-            held.wait(20)
+        is_late = is_first.acquire(blocking=False)
+        if is_late:
+            held.wait(TIME_LIMIT)
         announce(active, job_id, *refusal)
+        if is_late:
+            told.set()
 
     async def calls() -> str:
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=60) as client:
+        async with connected(service) as client:
             key = {"Idempotency-Key": "late"}
             first = (await client.post("/answer", json=body(1), headers=key | {"Prefer": "respond-async"})).json()["id"]
-            while (await client.get(f"/jobs/{first}")).json()["status"] != "succeeded":
-                await asyncio.sleep(0.02)
+
+            async def succeeded() -> bool:
+                return (await client.get(f"/jobs/{first}")).json()["status"] == "succeeded"
+
+            await eventually_async(succeeded)
             await client.delete(f"/jobs/{first}")
-            witness.delay = 1.0
+            witness.is_asked.clear()
+            witness.may_answer.clear()
             second = asyncio.create_task(client.post("/answer", json=body(2), headers=key))
-            await asyncio.sleep(0.5)
+            await asyncio.to_thread(witness.is_asked.wait, TIME_LIMIT)
             held.set()
+            await asyncio.to_thread(told.wait, TIME_LIMIT)
+            witness.may_answer.set()
             return (await second).json()["answer"]
 
     monkeypatch.setattr(ActiveJobs, "notify_ended", late)

@@ -2,91 +2,65 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import threading
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
-from hypothesis import given
-from hypothesis import strategies as st
-from job_rows import add_job
+from job_rows import add_job, open_database, take_new_job
+from refusals import refused
 from waiting import eventually
 
-from cow_service.errors import ArtifactNotFound
 from cow_service.jobs import maintenance
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.calls import Calls
+from cow_service.jobs.computing import EngineParts
 from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import JobTable
 from cow_service.jobs.maintenance import BUDGET_GRACE_SECONDS, CHUNK, UNREFERENCED_GRACE_SECONDS, collect_artifacts
-from cow_service.jobs.packing import packed, unpacked
+from cow_service.jobs.schema import JOBS
 from cow_service.media.artifacts import DiskArtifacts, ListedArtifact
-from cow_service.service import Service
 from cow_service.settings import Settings
 
 
-@given(st.recursive(st.none() | st.booleans() | st.text() | st.floats(-1e9, 1e9), st.lists))
-def test_values_come_back_as_they_were(value: object) -> None:
-    assert unpacked(packed(json.dumps(value))) == value
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[Database]:
+    with closing(open_database(tmp_path)) as database:
+        yield database
 
 
-def test_long_results_are_kept_small() -> None:
-    path = json.dumps([[0.125 * i, 0.5 * i] for i in range(2000)])
-    assert len(packed(path)) < len(path) / 3
+def test_one_process_cleans_up_at_a_time(tmp_path: Path, database: Database) -> None:
+    with closing(open_database(tmp_path)) as other:
+        assert database.take_turn("jobs", 600)
+        assert not other.take_turn("jobs", 600)
+        assert not database.take_turn("jobs", 600)
+        assert other.take_turn("artifacts", 600), "that is another turn"
+        assert other.take_turn("jobs", 0), "the turn is over"
+        assert not database.take_turn("artifacts", 600)
+        other.give_turn_back("artifacts")
+        assert database.take_turn("artifacts", 600), "its work was not done"
+        assert not database.take_turn("jobs", 600)
 
 
-def test_one_process_cleans_up_at_a_time(tmp_path: Path) -> None:
-    one, other = (Database(Settings(data_dir=tmp_path)) for _ in range(2))
-    one.create_tables()
-    assert one.take_turn("jobs", 600)
-    assert not other.take_turn("jobs", 600)
-    assert not one.take_turn("jobs", 600)
-    assert other.take_turn("artifacts", 600), "that is another turn"
-    assert other.take_turn("jobs", 0), "the turn is over"
-    assert not one.take_turn("artifacts", 600)
-    other.give_turn_back("artifacts")
-    assert one.take_turn("artifacts", 600), "its work was not done"
-    assert not one.take_turn("jobs", 600)
-    one.close()
-    other.close()
-
-
-def test_what_belongs_to_a_job_is_deleted_with_it(tmp_path: Path) -> None:
-    database = Database(Settings(data_dir=tmp_path))
-    database.create_tables()
+def test_what_belongs_to_a_job_is_deleted_with_it(database: Database) -> None:
     for job, shared in (("one", "5" * 64), ("two", "5" * 64)):
         add_job(database, job)
         stored = StoredResult(job * 4, "trajectory", "{}", (job * 8, shared), '{"value":1}')
         database.store_results(job, [stored])
+    assert database.referenced(["one" * 8, "5" * 64, "6" * 64]) == {"one" * 8, "5" * 64}
     assert JobTable(database).delete(["one"]) == {"one" * 8}, "the other artifacts are needed by another job"
     assert database.find_result("one" * 4) is None
     assert database.find_result("two" * 4) == ("two", {"value": {"value": 1}})
     assert database.finished_stages("one") == set()
-    with database.engine.connect() as connection:
-        for table in ("cow_results", "cow_trajectories_of_jobs", "cow_references", "cow_stages_of_jobs"):
-            left = connection.execute(sa.text(f"SELECT DISTINCT job_id FROM {table}")).scalars().all()
-            assert left == ["two"], table
-    database.close()
-
-
-def test_lists_of_a_status_look_at_no_other_jobs(tmp_path: Path) -> None:
-    database = Database(Settings(data_dir=tmp_path))
-    database.create_tables()
-    with database.engine.connect() as connection:
-        for wanted in ("status IN ('failed', 'canceled')", "owner = 'x'"):
-            query = f"SELECT kind FROM cow_jobs WHERE {wanted} AND kind IN ('simulate', 'answer') "
-            steps = connection.execute(
-                sa.text(f"EXPLAIN QUERY PLAN {query} ORDER BY created_at DESC, id DESC LIMIT 50")
-            )
-            assert any("SEARCH" in row[3] and "cow_jobs_of" in row[3] for row in steps), wanted
-    database.close()
+    for table in ("cow_results", "cow_trajectories_of_jobs", "cow_references", "cow_stages_of_jobs"):
+        assert database.read(sa.text(f"SELECT DISTINCT job_id FROM {table}")) == [("two",)], table
 
 
 NOW = 1e9
@@ -118,17 +92,9 @@ class ManyArtifacts(DiskArtifacts):
         return sorted(NOW - used_at for used_at in self.used_at.values())
 
 
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database(Settings(data_dir=tmp_path))
-    database.create_tables()
-    yield database
-    database.close()
-
-
 def sweep(store: DiskArtifacts, database: Database, max_gb: float | None = None) -> None:
-    service = SimpleNamespace(artifacts=store, settings=Settings(artifacts_max_gb=max_gb))
-    collect_artifacts(cast(Service, service), database, lambda: False, NOW)
+    service: Any = SimpleNamespace(artifacts=store, settings=Settings(artifacts_max_gb=max_gb))
+    collect_artifacts(service, database, lambda: False, NOW)
 
 
 def refer(database: Database, job: str, artifacts: Collection[str], *, is_open: bool = False) -> None:
@@ -180,14 +146,8 @@ def test_an_artifact_that_is_used_while_it_is_listed_stays(
     monkeypatch.setattr(store, "listed", lambda: iter(listed))
     sweep(store, database)
     assert store.read(used) == b"used"
-    with pytest.raises(ArtifactNotFound):
+    with refused("artifact-not-found"):
         store.get(loose)
-
-
-def test_an_artifact_of_many_jobs_is_one(database: Database) -> None:
-    for job in ("one", "two"):
-        refer(database, job, ["a" * 64])
-    assert database.referenced(["a" * 64, "b" * 64]) == {"a" * 64}
 
 
 class EndlessListing(ManyArtifacts):
@@ -203,27 +163,74 @@ class EndlessListing(ManyArtifacts):
             yield ListedArtifact("a" * 64, SIZE, time.time())
 
 
+@contextmanager
+def running(
+    service: Any, database: Database, active: ActiveJobs, remove: Any = None, offer: Callable[[], None] = lambda: None
+) -> Iterator[maintenance.Maintenance]:
+    """Maintenance at work. Jobs of "me" are this process's, and those of "gone" of one that has ended."""
+    parts = EngineParts(service, database, JobTable(database), active, "me")
+    lease = maintenance.FolderLease(Path(database.file or "").parent / "executors")
+    lease.acquire()
+    thread = maintenance.Maintenance(parts, Calls(), lease, remove, offer)
+    thread.start()
+    yield thread
+    thread.stop()
+    lease.release()
+
+
 def test_a_long_listing_holds_up_no_other_maintenance(
     tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(maintenance, "CLEAN_UP_SECONDS", 0.0)
     monkeypatch.setattr(maintenance, "POLL_SECONDS", 0.01)
-    store, canceled = EndlessListing(tmp_path), list[str]()
-    service = SimpleNamespace(artifacts=store, settings=Settings())
-    # A job that another process has canceled, once the listing has begun.
-    active = ActiveJobs()
-    monkeypatch.setattr(active, "runs", lambda: {"job": "1"} if store.is_listed.is_set() else {})
-    monkeypatch.setattr(active, "request_cancel", canceled.append)
-    parts: Any = SimpleNamespace(
-        service=service, database=database, jobs=JobTable(database), active=active, executor="me"
-    )
-    thread = maintenance.Maintenance(
-        parts, Calls(), maintenance.FolderLease(tmp_path), lambda _jobs, _since: None, lambda: None
-    )
-    thread.start()
-    try:
-        eventually(lambda: canceled)
+    store, active, turns, take_turn = EndlessListing(tmp_path), ActiveJobs(), list[Any](), database.take_turn
+    monkeypatch.setattr(database, "take_turn", lambda *turn: (turns.append(turn), take_turn(*turn))[1])
+    with running(SimpleNamespace(artifacts=store, settings=Settings()), database, active):
+        eventually(store.is_listed.is_set)
+        with active.running("job", "simulate", "1") as job:  # which another process has canceled
+            eventually(job.cancel_requested.is_set)
+        assert turns[:2] == [("jobs", maintenance.TURN_SECONDS), ("artifacts", maintenance.LISTING_SECONDS)]
         assert not database.take_turn("artifacts", 600)
-    finally:
-        thread.stop()
     assert database.take_turn("artifacts", 600), "it was stopped before it was done: another process may begin"
+
+
+def test_jobs_that_nobody_works_on_go_back_to_their_queue(
+    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a process that has ended, and those of this one that could not be started."""
+    monkeypatch.setattr(maintenance, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(maintenance, "STALLED_SECONDS", 0.05)
+    active, offered = ActiveJobs(), list[int]()
+    at_work = take_new_job(database, "at work", "me")
+    for job, executor in (("stalled", "me"), ("left", "gone")):
+        take_new_job(database, job, executor)
+    waits = sa.select(JOBS.c.id).where(JOBS.c.executor.is_(None))
+    service = SimpleNamespace(settings=Settings())
+    with (
+        active.running("at work", "simulate", at_work.run) as job,
+        running(service, database, active, offer=lambda: offered.append(1)),
+    ):
+        eventually(lambda: {row.id for row in database.read(waits)} == {"stalled", "left"} and len(offered) == 2)
+        assert not job.cancel_requested.is_set()
+    assert not [*(tmp_path / "executors").iterdir()], "no locks are left"
+
+
+def test_jobs_go_when_they_were_kept_as_long_as_they_are_to_be(database: Database) -> None:
+    removed: list[tuple[list[str], float]] = []
+
+    def remove(jobs: list[str], since: float) -> None:
+        removed.append((jobs, since))
+        JobTable(database).delete(jobs)
+
+    service: Any = SimpleNamespace(settings=Settings(job_retention_hours=2))
+    parts = EngineParts(service, database, JobTable(database), ActiveJobs(), "me")
+    cleaner = maintenance.Maintenance(parts, Calls(), maintenance.FolderLease(Path()), remove, lambda: None)
+    for job, hours in (("old", 2.1), ("young", 1.9), ("open", None)):
+        add_job(database, job)
+        if hours is not None:
+            with database.transaction() as connection:
+                ended = {"status": "failed", "ended": time.time() - 3600 * hours}
+                connection.execute(sa.update(JOBS).where(JOBS.c.id == job).values(ended))
+    cleaner.clean_up_jobs()
+    ((jobs, since),) = removed
+    assert (jobs, time.time() - since) == (["old"], pytest.approx(7200, abs=120))

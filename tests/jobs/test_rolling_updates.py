@@ -15,30 +15,31 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import psycopg
 import pytest
 import sqlalchemy as sa
 from conftest import DATA
-from job_rows import add_job
-from postgres import postgres_server
+from job_rows import add_job, open_database
+from postgres import postgres
 from pydantic import SecretStr
+from refusals import refused
 from servers import BODY, IMAGE, Served
-from test_migration import cow
+from tables import rows
 from waiting import eventually
 
-from cow_service.errors import StorageUnavailable
+from cow_service.client import Client
 from cow_service.jobs import schema
 from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import JobTable
+from cow_service.jobs.job_table import JobSpec, JobTable
 from cow_service.jobs.packing import packed
 from cow_service.jobs.schema import METADATA, PROCESSES, SCHEMAS
 from cow_service.media.artifacts import DiskArtifacts
+from cow_service.records import Answer, Simulation
 from cow_service.settings import Settings
 from cow_service.stages.keys import FORMAT
 from cow_service.stages.run import now
 
 OLD_TABLES = (DATA / "schema_1.sql").read_text()
-OLD_RESULT = json.loads((DATA / "answer_of_format_2.json").read_text())["simulation"]
+OLD_ANSWER = json.loads((DATA / "answer_of_format_2.json").read_text())  # its trajectory is its only path
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
@@ -47,10 +48,14 @@ def old(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
     folder = tmp_path / "data"
     folder.mkdir()
     if request.param == "sqlite":
-        yield with_old_tables(Database(Settings(data_dir=folder)))
+        with closing(with_old_tables(Database(Settings(data_dir=folder)))) as database:
+            yield database
         return
-    with postgres_server() as url:
-        yield with_old_tables(Database(Settings(data_dir=folder, database_url=SecretStr(url))))
+    settings = {"data_dir": folder}
+    with postgres() as server:
+        address = SecretStr(server.url)
+        with closing(with_old_tables(Database(Settings(database_url=address, **settings)))) as database:
+            yield database
 
 
 def with_old_tables(database: Database) -> Database:
@@ -62,19 +67,18 @@ def with_old_tables(database: Database) -> Database:
     return database
 
 
-def write_old(database: Database, image: str, **values: Any) -> str:
+def write_old(database: Database, image: str, kind: str = "simulate", **values: Any) -> str:
     """A job as the older version writes it: it knows no other column than these."""
     job = str(uuid4())
     asked = {name: value for name, value in BODY.items() if name != "image"} | {"image": {"artifact": image}}
-    spec = {"kind": "simulate", "request": asked, "reader": "embedded", "generator": "cutout", "created_at": now()}
+    spec = {"kind": kind, "request": asked, "reader": "embedded", "generator": "cutout", "created_at": now()}
+    absent = ("ended", "owner", "executor", "run", "webhook", "format", "result", "trajectory_key", "error")
     row = {
-        "id": job, "kind": "simulate", "owner": None, "status": "queued", "created_at": spec["created_at"],
-        "ended": None, "version": "2", "queue": "light", "priority": "normal", "turn": 0, "executor": None, "run": None,
-        "starts": 0, "generator": "cutout", "question": BODY["question"], "image": image, "webhook": None,
-        "spec": zlib.compress(json.dumps(spec).encode()), "format": None, "result": None, "trajectory_key": None,
-        "error": None,
+        "id": job, "kind": kind, "status": "queued", "created_at": spec["created_at"], "version": "2", "turn": 0,
+        "queue": "light", "priority": "normal", "starts": 0, "generator": "cutout", "question": BODY["question"],
+        "image": image, "spec": zlib.compress(json.dumps(spec).encode()),
     }  # fmt: skip
-    row |= values
+    row |= dict.fromkeys(absent) | values
     insert = f"INSERT INTO cow_jobs ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})"
     with database.transaction() as connection:
         connection.execute(sa.text(insert), row)
@@ -102,29 +106,53 @@ def tell_of_a_process(database: Database, seconds_ago: float) -> None:
         connection.execute(sa.insert(PROCESSES).values(executor="old", seen=time.time() - seconds_ago, info="{}"))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("old", rows({"several machines": "postgres"}, ["sqlite"]), indirect=True)
 def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
     image = DiskArtifacts(tmp_path / "data" / "artifacts").put(IMAGE, "image/png").sha256
-    result = zlib.compress(json.dumps(OLD_RESULT).encode())
-    finished = write_old(old, image, status="succeeded", ended=time.time(), format=2, result=result)
+    ended = {"status": "succeeded", "ended": time.time(), "format": 2}
+    finished = {
+        kind: write_old(old, image, kind, **ended, result=zlib.compress(json.dumps(result).encode()))
+        for kind, result in (("simulate", OLD_ANSWER["simulation"]), ("answer", OLD_ANSWER))
+    }
     waiting = write_old(old, image)
     tell_of_a_process(old, 0.0)  # the older server runs
     address = {} if old.file is not None else {"COW_DATABASE_URL": old.url}
-    with Served(tmp_path, **address) as new:
-        assert new.job(finished)["result"]["trajectory"]["law"] == "ballistic"
+    with Served(tmp_path, **address) as new, Client(str(new.http.base_url)) as client:
+        for kind, job in finished.items():
+            result = new.job(job)["result"]
+            told = (result["simulation"] if kind == "answer" else result)["trajectory"]
+            assert (told["law"], "points" in told) == ("ballistic", False)
+            read: Any = client.job(job).wait()
+            assert (read.simulation if kind == "answer" else read).trajectory.path.points[0] == (275.5, 225.5)
         assert new.ended(waiting)["status"] == "succeeded"
         assert old.read(sa.select(SCHEMAS.c.version, SCHEMAS.c.oldest_serving)) == [(schema.SCHEMA, 1)]
         # The older server goes on: what it writes is served here, and what is computed here it can read.
         later = write_old(old, image)
         assert new.ended(later)["status"] == "succeeded"
         own = new.submit(BODY)["id"]
-        read = eventually(lambda: read_old(old, own))
-        assert read["trajectory"] == new.job(own)["result"]["trajectory"]
+        assert eventually(lambda: read_old(old, own))["trajectory"] == new.job(own)["result"]["trajectory"]
         # Work of another workflow version is left to servers that have it, and told of.
         foreign = write_old(old, image, version="1")
-        told = eventually(lambda: new.http.get("/workers").json()["unserved"])
-        assert [(one["workflow_version"], one["reason"]) for one in told] == [("1", "version")]
+        unserved = eventually(lambda: new.http.get("/workers").json()["unserved"])
+        assert [(one["workflow_version"], one["reason"]) for one in unserved] == [("1", "version")]
         assert new.job(foreign)["status"] == "queued"
-    old.close()
+
+
+def test_results_and_requests_of_an_older_version_are_read() -> None:
+    answer = Answer.model_validate(OLD_ANSWER)
+    assert answer.simulation is not None
+    trajectory = answer.simulation.trajectory
+    assert (trajectory.law, trajectory.bodies, trajectory.outcome) == ("ballistic", (), None)
+    assert json.loads(trajectory.path.model_dump_json())["points"] == OLD_ANSWER["simulation"]["trajectory"]["points"]
+    assert trajectory.num_frames == 7
+    assert Simulation.model_validate_json(answer.simulation.model_dump_json()) == answer.simulation
+    request = {"image": {"artifact": "0" * 64}, "question": "?", "motion": {"direction": [1, 0]}}
+    spec = JobSpec(kind="simulate", request=request, reader="embedded", generator="cutout", created_at="")
+    asked = spec.parsed()
+    assert (asked.law, asked.ensemble, spec.attached) == ("contact", 50, [])
+    assert asked.stated_motion is not None
+    assert asked.stated_motion.stated_kind == "linear"
 
 
 def test_tables_only_gain_what_older_servers_do_not_notice(tmp_path: Path) -> None:
@@ -143,17 +171,6 @@ def test_tables_only_gain_what_older_servers_do_not_notice(tmp_path: Path) -> No
             assert was is None or str(column.type) == str(was["type"]), column
 
 
-def test_a_column_that_an_older_version_lacks_is_added(old: Database) -> None:
-    write_old(old, "0" * 64)
-    with old.transaction() as connection:
-        connection.execute(sa.text("ALTER TABLE cow_jobs DROP COLUMN webhook"))
-    assert old.schema() == 1
-    old.create_tables()
-    assert old.read(sa.text("SELECT webhook FROM cow_jobs")) == [(None,)]
-    assert old.schema() == schema.SCHEMA
-    old.close()
-
-
 def indexes_of(database: Database) -> dict[str, bool]:
     """Those of the table of jobs, and whether they are used."""
     if database.file is not None:
@@ -163,11 +180,17 @@ def indexes_of(database: Database) -> dict[str, bool]:
     return {row.relname: row.indisvalid for row in database.read(sa.text(query))}
 
 
-def test_indexes_that_an_older_version_lacks_are_added(old: Database) -> None:
+def test_columns_and_indexes_that_an_older_version_lacks_are_added(old: Database) -> None:
     wanted = {str(index.name): True for index in schema.JOBS.indexes}
     assert indexes_of(old).items() < wanted.items()
-    old.create_tables()
-    assert indexes_of(old) == wanted
+    write_old(old, "0" * 64)
+    assert old.schema() == 1
+    with refused("storage-unavailable"):
+        old.prepare(migrate=False)
+    old.prepare(migrate=True)
+    assert old.read(sa.text("SELECT answer FROM cow_jobs")) == [(None,)]
+    assert (old.schema(), indexes_of(old)) == (schema.SCHEMA, wanted)
+    old.prepare(migrate=False)
     if old.file is None:  # the making of one was interrupted
         with old.transaction() as connection:
             broken = "UPDATE pg_index SET indisvalid = false WHERE indexrelid = 'cow_jobs_of_kind'::regclass"
@@ -175,86 +198,65 @@ def test_indexes_that_an_older_version_lacks_are_added(old: Database) -> None:
         assert indexes_of(old) != wanted
         old.create_tables()
         assert indexes_of(old) == wanted
-    old.close()
 
 
-def hurry(connection: psycopg.Connection[Any], _: object) -> None:
-    connection.execute("SET lock_timeout = '100ms'")
-    connection.commit()
+@pytest.mark.parametrize("old", [pytest.param("postgres", marks=pytest.mark.slow)], indirect=True)
+def test_an_index_that_must_wait_for_too_long_keeps_no_server_from_starting(old: Database, tmp_path: Path) -> None:
+    with old.transaction() as connection:  # a new column has to wait for a backup, and the server with it
+        connection.execute(sa.text("ALTER TABLE cow_jobs ADD COLUMN answer TEXT, ADD COLUMN given TEXT"))
+    with old.engine.connect() as backup:
+        backup.execution_options(isolation_level="REPEATABLE READ").execute(sa.text("SELECT * FROM cow_jobs"))
+        with closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(old.url)))) as other:
 
+            @sa.event.listens_for(other.engine, "connect")
+            def hurry(connection: Any, _: object) -> None:
+                connection.execute("SET lock_timeout = '100ms'")
+                connection.commit()
 
-@pytest.mark.slow
-def test_an_index_that_must_wait_for_too_long_keeps_no_server_from_starting(tmp_path: Path) -> None:
-    with postgres_server() as url, closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))) as old:
-        with_old_tables(old)
-        with old.transaction() as connection:  # a new column has to wait for a backup, and the server with it
-            connection.execute(sa.text("ALTER TABLE cow_jobs ADD COLUMN answer TEXT, ADD COLUMN given TEXT"))
-        with old.engine.connect() as backup:
-            backup.execution_options(isolation_level="REPEATABLE READ").execute(sa.text("SELECT * FROM cow_jobs"))
-            other = Database(Settings(data_dir=tmp_path, database_url=SecretStr(url)))
-            sa.event.listen(other.engine, "connect", hurry)
             other.create_tables()
-            other.close()
-            assert old.schema() == schema.SCHEMA
-            assert not all(indexes_of(old).values())
-        old.create_tables()
-        assert all(indexes_of(old).values())
+        assert old.schema() == schema.SCHEMA
+        assert not all(indexes_of(old).values())
+    old.create_tables()
+    assert all(indexes_of(old).values())
 
 
 def test_a_change_that_others_do_not_bear_waits_for_their_end(old: Database, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schema, "OLDEST_SERVING", 2)
     tell_of_a_process(old, 0.0)
-    with pytest.raises(StorageUnavailable, match="stop all of them first"):
+    with refused("storage-unavailable"):
         old.create_tables()
     assert old.schema() == 1, "nothing was changed"
     tell_of_a_process(old, schema.ALIVE_SECONDS + 1)
     old.create_tables()
     assert old.schema() == schema.SCHEMA
-    old.close()
 
 
-def set_schema(database: Database, version: int, oldest_serving: int) -> None:
-    with database.transaction() as connection:
-        connection.execute(sa.update(SCHEMAS).values(version=version, oldest_serving=oldest_serving))
-
-
-def test_tables_of_a_later_version_stay_as_they_are(tmp_path: Path) -> None:
-    with closing(Database(Settings(data_dir=tmp_path))) as database:
-        database.create_tables()
-        set_schema(database, schema.SCHEMA + 1, schema.SCHEMA)
-        with database.transaction() as connection:
-            connection.execute(sa.text("DROP TABLE cow_stages_of_jobs"))
-        database.create_tables()
-        assert "cow_stages_of_jobs" not in sa.inspect(database.engine).get_table_names()
-        assert database.schema() == schema.SCHEMA + 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("migrate", ["true", "false"])
-def test_a_server_that_is_too_old_says_so(tmp_path: Path, migrate: str) -> None:
-    own = {"COW_DATA_DIR": str(tmp_path), "COW_MIGRATE": migrate, "COW_WORKERS": "false"}
-    with closing(Database(Settings(data_dir=tmp_path))) as database:
-        database.create_tables()
-        set_schema(database, 9, 8)
-        told = cow("serve", "--port", "0", **own)
-        assert told.returncode == 1
-        assert f"(schema 9), on whose tables this one (schema {schema.SCHEMA}) cannot serve" in told.stderr
-        assert "Traceback" not in told.stderr
-        assert "dbos_migrations" not in sa.inspect(database.engine).get_table_names()
+def test_tables_of_another_version_stay_as_they_are(tmp_path: Path) -> None:
+    with closing(open_database(tmp_path)) as database:
+        for version, oldest in ((schema.SCHEMA + 1, schema.SCHEMA), (9, schema.SCHEMA + 1)):
+            with database.transaction() as connection:
+                connection.execute(sa.update(SCHEMAS).values(version=version, oldest_serving=oldest))
+                connection.execute(sa.text("DROP TABLE IF EXISTS cow_stages_of_jobs"))
+            if oldest <= schema.SCHEMA:
+                database.create_tables()
+                assert database.schema() == version
+            for migrate in (True, False) if oldest > schema.SCHEMA else ():
+                with refused("storage-unavailable"):
+                    database.prepare(migrate=migrate)
+            assert "cow_stages_of_jobs" not in sa.inspect(database.engine).get_table_names()
 
 
 def test_tables_that_are_too_old_are_refused(tmp_path: Path) -> None:
     with closing(Database(Settings(data_dir=tmp_path))) as database:
         with database.transaction() as connection:
             connection.execute(sa.text("CREATE TABLE cow_holds (sha256 TEXT)"))
-        with pytest.raises(StorageUnavailable, match="cannot take over"):
+        with refused("storage-unavailable"):
             database.create_tables()
         assert sa.inspect(database.engine).get_table_names() == ["cow_holds"]
 
 
 def test_a_result_of_a_later_version_is_handed_on_as_it_is(tmp_path: Path) -> None:
-    with closing(Database(Settings(data_dir=tmp_path))) as database:
-        database.create_tables()
+    with closing(open_database(tmp_path)) as database:
         add_job(database, "job")
         written = {"of a later version": 1}
         with database.transaction() as connection:

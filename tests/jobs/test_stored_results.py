@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import sqlalchemy as sa
 from drawn import ball, floor, png_bytes
 from engines import app_for, running_engine
 from fastapi.testclient import TestClient
-from job_rows import add_job
+from job_rows import add_job, open_database
 from servers import data_url
 
 from cow_service.jobs.database import Database, StoredResult
@@ -20,7 +21,6 @@ from cow_service.records import Simulation
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-KEY, OTHER = "a1" * 32, "b2" * 32
 BODY: dict[str, Any] = {
     "image": data_url(png_bytes(ball(floor(96, 64), (30, 40), 8, (210, 20, 20)))),
     "question": "If the red ball rolls to the right, does it stop?",
@@ -68,11 +68,10 @@ def has(part: Any, value: Any) -> bool:
 
 def test_each_stage_key_has_a_trajectory_of_its_own(tmp_path: Path) -> None:
     """A job that is computed again from an earlier stage on, or by two processes, may come to two."""
-    database = Database(Settings(data_dir=tmp_path))
-    database.create_tables()
-    add_job(database, "job")
-    for key, text in ((KEY, '{"paths":[1]}'), (OTHER, '{"paths":[2]}')):
-        database.store_results("job", [StoredResult(key, "trajectory", "{}", (), text)])
-    found = [database.find_result(key) for key in (KEY, OTHER)]
-    assert found == [("job", {"value": {"paths": [1]}}), ("job", {"value": {"paths": [2]}})]
-    database.close()
+    with closing(open_database(tmp_path)) as database:
+        add_job(database, "job")
+        paths = {"a1" * 32: 1, "b2" * 32: 2}
+        for key, number in paths.items():
+            database.store_results("job", [StoredResult(key, "trajectory", "{}", (), f'{{"paths":[{number}]}}')])
+        found = {key: database.find_result(key) for key in paths}
+    assert found == {key: ("job", {"value": {"paths": [number]}}) for key, number in paths.items()}

@@ -1,4 +1,4 @@
-"""Whose job comes next: turns of keys, their weights, and priorities within a key."""
+"""Whose job comes next: queues, turns of keys, their weights, and priorities within a key."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.jobs.queues import LAST, STEP, moves, next_turn, step_of
+from cow_service.jobs.queues import LAST, STEP, clips, known_queues, moves, next_turn, queue_of, step_of
 from cow_service.requests import PRIORITIES, Priority
+from cow_service.settings import Settings
 
 OWNERS = st.sampled_from(("alice", "bob", "carol", None))
 JOBS = st.lists(st.tuples(OWNERS, st.sampled_from(PRIORITIES)), max_size=40)
@@ -101,3 +102,12 @@ def test_turns_begin_anew_when_nobody_waits_and_never_become_too_large() -> None
     late = Waiting(0, "alice", "normal", LAST)
     assert next_turn([late], "alice", "normal", STEP) == LAST
     assert step_of(1e9) == 1
+
+
+def test_what_has_a_device_or_a_limit_of_its_own_has_a_queue_of_its_own() -> None:
+    plain, limited = Settings(), Settings(generator_concurrency={"slow": 2})
+    assert [clips(name, limited) for name in ("cutout", "ati", "slow")] == [None, 1, 2]
+    assert [queue_of("embedded", name, plain) for name in ("cutout", "ati", "slow")] == ["light", "ati", "light"]
+    assert [queue_of(reader, "slow", limited) for reader in ("embedded", "local")] == ["slow", "local"]
+    assert {*known_queues(limited)} - {*known_queues(plain)} == {"slow"}
+    assert {"light", "ati", "local"} < {*known_queues(plain)}

@@ -5,13 +5,12 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
-from cow_service.errors import ArtifactNotFound, StorageUnavailable
 from cow_service.media.artifacts import MEDIA_TYPES, DiskArtifacts
 
 DATA = b"frame" * 1000
@@ -45,18 +44,15 @@ def failing(number: int):
 
 
 @pytest.mark.parametrize(("media_type", "extension"), MEDIA_TYPES.items())
-def test_put_get_read(store, folder, media_type, extension):
+def test_what_is_put_is_found_by_this_store_and_another(store, folder, media_type, extension):
     artifact = store.put(DATA, media_type)
     assert artifact.model_dump() == {
-        "sha256": SHA256,
-        "url": f"/artifacts/{SHA256}",
-        "media_type": media_type,
-        "size": len(DATA),
-    }
-    assert store.get(SHA256) == artifact
-    with store.local_file(SHA256) as path:
-        assert path == folder / SHA256[:2] / f"{SHA256}.{extension}"
-    assert store.read(SHA256) == DATA
+        "sha256": SHA256, "url": f"/artifacts/{SHA256}", "media_type": media_type, "size": len(DATA)
+    }  # fmt: skip
+    for found in (store, DiskArtifacts(folder)):
+        assert found.get(SHA256) == artifact
+        assert found.read(SHA256) == DATA
+        assert path_of(found, SHA256) == folder / SHA256[:2] / f"{SHA256}.{extension}"
     assert files(folder) == [f"{SHA256[:2]}/{SHA256}.{extension}"]
 
 
@@ -67,7 +63,7 @@ def test_what_is_damaged_is_not_handed_out_and_heals(store, folder, damage, star
     path.write_bytes(damage)
     if started_anew:
         store = DiskArtifacts(folder)
-    with pytest.raises(ArtifactNotFound):
+    with refused("artifact-not-found"):
         store.get(SHA256)
     assert files(folder) == []
     path.write_bytes(damage)
@@ -86,44 +82,21 @@ def test_bytes_are_compared_once(store, folder, monkeypatch):
     assert len(compared) == 1
 
 
-def test_no_bytes_are_an_artifact_too(store):
-    assert store.read(store.put(b"", "application/json").sha256) == b""
-
-
-def test_a_second_put_changes_nothing_but_says_that_it_is_needed(store, folder):
-    first = store.put(DATA, "image/png")
-    before = path_of(store, SHA256).stat()
-    assert store.put(DATA, "image/png") == first
-    after = path_of(store, SHA256).stat()
-    assert (before.st_ino, before.st_size) == (after.st_ino, after.st_size)
-    assert before.st_mtime_ns <= after.st_mtime_ns
+def test_a_second_put_keeps_the_first_media_type_and_says_that_it_is_needed(store, folder):
+    first = store.put(DATA, "video/mp4")
+    path = path_of(store, SHA256)
+    os.utime(path, (1000, 1000))
+    number = path.stat().st_ino
+    assert store.put(DATA, "image/png") == first == store.get(SHA256)
+    assert path.stat().st_ino == number
+    assert path.stat().st_mtime > 1000
     assert len(files(folder)) == 1
-
-
-def test_the_first_media_type_stays(store, folder):
-    store.put(DATA, "video/mp4")
-    assert store.put(DATA, "image/png").media_type == "video/mp4"
-    assert store.get(SHA256).media_type == "video/mp4"
-    assert len(files(folder)) == 1
-
-
-def test_another_store_on_the_same_folder_finds_it(store, folder):
-    artifact = store.put(DATA, "image/jpeg")
-    assert DiskArtifacts(folder).get(SHA256) == artifact
 
 
 def test_an_unknown_media_type_is_a_programming_error(store, folder):
-    with pytest.raises(ValueError, match="'image/gif' is not supported: use one of image/png"):
+    with pytest.raises(ValueError, match="image/gif"):
         store.put(DATA, "image/gif")
     assert not folder.exists()
-
-
-def test_an_absent_digest_is_named(store):
-    with pytest.raises(ArtifactNotFound, match=SHA256) as caught:
-        store.get(SHA256)
-    assert caught.value.code == "artifact-not-found"
-    with pytest.raises(ArtifactNotFound):
-        store.read(SHA256)
 
 
 @pytest.mark.parametrize(
@@ -132,34 +105,28 @@ def test_an_absent_digest_is_named(store):
 def test_what_is_no_digest_never_reaches_the_disk(store, monkeypatch, name):
     store.put(DATA, "image/png")
     monkeypatch.setattr(Path, "stat", failing(errno.EIO))
-    with pytest.raises(ArtifactNotFound, match="64 lower-case hex digits"):
+    with refused("artifact-not-found"):
         store.get(name)
 
 
-def test_a_long_name_is_cut_in_the_message(store):
-    with pytest.raises(ArtifactNotFound) as caught:
+def test_an_absent_digest_is_named_and_a_long_name_is_cut(store):
+    for find in (store.get, store.read, store.touch):
+        with refused("artifact-not-found") as caught:
+            find(SHA256)
+        assert SHA256 in caught.value.detail
+    with refused("artifact-not-found") as caught:
         store.get("x" * 100_000)
     assert len(caught.value.detail) < 200
 
 
-def test_a_half_written_file_is_never_found(store, folder, monkeypatch):
-    monkeypatch.setattr(os, "fsync", failing(errno.EIO))
-    with pytest.raises(StorageUnavailable):
-        store.put(DATA, "image/png")
-    assert files(folder) == []
-    with pytest.raises(ArtifactNotFound):
-        store.get(SHA256)
-
-
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
-def test_a_full_disk_is_named(store, folder, monkeypatch, number):
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EACCES])
+def test_what_the_disk_refuses_is_told_without_its_path_and_leaves_nothing(store, folder, monkeypatch, number):
     monkeypatch.setattr(os, "fsync", failing(number))
-    with pytest.raises(StorageUnavailable, match=r"disk of the data folder is full: free some space") as caught:
-        store.put(DATA, "image/png")
-    assert "/" not in caught.value.detail
-    assert isinstance(caught.value.__cause__, OSError)
-    with pytest.raises(StorageUnavailable, match="full"):
-        store.check()
+    for call in (lambda: store.put(DATA, "image/png"), store.check):
+        with refused("storage-unavailable") as caught:
+            call()
+        assert ("full" in caught.value.detail) == (number != errno.EACCES)
+        assert "/" not in caught.value.detail
     assert files(folder) == []
 
 
@@ -167,38 +134,15 @@ def test_a_file_where_the_folder_should_be(tmp_path):
     blocked = tmp_path / "data"
     blocked.write_bytes(b"")
     store = DiskArtifacts(blocked)
-    for call in (
-        store.check,
-        lambda: store.put(DATA, "image/png"),
-        lambda: store.get(SHA256),
-        lambda: store.read(SHA256),
-    ):
-        with pytest.raises(StorageUnavailable, match="data folder cannot be used") as caught:
+    for call in (store.check, lambda: store.put(DATA, "image/png"), lambda: store.get(SHA256)):
+        with refused("storage-unavailable") as caught:
             call()
-        assert caught.value.code == "storage-unavailable"
         assert str(tmp_path) not in caught.value.detail
-
-
-def test_a_folder_that_may_not_be_written(store, folder, monkeypatch):
-    monkeypatch.setattr(Path, "mkdir", failing(errno.EACCES))
-    with pytest.raises(StorageUnavailable, match=r"Permission denied") as caught:
-        store.check()
-    assert "/" not in caught.value.detail
 
 
 def test_check_leaves_nothing_behind(store, folder):
     store.check()
-    store.check()
     assert files(folder) == []
-
-
-def test_a_folder_that_is_removed_is_made_again(store, folder):
-    store.put(DATA, "image/png")
-    shutil.rmtree(folder)
-    with pytest.raises(ArtifactNotFound):
-        store.get(SHA256)
-    store.put(DATA, "image/png")
-    assert store.read(SHA256) == DATA
 
 
 def test_the_same_bytes_from_many_threads(store, folder):
@@ -221,5 +165,21 @@ def test_what_nobody_needs_any_more_goes(store, folder):
     assert store.delete(both, untouched_since=1000) == {loose.sha256}
     assert store.delete(both, untouched_since=1000) == set()
     assert store.read(kept.sha256) == DATA
-    with pytest.raises(ArtifactNotFound):
+    with refused("artifact-not-found"):
         store.touch(loose.sha256)
+
+
+def test_temporary_files_of_processes_that_were_killed_go(store, folder):
+    left, young = folder / ".a.part", folder / ".b.part"
+    with store.scratch() as path:
+        assert path.parent == folder
+        for file in (left, young, path):
+            file.write_bytes(b"")
+        os.utime(left, (1000, 1000))
+        store.remove_leftovers(1000)
+        assert files(folder) == sorted([young.name, path.name])
+    assert files(folder) == [young.name]
+
+
+def test_a_folder_has_one_name_for_all_processes(store, folder, tmp_path):
+    assert store.address == DiskArtifacts(folder).address != DiskArtifacts(tmp_path / "other").address

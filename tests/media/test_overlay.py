@@ -11,13 +11,23 @@ from drawn import floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cow_service.media.overlay import ENCOUNTERS, OUTLINE, PATH, PUSHED, Label, draw_labels, draw_overlay
+from cow_service.media.overlay import (
+    ARROW,
+    DARK,
+    ENCOUNTERS,
+    LIGHT,
+    OUTLINE,
+    PATH,
+    PLACED,
+    PUSHED,
+    REMOVED,
+    Label,
+    Replaced,
+    draw_labels,
+    draw_overlay,
+    named_strip,
+)
 from cow_service.records import Grounding, Motion, Trajectory
-
-MOTION = Motion.model_validate(
-    {"kind": "static", "direction": None, "cue": "request", "speed": 0, "sentence": "", "source": "request",
-     "metres_per_pixel": {"value": 0.01, "source": "default"}}
-)  # fmt: skip
 
 
 def path(points, body: int = 0, spread: float = 0.0) -> dict:
@@ -28,44 +38,74 @@ def path(points, body: int = 0, spread: float = 0.0) -> dict:
     }  # fmt: skip
 
 
-def drawn(image, paths, mask=None, times=1, max_side=None, **rest) -> np.ndarray:
+def drawn(image, paths, mask=None, times=1, direction=None, **rest) -> np.ndarray:
+    """The overlay of an image whose places are `times` as far apart; the ball is at (80, 80) of the smallest."""
     box = (60 * times, 60 * times, 100 * times, 100 * times)
     grounding = Grounding(object="ball", point=(80 * times, 80 * times), bbox=box, source="request")
+    motion = Motion.model_validate(
+        {"kind": "static", "direction": direction, "cue": "request", "speed": 0, "sentence": "", "source": "request",
+         "metres_per_pixel": {"value": 0.01, "source": "default"}}
+    )  # fmt: skip
+    lists = {name: rest.pop(name) for name in ("removed", "placed", "max_side") if name in rest}
     trajectory = Trajectory.model_validate({"fps": 16, "paths": paths, "anchors": []} | rest)
-    return draw_overlay(image, grounding, MOTION, trajectory, mask, max_side=max_side)
+    return draw_overlay(image, grounding, motion, trajectory, mask, **lists)
 
 
-def near(canvas, colour, x: float, y: float, reach: int = 4) -> bool:
-    part = canvas[round(y) - reach : round(y) + reach, round(x) - reach : round(x) + reach].astype(int)
-    return bool((np.abs(part - np.array(colour)).max(axis=2) < 30).any())
+def with_everything(image, times: int, max_side: int | None = None) -> np.ndarray:
+    """Whatever can be drawn, `times` as large."""
+    ys, xs = np.mgrid[: image.shape[0] // times, : image.shape[1] // times]
+
+    def disc(x: float, y: float, radius: float) -> np.ndarray:
+        return (np.hypot(xs - x, ys - y) < radius).repeat(times, axis=0).repeat(times, axis=1)
+
+    def moved(*places: float) -> tuple[float, ...]:
+        return tuple(times * each for each in places)
+
+    one, other = ([moved(80 + 20 * i, y) for i in range(18)] for y in (80, 200))
+    seen = path(one, spread=20 * times)
+    seen["visible"] = [not 10 < i < 14 for i in range(18)]
+    contacts = [{"a": 0, "b": None, "time": 0.2, "point": moved(300, 320), "impulse": 1},
+                {"a": 0, "b": 1, "time": 0.3, "point": moved(400, 320), "impulse": 1}]  # fmt: skip
+    box, cup = moved(500, 40, 560, 100), moved(500, 240, 560, 300)
+    encounters = [{"object": "box", "bbox": box, "kind": "touches", "first_frame": 24, "probability": 0.93},
+                  {"object": "cup", "bbox": cup, "kind": "occludes", "first_frame": 3, "time": 0.25}]  # fmt: skip
+    put = Replaced(
+        "can", "next to the cup", moved(80, 280, 120, 320), disc(100, 300, 20), moved(180, 280, 220, 320),
+        disc(200, 300, 20),
+    )  # fmt: skip
+    return drawn(
+        image, [seen, path(other, 1)], disc(80, 80, 15), times, (0.6, 0.8), contacts=contacts, encounters=encounters,
+        removed=[("vase", moved(300, 130, 340, 170), disc(320, 150, 20))], placed=[put], max_side=max_side,
+    )  # fmt: skip
 
 
-def test_every_path_its_band_and_the_contacts_are_drawn() -> None:
-    image = floor()
-    one, other = [(80 + 20.0 * i, 80.0) for i in range(9)], [(240 + 20.0 * i, 200.0) for i in range(9)]
-    contacts = [{"a": 0, "b": None, "time": 0.2, "point": (300, 320), "impulse": 1},
-                {"a": 0, "b": 1, "time": 0.3, "point": (400, 320), "impulse": 1}]  # fmt: skip
-    canvas = drawn(image, [path(one, spread=20), path(other, 1)], contacts=contacts)
-    assert near(canvas, PATH, 240, 80)
-    assert near(canvas, PUSHED, 400, 200)
-    change = canvas[68, 190].astype(int) - image[68, 190]  # within the band, off the line
-    assert change[2] > 15
-    assert change[0] < -15
+SHOWN = {  # by colour: left, top, right and bottom (px) of its pixels, and how many have exactly that colour
+    OUTLINE: (64, 48, 95, 95, 237),
+    PATH: (237, 77, 402, 82, 44),
+    ARROW: (83, 83, 137, 151, 258),
+    PUSHED: (237, 197, 402, 202, 44),
+    REMOVED: (300, 116, 355, 170, 321),
+    PLACED: (80, 263, 301, 320, 678),
+    LIGHT: (77, 77, 401, 325, 46),
+    DARK: (60, 38, 639, 322, 10365),
+    ENCOUNTERS["touches"]: (393, 109, 552, 325, 71),
+    ENCOUNTERS["occludes"]: (496, 309, 625, 316, 16),
+}
+
+
+def test_everything_is_drawn_where_it_belongs_in_its_colour() -> None:
+    image = np.full((400, 640, 3), 120, np.uint8)
+    canvas = with_everything(image, 1)
+    for colour, expected in SHOWN.items():
+        ys, xs = np.nonzero((canvas == np.array(colour)).all(axis=2))
+        assert (xs.min(), ys.min(), xs.max(), ys.max(), len(xs)) == pytest.approx(expected, rel=0.02, abs=1), colour
+    assert canvas[68, 190].tolist() == pytest.approx([84, 152, 160], abs=2), "within the band, off the line"
     assert (canvas[110, 190] == image[110, 190]).all()
-    assert near(canvas, (255, 255, 255), 300, 324)
-    assert near(canvas, ENCOUNTERS["touches"], 400, 320, 8)
-    assert not near(canvas, ENCOUNTERS["touches"], 300, 320, 8)
 
 
 def test_of_a_large_picture_it_is_drawn_at_the_size_that_is_sent() -> None:
-    ys, xs = np.mgrid[:1200, :1920]
-    mask = np.hypot(xs - 240, ys - 240) < 45
-    one = [(240 + 60.0 * i, 240.0) for i in range(9)]
-    contacts = [{"a": 0, "b": None, "time": 0.2, "point": (900, 960), "impulse": 1}]
     large = np.repeat(np.repeat(floor(), 3, 0), 3, 1)
-    canvas = drawn(large, [path(one, spread=60)], mask, times=3, max_side=640, contacts=contacts)
-    small, contacts[0]["point"] = [(80 + 20.0 * i, 80.0) for i in range(9)], (300, 320)
-    expected = drawn(floor(), [path(small, spread=20)], mask[1::3, 1::3], contacts=contacts)
+    canvas, expected = with_everything(large, 3, max_side=640), with_everything(floor(), 1)
     assert canvas.shape == expected.shape
     assert (np.abs(canvas.astype(int) - expected).max(axis=2) > 40).mean() < 0.001
 
@@ -92,13 +132,10 @@ def test_a_wide_band_leaves_the_picture_to_be_seen() -> None:
     assert narrow[190, 290] > 40
 
 
-def test_the_outline_takes_the_place_of_the_box() -> None:
-    ys, xs = np.mgrid[:400, :640]
-    mask = np.hypot(xs - 80, ys - 80) < 15
-    inside = drawn(floor(), [path([(80, 80)] * 2)], mask)
-    assert near(inside, OUTLINE, 80, 95)
-    assert not near(inside, OUTLINE, 60, 90)
-    assert near(drawn(floor(), [path([(80, 80)] * 2)]), OUTLINE, 60, 90)
+def test_a_box_is_drawn_where_no_outline_is_known() -> None:
+    canvas = drawn(floor(), [path([(80, 80)] * 2)])
+    for y, x in ((60, 80), (100, 80), (80, 60), (80, 100)):
+        assert np.abs(canvas[y, x].astype(int) - OUTLINE).max() < 30
 
 
 @settings(max_examples=25, deadline=None)
@@ -126,3 +163,10 @@ def test_any_size_can_be_drawn_on(side: int) -> None:
     encounters = [{"object": "cube", "bbox": (0, 0, 10, 10), "kind": "touches", "first_frame": 3, "probability": 0.93}]
     far = path([(80.0, 80.0), (1e7, -1e7)], spread=1e6)
     assert drawn(image, [far], encounters=encounters).shape == image.shape
+
+
+def test_a_strip_of_frames_is_named_above_them() -> None:
+    strip = named_strip([np.full((60, 90, 3), level, np.uint8) for level in (50, 100, 150, 200)], "before")
+    assert strip.shape == (26 + 60 + 6 + 60, 90 + 6 + 90 + 6 + 90, 3)
+    assert strip[26:, :, 0][[0, 59, 66, 125]][:, [0, 96, 192]].tolist() == [[50, 100, 150]] * 2 + [[200, 20, 20]] * 2
+    assert strip[:26].max() > 200 > 60 > strip[:26, 100:].max()

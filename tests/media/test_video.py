@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from fractions import Fraction
 from pathlib import Path
@@ -12,9 +13,10 @@ import pytest
 from av.video.reformatter import ColorRange, Colorspace, VideoReformatter
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image, ImageSequence
+from refusals import refused
 
-from cow_service.errors import InternalError, StorageUnavailable
-from cow_service.media.video import YuvFrames, write_mp4
+from cow_service.media.video import YuvFrames, animation, write_mp4
 
 
 def scene(index: int, width: int = 96, height: int = 64) -> np.ndarray:
@@ -27,17 +29,15 @@ def scene(index: int, width: int = 96, height: int = 64) -> np.ndarray:
     return pixels
 
 
-def read_mp4(path: Path) -> tuple[list[np.ndarray], Fraction]:
+def read_mp4(path: Path) -> list[np.ndarray]:
     reformatter = VideoReformatter()
     with av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        frames = [
+        return [
             reformatter.reformat(
                 frame, format="rgb24", src_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.JPEG
             ).to_ndarray()
-            for frame in container.decode(stream)
+            for frame in container.decode(video=0)
         ]
-        return frames, stream.average_rate
 
 
 def boxes(data: bytes) -> list[bytes]:
@@ -54,25 +54,17 @@ def path(tmp_path) -> Path:
     return tmp_path / "clip.part"
 
 
-def test_what_is_written_is_what_is_shown(path):
-    written = [scene(i) for i in range(33)]
-    assert write_mp4(iter(written), path, fps=16, width=96, height=64) == 33
-    shown, rate = read_mp4(path)
-    assert len(shown) == 33
-    assert rate == 16
-    errors = [np.abs(a.astype(int) - b).mean() for a, b in zip(written, shown, strict=True)]
-    assert max(errors) < 3
-
-
-def test_the_stream_is_one_that_browsers_play(path):
-    write_mp4((scene(i) for i in range(20)), path, fps=16, width=96, height=64)
+def test_what_is_written_is_what_is_shown_in_a_stream_that_browsers_play(path):
+    written = [scene(i)[:, ::-1] for i in range(20)]  # views that are not contiguous
+    assert write_mp4(iter(written), path, fps=16, width=96, height=64) == 20
+    shown = read_mp4(path)
+    assert len(shown) == 20
+    assert max(np.abs(a.astype(int) - b).mean() for a, b in zip(written, shown, strict=True)) < 3
     with av.open(str(path)) as container:
         assert "mp4" in container.format.name
         stream = container.streams.video[0]
         context = stream.codec_context
-        assert context.name == "h264"
-        assert context.profile == "High"
-        assert context.pix_fmt == "yuv420p"
+        assert (context.name, context.profile, context.pix_fmt) == ("h264", "High", "yuv420p")
         assert (stream.width, stream.height, stream.frames) == (96, 64, 20)
         bt709 = 1  # ITU-T H.273
         assert (context.colorspace, context.color_primaries, context.color_trc) == (bt709, bt709, bt709)
@@ -95,35 +87,15 @@ def test_every_frame_stands_at_its_exact_time(path, fps, rate):
         assert stream.duration * stream.time_base == 40 / rate
 
 
-@pytest.mark.parametrize("colour", [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255), (0, 0, 0), (30, 140, 200)])
-def test_flat_colours_come_back(path, colour):
-    frame = np.full((64, 64, 3), colour, np.uint8)
-    write_mp4([frame] * 3, path, fps=8, width=64, height=64)
-    shown, _ = read_mp4(path)
-    assert np.abs(shown[1].astype(int) - colour).max() <= 4
-
-
-@pytest.mark.parametrize("size", [(97, 64), (96, 65), (33, 35), (1, 1)])
+@pytest.mark.parametrize("size", [(97, 64), (96, 65), (1, 1)])  # px
 def test_odd_sides_are_padded_with_their_last_row_or_column(path, size):
     width, height = size
     frame = scene(3, width, height) if width > 1 else np.full((1, 1, 3), 120, np.uint8)
     assert write_mp4([frame] * 4, path, fps=16, width=width, height=height) == 4
-    shown, _ = read_mp4(path)
+    shown = read_mp4(path)
     padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     assert shown[0].shape == padded.shape
     assert np.abs(shown[0].astype(int) - padded).mean() < 6
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_very_short_clips(path, count):
-    assert write_mp4([scene(0)] * count, path, fps=16, width=96, height=64) == count
-    assert len(read_mp4(path)[0]) == count
-
-
-def test_views_that_are_not_contiguous(path):
-    mirrored = scene(0)[:, ::-1]
-    write_mp4([mirrored] * 2, path, fps=16, width=96, height=64)
-    assert np.abs(read_mp4(path)[0][0].astype(int) - mirrored).mean() < 3
 
 
 def test_frames_are_taken_one_at_a_time(path):
@@ -148,20 +120,23 @@ def test_frames_are_taken_one_at_a_time(path):
     assert most <= 2
 
 
-def test_no_frames(path):
-    with pytest.raises(ValueError, match="no frames"):
-        write_mp4([], path, fps=16, width=96, height=64)
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [],
+        [scene(0), scene(1, 94)],
+        [scene(0), scene(1)[..., :2]],
+        [scene(0), scene(1).astype(np.float32)],
+    ],
+    ids=["none", "another width", "two channels", "floats"],
+)
+def test_frames_that_make_no_video_leave_no_file(path, frames):
+    with pytest.raises(ValueError, match="Frame 1 is" if frames else "no frames"):
+        write_mp4(frames, path, fps=16, width=96, height=64)
     assert not path.exists()
 
 
-@pytest.mark.parametrize("second", [scene(1, 94), scene(1)[..., :2], scene(1).astype(np.float32)])
-def test_a_frame_of_another_shape(path, second):
-    with pytest.raises(ValueError, match=r"Frame 1 is .* must be \(64, 96, 3\) of uint8"):
-        write_mp4([scene(0), second], path, fps=16, width=96, height=64)
-    assert not path.exists()
-
-
-@pytest.mark.parametrize("after", [0, 1, 60])
+@pytest.mark.parametrize("after", [0, 60])
 def test_what_the_frames_raise_passes_through(path, after):
     class Stop(Exception):
         pass
@@ -180,26 +155,20 @@ def test_a_full_disk(path):
     # By a link, since what is left after an error is removed.
     path.symlink_to("/dev/full")
     noise = np.random.default_rng(0).integers(0, 256, (50, 128, 128, 3), np.uint8)
-    with pytest.raises(StorageUnavailable, match="disk is full") as caught:
+    with refused("storage-unavailable") as caught:
         write_mp4(noise, path, fps=16, width=128, height=128)
     assert "/" not in caught.value.detail
-    assert isinstance(caught.value.__cause__, av.error.FFmpegError)
     assert Path("/dev/full").exists()
     assert not path.is_symlink()
 
 
-def test_an_encoder_that_fails_otherwise(tmp_path):
-    with pytest.raises(InternalError, match="could not be encoded") as caught:
-        write_mp4([scene(0)], tmp_path / "absent" / "clip.mp4", fps=16, width=96, height=64)
-    assert str(tmp_path) not in caught.value.detail
-
-
-def test_a_size_that_the_encoder_refuses(path):
-    frame = np.zeros((2, 40_000, 3), np.uint8)
-    with pytest.raises(InternalError) as caught:
-        write_mp4([frame], path, fps=16, width=40_000, height=2)
-    assert str(path) not in caught.value.detail
-    assert not path.exists()
+def test_an_encoder_that_fails_names_no_path(tmp_path):
+    wide = np.zeros((2, 40_000, 3), np.uint8)  # the encoder refuses this size
+    for folder, frame in ((tmp_path / "absent", scene(0)), (tmp_path, wide)):
+        with refused("internal-error") as caught:
+            write_mp4([frame], folder / "clip.mp4", fps=16, width=frame.shape[1], height=frame.shape[0])
+        assert str(tmp_path) not in caught.value.detail
+        assert not (folder / "clip.mp4").exists()
 
 
 def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
@@ -207,7 +176,7 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     frames = [random.integers(0, 60, (96, 160, 3), np.uint8) + np.uint8(4 * i) for i in range(17)]
     held, digests = [], set()
-    for _ in range(40):
+    for _ in range(20):
         held = [*held[-20:], random.integers(0, 255, random.integers(1, 200_000), np.uint8)]
         write_mp4(frames, tmp_path / "a.mp4", fps=16, width=160, height=96)
         digests.add((tmp_path / "a.mp4").read_bytes())
@@ -229,3 +198,24 @@ def test_what_has_changed_is_converted_as_the_whole_frame_would_be(changes, seed
         frame = frame.copy()
         frame[rows, columns] = generator.integers(0, 256, 3)
         np.testing.assert_array_equal(frames.converted(frame), YuvFrames(12, 20).converted(frame))
+
+
+@pytest.mark.parametrize(
+    ("format", "size", "every", "times"),
+    [("gif", (480, 120), 2, [80] * 7), ("webp", (480, 120), 1, [40] * 13), ("sheet", (1292, 248), None, None)],
+)
+def test_pictures_that_are_made_of_a_clip(path, format: str, size: tuple[int, int], every, times) -> None:
+    levels = np.arange(10, 200, 15)
+    write_mp4([np.full((160, 640, 3), level, np.uint8) for level in levels], path, fps=25, width=640, height=160)
+    picture = Image.open(io.BytesIO(animation(path.read_bytes(), format)))
+    assert picture.size == size
+    if times is None:
+        sheet = np.asarray(picture).astype(int)[..., 0]
+        assert np.abs(sheet[40::84, 160::324].ravel() - np.delete(levels, 6)).max() < 4
+        assert (sheet[80:84] == 255).all()
+        return
+    assert picture.info["loop"] == 0
+    shown = ImageSequence.Iterator(picture)
+    frames = [(frame.convert("L").getpixel((9, 9)), frame.info["duration"]) for frame in shown]
+    assert [time for _, time in frames] == times
+    assert np.abs(np.array([grey for grey, _ in frames]) - levels[::every]).max() < 20

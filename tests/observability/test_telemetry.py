@@ -6,7 +6,6 @@ import asyncio
 import io
 import json
 import logging
-import os
 import re
 import subprocess
 import sys
@@ -15,12 +14,12 @@ from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 
-import httpx
 import pytest
+from asgi import app_of, ask
 from fastapi import FastAPI
 from fastapi.responses import StreamingResponse
-from otlp import Collector, value
 from prometheus_client.parser import text_string_to_metric_families
+from servers import Served
 from starlette.types import Message
 
 from cow_service.api.app import create_app
@@ -41,35 +40,22 @@ PARENT = f"00-{TRACE}-{SPAN}-01"
 SHA = "0" * 64
 
 
-def ask(app: FastAPI, *requests: tuple[str, str] | tuple[str, str, dict[str, str]]) -> list[httpx.Response]:
-    async def run() -> list[httpx.Response]:
-        transport = httpx.ASGITransport(app, raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url="http://cow", timeout=20) as http:
-            return [await http.request(method, path, headers=dict(*headers)) for method, path, *headers in requests]
-
-    return asyncio.run(run())
-
-
-@pytest.fixture
-def app(service: Service) -> FastAPI:
-    return create_app(JobEngine(service))
+@pytest.fixture(scope="module")
+def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
+    return app_of(tmp_path_factory.mktemp("telemetry"))
 
 
 # --- ids ---
 
 
-@pytest.mark.parametrize("given", ["a", "Req_1.2-3", "x" * 128])
-def test_a_request_id_is_kept(app: FastAPI, given: str) -> None:
-    for response in ask(app, ("GET", "/livez", {"X-Request-Id": given}), ("GET", "/x", {"X-Request-Id": given})):
-        assert response.headers["x-request-id"] == given
-
-
-@pytest.mark.parametrize("given", ["", "a b", "x" * 129, "a\tb", "<a>", "ä"])
-def test_a_request_id_that_could_harm_a_log_is_replaced(app: FastAPI, given: str) -> None:
-    sent = {"X-Request-Id": given.encode("latin-1")}
-    first, second = ask(app, ("GET", "/livez", sent), ("GET", "/livez"))  # type: ignore[arg-type]
-    assert re.fullmatch("[0-9a-f]{32}", first.headers["x-request-id"])
-    assert first.headers["x-request-id"] != second.headers["x-request-id"]
+def test_a_request_id_is_kept_unless_it_could_harm_a_log(app: FastAPI) -> None:
+    for given in ("a", "Req_1.2-3", "x" * 128):
+        for response in ask(app, ("GET", "/livez", {"X-Request-Id": given}), ("GET", "/x", {"X-Request-Id": given})):
+            assert response.headers["x-request-id"] == given
+    harmful = [{"X-Request-Id": given.encode("latin-1")} for given in ("", "a b", "x" * 129, "a\tb", "<a>", "ä")]
+    made = [one.headers["x-request-id"] for one in ask(app, *(("GET", "/livez", headers) for headers in harmful))]
+    assert all(re.fullmatch("[0-9a-f]{32}", one) for one in made)
+    assert len(set(made)) == len(harmful)
 
 
 def test_a_trace_goes_on_or_begins(app: FastAPI) -> None:
@@ -88,26 +74,23 @@ def test_a_trace_goes_on_or_begins(app: FastAPI) -> None:
         assert begun[1] not in (TRACE, "0" * 32)
 
 
-@pytest.mark.parametrize(
-    ("header", "valid"),
-    [
-        (PARENT, True),
-        (f"00-{TRACE}-{SPAN}-00", True),
-        (f"01-{TRACE}-{SPAN}-01-more", True),
-        (f"00-{TRACE}-{SPAN}-01-more", False),
-        (f"ff-{TRACE}-{SPAN}-01", False),
-        (f"00-{'0' * 32}-{SPAN}-01", False),
-        (f"00-{TRACE}-{'0' * 16}-01", False),
-        (f"00-{TRACE.upper()}-{SPAN}-01", False),
-        (f"00-{TRACE[1:]}-{SPAN}-01", False),
-        ("", False),
-        ("nonsense", False),
-    ],
-)
-def test_which_traceparents_are_valid(header: str, valid: bool) -> None:
-    with tracing.span("job", parent=header):
-        assert context.ids() == ({"trace_id": TRACE, "span_id": SPAN} if valid else {})
-        assert context.traceparent() == (f"00-{TRACE}-{SPAN}-{header.split('-')[3]}" if valid else None)
+def test_which_traceparents_are_valid() -> None:
+    for header, valid in {
+        PARENT: True,
+        f"00-{TRACE}-{SPAN}-00": True,
+        f"01-{TRACE}-{SPAN}-01-more": True,
+        f"00-{TRACE}-{SPAN}-01-more": False,
+        f"ff-{TRACE}-{SPAN}-01": False,
+        f"00-{'0' * 32}-{SPAN}-01": False,
+        f"00-{TRACE}-{'0' * 16}-01": False,
+        f"00-{TRACE.upper()}-{SPAN}-01": False,
+        f"00-{TRACE[1:]}-{SPAN}-01": False,
+        "": False,
+        "nonsense": False,
+    }.items():
+        with tracing.span("job", parent=header):
+            assert context.ids() == ({"trace_id": TRACE, "span_id": SPAN} if valid else {}), header
+            assert context.traceparent() == (f"00-{TRACE}-{SPAN}-{header.split('-')[3]}" if valid else None)
 
 
 def test_faults_carry_the_ids_too(
@@ -119,8 +102,8 @@ def test_faults_carry_the_ids_too(
     app = create_app(JobEngine(service))
     monkeypatch.setattr(service, "models", fail)
     in_route = ask(app, ("GET", "/models", {"X-Request-Id": "one"}))[0]
-    monkeypatch.setattr(Origins, "_is_local", fail)
-    in_layer = ask(app, ("GET", "/livez", {"X-Request-Id": "two"}))[0]
+    monkeypatch.setattr(Origins, "refuse", fail)
+    in_layer = ask(create_app(JobEngine(service)), ("GET", "/livez", {"X-Request-Id": "two"}))[0]
     for response, given in ((in_route, "one"), (in_layer, "two")):
         assert response.status_code == 500
         assert response.json()["type"] == "urn:cow:problem:internal-error"
@@ -131,14 +114,14 @@ def test_faults_carry_the_ids_too(
     assert len([record for record in caplog.records if record.exc_info]) == 2
 
 
-def test_an_answer_that_breaks_off_is_not_taken_for_whole(service: Service) -> None:
-    app = create_app(JobEngine(service))
+def test_an_answer_that_breaks_off_is_not_taken_for_whole(tmp_path: Path) -> None:
+    app = app_of(tmp_path)
 
     @app.get("/broken")
     async def broken() -> StreamingResponse:
         async def parts() -> object:
             yield b"half"
-            raise ValueError("gone")
+            raise ZeroDivisionError
 
         return StreamingResponse(parts())
 
@@ -151,15 +134,9 @@ def test_an_answer_that_breaks_off_is_not_taken_for_whole(service: Service) -> N
         sent.append(message)
 
     scope = {"type": "http", "method": "GET", "path": "/broken", "headers": [], "query_string": b"", "root_path": ""}
-    with pytest.raises(ValueError, match="gone"):
+    with pytest.raises(ZeroDivisionError):
         asyncio.run(app(scope, receive, send))
     assert sent[-1].get("more_body")
-
-
-def test_ids_are_there_for_as_long_as_the_block_runs() -> None:
-    with tracing.span("job", parent=PARENT), context.bound(request="r"), context.bound(job="j"):
-        assert context.ids() == {"request_id": "r", "job_id": "j", "trace_id": TRACE, "span_id": SPAN}
-    assert context.ids() == {}
 
 
 # --- metrics ---
@@ -176,8 +153,7 @@ def samples(metrics: Metrics | str) -> dict[tuple[str, tuple[str, ...]], float]:
 
 
 def test_requests_are_counted_by_the_template_of_their_route(tmp_path: Path) -> None:
-    settings = Settings(data_dir=tmp_path, api_keys={"alice": hash_of("cow_alice")}, rate_limit=4)
-    app = create_app(JobEngine(Service(settings)))
+    app = app_of(tmp_path, api_keys={"alice": hash_of("cow_alice")}, rate_limit=4)
     key = {"Authorization": "Bearer cow_alice"}
     ask(
         app,
@@ -206,14 +182,6 @@ def test_requests_are_counted_by_the_template_of_their_route(tmp_path: Path) -> 
     assert ask(app, ("GET", "/metrics"))[0].status_code == 401
     if sys.platform == "linux":
         assert seen["process_resident_memory_bytes", ()] > 0
-
-
-def test_apps_count_for_themselves(tmp_path: Path) -> None:
-    first, second = (Service(Settings(data_dir=tmp_path)) for _ in range(2))
-    app, _ = create_app(JobEngine(first)), create_app(JobEngine(second))
-    ask(app, ("GET", "/livez"))
-    assert ("cow_http_requests_total", ("GET", "/livez", "200")) in samples(first.metrics)
-    assert ("cow_http_requests_total", ("GET", "/livez", "200")) not in samples(second.metrics)
 
 
 def test_stages_jobs_and_queues(caplog: pytest.LogCaptureFixture) -> None:
@@ -294,6 +262,9 @@ def test_text_is_one_line_a_record(written: SimpleNamespace) -> None:
     assert second.endswith("INFO uvicorn: Uvicorn running on http://127.0.0.1:8000")
     assert third.endswith("ERROR cow_service: failed")
     assert trace[-1] == "ValueError: why"
+    logging.getLogger(logs.ACCESS).info("GET /")
+    assert written.out.getvalue().endswith("INFO cow_service.access: GET /\n")
+    assert "GET /" not in written.err.getvalue()
 
 
 def test_json_is_one_object_a_line(written: SimpleNamespace) -> None:
@@ -350,46 +321,38 @@ def test_the_job_engine_speaks_through_our_handler(written: SimpleNamespace) -> 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """A `cow serve` that logs JSON and exports traces: its answers, its log, and what the collector took."""
-    data = tmp_path_factory.mktemp("telemetry")
+    from otlp import Collector
+
     with Collector() as collector:
-        environment = os.environ | {
-            "COW_DATA_DIR": str(data),
+        own = {
             "COW_LOG_FORMAT": "json",
             "COW_API_KEYS": json.dumps({"alice": hash_of("cow_alice")}),
             "OTEL_EXPORTER_OTLP_ENDPOINT": collector.address,
             "OTEL_RESOURCE_ATTRIBUTES": "deployment.environment=test",
         }
-        command = [sys.executable, "-m", "cow_service.cli.main", "serve", "--port", "0"]
-        with subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
-            assert process.stderr is not None
-            started: list[str] = []
-            while "running on" not in (line := process.stderr.readline()):
-                assert line, started
-                started.append(line)
-            started.append(line)
-            address = json.loads(line)["message"].split("running on ")[1].split()[0]
-            with httpx.Client(base_url=address, headers={"Authorization": "Bearer cow_alice"}) as http:
-                answers = [
-                    http.get("/models", headers={"X-Request-Id": "first", "traceparent": PARENT}),
-                    http.get(f"/artifacts/{SHA}?secret=1", headers={"X-Request-Id": "second"}),
-                    http.get("/livez", headers={"traceparent": PARENT[:-2] + "00"}),
-                    httpx.get(address + "/models"),
-                ]
-            process.terminate()
-            out, err = process.communicate(timeout=20)
-    return SimpleNamespace(answers=answers, out=out, err="".join(started) + err, collector=collector)
+        with Served(tmp_path_factory.mktemp("telemetry"), **own) as one:
+            key = {"Authorization": "Bearer cow_alice"}
+            asked = [
+                ("/models", key | {"X-Request-Id": "first", "traceparent": PARENT}),
+                (f"/artifacts/{SHA}?secret=1", key | {"X-Request-Id": "second"}),
+                ("/livez", {"traceparent": PARENT[:-2] + "00"}),
+                ("/models", {}),
+            ]
+            before = one.log()
+            answers = [one.http.get(path, headers=headers) for path, headers in asked]
+            one.stop()
+            lines = [json.loads(line) for line in one.log()[len(before) :].splitlines()]
+    return SimpleNamespace(answers=answers, lines=lines, log=one.log(), collector=collector)
 
 
 def test_every_line_of_a_json_log_is_json(run: SimpleNamespace) -> None:
-    lines = [json.loads(line) for line in run.err.splitlines()]
-    assert {"uvicorn.error"} <= {line["logger"] for line in lines}
-    assert "Application shutdown complete." in [line["message"] for line in lines]
+    loggers = {line["logger"] for line in run.lines}
+    assert {"uvicorn.error", "cow_service.access"} <= loggers
+    assert "Application shutdown complete." in [line["message"] for line in run.lines]
 
 
 def test_one_access_line_a_request_with_its_ids(run: SimpleNamespace) -> None:
-    lines = [json.loads(line) for line in run.out.splitlines()]
+    lines = [line for line in run.lines if line["logger"] == "cow_service.access"]
     assert [(line["path"], line["status"], line.get("owner")) for line in lines] == [
         ("/models", 200, "alice"),
         (f"/artifacts/{SHA}", 404, "alice"),
@@ -397,20 +360,21 @@ def test_one_access_line_a_request_with_its_ids(run: SimpleNamespace) -> None:
         ("/models", 401, None),
     ]
     for line, answer in zip(lines, run.answers, strict=True):
-        assert line["logger"] == "cow_service.access"
         assert line["method"] == "GET"
         assert line["milliseconds"] >= 0
         assert line["request_id"] == answer.headers["x-request-id"]
         assert (line["trace_id"], line["span_id"]) == tuple(answer.headers["traceparent"].split("-")[1:3])
-    assert "secret" not in run.out
-    assert "cow_alice" not in run.out + run.err
+    assert "secret" not in run.log
+    assert "cow_alice" not in run.log
 
 
 def test_a_collector_takes_a_span_for_each_request(run: SimpleNamespace) -> None:
+    from otlp import value
+
     assert run.collector.paths == {"/v1/traces"}
     assert run.collector.resources[0]["service.name"] == "cow"
     assert run.collector.resources[0]["deployment.environment"] == "test"
-    spans = {span.span_id.hex(): span for span in run.collector.spans}
+    spans = {span.span_id.hex(): span for span in run.collector.spans if span.name != "GET /readyz"}  # of the start
     here = [answer.headers["traceparent"].split("-") for answer in run.answers]
     assert set(spans) == {span for _, _, span, flags in here if flags == "01"}  # not the one that its caller left out
     first, second, refused = (spans[here[place][2]] for place in (0, 1, 3))
@@ -432,6 +396,8 @@ def test_a_collector_takes_a_span_for_each_request(run: SimpleNamespace) -> None
 
 
 def test_spans_nest_and_are_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    from otlp import Collector, value
+
     with Collector() as collector:
         environment = {"OTEL_EXPORTER_OTLP_TRACES_ENDPOINT": collector.address + "/here"}
         monkeypatch.setenv(*next(iter(environment.items())))
@@ -471,22 +437,18 @@ def test_without_a_collector_the_sdk_is_not_imported() -> None:
     assert shown.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize(
-    ("environment", "told"),
-    [
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "collector:4318"}, "OTEL_EXPORTER_OTLP_ENDPOINT must begin with http"),
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"}, "http/protobuf only"),
-        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c"}, re.escape(install_line("otel"))),
-    ],
-)
-def test_traces_that_cannot_be_sent_stop_the_start(
-    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], told: str
-) -> None:
+def test_traces_that_cannot_be_sent_stop_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
-    with pytest.raises(SettingsError, match=told):
-        tracing.start(environment)
+    for environment, named in (
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "collector:4318"}, "OTEL_EXPORTER_OTLP_ENDPOINT"),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c", "OTEL_EXPORTER_OTLP_PROTOCOL": "grpc"}, "http/protobuf"),
+        ({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://c"}, install_line("otel")),
+    ):
+        with pytest.raises(SettingsError) as caught:
+            tracing.start(environment)
+        assert named in str(caught.value)
 
 
-@pytest.mark.parametrize("off", [{"OTEL_SDK_DISABLED": "true"}, {"OTEL_TRACES_EXPORTER": "none"}])
-def test_the_standard_switches_turn_traces_off(off: dict[str, str]) -> None:
-    assert not tracing.start({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:9"} | off)
+def test_the_standard_switches_turn_traces_off() -> None:
+    for off in ({"OTEL_SDK_DISABLED": "true"}, {"OTEL_TRACES_EXPORTER": "none"}):
+        assert not tracing.start({"OTEL_EXPORTER_OTLP_ENDPOINT": "http://127.0.0.1:9"} | off)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,12 +87,7 @@ class TestProjection:
 
 def round_trip(shape: str, rng: np.random.Generator) -> tuple[float, float, float] | None:
     """How far a solid is placed from where it stands, in half widths; and width and height placed, of the true ones."""
-    camera = TrueCamera(
-        pitch=rng.uniform(20, 35),
-        roll=rng.uniform(-2, 2),
-        focal=rng.uniform(450, 1000),
-        height=10 ** rng.uniform(-1, 1),
-    )
+    camera = TrueCamera(rng.uniform(20, 35), rng.uniform(-2, 2), rng.uniform(450, 1000), 10 ** rng.uniform(-1, 1))
     there = camera.on_floor((rng.uniform(60, 580), rng.uniform(150, 380)))
     if there is None:
         return None
@@ -156,31 +152,28 @@ class TestStanding:
     @given(cameras, feet, st.floats(2, 30))
     def test_in_the_air_it_is_where_its_depth_puts_it(self, camera, point, depth) -> None:
         x, y = point[0], 400 - point[1]
-        radius = 20.0
-        found = in_the_air(
-            exactly(camera), (x - radius, y - radius, x + radius, y + radius), "sphere", np.array([depth])
-        )
-        assert camera.seen(found.centre)[0] == pytest.approx((x, y), abs=1e-4)
-        assert camera.positions(found.centre)[0, 2] == pytest.approx(depth)
-        assert found.half_width[0] == found.half_height[0] == pytest.approx(radius * depth / camera.focal)
+        box, pixel = (x - 20, y - 30, x + 20, y + 30), depth / camera.focal
+        for shape, half, tall in (("sphere", 25, 25), ("cylinder", 20, 30)):
+            found = in_the_air(exactly(camera), box, shape, np.array([depth]))
+            assert camera.seen(found.centre)[0] == pytest.approx((x, y), abs=1e-4)
+            assert camera.positions(found.centre)[0, 2] == pytest.approx(depth)
+            assert (found.half_width[0], found.half_height[0]) == pytest.approx((half * pixel, tall * pixel))
         assert not found.stands
 
 
 class TestLayout:
-    def test_a_camera_that_looks_up_sees_bodies_in_the_air(self) -> None:
+    def test_above_the_horizon_things_are_in_the_air_and_above_the_floor(self) -> None:
         bodies = body((300, 150, 340, 190), "sphere"), body((100, 100, 200, 260), "cylinder")
         for draws in (likeliest(), ensemble(50)):
             scene = lay_out(bodies, motion(), known(TrueCamera(pitch=-35), 0.1), (640, 400), draws)
-            assert not any(placed.stands for placed in scene.bodies)
             for placed in scene.bodies:
+                assert not placed.stands
                 assert np.isfinite(placed.centre).all()
                 assert (placed.half_width > 0).all()
-                assert (placed.centre[:, 1] > 0).all(), "what is seen lies above the floor"
-
-    def test_a_foot_above_the_horizon_is_in_the_air_and_nobody_elses_concern(self) -> None:
+                assert (placed.centre[:, 1] > 0).all()
         bodies = body((300, 250, 340, 290), "sphere"), body((100, 10, 140, 40), "box"), body((500, 240, 540, 300))
         scene = lay_out(bodies, motion(), known(TrueCamera(pitch=8)), (640, 400), likeliest())
-        assert [placed.stands for placed in scene.bodies] == [True, False, True]
+        assert [placed.stands for placed in scene.bodies] == [True, False, True], "which is nobody else's concern"
         assert scene.bodies[1].centre[0, 1] > scene.cameras.height[0]
 
     def test_the_metres_are_those_of_the_mover(self) -> None:
@@ -195,7 +188,7 @@ class TestLayout:
         assert scene.bodies[0].centre[0] == pytest.approx((0.2, half, 3.0), abs=0.05)
         assert scene.bodies[1].centre[0, [0, 2]] == pytest.approx((-0.6, 4.0), abs=0.1)
 
-    @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.6, 0.8), (0.0, -1.0), (-0.8, -0.6), (0.0, 1.0)])
+    @pytest.mark.parametrize("direction", [(1.0, 0.0), (-0.6, 0.8), (0.0, -1.0)])
     def test_along_the_floor_it_goes_where_it_is_seen_to_go(self, direction) -> None:
         given_ = motion("linear", direction, speed=100)
         world = WorldInput((body((280, 240, 330, 290), "sphere"),), given_, known(TrueCamera()), (640, 400), 17, 16.0)
@@ -207,7 +200,7 @@ class TestLayout:
         speed = float(np.linalg.norm(worlds.layout.velocity[0]))
         assert speed == pytest.approx(100 * METRES), "speeds are along the floor, at the first depth"
 
-    @pytest.mark.parametrize("roll", [-15.0, 0.0, 8.0])
+    @pytest.mark.parametrize("roll", [-15.0, 0.0])
     def test_in_a_tilted_photograph_things_fall_along_its_vertical(self, roll: float) -> None:
         lean = math.radians(roll)
         given_ = motion("fall", gravity=(0, 9.81 / METRES), down=(math.sin(lean), math.cos(lean)))
@@ -238,13 +231,6 @@ class TestLayout:
         assert (np.abs(self.fallen(420)) < wide).mean() < 0.5, "beside it, the camera's priors say where"
         assert (np.abs(self.fallen(300, radii=2)) < wide).mean() < 0.5, "a height that is known outweighs that"
 
-    def test_every_draw_of_an_ensemble_is_placed(self) -> None:
-        bodies = body((280, 240, 330, 290), "sphere"), body((400, 200, 470, 300)), body((100, 150, 180, 260), "cone")
-        scene = lay_out(bodies, motion("linear", (1.0, 0.0), 100), known(TrueCamera(), 0.1), (640, 400), ensemble(50))
-        for placed in scene.bodies:
-            assert placed.centre.shape == (50, 3)
-            assert np.isfinite(placed.centre).all()
-
 
 @given(cameras, feet, st.floats(0.3, 0.7), st.floats(0.35, 0.7))
 def test_a_bowl_is_as_high_as_it_is_though_its_foot_is_narrower_than_its_rim(camera, foot, bottom, height) -> None:
@@ -265,47 +251,42 @@ def test_a_bowl_is_as_high_as_it_is_though_its_foot_is_narrower_than_its_rim(cam
     assert abs(right.half_height[0] - tall) < abs(wrong.half_height[0] - tall)
 
 
-class TestSupports:
-    def table(self, top: int = 200, bottom: int = 330) -> SeenBody:
-        return body((200, top, 440, bottom), "box", "table")
+TABLE = body((200, 200, 440, 330), "box", "table")
+SUPPORTS: dict[str, tuple[Any, SeenBody, int | None]] = {
+    "on a table": ((300, 180, 340, 220), TABLE, 1),
+    "before its far corner": ((300, 205, 340, 245), TABLE, 1),
+    "behind it": ((300, 150, 340, 200), TABLE, None),
+    "before it": ((300, 290, 340, 330), TABLE, None),
+    "beside it": ((10, 180, 60, 220), TABLE, None),
+    "on a ball": ((300, 180, 340, 220), replace(TABLE, shape="sphere"), None),
+    "on what is narrower": ((300, 180, 340, 220), body((305, 200, 335, 330)), None),
+}
 
-    def test_a_ball_on_a_table_stands_on_it(self) -> None:
-        assert supports_of([body((300, 180, 340, 220), "sphere"), self.table()]) == [1, None]
 
-    def test_one_before_the_far_corner_of_a_table_stands_on_it(self) -> None:
-        assert supports_of([body((300, 205, 340, 245), "sphere"), self.table()]) == [1, None]
+@pytest.mark.parametrize("case", SUPPORTS)
+def test_what_something_is_seen_to_stand_on(case: str) -> None:
+    bbox, under, on = SUPPORTS[case]
+    assert supports_of([body(bbox, "sphere"), under]) == [on, None]
 
-    def test_one_behind_a_box_does_not_and_one_before_it_neither(self) -> None:
-        assert supports_of([body((300, 150, 340, 200), "sphere"), self.table()]) == [None, None]
-        assert supports_of([body((300, 290, 340, 330), "sphere"), self.table()]) == [None, None]
-        assert supports_of([body((10, 180, 60, 220), "sphere"), self.table()]) == [None, None]
 
-    def test_nothing_stands_on_a_ball_or_on_what_is_narrower(self) -> None:
-        ball = body((300, 180, 340, 220), "sphere")
-        assert supports_of([ball, body((200, 200, 440, 330), "sphere")])[0] is None
-        assert supports_of([ball, body((305, 200, 335, 330))])[0] is None
+@pytest.mark.parametrize(
+    ("said", "on"), [("table", 1), ("floor", None), ("air", None), ("a table that is not there", 1)]
+)
+def test_what_is_said_goes_before_what_is_seen(said: str, on: int | None) -> None:
+    ball = body((300, 180, 340, 220), "sphere", prior=ObjectPrior(stands_on=said))
+    assert supports_of([ball, TABLE])[0] == on
+    hangs = body((300, 100, 340, 140), "sphere", prior=ObjectPrior(stands_on=said))
+    assert supports_of([hangs, TABLE])[0] == (1 if said == "table" else None), "where nothing is seen"
 
-    @pytest.mark.parametrize(
-        ("said", "on"), [("table", 1), ("floor", None), ("air", None), ("a table that is not there", 1)]
-    )
-    def test_what_is_said_goes_before_what_is_seen(self, said: str, on: int | None) -> None:
-        ball = body((300, 180, 340, 220), "sphere", prior=ObjectPrior(stands_on=said))
-        assert supports_of([ball, self.table()])[0] == on
 
-    def test_what_is_said_holds_where_nothing_is_seen(self) -> None:
-        ball = body((300, 100, 340, 140), "sphere", prior=ObjectPrior(stands_on="table"))
-        assert supports_of([ball, self.table()])[0] == 1
-
-    def test_circles_end(self) -> None:
-        a = body((200, 180, 300, 260), "box", "a", ObjectPrior(stands_on="b"))
-        b = body((320, 180, 420, 260), "box", "b", ObjectPrior(stands_on="a"))
-        itself = body((20, 180, 120, 260), "box", "c", ObjectPrior(stands_on="c"))
-        for bodies in ([a, b, itself], [itself, b, a]):
-            scene = lay_out(
-                bodies, motion("linear", (1.0, 0.0), 50), known(TrueCamera(), 0.1), (640, 400), ensemble(10)
-            )
-            assert all(np.isfinite(placed.centre).all() for placed in scene.bodies)
-        assert supports_of([itself]) == [None]
+def test_things_that_stand_on_each_other_in_a_circle_end_somewhere() -> None:
+    a = body((200, 180, 300, 260), "box", "a", ObjectPrior(stands_on="b"))
+    b = body((320, 180, 420, 260), "box", "b", ObjectPrior(stands_on="a"))
+    itself = body((20, 180, 120, 260), "box", "c", ObjectPrior(stands_on="c"))
+    for bodies in ([a, b, itself], [itself, b, a]):
+        scene = lay_out(bodies, motion("linear", (1.0, 0.0), 50), known(TrueCamera(), 0.1), (640, 400), ensemble(10))
+        assert all(np.isfinite(placed.centre).all() for placed in scene.bodies)
+    assert supports_of([itself]) == [None]
 
 
 def laid_out(*bodies: SeenBody, kind: str = "static"):
@@ -314,14 +295,11 @@ def laid_out(*bodies: SeenBody, kind: str = "static"):
     return lay_out(bodies, motion(kind), camera, (640, 400), ensemble(50))
 
 
-def test_feet_of_small_things_are_off_by_pixels_of_their_own() -> None:
+def test_feet_are_off_by_pixels_of_their_own_and_what_the_border_cuts_off_may_reach_far_beyond_it() -> None:
     one, other = laid_out(body((300, 180, 312, 192)), body((340, 180, 352, 192))).bodies
     off = one.centre[:, 2] / other.centre[:, 2]
     assert np.std(off) > 0.01
     assert abs(np.mean(off) - 1) < 0.02
-
-
-def test_what_the_lower_border_cuts_off_may_reach_far_beyond_it() -> None:
     whole, cut = (laid_out(body((300, 250, 360, y))).bodies[0].centre for y in (395, 400))
     assert np.ptp(np.log(cut[:, 2] / cut[:, 1])) > 3 * np.ptp(np.log(whole[:, 2] / whole[:, 1]))
 

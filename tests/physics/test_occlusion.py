@@ -29,59 +29,39 @@ def path(points, depth, scale=None) -> SeenPaths:
 def shares(mover: CroppedMask, seen: SeenPaths, other: CroppedMask, depths) -> Shares:
     """Of another body that stays where it is, at depths [K]."""
     frames = seen.depth.shape
-    there = SeenPaths(
-        np.full((*frames, 2), 100.0),
-        np.broadcast_to(depths[:, None], frames),
-        np.ones(frames),
-        np.zeros(frames, bool),
-    )
-    return shares_of(mover, seen, other, there)
+    deep, size = np.broadcast_to(depths[:, None], frames), np.ones(frames)
+    return shares_of(mover, seen, other, SeenPaths(np.full((*frames, 2), 100.0), deep, size, np.zeros(frames, bool)))
 
 
 MOVER = block(20, 80, 60, 120)  # its middle at (40, 100)
 OTHER = block(200, 80, 240, 120)
 
 
-def test_half_over_it_covers_a_half() -> None:
+def test_before_the_other_it_covers_it_and_behind_it_it_is_covered() -> None:
     places = [(40, 100), (180, 100), (200, 100), (220, 100), (230, 110), (280, 100)]
-    found = shares(MOVER, path(places, 2.0), OTHER, np.array([3.0]))
-    assert found.covers[0] == pytest.approx([0, 0, 0.5, 1, 0.75 * 0.75, 0], abs=0.06)
-    assert found.covered[0].tolist() == [0] * 6, "the farther covers nothing of the nearer"
+    before, behind = (shares(MOVER, path(places, depth), OTHER, np.array([3.0])) for depth in (2.0, 4.0))
+    assert before.covers[0] == pytest.approx([0, 0, 0.5, 1, 0.75 * 0.75, 0], abs=0.06)
+    assert behind.covered[0] == pytest.approx([0, 0, 0.5, 1, 0.75 * 0.75, 0], abs=0.06)
+    assert before.covered.tolist() == behind.covers.tolist() == [[0] * 6]
 
 
-def test_behind_it_it_is_covered_itself() -> None:
-    places = [(40, 100), (200, 100), (220, 100), (230, 100)]
-    found = shares(MOVER, path(places, 4.0), OTHER, np.array([3.0]))
-    assert found.covered[0] == pytest.approx([0, 0.5, 1, 0.75], abs=0.06)
-    assert found.covers[0].tolist() == [0] * 4
-
-
-def test_shares_are_of_what_is_hidden() -> None:
-    large, there = block(180, 40, 280, 140), [(230, 100)]
-    first = path([(40, 100), *there], 4.0)
-    assert shares(MOVER, first, large, np.array([3.0])).covered[0, 1] == pytest.approx(1, abs=0.03)
-    before = path([(40, 100), *there], 2.0)
-    assert shares(MOVER, before, large, np.array([3.0])).covers[0, 1] == pytest.approx(0.16, abs=0.05)
-
-
-def test_it_grows_as_it_comes_nearer() -> None:
+def test_shares_are_of_what_is_hidden_and_it_grows_as_it_comes_nearer() -> None:
+    large, there, other = block(180, 40, 280, 140), [(40, 100), (230, 100)], np.array([3.0])
+    assert shares(MOVER, path(there, 4.0), large, other).covered[0, 1] == pytest.approx(1, abs=0.03)
+    assert shares(MOVER, path(there, 2.0), large, other).covers[0, 1] == pytest.approx(0.16, abs=0.05)
     large = block(180, 60, 260, 140)
     found = shares(MOVER, path([(40, 100), (220, 100), (220, 100)], 4.0, [1, 1, 2]), large, np.array([4.5]))
     assert found.covers[0] == pytest.approx([0, 0.25, 1], abs=0.06)
 
 
-def test_what_has_passed_the_camera_hides_nothing() -> None:
-    seen = path([(40, 100), (220, 100)], 2.0)
-    gone = SeenPaths(seen.points, seen.depth, seen.scale, np.array([[False, True]]))
-    assert shares(MOVER, gone, OTHER, np.array([3.0])).covers[0].tolist() == [0, 0]
-
-
-def test_each_draw_has_its_own_depths() -> None:
+def test_each_draw_has_its_own_depths_and_what_has_passed_the_camera_hides_nothing() -> None:
     one = path([(40, 100), (220, 100)], 2.0)
     two = SeenPaths(*(np.repeat(v, 2, axis=0) for v in (one.points, one.depth, one.scale, one.passed)))
     found = shares(MOVER, two, OTHER, np.array([3.0, 1.0]))
     assert found.covers[:, 1] == pytest.approx([1, 0])
     assert found.covered[:, 1] == pytest.approx([0, 1])
+    gone = SeenPaths(one.points, one.depth, one.scale, np.array([[False, True]]))
+    assert shares(MOVER, gone, OTHER, np.array([3.0])).covers[0].tolist() == [0, 0]
 
 
 @given(

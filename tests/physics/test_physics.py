@@ -9,57 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.physics.ballistic import GRAVITY, Camera, FreePath, ballistic_path, given_path, has_passed, roll_out
+from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.camera import depth_motion
 from cow_service.physics.tracks import points_inside, spread_anchors, swept
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Path
 from cow_service.requests import TrajectoryRequest
 from cow_service.vision.masks import CroppedMask
 
-number = st.floats(-50, 50)
-vector = st.tuples(number, number, number).map(np.array)
 
-
-@given(vector, vector, vector, st.floats(0.1, 5))
-def test_velocity_is_the_derivative_and_gravity_its_own(position, velocity, acceleration, t) -> None:
-    h = 1e-4
-    states = roll_out(position, velocity, acceleration, np.array([0.0, t - h, t, t + h]))
-    assert np.allclose(states[0], [*position, *velocity])
-    assert np.allclose((states[3, :3] - states[1, :3]) / (2 * h), states[2, 3:], atol=1e-4)
-    assert np.allclose((states[3, 3:] - states[1, 3:]) / (2 * h), acceleration, atol=1e-4)
-
-
-def test_a_second_of_free_fall() -> None:
-    states = roll_out(np.zeros(3), np.zeros(3), np.array([0, GRAVITY, 0]), np.array([1.0]))
-    assert states[0].tolist() == pytest.approx([0, 4.905, 0, 0, 9.81, 0])
-
-
-@given(st.floats(-2000, 4000), st.floats(-2000, 4000), st.integers(8, 5000), st.integers(8, 5000), st.floats(1e-5, 1))
-def test_lifting_and_projecting_are_inverse(x, y, width, height, scale) -> None:
-    camera = Camera(width, height, scale)
-    points, sizes = camera.project(camera.lift((x, y))[None])
-    assert np.allclose(points[0], [x, y], atol=1e-6 * max(1, abs(x), abs(y)))
-    assert sizes[0] == pytest.approx(1)
-
-
-def test_what_comes_closer_grows_and_what_leaves_shrinks() -> None:
-    camera = Camera(800, 600, 3 / 800)
-    for sense, growing in ((-1.0, True), (1.0, False)):
-        direction, depth = depth_motion(sense)
-        velocity = np.array([0.0, direction[1] * np.sqrt(1 - depth**2), depth])
-        states = roll_out(camera.lift((400, 300)), velocity, np.zeros(3), np.linspace(0, 1, 10))
-        points, sizes = camera.project(states[:, :3])
-        assert (np.diff(sizes) > 0).all() == growing
-        assert (np.diff(points[:, 1]) > 0).all() == growing
-
-
-def test_behind_the_camera_there_is_no_image() -> None:
-    camera = Camera(800, 600, 0.004)
-    positions = np.array([[0, 0, camera.depth], [0, 0, -1.0]])
-    points, sizes = camera.project(positions)
-    assert has_passed(positions[:, 2], camera.depth).tolist() == [False, True]
-    assert np.isfinite(points).all()
-    assert np.isfinite(sizes).all()
+def test_what_goes_straight_away_over_the_floor_rises_in_the_image() -> None:
+    assert depth_motion(1.0) == ((0.0, -1.0), pytest.approx(math.sqrt(0.75)))
+    assert depth_motion(-1.0) == ((0.0, 1.0), pytest.approx(-math.sqrt(0.75)))
 
 
 @given(

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 
+import httpx
 import kubernetes_validate
 import pytest
 import yaml
 from conftest import ROOT
-from servers import Served
-from test_docker import IMAGES, check_cow, check_settings, longest_stop, pairs, texts
+from containers import IMAGES, check_cow, check_settings, longest_stop, pairs, texts
 
 KUBERNETES = ROOT / "docker" / "kubernetes"
 OLDEST_KUBERNETES = "1.30"  # that the files are for
@@ -32,7 +31,10 @@ def resources() -> list[dict[str, Any]]:
 RESOURCES = resources()
 BUILT_IN = [one for one in RESOURCES if not one["apiVersion"].startswith("keda.sh/")]
 DEPLOYMENTS = {one["metadata"]["name"]: one for one in RESOURCES if one["kind"] == "Deployment"}
-SCALED = [one for one in RESOURCES if one["kind"] == "ScaledObject"]
+
+
+def of_kind(kind: str) -> list[dict[str, Any]]:
+    return [one for one in RESOURCES if one["kind"] == kind]
 
 
 def container_of(workload: dict[str, Any]) -> dict[str, Any]:
@@ -49,10 +51,10 @@ def test_resources_are_those_of_kubernetes(resource: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", DEPLOYMENTS)
 def test_deployments_are_set_up(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     spec, container = DEPLOYMENTS[name]["spec"], container_of(DEPLOYMENTS[name])
-    shared = next(one["data"] for one in RESOURCES if one["kind"] == "ConfigMap")
+    (shared,) = of_kind("ConfigMap")
     image = IMAGES[container["image"]]
     own = {one["name"]: one["value"] for one in container["env"]}
-    settings = check_settings(monkeypatch, pairs(image, "ENV") | shared | own)
+    settings = check_settings(monkeypatch, pairs(image, "ENV") | shared["data"] | own)
     check_cow(list(container["args"]))
     labels = spec["template"]["metadata"]["labels"]
     assert spec["selector"]["matchLabels"] == labels
@@ -66,30 +68,25 @@ def test_deployments_are_set_up(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert {one["name"] for one in container["volumeMounts"]} == {
         one["name"] for one in spec["template"]["spec"]["volumes"]
     }
-    budget = next(one for one in RESOURCES if one["kind"] == "PodDisruptionBudget" and one["metadata"]["name"] == name)
+    (budget,) = (one for one in of_kind("PodDisruptionBudget") if one["metadata"]["name"] == name)
     assert budget["spec"]["selector"]["matchLabels"] == labels
 
 
-@pytest.mark.parametrize(
-    "job", [one for one in RESOURCES if one["kind"] == "Job"], ids=lambda one: one["metadata"]["name"]
-)
-def test_jobs_are_commands_that_there_are(job: dict[str, Any]) -> None:
-    container = container_of(job)
-    check_cow(list(container["args"]))
-    (volumes,) = texts(IMAGES[container["image"]], "VOLUME")
-    assert {one["mountPath"] for one in container["volumeMounts"]} == {*json.loads(volumes), "/tmp"}
-
-
-def test_one_job_creates_the_tables_and_nobody_else() -> None:
-    shared = next(one["data"] for one in RESOURCES if one["kind"] == "ConfigMap")
-    migrating = [one for one in RESOURCES if one["kind"] == "Job" and container_of(one)["args"] == ["migrate"]]
-    assert (len(migrating), shared["COW_MIGRATE"]) == (1, "false")
-    assert container_of(migrating[0])["envFrom"] == container_of(DEPLOYMENTS["cow-api"])["envFrom"]
+def test_jobs_are_commands_and_one_of_them_alone_creates_the_tables() -> None:
+    for job in of_kind("Job"):
+        container = container_of(job)
+        check_cow(list(container["args"]))
+        (volumes,) = texts(IMAGES[container["image"]], "VOLUME")
+        assert {one["mountPath"] for one in container["volumeMounts"]} == {*json.loads(volumes), "/tmp"}
+    (shared,) = of_kind("ConfigMap")
+    (migrating,) = (container_of(one) for one in of_kind("Job") if container_of(one)["args"] == ["migrate"])
+    assert shared["data"]["COW_MIGRATE"] == "false"
+    assert migrating["envFrom"] == container_of(DEPLOYMENTS["cow-api"])["envFrom"]
 
 
 def test_each_queue_is_scaled_by_its_own_jobs() -> None:
-    assert {one["metadata"]["name"] for one in SCALED} == DEPLOYMENTS.keys() - {"cow-api"}
-    for scaled in SCALED:
+    assert {one["metadata"]["name"] for one in of_kind("ScaledObject")} == DEPLOYMENTS.keys() - {"cow-api"}
+    for scaled in of_kind("ScaledObject"):
         container = container_of(DEPLOYMENTS[scaled["spec"]["scaleTargetRef"]["name"]])
         (trigger,) = scaled["spec"]["triggers"]
         queue = container["args"][container["args"].index("--queues") + 1]
@@ -98,12 +95,10 @@ def test_each_queue_is_scaled_by_its_own_jobs() -> None:
         assert trigger["metadata"]["targetQueryValue"] == given.get("COW_CONCURRENCY", "1")
 
 
-def of_kind(kind: str) -> list[dict[str, Any]]:
-    return [one for one in RESOURCES if one["kind"] == kind]
-
-
 def test_every_deployment_is_scaled_by_one_thing() -> None:
-    scaled = [one["spec"]["scaleTargetRef"]["name"] for one in [*SCALED, *of_kind("HorizontalPodAutoscaler")]]
+    scaled = [
+        one["spec"]["scaleTargetRef"]["name"] for one in [*of_kind("ScaledObject"), *of_kind("HorizontalPodAutoscaler")]
+    ]
     assert sorted(scaled) == sorted(DEPLOYMENTS)
     for name, workload in DEPLOYMENTS.items():
         assert "replicas" not in workload["spec"], f"{name}: each update would set the number back"
@@ -143,21 +138,15 @@ def test_every_alarm_is_in_the_runbook() -> None:
         assert rule["annotations"]["summary"]
 
 
-@pytest.fixture(scope="module")
-def metrics(tmp_path_factory: pytest.TempPathFactory) -> Iterator[set[str]]:
-    """The names of the series of a real server."""
-    with Served(tmp_path_factory.mktemp("metrics")) as served:
-        told = re.findall(r"^# TYPE (\S+) (\S+)", served.http.get("/metrics").text, re.MULTILINE)
-        parts = {"histogram": ("_bucket", "_sum", "_count")}
-        yield {name + part for name, kind in told for part in parts.get(kind, ("",))}
-
-
 def names_in(expression: str) -> set[str]:
     return set(re.findall(r"\b(?:cow|process)_[a-z_]+|\bup\b", expression)) - OF_PROMETHEUS
 
 
 @pytest.mark.slow
-def test_alarms_and_panels_are_of_metrics_that_exist(metrics: set[str]) -> None:
+def test_alarms_and_panels_are_of_metrics_that_exist(http: httpx.Client) -> None:
+    told = re.findall(r"^# TYPE (\S+) (\S+)", http.get("/metrics").text, re.MULTILINE)
+    parts = {"histogram": ("_bucket", "_sum", "_count")}
+    metrics = {name + part for name, kind in told for part in parts.get(kind, ("",))}
     panels = [target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", ())]
     for expression in [rule["expr"] for rule in RULES] + panels:
         assert names_in(expression) <= metrics, expression

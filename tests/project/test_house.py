@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, TESTS
 
 from hatch_build import TWINS
 
@@ -190,3 +190,102 @@ def imported_by(statement: str, suspects: tuple[str, ...]) -> list[str]:
     code = f"import sys; {statement}; print(*[m for m in {suspects} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
     return result.stdout.split()
+
+
+# --- the tests
+
+
+# What takes seconds to import is imported by the fixtures and functions that use it.
+HEAVY_IN_TESTS = (
+    *("torch", "transformers", "diffusers", "accelerate", "safetensors.torch", "peft", "inspect_ai", "matplotlib"),
+    *("playwright", "axe_playwright_python", "schemathesis", "moto", "openai", "mcp", "pydantic_ai", "scipy"),
+    *("pyarrow", "dbos"),
+)
+COLLECT = """
+import sys, pytest
+code = pytest.main(["--collect-only", "-qq", "-p", "no:cacheprovider", "-p", "no:schemathesis"])
+print("\\nloaded:", int(code), *[name for name in sys.argv[1:] if name in sys.modules])
+"""
+# Names with a leading underscore that are public all the same, or that there is no public way around.
+DOORS = {
+    "_exit": "os: ends a process at once",
+    "_repr_html_": "what notebooks ask an object for",
+    "_dynamo": "torch: counts what was compiled",
+}
+# Where a test may sleep: to be slow is what these are for, and no verdict hangs on how long it takes.
+SLEEPERS = {
+    "waiting.py": "the one way to wait",
+    "chaos.py": "faults last for a while, and come after a while",
+    "mllm_server.py": "a model that is slow",
+    "random_mllm.py": "a model that is slow",
+}
+
+
+@cache
+def trees_of_tests() -> dict[str, ast.Module]:
+    """The tests and what helps them, by their place in the folder."""
+    return {path.relative_to(TESTS).as_posix(): ast.parse(path.read_text()) for path in TESTS.rglob("*.py")}
+
+
+def imported_at_top(body: list[ast.stmt]) -> Iterator[str]:
+    """What a file imports when it is imported itself."""
+    for node in body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Try) or (isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test)):
+            yield from imported_at_top(node.body)
+
+
+def test_no_test_imports_what_is_heavy_at_its_top_or_another_test() -> None:
+    heavy = re.compile(rf"({'|'.join(map(re.escape, HEAVY_IN_TESTS))})(\.|$)|test_\w+\.")
+    files = {place: tree for place, tree in trees_of_tests().items() if re.search(r"(^|/)(test_|conftest)", place)}
+    found = [
+        f"{place}: {name}" for place, tree in files.items() for name in imported_at_top(tree.body) if heavy.match(name)
+    ]
+    assert found == []
+
+
+@pytest.mark.slow
+def test_nothing_heavy_is_loaded_when_the_tests_are_collected() -> None:
+    """Neither by a test file nor by a helper or a module of the product that it imports."""
+    command = [sys.executable, "-c", COLLECT, *HEAVY_IN_TESTS]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.rpartition("\n\n")[2].split() == ["loaded:", "0"], done.stdout[-2000:]
+
+
+def is_private(name: str) -> bool:
+    return re.match(r"_(?!_)", name) is not None and name not in DOORS
+
+
+def test_tests_use_what_is_public() -> None:
+    """No name with a leading underscore of an object that is not their own, and none of the product's modules."""
+    found: list[str] = []
+    for place, tree in trees_of_tests().items():
+        for node in ast.walk(tree):
+            names: list[str] = []
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls", "super()"):
+                names = [node.attr]
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("cow_service"):
+                names = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in ("getattr", "setattr"):
+                texts = [one.value for one in node.args if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+                names = [text.rpartition(".")[2] for text in texts]
+            found += [f"{place}:{node.lineno}: {name}" for name in names if is_private(name)]
+    assert found == []
+
+
+def sleeps(tree: ast.Module) -> Iterator[int]:
+    """The lines in which a file sleeps; to sleep for no time lets others run."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and [ast.unparse(one) for one in node.args] != ["0"]:
+            module, _, name = ast.unparse(node.func).rpartition(".")
+            if name == "wait_for_timeout" or (name == "sleep" and module in ("", "time", "asyncio", "anyio")):
+                yield node.lineno
+
+
+def test_no_test_sleeps_and_then_looks() -> None:
+    sleepers = {place: list(sleeps(tree)) for place, tree in trees_of_tests().items()}
+    assert {place: found for place, found in sleepers.items() if found and place not in SLEEPERS} == {}
+    assert [place for place in SLEEPERS if not sleepers.get(place)] == [], "no longer needed"

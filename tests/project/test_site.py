@@ -13,20 +13,18 @@ from collections.abc import Iterator
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import unquote
 
 import pytest
 import yaml
+from browser import Windows, expect
 from conftest import ROOT, SCALE, made_once
 from typer.main import get_command
 
 from cow_service import errors
 from cow_service.cli.main import app
 from cow_service.settings import Settings
-
-if TYPE_CHECKING:
-    from browser import Windows
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 LOADS = {("script", "src"), ("img", "src"), ("iframe", "src"), ("video", "src"), ("video", "poster"), ("link", "href")}
@@ -70,50 +68,42 @@ def text_of(page: Path) -> str:
     return unescape(re.sub(r"<[^>]+>", "", page.read_text()))
 
 
-def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Links]) -> None:
+def test_nothing_is_loaded_from_elsewhere_and_links_lead_somewhere(site: Path, pages: dict[Path, Links]) -> None:
     for path, links in pages.items():
+        stands_everywhere = path.name == "404.html"
         for target in links.loads:
             assert not re.match(r"(\w+:)?//", target), f"{path.name}: {target}"
-            if path.name != "404.html" and not target.startswith("data:"):  # it stands at every address
-                assert (path.parent / target).exists(), f"{path.name}: {target}"
-    for path in site.rglob("*.css"):
-        assert not re.search(r"url\(['\"]?(https?:)?//|@import", path.read_text()), path
-
-
-def test_links_and_anchors_lead_somewhere(pages: dict[Path, Links]) -> None:
-    for path, links in pages.items():
-        for target in links.leads if path.name != "404.html" else ():
+            assert stands_everywhere or target.startswith("data:") or (path.parent / target).exists(), target
+        for target in () if stands_everywhere else links.leads:
             if not re.match(r"[a-z]+:", target):
                 name, _, anchor = target.partition("#")
                 led = (path.parent / unquote(name)).resolve() if name else path
                 assert led.is_file(), f"{path.name}: {target}"
                 assert not anchor or unquote(anchor) in pages[led].anchors, f"{path.name}: {target}"
-
-
-def test_every_page_of_docs_is_there_and_none_has_a_list_in_a_paragraph(site: Path) -> None:
+    for path in site.rglob("*.css"):
+        assert not re.search(r"url\(['\"]?(https?:)?//|@import", path.read_text()), path
     for path in (ROOT / "docs").glob("*.md"):
-        page = site / f"{path.stem}.html"
-        assert not re.search(r"<p>[^<]*\n([-*]|\d+\.) ", page.read_text()), f"{path.name}: a list needs an empty line"
+        page = (site / f"{path.stem}.html").read_text()
+        assert not re.search(r"<p>[^<]*\n([-*]|\d+\.) ", page), f"{path.name}: a list needs an empty line"
 
 
-def test_the_reference_has_every_endpoint_and_record(site: Path, pages: dict[Path, Links]) -> None:
+def test_the_reference_has_every_endpoint_record_setting_error_and_call(site: Path, pages: dict[Path, Links]) -> None:
     api = yaml.safe_load((ROOT / "openapi.yaml").read_text())
     text = text_of(site / "http.html")
     for path, methods in api["paths"].items():
         for method, call in methods.items():
             assert f"{method.upper()} {path}" in text
-            for parameter in call.get("parameters", ()):
-                assert parameter["name"] in text
-    assert {name.lower() for name in api["components"]["schemas"]} <= pages[site / "records.html"].anchors
-
-
-def test_the_reference_has_every_setting_and_error(site: Path, pages: dict[Path, Links]) -> None:
-    assert {f"cow_{name}" for name in Settings.model_fields} <= pages[site / "settings.html"].anchors
+            assert all(parameter["name"] in text for parameter in call.get("parameters", ()))
+    anchors = {name: pages[site / f"{name}.html"].anchors for name in ("records", "settings", "errors", "sdk")}
+    assert {name.lower() for name in api["components"]["schemas"]} <= anchors["records"]
+    assert {f"cow_{name}" for name in Settings.model_fields} <= anchors["settings"]
+    assert set(errors.kinds()) <= anchors["errors"]
+    assert {f"cow_service.client.sync_client.Client.{name}" for name in ("simulate", "answer", "map")} <= anchors["sdk"]
     text = " ".join(text_of(site / "settings.html").split())
     for name, field in Settings.model_fields.items():
         assert f"COW_{name.upper()}" in text
         assert " ".join((field.description or "?").replace("`", "").split()) in text
-    assert set(errors.kinds()) <= pages[site / "errors.html"].anchors
+    assert ">>>" not in re.sub(r"<pre.*?</pre>", "", (site / "sdk.html").read_text(), flags=re.DOTALL)
 
 
 def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -135,12 +125,6 @@ def test_the_reference_has_every_command_and_option(site: Path) -> None:
                 assert option.startswith("-") is False or option in sections[name.replace(" ", "-")], (name, option)
 
 
-def test_the_reference_has_the_sdk(pages: dict[Path, Links], site: Path) -> None:
-    anchors = pages[site / "sdk.html"].anchors
-    assert {f"cow_service.client.sync_client.Client.{name}" for name in ("simulate", "answer", "map")} <= anchors
-    assert ">>>" not in re.sub(r"<pre.*?</pre>", "", (site / "sdk.html").read_text(), flags=re.DOTALL)
-
-
 def test_search_finds_without_a_network(site: Path, windows: Windows) -> None:
     page = windows.open((site / "index.html").as_uri(), offline=True)
     page.get_by_role("textbox", name="Search").fill("COW_MLLM_BUDGET")
@@ -149,8 +133,6 @@ def test_search_finds_without_a_network(site: Path, windows: Windows) -> None:
 
 
 def test_scenes_play_and_answer_a_drag_without_a_network(site: Path, windows: Windows) -> None:
-    from browser import expect
-
     page = windows.open((site / "gallery.html").as_uri(), offline=True, reduced_motion="no-preference")
     scenes = page.locator(".scene")
     assert scenes.count() == (6 if SCALE == 1 else 20)

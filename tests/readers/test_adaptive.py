@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import math
 import random
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,10 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mllm_server import completion, mllm_server
 
-from cow_service.adaptive import FIRST, AdaptiveLimit
+from cow_service.adaptive import FIRST, MAX_PAUSE_SECONDS, AdaptiveLimit
 from cow_service.readers.base import ReaderInput
-from cow_service.readers.mllm.client import MllmClient, PromptCall
-from cow_service.readers.mllm.models import configure
 from cow_service.settings import Settings
 from cow_service.vision.scene import Scene
 
@@ -88,8 +85,7 @@ def test_sixty_four_places_are_reached_in_a_few_round_trips_and_used() -> None:
     server = Simulation(256, lambda _: 64)
     assert server.run(1320) < 1.3 * 1320 * 2 / 64
     assert server.refused <= 0.02 * 1320
-    reached = next(now for now, limit in server.limits if limit >= 64)
-    assert reached <= 5 * 2.0
+    assert next(now for now, limit in server.limits if limit >= 64) <= 5 * 2.0
 
 
 @pytest.mark.parametrize("accepted", [1, 3])
@@ -105,8 +101,7 @@ def test_it_recovers_when_more_is_accepted_and_after_an_outage() -> None:
     server = Simulation(256, lambda now: 20 if now < 60 else 100, lambda *_: draws.uniform(1.6, 2.4))
     server.run(4000)
     assert server.limits[-1][1] > 80
-    server = Simulation(64, lambda now: 0 if 30 < now < 32 else 64)
-    server.refusal_seconds = 0.2
+    server = Simulation(64, lambda now: 0 if 30 < now < 32 else 64, refusal_seconds=0.2)
     server.run(2500)
     assert min(limit for _, limit in server.limits) < 16
     assert server.limits[-1][1] == 64
@@ -116,6 +111,7 @@ def test_calls_in_flight_together_halve_it_once() -> None:
     now = 0.0
     limit = AdaptiveLimit(64, lambda: now)
     flying = [limit.begin() for _ in range(FIRST)]
+    assert limit.seconds_to_wait() == math.inf
     now = 1.0
     for began in flying:
         limit.refuse(began)
@@ -139,15 +135,16 @@ def test_it_grows_only_while_calls_wait() -> None:
     assert limit.limit == FIRST
 
 
-def test_a_retry_after_holds_all_calls_back() -> None:
+@pytest.mark.parametrize(("asked", "kept"), [(7.0, 7.0), (1000.0, MAX_PAUSE_SECONDS)])
+def test_a_retry_after_holds_all_calls_back(asked: float, kept: float) -> None:
     now = 0.0
     limit = AdaptiveLimit(64, lambda: now)
     began = limit.begin()
-    limit.refuse(began, 7.0)
+    limit.refuse(began, asked)
     limit.end(began, succeeded=False)
-    assert limit.seconds_to_wait() == 7.0
-    now = 7.0
-    assert limit.seconds_to_wait() == 0
+    assert limit.seconds_to_wait() == limit.seconds_paused == kept == min(asked, 60)
+    now = kept
+    assert limit.seconds_to_wait() == limit.seconds_paused == 0
 
 
 def test_it_halves_when_latency_rises_with_the_load() -> None:
@@ -160,7 +157,7 @@ def test_it_halves_when_latency_rises_with_the_load() -> None:
     assert min(tail) >= 4
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
+@pytest.mark.parametrize("share", [0.05, 0.5])
 def test_calls_of_very_different_lengths_do_not_misfire(share: float) -> None:
     draws = random.Random(1)
     server = Simulation(64, seconds=lambda *_: 0.005 if draws.random() < share else draws.uniform(1, 3))
@@ -174,34 +171,36 @@ def test_calls_that_become_longer_for_good_are_made_as_many() -> None:
     assert server.limits[-1][1] == 64
 
 
-def test_an_mllm_is_called_as_often_at_once_as_it_takes() -> None:
-    accepted, calls = 20, 300
+def test_an_mllm_is_called_more_often_at_once_as_it_accepts_more() -> None:
+    """Over sockets: calls that are refused are made again, and all places are free at the end."""
+    from cow_service.readers.mllm.client import MllmClient, PromptCall
+    from cow_service.readers.mllm.models import configure
+
+    accepted, calls, begun, most, refused = 12, 80, 0, 0, 0
     with mllm_server() as mllm:
-        begun = refused = 0
+        settings = Settings(mllm="generic", mllm_base_url=mllm.address)
+        client = MllmClient(configure(settings), settings)
+        limit = client.places.limit
 
         def reply(handler: Any) -> None:
-            nonlocal begun, refused
+            nonlocal begun, most, refused
             with mllm.lock:
+                most = max(most, limit.limit)
                 is_accepted = begun < accepted
                 begun, refused = begun + is_accepted, refused + (not is_accepted)
-                mllm.most_at_once = begun
             if not is_accepted:
                 handler.send(429, {"error": {"message": "busy"}}, {"retry-after": "0"})
                 return
-            time.sleep(0.03)
             with mllm.lock:
                 begun -= 1
             handler.send(200, completion("42"))
 
         mllm.say(reply)
-        settings = Settings(mllm="generic", mllm_base_url=mllm.address)
-        client = MllmClient(configure(settings), settings)
-        scene, asked = Scene(floor(8, 8)), {"question": "How many?", "shown": "nothing", "facts": ()}
+        asked = {"question": "How many?", "shown": "nothing", "facts": ()}
         prompts = [PromptCall("eval-question", asked, (), {"type": "object"}, int, vote) for vote in range(calls)]
-        replies = client.complete_all(prompts, ReaderInput(scene, "How many?"))
-        reached = client.places.limit.limit
+        replies = client.complete_all(prompts, ReaderInput(Scene(floor(8, 8)), "How many?"))
         client.close()
     assert replies == [42] * calls
-    assert reached > FIRST
-    assert refused < 0.1 * calls  # replies this quick leave little time to hear of a refusal
-    assert client.places.limit.in_flight == client.places.waiting == 0
+    assert most > FIRST
+    assert len(mllm.asked) == calls + refused
+    assert limit.in_flight == client.places.waiting == 0

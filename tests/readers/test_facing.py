@@ -9,17 +9,15 @@ import cv2
 import numpy as np
 import pytest
 from conftest import DATA, example
-from drawn import angle_between, ball, floor
-from hypothesis import given
+from drawn import angle_between, floor
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cow_service.errors import CannotReadDirection
 from cow_service.physics.camera import FloorCamera
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.facing import DARK, OTHER, PAINT, VehicleModel, facing
-from cow_service.readers.embedded.reader import EmbeddedReader, create
+from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
-from cow_service.settings import Settings
 from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
@@ -43,29 +41,14 @@ def drawn_car(yaw: float, pitch: float) -> tuple[Image, Mask, tuple[float, float
     return np.asarray(cv2.GaussianBlur(image, (3, 3), 0.8), np.uint8), labels > 0, (x, y)
 
 
-def grounded(reader: EmbeddedReader, asked: ReaderInput) -> Grounding:
-    """Stage 1 of a question."""
-    found = reader.ground(asked)
-    middle = (found.bbox[0] + found.bbox[2]) / 2, (found.bbox[1] + found.bbox[3]) / 2
-    return Grounding(object=found.object, point=middle, bbox=found.bbox, source="embedded")
-
-
+@settings(max_examples=6)
 @given(st.floats(0, 2 * math.pi), st.floats(math.radians(22), math.radians(36)))
 def test_a_drawn_car_faces_the_way_that_it_was_turned(yaw: float, pitch: float) -> None:
     image, mask, way = drawn_car(yaw, pitch)
     told = facing(image, mask, bbox_of(mask))
     assert told is not None
-    assert angle_between(told, way) <= 40  # straight away from the camera, degrees of the turn are many in the image
-
-
-def test_a_turn_is_told_to_a_few_degrees() -> None:
-    errors: list[float] = []
-    for yaw in np.linspace(0.1, 2 * math.pi, 24, endpoint=False).tolist():
-        image, mask, way = drawn_car(yaw, math.radians(26))
-        told = facing(image, mask, bbox_of(mask))
-        assert told is not None
-        errors.append(angle_between(told, way))
-    assert np.median(errors) <= 4
+    # Straight away from the camera, degrees of the turn are many in the image.
+    assert angle_between(told, way) <= (6 if abs(math.cos(yaw)) > 0.5 else 40)
 
 
 def test_paint_alone_does_not_tell_the_front() -> None:
@@ -78,12 +61,14 @@ def test_paint_alone_does_not_tell_the_front() -> None:
 
 @pytest.mark.parametrize(("word", "sense"), [("forward", 1), ("backward", -1)])
 def test_forward_and_backward_are_the_way_that_the_car_of_an_example_faces(word: str, sense: int) -> None:
-    scene, reader = example("car-forward"), create(Settings())
-    asked = ReaderInput(
-        Scene(scene.pixels("image.jpg")), f"If the red toy car moves {word}, will it hit the green mug?"
+    car = example("car-forward")
+    asked = ReaderInput(Scene(car.pixels("image.jpg")), f"If the red toy car moves {word}, what happens?")
+    x0, y0, x1, y1 = car.meta["bbox"]
+    place = Grounding(
+        object="red toy car", point=((x0 + x1) / 2, (y0 + y1) / 2), bbox=(x0, y0, x1, y1), source="embedded"
     )
-    reading = reader.read_motion(asked, grounded(reader, asked), None)
-    x, y = scene.meta["direction"]
+    reading = EmbeddedReader().read_motion(asked, place, None)
+    x, y = car.meta["direction"]
     assert reading.cue == "orientation"
     assert reading.direction is not None
     assert angle_between(reading.direction, (sense * x, sense * y)) <= 5
@@ -107,12 +92,3 @@ def test_a_rendered_car_is_whole_and_faces_its_way(name: str) -> None:
     way = facing(scene.clean, scene.silhouette(region.bbox), region.bbox)
     assert way is not None
     assert angle_between(way, tuple(truth["direction"])) <= 10
-
-
-def test_a_ball_has_no_front() -> None:
-    asked = ReaderInput(
-        Scene(ball(floor(), (150, 200), 40, (200, 30, 30))), "If the red ball moves forward, what happens?"
-    )
-    reader = create(Settings())
-    with pytest.raises(CannotReadDirection, match="only of vehicles"):
-        reader.read_motion(asked, grounded(reader, asked), None)

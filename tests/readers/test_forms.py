@@ -36,16 +36,18 @@ def turned(image: Image, middle: int, noun: str) -> Image:
     return image
 
 
+def region_of(image: Image) -> Region:
+    (region,) = find_regions(jpeg(image))
+    return region
+
+
 def test_two_that_are_seen_as_one_are_unlike_either() -> None:
     """One cylinder behind another of its hue, to its left."""
     image = floor()
-    image[150:240, 280:330], image[200:300, 310:370] = GREEN, GREEN
-    (region,) = find_regions(jpeg(image))
-    assert is_unlike(region, "cylinder")
-    alone = floor()
-    alone[150:240, 280:330] = GREEN
-    (region,) = find_regions(jpeg(alone))
-    assert not is_unlike(region, "cylinder")
+    image[150:240, 280:330] = GREEN
+    assert not is_unlike(region_of(image), "cylinder")
+    image[200:300, 310:370] = GREEN
+    assert is_unlike(region_of(image), "cylinder")
 
 
 def test_half_of_a_thing_may_be_a_ball_but_no_vase() -> None:
@@ -54,7 +56,7 @@ def test_half_of_a_thing_may_be_a_ball_but_no_vase() -> None:
     assert [is_unlike(region, noun) for noun in ("ball", "cylinder", "vase", "bottle")] == [False, False, True, True]
 
 
-@pytest.mark.parametrize(("height", "is_odd"), [(64, False), (56, False), (52, True), (38, True)])
+@pytest.mark.parametrize(("height", "is_odd"), [(56, False), (52, True), (38, True)])
 def test_a_lit_cap_is_not_believed_to_be_the_ball(height: int, is_odd: bool) -> None:
     """Its lower part may be as light as the floor."""
     image = floor()
@@ -62,17 +64,16 @@ def test_a_lit_cap_is_not_believed_to_be_the_ball(height: int, is_odd: bool) -> 
     cv2.ellipse(seen, (300, 232), (32, 32), 0, 0, 360, 1, -1)
     seen[200 + height :] = 0
     image[seen > 0] = GREEN
-    (region,) = find_regions(jpeg(image))
-    assert is_unlike(region, "ball") is is_odd
+    assert is_unlike(region_of(image), "ball") is is_odd
 
 
-@pytest.mark.parametrize(("noun", "is_odd"), [("cylinder", False), ("can", False), ("bottle", True), ("cone", True)])
-def test_a_squat_cylinder_seen_from_above_is_one(noun: str, is_odd: bool) -> None:
+def test_a_squat_cylinder_seen_from_above_is_one() -> None:
     image = np.ascontiguousarray(floor())
     rims = [cv2.ellipse2Poly(middle, (40, 26), 20, 0, 360, 5) for middle in ((310, 190), (285, 240))]
     cv2.fillConvexPoly(image, cv2.convexHull(np.concatenate(rims)), GREEN, cv2.LINE_AA)
-    (region,) = find_regions(jpeg(image))
-    assert is_unlike(region, form_of(noun) or "") == is_odd
+    region = region_of(image)
+    nouns = ("cylinder", "can", "bottle", "cone")
+    assert [is_unlike(region, form_of(noun) or "") for noun in nouns] == [False, False, True, True]
 
 
 def test_without_a_colour_nothing_is_meant_that_looks_like_something_else() -> None:
@@ -82,10 +83,14 @@ def test_without_a_colour_nothing_is_meant_that_looks_like_something_else() -> N
     assert doubted == [True, False]
 
 
-def matches(regions: tuple[Region, ...], text: str) -> list[int]:
+def phrase_of(text: str) -> ObjectPhrase:
     phrase = parse_noun_phrase(text)
     assert phrase is not None
-    return sorted(round(region.centre[0]) for region in best_matches(regions, phrase))
+    return phrase
+
+
+def matches(regions: tuple[Region, ...], text: str) -> list[int]:
+    return sorted(round(region.centre[0]) for region in best_matches(regions, phrase_of(text)))
 
 
 @pytest.mark.parametrize("noun", sorted(HALF_WIDTHS))
@@ -94,14 +99,7 @@ def test_two_of_one_colour_are_told_apart_by_outline(noun: str, other: str) -> N
     regions = find_regions(jpeg(turned(turned(floor(), 200, noun), 440, other)))
     assert len(regions) == 2
     for text in (f"the purple {noun}", f"the {noun}"):
-        found = matches(regions, text)
-        assert found == pytest.approx([200] if noun != other else [200, 440], abs=2)
-
-
-def phrase_of(text: str) -> ObjectPhrase:
-    phrase = parse_noun_phrase(text)
-    assert phrase is not None
-    return phrase
+        assert matches(regions, text) == pytest.approx([200] if noun != other else [200, 440], abs=2)
 
 
 def test_an_outline_that_both_could_have_decides_nothing() -> None:
@@ -112,22 +110,23 @@ def test_an_outline_that_both_could_have_decides_nothing() -> None:
 
 
 def test_names_are_told_apart_together_where_one_alone_is_not() -> None:
-    box, tin = (150, 150, 250, 250), (400, 120, 480, 240)
-    regions = find_regions(jpeg(block(block(floor(), box, GREEN), tin, PURPLE)))
+    regions = find_regions(jpeg(block(block(floor(), (150, 150, 250, 250), GREEN), (400, 120, 480, 240), PURPLE)))
     cube, cylinder = phrase_of("the cube"), phrase_of("the cylinder")
     assert match_one(regions, cylinder) is None
-    for phrase, other, x in ((cube, cylinder, 200), (cylinder, cube, 440)):
-        found = match_one(regions, phrase, [other])
-        assert found is not None
-        assert found.centre[0] == pytest.approx(x, abs=3)
+    assert match_one(regions, cube, [cylinder]) is regions[0]
+    assert match_one(regions, cylinder, [cube]) is regions[1]
 
 
-def test_no_region_has_two_names_that_differ() -> None:
+def test_no_region_has_two_names_that_differ_and_a_name_of_what_is_not_there_means_nothing() -> None:
     regions = find_regions(jpeg(ball(block(floor(), (150, 150, 250, 250), GREEN), (440, 200), 50, PURPLE)))
     assert match_one(regions, phrase_of("the mug"), [phrase_of("the green cube")]) is None
     shared = match_one(regions, phrase_of("the ball"), [phrase_of("the purple ball")])
     assert shared is not None
     assert shared.centre[0] == pytest.approx(440, abs=3)
+    regions = find_regions(jpeg(block(block(floor(), (150, 150, 250, 250), GREEN), (400, 160, 490, 250), PURPLE)))
+    for noun in ("vase", "cone", "ball", "bottle"):
+        assert match_one(regions[:1], phrase_of(f"the {noun}")) is None
+        assert match_one(regions, phrase_of(f"the {noun}"), [phrase_of("the green cube")]) is None
 
 
 @pytest.mark.parametrize("noun", sorted(HALF_WIDTHS))
@@ -139,34 +138,17 @@ def test_a_shadow_in_the_outline_names_no_other_thing(noun: str, side: int) -> N
     assert found is None or found.centre[0] == pytest.approx(200, abs=3)
 
 
-@pytest.mark.parametrize("noun", ["vase", "cone", "ball", "bottle"])
-def test_a_name_of_what_is_not_there_means_nothing(noun: str) -> None:
-    regions = find_regions(jpeg(block(block(floor(), (150, 150, 250, 250), GREEN), (400, 160, 490, 250), PURPLE)))
-    assert match_one(regions[:1], phrase_of(f"the {noun}")) is None
-    assert match_one(regions, phrase_of(f"the {noun}"), [phrase_of("the green cube")]) is None
-
-
-def cup(reach: int) -> SeenBody:
-    """A vessel 60 px wide and 80 px high with a handle of a given length in px on the right."""
+def test_a_handle_tells_a_mug_from_a_cylinder_and_does_not_make_it_wider() -> None:
+    for reach in (0, 25):
+        image = floor()
+        for x in (150, 400):
+            image[120:220, x : x + 75] = PURPLE
+        image[145:190, 475 : 475 + reach] = PURPLE
+        found = matches(find_regions(jpeg(image)), "the purple mug")
+        assert (len(found) == 1) is (reach > 0)
     mask = np.zeros((200, 300), bool)
     mask[60:140, 100:160] = True
-    mask[80:120, 160 : 160 + reach] = True
-    cropped = CroppedMask.of(mask)
-    return SeenBody("mug", cropped.bbox, cropped, "cylinder")
-
-
-def test_a_handle_does_not_make_a_vessel_wider() -> None:
-    assert cup(25).bbox == (100, 60, 185, 140)
-    assert cup(25).core == (100, 60, 160, 140)
-    assert cup(0).core == cup(0).bbox
-    assert replace(cup(25), shape="box").core == cup(25).bbox
-
-
-@pytest.mark.parametrize("reach", [0, 25])
-def test_a_handle_tells_a_mug_from_a_cylinder(reach: int) -> None:
-    image = floor()
-    for x in (150, 400):
-        image[120:220, x : x + 75] = PURPLE
-    image[145:190, 475 : 475 + reach] = PURPLE
-    found = matches(find_regions(jpeg(image)), "the purple mug")
-    assert (len(found) == 1) is (reach > 0)
+    mask[80:120, 160:185] = True
+    cup = SeenBody("mug", (100, 60, 185, 140), CroppedMask.of(mask), "cylinder")
+    assert cup.core == (100, 60, 160, 140)
+    assert replace(cup, shape="box").core == cup.bbox

@@ -6,41 +6,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from outcomes import simulated
 
 from cow_service.readers.base import Imagined
-from cow_service.readers.mllm.answer import answer_calls
-from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt
-from cow_service.records import Intervention, LocatedObject, Simulation
+from cow_service.records import Intervention, LocatedObject
 
-SHA = "0" * 64
 OPTIONS = read_choices("", ["Yes", "No", "Not sure"])
 MUG = {"object": "the blue mug", "bbox": (60, 20, 80, 40), "first_frame": 8}
-
-
-def simulated(**trajectory: Any) -> Simulation:
-    """A simulation with this trajectory."""
-    image = {"sha256": SHA, "url": f"/artifacts/{SHA}", "media_type": "image/png", "size": 1}
-    path = {"states": [(0,) * 6] * 2, "points": [(1, 1)] * 2, "visible": [True] * 2, "scale": [1, 1], "tracks": []}
-    return Simulation.model_validate(
-        {
-            "id": "x", "created_at": "", "question": "q", "frames": (), "video": None, "overlay": image,
-            "image": {"sha256": SHA, "width": 96, "height": 64},
-            "grounding": {"object": "the ball", "point": (1, 1), "bbox": (0, 0, 9, 9), "source": "mllm"},
-            "motion": {
-                "kind": "linear", "direction": (1, 0), "cue": "text", "speed": 10, "sentence": "The ball rolls.",
-                "metres_per_pixel": {"value": 0.01, "source": "default"}, "source": "mllm",
-            },
-            "trajectory": {"law": "contact", "fps": 16, "paths": [path], "anchors": [], "ensemble": 200} | trajectory,
-            "generator": {"name": "cutout", "seed": 0}, "reader": {"name": "mllm"}, "timings": {},
-        }
-    )  # fmt: skip
+PATH = {"states": [(0,) * 6] * 2, "points": [(1, 1)] * 2, "visible": [True] * 2, "scale": [1, 1], "tracks": []}
 
 
 def prompt(removed: str | None = None, strips: bool = False, **trajectory: Any) -> str:
     """The text of the answer's prompt for a simulation with this trajectory, with something removed."""
-    simulation, frames = simulated(**trajectory), (np.zeros((4, 4, 3), np.uint8),)
+    from cow_service.readers.mllm.answer import answer_calls
+
+    frames = (np.zeros((4, 4, 3), np.uint8),)
+    plain = {"outcome": None, "ensemble": 200, "fps": 16, "encounters": (), "encounters_known": True}
+    simulation = simulated(**plain | trajectory)
     if removed is not None:
         change = Intervention(kind="remove", object=LocatedObject(object=removed, bbox=(50, 20, 60, 40)))
         grounding = simulation.grounding.model_copy(update={"interventions": (change,)})
@@ -55,18 +39,16 @@ def outcome(**fields: Any) -> dict[str, Any]:
     return {"asked": asked, "object": "the white cube", "sure": True, "robust": True} | fields
 
 
-def test_the_outcome_is_told_as_a_hypothesis() -> None:
+def test_the_outcome_is_told_as_a_hypothesis_that_names_no_option() -> None:
     text = prompt(
         outcome=outcome(probability=0.93, robust=False, depends_on=["speed", "heading"]),
         encounters=[MUG | {"kind": "touches"}],
     )
     lines = text.splitlines()
-    story = "hits the blue mug after about 0.5 s (after the clip ends) and misses the white cube."
-    assert f"> The ball stays where it is, {story}" in lines
     assert "> In 186 of 200 simulated versions it hits the white cube." in lines
-    assert "> It depends most on how fast it moves, which way it heads in depth." in lines
-    assert "a computed hypothesis about the first image" in text
-    assert "It can be wrong" in text
+    assert any(line.startswith("> It depends most on") for line in lines)
+    assert any(line.startswith("> The red ball moves to the right, hits the blue mug") for line in lines), "its story"
+    assert "hypothesis" in text
     told = text[text.index("The simulation came to") : text.index("- `answer`")]
     assert not any(f"({option.letter})" in told or option.text in told.split() for option in OPTIONS)
 
@@ -74,20 +56,14 @@ def test_the_outcome_is_told_as_a_hypothesis() -> None:
 @pytest.mark.parametrize(
     ("fields", "told"),
     [
-        ({"asked": {"negated": True}}, "it misses the white cube"),
         ({"asked": {"relation": "covers", "negated": True}}, "it leaves the white cube in view"),
-        ({"asked": {"relation": "covered"}}, "it is hidden by the white cube"),
-        ({"asked": {"target": None}, "object": None}, "it hits something"),
         ({"asked": {"target": None, "negated": True}, "object": None}, "it hits nothing"),
         ({"asked": {"form": "which-first"}, "first": "red\nbox"}, "the first one is the red box"),
-        ({"asked": {"form": "which-first"}, "object": None}, "it hits nothing"),
         ({"asked": {"form": "how-many"}, "count": 2}, "it is 2 objects"),
-        ({"asked": {"relation": "tips"}}, "the white cube is knocked over"),
         ({"asked": {"within": 1.0}}, "it hits the white cube within 1.0 s"),
-        ({"asked": {"form": "changes"}}, "that makes a difference"),
     ],
 )
-def test_every_form_of_question_is_put_in_words(fields: dict[str, Any], told: str) -> None:
+def test_the_outcome_of_each_form_of_question_is_one_line(fields: dict[str, Any], told: str) -> None:
     text = prompt(outcome=outcome(probability=0.5, **fields))
     assert f"> In 100 of 200 simulated versions {told}." in text.splitlines()
     assert "depends" not in text
@@ -95,40 +71,36 @@ def test_every_form_of_question_is_put_in_words(fields: dict[str, Any], told: st
 
 def test_encounters_are_told_where_there_is_no_outcome() -> None:
     hidden = MUG | {"kind": "occludes", "share": 0.4, "probability": 0.9}
-    text = prompt(encounters=[MUG | {"kind": "touches"}, hidden])
-    assert "> hits the blue mug, 0.5 s in" in text.splitlines()
-    line = "> passes in front of the blue mug, 0.5 s in, at most 40% covered; in 180 of 200 simulated versions"
-    assert line in text.splitlines()
-    assert "a computed hypothesis" in text
+    lines = prompt(encounters=[MUG | {"kind": "touches"}, hidden]).splitlines()
+    assert "> hits the blue mug, 0.5 s in" in lines
+    passes = "> passes in front of the blue mug, 0.5 s in, at most 40% covered; in 180 of 200 simulated versions"
+    assert passes in lines
     assert "The simulation found nothing" in prompt()
     assert "The simulation found nothing" not in prompt(encounters_known=False)
-
-
-def test_a_law_without_contacts_is_told() -> None:
-    assert "move on through whatever they meet" in prompt(law="ballistic")
-    assert "move on through whatever they meet" not in prompt()
+    assert "through whatever they meet" in prompt(law="ballistic")
+    assert "through whatever they meet" not in prompt()
 
 
 def test_both_worlds_of_a_removal_are_told_and_named() -> None:
-    path = {"states": [(0,) * 6] * 2, "points": [(1, 1)] * 2, "visible": [True] * 2, "scale": [1, 1], "tracks": []}
-    as_it_is = {"fps": 16, "paths": [path], "anchors": [], "ensemble": 200, "outcome": outcome(probability=0.02)}
+    as_it_is = {"fps": 16, "paths": [PATH], "anchors": [], "ensemble": 200, "outcome": outcome(probability=0.02)}
     given = {"outcome": outcome(probability=0.97), "factual": as_it_is}
     text = prompt("The vase", strips=True, **given)
-    assert 'first strip, named "Without the vase"' in text
-    assert 'named "As it is"' in text
+    assert '"Without the vase"' in text
+    assert '"As it is"' in text
+    assert "strip" in text
     lines = text.splitlines()
     assert "> Without the vase: In 194 of 200 simulated versions it hits the white cube." in lines
     assert "> As it is: In 196 of 200 simulated versions it misses the white cube." in lines
-    without_strips = prompt("The vase", **given)
-    assert 'changed from the beginning: "Without the vase"' in without_strips
-    assert "strip" not in without_strips
+    assert "strip" not in prompt("The vase", **given)
     assert "changed" not in prompt()
 
 
 def test_two_worlds_are_shown_as_two_strips_of_their_frames() -> None:
+    from cow_service.readers.mllm.hypothesis import pictures
+
     colours = np.array([(60, 0, 200), (120, 0, 200), (180, 0, 200), (240, 0, 200)], np.uint8)  # none is a grey
     frames = tuple(np.tile(colour, (40, 60, 1)) for colour in colours)
-    simulation = simulated()
+    simulation = simulated(None)
     assert pictures(Imagined(simulation, frames)) == frames
     changed, factual = pictures(Imagined(simulation, frames, frames[::-1]))
     assert changed.shape == factual.shape

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+from waiting import eventually
 
 from cow_service.concurrency import PrioritySemaphore, on_one_core
 from cow_service.jobs import active
@@ -33,8 +34,7 @@ def waiting(semaphore: PrioritySemaphore, priority: str, order: list[str]) -> th
 
 
 def until_waiting(semaphore: PrioritySemaphore, count: int) -> None:
-    while len(semaphore._waiting) < count:
-        time.sleep(0.001)
+    eventually(lambda: semaphore.waiting == count)
 
 
 def test_the_lowest_priority_comes_first_and_ties_in_their_order() -> None:
@@ -46,7 +46,7 @@ def test_the_lowest_priority_comes_first_and_ties_in_their_order() -> None:
         until_waiting(semaphore, place + 1)
     semaphore.release()
     for thread in threads:
-        thread.join(5)
+        thread.join()
     assert order == ["a", "a", "b", "c"]
 
 
@@ -59,7 +59,7 @@ def test_a_released_permit_goes_to_a_waiter_and_not_to_a_later_thread() -> None:
     semaphore.acquire("a")  # asked later: "m" was granted the permit already
     assert order == ["m"]
     semaphore.release()
-    thread.join(5)
+    thread.join()
 
 
 def test_a_canceled_wait_leaves_its_permit_to_others() -> None:
@@ -94,7 +94,7 @@ def test_who_was_canceled_before_a_permit_came_does_not_begin(monkeypatch: pytes
     until_waiting(semaphore, 1)
     canceled.set()
     semaphore.release()
-    thread.join(5)
+    thread.join()
     assert not began.is_set()
     semaphore.acquire("b")
     semaphore.release()
@@ -121,10 +121,15 @@ def test_never_more_holders_than_permits(permits: int) -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20)
+        thread.join()
     assert holders == 0
     assert 1 <= most <= permits
-    assert semaphore._permits == permits
+    for _ in range(permits):
+        semaphore.acquire()  # none was lost
+    last = waiting(semaphore, "a", [])
+    until_waiting(semaphore, 1)  # none was made
+    semaphore.release()
+    last.join()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="cores are chosen on Linux alone")
@@ -158,19 +163,20 @@ def test_there_are_as_many_workers_as_cores_where_memory_allows(
 
 
 def test_rest_is_long_without_jobs_and_a_job_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(active, "QUIET_SECONDS", 0.05)
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
     jobs, stop = ActiveJobs(), threading.Event()
+    now += active.QUIET_SECONDS
     assert not jobs.is_quiet
-    time.sleep(0.1)
+    now += 1
     assert jobs.is_quiet
     resting = threading.Thread(target=jobs.rest, args=(stop, 0.0, 600.0))
     resting.start()
     resting.join(0.2)
     assert resting.is_alive()
     with jobs.running("job", "simulate"):  # begins with a sign of it
-        resting.join(30)
-        assert not resting.is_alive()
-        time.sleep(0.1)
+        resting.join()
+        now += active.QUIET_SECONDS + 1
         assert not jobs.is_quiet
 
 
@@ -182,5 +188,4 @@ def test_what_is_to_end_does_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     jobs.stir()
     resting = threading.Thread(target=jobs.rest, args=(stop, 600.0, 600.0))
     resting.start()
-    resting.join(30)
-    assert not resting.is_alive()
+    resting.join()

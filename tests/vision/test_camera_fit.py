@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -14,8 +15,7 @@ from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import MEASUREMENT_SIGMA, CameraFit, Standing, fit_shadow, narrowed, prior
 from cow_service.physics.draws import ensemble
 from cow_service.physics.lift import Cameras
-from cow_service.physics.world import WorldInput, run_world
-from cow_service.records import BBox, MetresPerPixel, Motion
+from cow_service.records import BBox
 from cow_service.vision.edges import divide, find_segments
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
@@ -26,13 +26,7 @@ NAMES = ("pitch", "focal", "height", "slant right", "slant ahead")
 
 def shadow_of(camera: TrueCamera, ball: tuple[float, float, float], light: tuple[float, float]) -> Shadow:
     """The shadow of a ball of radius 1 (m, as all lengths), lit from far away: an ellipse on the floor."""
-    slant = np.array(light)
-    turns = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    along = slant / max(float(np.hypot(*slant)), 1e-9)
-    rim = circle + np.outer(circle @ along, along) * (math.sqrt(1 + slant @ slant) - 1)
-    rim += np.array([ball[0], ball[2]]) + ball[1] * slant
-    points = camera.seen(np.column_stack([rim[:, 0], np.zeros(len(rim)), rim[:, 1]]))
+    points = camera.shadow_rim(ball, light)
     (x, y), spread = points.mean(axis=0), np.cov(points.T, bias=True) / 2
     (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
     return Shadow((x0, y0, x1, y1), (x, y), (spread[0, 0], spread[1, 1], spread[0, 1]), 0.3)
@@ -48,86 +42,57 @@ def measured(shadow: Shadow, radius: float, rng: np.random.Generator) -> Shadow:
     return Shadow(shadow.bbox, centre, (xx, yy, correlation * math.sqrt(xx * yy)), shadow.shade)
 
 
-def throw(rng: np.random.Generator) -> tuple[np.ndarray, BBox, Shadow] | None:
-    """A camera and a light as the priors have them: what is true of them, the ball's box and its shadow."""
-    start = prior()
-    truth = start.mean + np.sqrt(np.diag(start.covariance)) * rng.normal(0, 1, 5)
-    height, distance = math.exp(truth[2]), rng.uniform(12, 25)
-    camera = TrueCamera(
-        pitch=math.degrees(truth[0]), focal=640 * math.exp(truth[1]), size=SIZE,
-        height=1 + distance * math.tan(truth[0]),
-    )  # fmt: skip
-    ball = rng.uniform(-0.3, 0.3) * distance, height, distance
-    box, shadow = camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (truth[3], truth[4]))
-    seen = (
-        min(*box[:2], *shadow.bbox[:2]) > 0 and max(box[2], shadow.bbox[2]) < 640 and max(box[3], shadow.bbox[3]) < 400
-    )
-    return (truth, box, shadow) if seen and height > 1.4 and 5 < truth[0] * 57 < 60 else None
+def throws(count: int, seed: int) -> Iterator[tuple[np.ndarray, BBox, Shadow, np.random.Generator]]:
+    """Cameras and lights as the priors have them: what is true of them, the ball's box and its shadow."""
+    rng, start, made = np.random.default_rng(seed), prior(), 0
+    while made < count:
+        truth = start.mean + np.sqrt(np.diag(start.covariance)) * rng.normal(0, 1, 5)
+        height, distance = math.exp(truth[2]), rng.uniform(12, 25)
+        pitch, focal = math.degrees(truth[0]), 640 * math.exp(truth[1])
+        camera = TrueCamera(pitch, 0.0, focal, 1 + distance * math.tan(truth[0]), SIZE)
+        ball = rng.uniform(-0.3, 0.3) * distance, height, distance
+        box, shadow = camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (truth[3], truth[4]))
+        edges = np.array([box, shadow.bbox])
+        if edges.min() > 0 and (edges.max(axis=0)[2:] < SIZE).all() and height > 1.4 and 5 < pitch < 60:
+            made += 1
+            yield truth, box, shadow, rng
 
 
 @pytest.mark.scaled
 def test_errors_are_as_large_as_the_deviations_say() -> None:
-    rng = np.random.default_rng(3)
     errors: list[np.ndarray] = []
-    refused = 0
-    while len(errors) < 50 * SCALE:
-        made = throw(rng)
-        if made is None:
-            continue
-        truth, box, shadow = made
+    count = 50 * SCALE
+    for truth, box, shadow, rng in throws(count, 3):
         fit = fit_shadow(prior(), box, measured(shadow, (box[2] - box[0]) / 2, rng), SIZE)
-        if fit is None:
-            refused += 1
-            continue
-        errors.append((fit.mean - truth) / np.sqrt(np.diag(fit.covariance)))
-    assert refused <= 0.1 * len(errors)
+        errors += [] if fit is None else [(fit.mean - truth) / np.sqrt(np.diag(fit.covariance))]
+    assert len(errors) >= 0.9 * count
     ratio = np.sqrt((np.array(errors) ** 2).mean(axis=0))
     assert ratio.max() < 2, dict(zip(NAMES, ratio.tolist(), strict=True))
     assert ratio.min() > 0.4, "deviations are not stated larger than they are"
 
 
-def test_it_knows_more_than_before() -> None:
-    rng = np.random.default_rng(5)
-    narrower = []
-    while len(narrower) < 20:
-        made = throw(rng)
-        fit = None if made is None else fit_shadow(prior(), made[1], made[2], SIZE)
-        if fit is not None:
-            assert fit.source == "shadow"
-            narrower.append(np.sqrt(np.diag(fit.covariance) / np.diag(prior().covariance)))
-    median = np.median(narrower, axis=0)
-    assert median[2] < 0.5, "the height above the floor"
-    assert median[0] < 0.85, "the pitch"
-    assert (median < 1.01).all()
+@pytest.mark.parametrize("roll", [-12.0, 12.0])
+def test_a_tilted_photograph_is_fitted_with_its_roll(roll: float) -> None:
+    camera, ball, start = TrueCamera(28, roll, 640, 9.0, SIZE), (0.5, 4.5, 15.0), prior(math.radians(roll))
+    fit = fit_shadow(start, camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (0.2, 0.2)), SIZE)
+    assert fit is not None
+    assert math.degrees(fit.roll) == pytest.approx(roll)
+    assert math.degrees(fit.mean[0]) == pytest.approx(28, abs=5)
+    assert math.exp(fit.mean[2]) == pytest.approx(4.5, rel=0.2)
 
 
-def test_a_tilted_photograph_is_fitted_with_its_roll() -> None:
-    for roll in (-12.0, 12.0):
-        camera = TrueCamera(pitch=28, roll=roll, height=9.0, size=SIZE)
-        ball = (0.5, 4.5, 15.0)
-        fit = fit_shadow(
-            prior(math.radians(roll)), camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (0.2, 0.2)), SIZE
-        )
-        assert fit is not None
-        assert fit.roll == pytest.approx(math.radians(roll))
-        assert math.degrees(fit.mean[0]) == pytest.approx(28, abs=5)
-        assert math.exp(fit.mean[2]) == pytest.approx(4.5, rel=0.2)
-
-
-@pytest.mark.parametrize("change", ["above the ball", "far to the side", "too large", "a streak"])
-def test_what_can_be_no_shadow_of_the_ball_gives_nothing(change: str) -> None:
-    camera = TrueCamera(pitch=28, height=9.0, size=SIZE)
-    ball = (0.0, 4.0, 15.0)
+def test_what_can_be_no_shadow_of_the_ball_gives_nothing() -> None:
+    camera, ball = TrueCamera(pitch=28, height=9.0, size=SIZE), (0.0, 4.0, 15.0)
     box, shadow = camera.sphere_box(ball, 1.0), shadow_of(camera, ball, (0.1, 0.1))
     assert fit_shadow(prior(), box, shadow, SIZE) is not None
     (x, y), (xx, yy, xy) = shadow.centre, shadow.spread
-    centre, spread = {
-        "above the ball": ((x, box[1] - 30), shadow.spread),
-        "far to the side": ((x - 600, y), shadow.spread),
-        "too large": ((x, y), (9 * xx, 9 * yy, 9 * xy)),
-        "a streak": ((x, y), (xx, 30 * yy, xy)),
-    }[change]
-    assert fit_shadow(prior(), box, Shadow(shadow.bbox, centre, spread, 0.3), SIZE) is None
+    for reason, centre, spread in (
+        ("above the ball", (x, box[1] - 30), shadow.spread),
+        ("far to the side", (x - 600, y), shadow.spread),
+        ("too large", (x, y), (9 * xx, 9 * yy, 9 * xy)),
+        ("a streak", (x, y), (xx, 30 * yy, xy)),
+    ):
+        assert fit_shadow(prior(), box, Shadow(shadow.bbox, centre, spread, 0.3), SIZE) is None, reason
 
 
 def standing(camera: TrueCamera, shape: str, right: float, ahead: float) -> Standing:
@@ -163,28 +128,6 @@ class TestNarrowed:
     def test_feet_lie_below_the_horizon(self) -> None:
         fit = narrowed(prior(), [Standing((300, 60, 340, 90))], SIZE)
         assert math.degrees(fit.mean[0]) > 30, "so high in the image they are on a floor that is seen from above"
-
-    def test_what_no_ellipse_is_tells_nothing(self) -> None:
-        spiky = np.zeros(SIZE[::-1], bool)
-        spiky[200:260, 300:340] = True
-        spiky[170:200, 318:322] = True
-        assert SeenBody("candle", (300, 170, 340, 260), CroppedMask.of(spiky), "cylinder").rim is None
-
-    def test_how_deep_an_unknown_thing_is_is_not_known(self) -> None:
-        block = np.zeros(SIZE[::-1], bool)
-        block[200:260, 300:340] = True
-        mover = SeenBody("ball", (100, 220, 140, 260), CroppedMask.of(block), "sphere")
-        motion = Motion(
-            kind="linear", direction=(1, 0), cue="request", speed=100, sentence="", source="request",
-            metres_per_pixel=MetresPerPixel(value=0.005, source="default"),
-        )  # fmt: skip
-        for known, least, most in ((True, 1.0, 1.0), (False, 0.33, 1.9)):
-            thing = SeenBody("it", (300, 200, 340, 260), CroppedMask.of(block), "cylinder", is_form_known=known)
-            world = WorldInput((mover, thing), motion, prior(), SIZE, 17, 16.0)
-            shapes = [bodies[1] for bodies in run_world(world, ensemble(50)).shapes]
-            shares = [shape.half_depth / shape.half_width for shape in shapes]
-            assert min(shares) <= least
-            assert max(shares) >= most
 
 
 GREY, DARK, LIGHT = (120, 118, 112), (150, 60, 40), (220, 120, 90)  # RGB of the floor, and of sides and tops
@@ -233,17 +176,20 @@ def fit_drawn(camera: TrueCamera, shapes: tuple[str, ...], tiles: bool, rng: np.
 
 
 class TestEdges:
-    @pytest.mark.parametrize("size", [(832, 480), (600, 800)])
     @pytest.mark.parametrize(
-        ("shapes", "tiles", "most"),
-        [(("box", "cylinder", "box"), False, 3.0), (("cylinder",) * 3, False, 4.5), (("box", "cone"), True, 3.0)],
+        ("shapes", "tiles", "most", "size"),
+        [
+            (("box", "cylinder", "box"), False, 3.0, (832, 480)),
+            (("cylinder",) * 3, False, 4.5, (600, 800)),
+            (("box", "cone"), True, 3.0, (832, 480)),
+        ],
     )
     def test_pitch_and_focal_length_are_measured(
-        self, size: tuple[int, int], shapes: tuple[str, ...], tiles: bool, most: float
+        self, shapes: tuple[str, ...], tiles: bool, most: float, size: tuple[int, int]
     ) -> None:
         rng = np.random.default_rng(7)
         errors, deviations, sources = [], [], set[str]()
-        for pitch in (12, 20, 28, 36, 44):
+        for pitch in (12, 24, 36, 44):
             camera = TrueCamera(pitch, 0.0, rng.uniform(0.6, 1.4) * max(size), 0.4 + 0.03 * pitch, size)
             fit = fit_drawn(camera, shapes, tiles, rng)
             errors.append(math.degrees(fit.mean[0]) - pitch)
@@ -255,21 +201,13 @@ class TestEdges:
         assert "edges" in sources
 
     def test_a_bare_floor_tells_nothing(self) -> None:
-        start = prior()
-        assert (
-            narrowed(start, [], SIZE, find_segments(np.full((400, 640, 3), 90, np.uint8), np.zeros((400, 640), bool)))
-            is start
-        )
-
-    def test_a_far_end_of_the_floor_is_below_the_horizon_and_not_far(self) -> None:
-        fit = narrowed(prior(), [Standing((300, 200, 340, 240))], SIZE, np.array([[0.0, 100.0, 640.0, 104.0]]))
-        above = math.degrees(math.atan2(98, 640 * math.exp(fit.mean[1])))
-        assert above < math.degrees(fit.mean[0]) < above + 20
+        start, bare = prior(), np.full((400, 640, 3), 90, np.uint8)
+        assert narrowed(start, [], SIZE, find_segments(bare, np.zeros((400, 640), bool))) is start
 
     def test_edges_of_clutter_rarely_pass_for_a_measurement(self) -> None:
         """Each thing has edges in two directions, such as those of another camera, or of what leans and tapers."""
         rng, measured = np.random.default_rng(3), 0
-        for _ in range(60):
+        for _ in range(30):
             things: list[Standing] = []
             for _ in range(int(rng.integers(2, 7))):
                 corner, sides = rng.uniform([0, 100], [400, 250]), rng.uniform(60, 150, 2)
@@ -280,12 +218,4 @@ class TestEdges:
                 bbox = (*corner.tolist(), *(corner + sides).tolist())
                 things.append(Standing(bbox, segments=np.hstack([middle - along, middle + along])))
             measured += narrowed(prior(), things, SIZE).source == "edges"
-        assert measured < 21
-
-    def test_random_lines_leave_the_camera_in_doubt(self) -> None:
-        rng = np.random.default_rng(2)
-        for _ in range(10):
-            middle, turn, reach = rng.uniform(0, SIZE, (12, 2)), rng.uniform(0, np.pi, 12), rng.uniform(10, 60, (12, 1))
-            along = reach * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-            fit = narrowed(prior(), [], SIZE, np.hstack([middle - along, middle + along]))
-            assert math.degrees(math.sqrt(fit.covariance[0, 0])) > 5
+        assert measured < 11

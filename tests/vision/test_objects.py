@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from drawn import ball, block, floor, png_bytes
+from refusals import refused
 from runs import run_of
 
-from cow_service.errors import CannotGround, InvalidRequest
 from cow_service.media.images import decode_own, encode_png
 from cow_service.readers.base import GroundingReading
-from cow_service.records import Grounding, LocatedObject
+from cow_service.records import LocatedObject
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.stages.grounding import ground
@@ -37,12 +37,6 @@ class OneReader:
         return GroundingReading("red ball", MOVER, others=others)
 
 
-def grounded(pixels: np.ndarray, *objects: dict, **request) -> tuple[Grounding, tuple[str, ...]]:
-    given = {"grounding": {"bbox": MOVER}} | request
-    result = ground(run_of(pixels, objects=objects, **given))
-    return result.value, result.warnings
-
-
 def kept(run, mask: np.ndarray) -> dict[str, str]:
     return {"artifact": run.backends.artifacts.put(encode_png(mask), "image/png").sha256}
 
@@ -51,20 +45,21 @@ def circle(centre: tuple[int, int], radius: int, size: tuple[int, int] = (640, 4
     return cv2.circle(np.zeros(size[::-1], np.uint8), centre, radius, 255, -1)
 
 
-def test_objects_stand_before_what_the_reader_finds_and_replace_it(pixels: np.ndarray) -> None:
-    objects = [{"object": "crate", "bbox": CUBE, "role": "obstacle", "shape": "box", "size": 0.3, "stands_on": "floor"}]
-    asked = ground(run_of(pixels, reader=OneReader, objects=objects)).value
+def test_objects_stand_before_what_the_reader_finds_and_the_mover_is_none(pixels: np.ndarray) -> None:
+    crate = {"object": "crate", "bbox": CUBE, "role": "obstacle", "shape": "box", "size": 0.3, "stands_on": "floor"}
+    result = ground(run_of(pixels, reader=OneReader, objects=[crate, {"object": "ball", "bbox": MOVER}]))
+    assert any("objects.1" in warning for warning in result.warnings)
+    asked = result.value
     assert [(other.object, other.source) for other in asked.others] == [("crate", "request"), ("vase", "embedded")]
-    crate = asked.others[0]
-    assert crate.role == "obstacle"
-    assert crate.prior is not None
-    assert crate.prior.size is not None
-    assert (crate.prior.shape, crate.prior.size.value, crate.prior.stands_on) == ("box", 0.3, "floor")
+    prior = asked.others[0].prior
+    assert asked.others[0].role == "obstacle"
+    assert prior is not None
+    assert prior.size is not None
+    assert (prior.shape, prior.size.value, prior.stands_on) == ("box", 0.3, "floor")
 
 
 def test_a_mask_gives_box_and_outline_and_is_found_again(pixels: np.ndarray) -> None:
-    run = run_of(pixels, grounding={"bbox": MOVER})
-    mask = circle((430, 260), 25)
+    run, mask = run_of(pixels, grounding={"bbox": MOVER}), circle((430, 260), 25)
     again = run_of(pixels, grounding={"bbox": MOVER}, objects=[{"object": "disc", "mask": kept(run, mask)}])
     result = ground(again)
     disc = result.value.others[0]
@@ -87,66 +82,56 @@ def test_the_mover_may_be_given_by_mask(pixels: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mask", "told"),
+    ("given", "pointer"),
     [
-        (np.zeros((400, 640), np.uint8), "is empty"),
-        (np.full((400, 640), 255, np.uint8), "covers 100% of the image"),
-        (circle((100, 100), 30, (320, 200)), "has 320 x 200 px where the upright image has 640 x 400 px"),
-        (circle((100, 100), 30, (1280, 800)), "cannot be read"),
+        ({"mask": np.zeros((400, 640), np.uint8)}, "/objects/1/mask"),
+        ({"mask": np.full((400, 640), 255, np.uint8)}, "/objects/1/mask"),
+        ({"mask": circle((100, 100), 30, (320, 200))}, "/objects/1/mask"),
+        ({"mask": circle((100, 100), 30, (1280, 800))}, "/objects/1/mask"),
+        ({"bbox": (700, 10, 800, 90)}, "/objects/1/bbox"),
+        ({"point": (10, 400)}, "/objects/1/point"),
+        ({"point": (440, 260)}, "/objects/1"),
     ],
+    ids=["an empty mask", "all of it", "a smaller one", "a larger one", "a box outside", "a point outside", "again"],
 )
-def test_a_mask_that_is_none_of_the_image_is_refused(pixels: np.ndarray, mask: np.ndarray, told: str) -> None:
-    good = {"object": "cube", "bbox": CUBE}
-    with pytest.raises(InvalidRequest, match=told) as caught:
-        grounded(pixels, good, {"object": "disc", "mask": kept(run_of(pixels), mask)})
-    assert caught.value.errors[0].pointer == "/objects/1/mask"
+def test_an_object_that_is_none_of_the_image_or_given_twice_is_refused(
+    pixels: np.ndarray, given: dict, pointer: str
+) -> None:
+    given = {name: kept(run_of(pixels), value) if name == "mask" else value for name, value in given.items()}
+    with refused("invalid-request", pointer):
+        ground(
+            run_of(
+                pixels,
+                grounding={"bbox": MOVER},
+                objects=[{"object": "cube", "bbox": CUBE}, {"object": "disc", **given}],
+            )
+        )
 
 
-@pytest.mark.parametrize(("given", "field"), [({"bbox": (700, 10, 800, 90)}, "bbox"), ({"point": (10, 400)}, "point")])
-def test_an_object_outside_the_image_is_refused(pixels: np.ndarray, given: dict, field: str) -> None:
-    with pytest.raises(InvalidRequest, match="outside the upright image") as caught:
-        grounded(pixels, {"object": "cube", **given})
-    assert caught.value.errors[0].pointer == f"/objects/0/{field}"
-
-
-def test_an_object_given_twice_is_refused_and_the_mover_is_no_other(pixels: np.ndarray) -> None:
-    with pytest.raises(InvalidRequest, match=r"same box as `objects\.0`") as caught:
-        grounded(pixels, {"object": "cube", "bbox": CUBE}, {"object": "crate", "point": (440, 260)})
-    assert caught.value.errors[0].pointer == "/objects/1"
-    grounding, warnings = grounded(pixels, {"object": "ball", "bbox": MOVER}, {"object": "cube", "bbox": CUBE})
-    assert [other.object for other in grounding.others] == ["cube"]
-    assert any("`objects.0` ('ball') lies where the moving object is" in warning for warning in warnings)
-
-
-def fur(seed: int) -> np.ndarray:
+def fur() -> np.ndarray:
     """A texture of many fine strokes, such as fur or grass."""
-    rng = np.random.default_rng(seed)
-    image = np.full((400, 640, 3), (110, 90, 60), np.uint8)
-    for x, y, dx, shade in zip(
-        rng.uniform(0, 640, 9000), rng.uniform(0, 400, 9000), rng.normal(0, 6, 9000), rng.normal(0, 30, 9000),
-        strict=True,
-    ):  # fmt: skip
+    rng, image = np.random.default_rng(0), np.full((400, 640, 3), (110, 90, 60), np.uint8)
+    strokes = np.stack([rng.uniform(0, 640, 9000), rng.uniform(0, 400, 9000), rng.normal(0, 6, 9000)], axis=1)
+    for (x, y, dx), shade in zip(strokes.tolist(), rng.normal(0, 30, 9000), strict=True):
         colour = np.clip(np.array((110, 90, 60)) + shade, 0, 255).tolist()
         cv2.line(image, (int(x), int(y)), (int(x + dx), int(y + 14)), colour, 1, cv2.LINE_AA)
     return image
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_a_tuft_of_fur_is_refused_with_what_to_give(seed: int) -> None:
-    image = fur(seed)
-    with pytest.raises(CannotGround, match=r"Give its box as `grounding\.bbox`, or its outline as `grounding\.mask`"):
+def test_a_tuft_of_fur_is_refused_unless_something_stands_out_there() -> None:
+    image = fur()
+    with refused("cannot-ground"):
         ground(run_of(image, grounding={"point": (320, 200)}))
-    with pytest.raises(CannotGround, match=r"`objects\.0\.bbox`") as caught:
+    with refused("cannot-ground", "/objects/0/point"):
         ground(run_of(image, grounding={"bbox": MOVER}, objects=[{"object": "tuft", "point": (320, 200)}]))
-    assert caught.value.errors[0].pointer == "/objects/0/point"
-    begun = ground(run_of(image, trajectory={"points": [(320, 200), (400, 200)]}))  # a path says where it begins
-    assert any("was guessed to be" in warning for warning in begun.warnings)
-    seen = ball(image, (320, 200), 45, (220, 40, 40))
-    found = ground(run_of(seen, grounding={"point": (320, 200)})).value
+    assert ground(run_of(image, trajectory={"points": [(320, 200), (400, 200)]})).warnings, (
+        "a path says where it begins"
+    )
+    found = ground(run_of(ball(image, (320, 200), 45, (220, 40, 40)), grounding={"point": (320, 200)})).value
     assert found.bbox == pytest.approx((275, 155, 365, 245), abs=6)
 
 
-def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixels: np.ndarray) -> None:
+def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service) -> None:
     data = base64.b64encode(png_bytes(np.repeat(circle((430, 260), 25)[..., None], 3, axis=2))).decode()
     objects = [{"object": "disc", "mask": f"data:image/png;base64,{data}"}]
     asked = SimulateRequest.model_validate({"image": "data:,", "question": "?", "objects": objects})
@@ -155,11 +140,10 @@ def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixe
     service.keep(files)
     assert service.artifacts.read(kept_request.objects[0].mask.artifact)  # pyright: ignore[reportAttributeAccessIssue]
     assert service.digested(kept_request) == (kept_request, [])
-    for mask, told in (("data:image/png;base64,AAAA", "no PNG"), ("data:,x", "data URL with base64")):
+    for mask in ("data:image/png;base64,AAAA", "data:,x"):
         wrong = asked.objects[0].model_copy(update={"mask": mask})
-        with pytest.raises(InvalidRequest, match=told) as caught:
+        with refused("invalid-request", "/objects/0/mask"):
             service.digested(asked.model_copy(update={"objects": (wrong,)}))
-        assert caught.value.errors[0].pointer == "/objects/0/mask"
 
 
 @pytest.mark.parametrize(
@@ -167,8 +151,6 @@ def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixe
     [
         ({"relation": "touches", "target": "blue mug"}, "?", ["blue mug"]),
         ({"relation": "touches", "subject": "lid", "target": "crate"}, "?", ["lid"]),
-        ({"relation": "touches", "target": "crate"}, "?", []),
-        ({"relation": "touches", "target": "ball"}, "?", []),
         ({"relation": "touches", "subject": "The Ball", "target": "a crate"}, "?", []),
         (None, "If the ball moves to the right, will it hit the blue mug?", ["blue mug"]),
         (None, "If the ball moves to the right, will it hit the crate?", []),
@@ -177,21 +159,20 @@ def test_masks_are_kept_before_a_job_is_made_of_a_request(service: Service, pixe
 def test_what_is_asked_about_and_was_not_located_is_warned_of(
     pixels: np.ndarray, asked: dict | None, question: str, missing: list[str]
 ) -> None:
-    mover = {"bbox": MOVER, "object": "ball"}
-    given = {"question": question, "grounding": mover, "objects": [{"object": "crate", "bbox": CUBE}]}
-    result = ground(run_of(pixels, **given, **({} if asked is None else {"asked": asked})))
-    told = [each for each in result.warnings if each.startswith("The question asks about ")]
-    assert [each.split("'")[1] for each in told] == missing
+    given = {"question": question, "grounding": {"bbox": MOVER, "object": "ball"}}
+    given |= {"objects": [{"object": "crate", "bbox": CUBE}]} | ({} if asked is None else {"asked": asked})
+    warnings = ground(run_of(pixels, **given)).warnings
+    assert len(warnings) == len(missing)
+    assert all(f"'{name}'" in warning for name, warning in zip(missing, warnings, strict=True))
 
 
-@pytest.mark.parametrize("target", ["crate", "the crate", "A  Crate"])
-def test_what_is_asked_about_is_found_whatever_its_determiner(pixels: np.ndarray, target: str) -> None:
+def test_what_is_asked_about_is_found_whatever_its_determiner(pixels: np.ndarray) -> None:
     run = run_of(
         pixels,
         question="?",
         grounding={"bbox": MOVER, "object": "ball"},
         objects=[{"object": "crate", "bbox": CUBE}],
-        asked={"relation": "touches", "target": target},
+        asked={"relation": "touches", "target": "A  Crate"},
         motion={"direction": (1, 0.3)},
     )
     grounding = ground(run).value

@@ -5,37 +5,41 @@ from __future__ import annotations
 import json
 import math
 import re
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
-from browser import Windows, arrow_tip, ask, drag_in_picture, drop, in_window, result, said
+from browser import Windows, arrow_tip, ask, drag_in_picture, drop, expect, in_window, result, said
 from conftest import EXAMPLES, Server
 from live_worlds import LOAD, RUN, given_again
-from playwright.sync_api import Page, Route, expect
 from servers import QUESTION, picture
+from tables import rows
+from waiting import TIME_LIMIT
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page, Route
 
 pytestmark = pytest.mark.slow
 
-TURNS = (-2.2, -0.7, 0.5)  # radians by which the arrow is turned
+TURNS = (-2.2, 0.5)  # radians by which the arrow is turned
+SHIFTS = count(31)  # of the pictures: each is another one
 WITHIN = 0.02  # of the picture's width: paths differ by less
 
 
-def example(name: str) -> tuple[dict[str, Any], str]:
-    """The picture of an example as a file to send, and its question."""
-    folder = EXAMPLES / name
-    question = json.loads((folder / "meta.json").read_text())["question"]
-    return {"image": ("image.jpg", (folder / "image.jpg").read_bytes())}, question
+def posted(server: Server, name: str, **request: Any) -> dict[str, Any]:
+    """The result of an example's picture and question, without a film."""
+    folder, body = EXAMPLES / name, {"video": False, "frames": {"count": 1}} | request
+    files = {"image": ("image.jpg", (folder / "image.jpg").read_bytes())}
+    fields = {"question": json.loads((folder / "meta.json").read_text())["question"], "request": json.dumps(body)}
+    sent = httpx.post(f"{server.address}/simulate", files=files, data=fields, timeout=TIME_LIMIT)
+    return sent.raise_for_status().json()
 
 
 def simulated(server: Server, name: str, **corrected: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """The result of an example, and its worlds."""
-    body = json.dumps({"live": True, "video": False, "frames": {"count": 1}} | corrected)
-    files, question = example(name)
-    fields = {"question": question, "request": body}
-    found = httpx.post(f"{server.address}/simulate", files=files, data=fields, timeout=60).raise_for_status().json()
+    found = posted(server, name, **{"live": True} | corrected)
     live = found["trajectory"]["live"]
     return found, {} if live is None else httpx.get(f"{server.address}{live['url']}").raise_for_status().json()
 
@@ -55,8 +59,8 @@ def test_the_page_computes_the_worlds_of_the_server(server: Server, windows: Win
         direction = [x * math.cos(turn) - y * math.sin(turn), x * math.sin(turn) + y * math.cos(turn)]
         dragged, worlds = simulated(server, name, motion=given_again(motion, direction))
         found = page.evaluate(RUN, {"world": world, "direction": direction})
-        count = len(found["velocities"])
-        there = [column(each, count) for each in worlds["bodies"][0]["velocity"]]
+        worlds_here = len(found["velocities"])
+        there = [column(each, worlds_here) for each in worlds["bodies"][0]["velocity"]]
         for mine, theirs in zip(found["velocities"], zip(*there, strict=True), strict=True):
             assert mine == pytest.approx(theirs, abs=1e-4)
         trajectory = dragged["trajectory"]
@@ -71,14 +75,19 @@ def test_the_page_computes_the_worlds_of_the_server(server: Server, windows: Win
             if frame / trajectory["fps"] < until:
                 assert math.dist([a + b for a, b in zip(point, shift, strict=False)], told) < WITHIN * world["size"][0]
         shares = found["shares"]
-        assert shares["count"] == count - 1
+        assert shares["count"] == worlds_here - 1
         assert shares["yes"] / shares["count"] == pytest.approx(trajectory["outcome"]["probability"], abs=0.08)
 
 
 @pytest.mark.parametrize(
     "ends",
-    [{"distance": 150}, {"until": "contact"}, {"duration": 0.8, "steps": [{"direction": [0, 1]}]}, {"speed": 1}],
-    ids=str,
+    rows(
+        core={
+            "it ends where it touches": {"until": "contact"},
+            "it turns when its time is over": {"duration": 0.8, "steps": [{"direction": [0, 1]}]},
+        },
+        rest=[{"distance": 150}, {"speed": 1}],
+    ),
 )
 def test_courses_end_in_the_page_as_they_do_on_the_server(
     server: Server, windows: Windows, ends: dict[str, Any]
@@ -115,10 +124,17 @@ def test_what_follows_a_path_moves_nothing_that_it_passes_through(server: Server
 def test_worlds_are_told_only_where_they_are_asked_for_and_can_be_aimed(server: Server) -> None:
     bound = {"live": True, "motion": {"law": "ballistic"}}
     for name, request in (("falling-ball", {"live": True}), ("ball-and-mug", {}), ("ball-and-mug", bound)):
-        files, question = example(name)
-        fields = {"question": question, "request": json.dumps({"video": False} | request)}
-        found = httpx.post(f"{server.address}/simulate", files=files, data=fields, timeout=60).raise_for_status()
-        assert found.json()["trajectory"]["live"] is None
+        assert posted(server, name, **request)["trajectory"]["live"] is None
+
+
+@pytest.fixture
+def answered(server: Server, windows: Windows) -> Page:
+    """A page that has answered a question about a picture that no other test asks about."""
+    page = windows.open(server.address, reduced_motion="no-preference")
+    drop(page, picture(next(SHIFTS)))
+    ask(page, QUESTION)
+    result(page)
+    return page
 
 
 def foretold(page: Page) -> str:
@@ -128,14 +144,10 @@ def foretold(page: Page) -> str:
     return words.inner_text()
 
 
-def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(server: Server, windows: Windows) -> None:
-    page = windows.open(server.address, reduced_motion="no-preference")
-    drop(page, picture(31))
-    ask(page, QUESTION)
-    first = result(page)
+def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(answered: Page) -> None:
+    page, first = answered, result(answered)
     assert said(page) == "Yes"
-    page.get_by_role("button", name="Pause").click()
-    page.get_by_role("slider", name="Frame of the clip").fill("0")
+    page.get_by_role("slider", name="Frame of the clip").fill("0")  # stops the film
     start, *way = in_window(page, arrow_tip(page), (150, 40), (91, 10), (91, 10))
     page.mouse.move(*start)
     page.mouse.down()
@@ -153,7 +165,7 @@ def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(se
 
 def test_a_page_that_was_passed_on_computes_without_a_network(server: Server, windows: Windows, tmp_path: Path) -> None:
     found, _ = simulated(server, "ball-and-mug")
-    job = next(each for each in jobs(server) if each["kind"] == "simulate")
+    (job,) = (each for each in httpx.get(f"{server.address}/jobs").json()["jobs"][:1])
     assert httpx.get(f"{server.address}/jobs/{job['id']}").json()["result"]["id"] == found["id"]
     file = tmp_path / "world.html"
     file.write_bytes(httpx.get(f"{server.address}/jobs/{job['id']}/download?format=page").content)
@@ -170,14 +182,9 @@ def test_a_page_that_was_passed_on_computes_without_a_network(server: Server, wi
     page.mouse.up()
 
 
-def jobs(server: Server) -> list[dict[str, Any]]:
-    return httpx.get(f"{server.address}/jobs").json()["jobs"]
-
-
 def test_examples_answer_at_once_what_the_start_page_says(server: Server, windows: Windows) -> None:
-    page = windows.open(server.address)
-    for name in range(4):
-        page.goto(server.address)
+    for name in (0, 3):
+        page = windows.open(server.address)
         example = page.locator(".examples button").nth(name)
         answer = example.locator("b").inner_text()
         example.click()
@@ -188,11 +195,8 @@ def test_examples_answer_at_once_what_the_start_page_says(server: Server, window
     expect(row.locator(".answered")).to_have_text(answer)
 
 
-def test_a_drag_is_broken_off_and_belongs_to_its_question(server: Server, windows: Windows) -> None:
-    page = windows.open(server.address)
-    drop(page, picture(33))
-    ask(page, QUESTION)
-    first = result(page)
+def test_a_drag_is_broken_off_and_belongs_to_its_question(answered: Page) -> None:
+    page, first = answered, result(answered)
     tip = arrow_tip(page)
     start, end = in_window(page, tip, (93, 10))
     page.mouse.move(*start)
@@ -214,11 +218,8 @@ def test_a_drag_is_broken_off_and_belongs_to_its_question(server: Server, window
     expect(page.locator(".sentence")).to_contain_text("to the left")
 
 
-def test_a_result_without_frames_ends_what_is_foreseen(server: Server, windows: Windows) -> None:
-    page = windows.open(server.address)
-    drop(page, picture(34))
-    ask(page, QUESTION)
-    first = result(page)
+def test_a_result_without_frames_ends_what_is_foreseen(answered: Page) -> None:
+    page, first = answered, result(answered)
 
     def without_simulation(route: Route) -> None:
         found = route.fetch()

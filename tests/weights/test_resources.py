@@ -8,55 +8,33 @@ import pytest
 from conftest import ROOT
 
 from cow_service.weights import manifests as resources
-from cow_service.weights.manifests import MANIFESTS, PROMPTS
+from cow_service.weights.manifests import FAMILIES, MANIFESTS, PROMPTS, TOOL_PROMPTS
 
 
-@pytest.fixture
-def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that stands for the installed package, with its shipped files inside."""
+def test_in_a_checkout_they_are_the_files_of_its_folders() -> None:
+    for kind in (PROMPTS, TOOL_PROMPTS, MANIFESTS, FAMILIES):
+        files = {file.stem: file for file in (ROOT / kind.folder).glob(f"*{kind.suffix}")}
+        assert {name: kind.read(name) for name in kind.names()} == {
+            name: file.read_text(encoding="utf-8") for name, file in files.items()
+        }
+        assert list(kind.names()) == sorted(files)
+
+
+def test_in_a_wheel_they_are_its_own_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resources, "files", lambda package: tmp_path)
+    (tmp_path / "_shipped").mkdir()
+    assert PROMPTS.names() == ()
+    with pytest.raises(LookupError):
+        PROMPTS.read("hello")
     for folder, name in (("prompts", "hello.md"), ("prompts", "notes.txt"), ("models", "toy.yaml")):
         file = tmp_path / "_shipped" / folder / name
-        file.parent.mkdir(parents=True, exist_ok=True)
+        file.parent.mkdir(exist_ok=True)
         file.write_text(f"{name}: ä", encoding="utf-8")
-    monkeypatch.setattr(resources, "files", lambda package: tmp_path)
-    return tmp_path
-
-
-def test_names_in_a_checkout() -> None:
-    assert PROMPTS.names() == tuple(sorted(file.stem for file in (ROOT / "prompts").glob("*.md")))
-    assert MANIFESTS.names() == tuple(sorted(file.stem for file in (ROOT / "models").glob("*.yaml")))
-
-
-def test_text_in_a_checkout() -> None:
-    for name in PROMPTS.names():
-        assert PROMPTS.read(name) == (ROOT / "prompts" / f"{name}.md").read_text(encoding="utf-8")
-    for name in MANIFESTS.names():
-        assert MANIFESTS.read(name) == (ROOT / "models" / f"{name}.yaml").read_text(encoding="utf-8")
-
-
-@pytest.mark.usefixtures("wheel")
-def test_wheel() -> None:
-    assert PROMPTS.names() == ("hello",)
-    assert MANIFESTS.names() == ("toy",)
-    assert PROMPTS.read("hello") == "hello.md: ä"
-    assert MANIFESTS.read("toy") == "toy.yaml: ä"
-
-
-@pytest.mark.usefixtures("wheel")
-@pytest.mark.parametrize("name", ["absent", "", "../models/toy", "hello.md", "notes"])
-def test_missing_names_what_exists(name: str) -> None:
-    with pytest.raises(LookupError, match="there are: hello"):
-        PROMPTS.read(name)
-    with pytest.raises(LookupError, match="there are: toy"):
-        MANIFESTS.read(name)
-
-
-def test_no_folder_means_no_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "_shipped").mkdir()
-    monkeypatch.setattr(resources, "files", lambda package: tmp_path)
-    assert PROMPTS.names() == ()
-    with pytest.raises(LookupError, match="there are: none"):
-        PROMPTS.read("hello")
+    assert (PROMPTS.names(), PROMPTS.read("hello")) == (("hello",), "hello.md: ä")
+    assert (MANIFESTS.names(), MANIFESTS.read("toy")) == (("toy",), "toy.yaml: ä")
+    for name in ("absent", "", "../models/toy", "hello.md", "notes"):
+        with pytest.raises(LookupError, match="hello"):  # what exists is named
+            PROMPTS.read(name)
 
 
 def test_shipped_folders_are_in_the_wheel_recipe() -> None:

@@ -1,0 +1,379 @@
+"""Questions in English as records, by the parser alone: what moves, what is asked and changed, what is not read."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from cow_service.narration.words import phrases_of
+from cow_service.readers.embedded.answers import answer_from, count_of, says_it_happens, seconds_of
+from cow_service.readers.embedded.english.asked import read_alternatives, read_asked, unread
+from cow_service.readers.embedded.english.questions import parse, without_reply_form
+from cow_service.readers.options import read_choices
+from cow_service.records import Asked
+
+IF = "If the red ball rolls left, "
+
+
+def asked_of(text: str) -> Asked | None:
+    return read_asked(parse(IF + text if text[0].islower() else text))
+
+
+def rows(table: str) -> list[tuple[str, ...]]:
+    return [tuple(part.strip() for part in row.split("|")) for row in table.strip().splitlines()]
+
+
+# What is asked, then form, relation, target (- for any) and "not" where it is negated.
+ASKED = """
+will it hit the yellow cube? | whether touches yellow cube
+does the ball bump into the vase? | whether touches vase
+will the vase be hit by the ball? | whether touches vase
+Will the vase be hit if the red ball rolls left? | whether touches vase
+will there be a collision between the ball and the cube? | whether touches cube
+will the ball and the cube touch each other? | whether touches cube
+will it hit the cube or not? | whether touches cube
+will it land in the bowl? | whether inside bowl
+will it knock the vase over? | whether tips vase
+will it tip over? | whether tips red ball
+will the vase move? | whether moves vase
+will the vase stay where it is? | whether moves vase not
+will it leave the image? | whether leaves -
+will it hit the floor? | whether lands -
+will it stay visible? | whether covered - not
+is it true that it hits the vase? | whether touches vase
+would the red ball rolling left collide with the vase? | whether touches vase
+where does it come down? | where touches -
+what happens? | what-happens touches -
+what will happen to the vase? | what-happens touches vase
+will anything be hit? | whether touches -
+will the red vase be occluded at some moment? | whether covers red vase
+will it block the view of the vase? | whether covers vase
+will the blue box hide it? | whether covered blue box
+will it pass behind the vase? | whether covered vase
+will it miss the vase, yes or no? | whether touches vase not
+will it avoid hitting the vase? | whether touches vase not
+will it pass the vase without touching it? | whether touches vase not
+will it hit nothing? | whether touches - not
+will it avoid all the objects? | whether touches - not
+will the vase not be hidden? | whether covers vase not
+will it not be hidden by the vase? | whether covered vase not
+which object will it hit first? | which-first touches -
+Which object will the red ball hit if it moves left? | which-first touches -
+which object will it hide first? | which-first covers -
+how long until the vase is hit? | when touches vase
+when will the vase be hidden? | when covers vase
+how many of the other objects are hit? | how-many touches -
+If the fan blows the leaf to the left, will it reach the pond? | whether touches pond
+There is a red ball next to a blue cup. If it rolls left, will the cup be hit? | whether touches blue cup
+If the red ball moves opposite to where the arrow points will it hit the vase? Answer yes or no. | whether touches vase
+Suppose the vase were not there. If the red ball rolls left, will it hit the cube? | whether touches cube
+If I put the cyan cube into the pink bowl, will it fit inside? | whether inside pink bowl
+If the orange ball flies on along the trail of positions that is shown, will it hit the cube? | whether touches cube
+will part of it be hidden behind the vase? | whether covered vase
+will it stay completely visible? | whether covered - not
+would it stay there? | whether moves red ball not
+Sent straight towards the vase, does the red ball hit it? | whether touches vase
+If the red ball slides halfway towards the blue one and stops, will it touch the blue ball? | whether touches blue ball
+Red ball rolls left - hits the vase? | whether touches vase
+The red ball rolls left and at the same time the blue ball goes up. Will the two collide? | whether touches blue ball
+Which mug is hit first by the red ball if it rolls left? | which-first touches -
+True or false? If the red ball rolls left, it misses the vase. | whether touches vase not
+The vase slides left by 20 pixels while the red ball drops. Does the ball land on the vase? | whether touches red ball
+Will the falling ball hit the vase? | whether touches vase
+"""
+
+
+@pytest.mark.parametrize(("question", "told"), rows(ASKED))
+def test_what_is_asked(question: str, told: str) -> None:
+    form, relation, *target = told.split()
+    negated = target[-1] == "not"
+    name = " ".join(target[:-1] if negated else target)
+    expected = Asked.model_validate(
+        {"form": form, "relation": relation, "target": None if name == "-" else name, "negated": negated}
+    )
+    asked = asked_of(question)
+    assert asked is not None
+    assert asked.model_copy(update={"among": (), "partly": False}) == expected
+
+
+# What is asked of several things, of others than the mover, or within limits: the record's fields.
+LIMITED = """
+will it cover any part of the vase? | {"relation": "covers", "target": "vase", "partly": true}
+will it hide the vase? | {"relation": "covers", "target": "vase"}
+will it hit the vase within 2 seconds? | {"relation": "touches", "target": "vase", "within": 2}
+will it have hit the vase after two seconds? | {"relation": "touches", "target": "vase", "within": 2}
+will it hit the cup behind the vase? | {"relation": "touches", "target": "cup"}
+will it hit both mugs? | {"relation": "touches", "among": ["both mugs"], "every": true}
+will it avoid both mugs? | {"relation": "touches", "among": ["both mugs"], "negated": true}
+will either mug be hit? | {"relation": "touches", "among": ["either mug"]}
+will it hit neither of the two cubes? | {"relation": "touches", "among": ["neither two cubes"], "negated": true}
+is it hidden by any of the cones? | {"relation": "covered", "among": ["cones"]}
+does it touch all the other balls? | {"relation": "touches", "among": ["other balls"], "every": true}
+will both cones stay visible? | {"relation": "covers", "among": ["both cones"], "negated": true}
+will any of the cones stay visible? | {"relation": "covers", "among": ["cones"], "every": true, "negated": true}
+will it hit a cube? | {"relation": "touches", "among": ["a cube"]}
+If the ball moves left and the car moves right, will they collide? | {"relation": "touches", "target": "car"}
+If the vase is removed and it rolls left, will it still hit the cup? | {"relation": "touches", "target": "cup"}
+would the outcome change if the vase were removed? | {"form": "changes", "relation": "touches"}
+will the cube be hidden by the cup? | {"relation": "covered", "subject": "cube", "target": "cup"}
+will the cube be hit by the cup? | {"relation": "touches", "subject": "cup", "target": "cube"}
+will the cyan ball hit the cube? | {"relation": "touches", "subject": "cyan ball", "target": "cube"}
+"""
+
+
+@pytest.mark.parametrize(("question", "fields"), rows(LIMITED))
+def test_limits_of_what_is_asked_several_things_and_others_than_the_mover(question: str, fields: str) -> None:
+    assert asked_of(question) == Asked.model_validate_json(fields)
+
+
+ALTERNATIVES = """
+will it hit the red cube or the blue mug? | red cube, blue mug
+which will it hit first, the red cube or the blue mug? | red cube, blue mug
+Which of these will the red ball hit first if it moves left: a cube, a vase, or a mug? | cube, vase, mug
+Which object does the red ball hit first if it falls? The cube or the mug? | cube, mug
+which ball will it hit first? | ball
+Which mug is hit first by the ball if it rolls left, the blue or the white? | blue, white
+which cube will it hit first, the red one or the blue one? | red cube, blue cube
+which object will it hit first? |
+will it hit the vase? |
+"""
+
+
+@pytest.mark.parametrize(("question", "named"), rows(ALTERNATIVES))
+def test_among_which_things_the_first_is_asked_for(question: str, named: str) -> None:
+    parsed = parse(IF + question if question[0].islower() else question)
+    assert ", ".join(phrase.text for phrase in read_alternatives(parsed)) == named
+
+
+SAME = """
+is there a moment when it blocks our view of the vase? | will it hide the vase?
+can we still see the vase? | will the vase stay visible?
+is there anything left for it to crash into? | will it hit anything?
+is the vase safe? | will the vase not be hit?
+the vase or the cube, which one does it crash into? | which does it hit first, the vase or the cube?
+does it fall off the edge of the table? | will it land on the floor?
+does it stay on top of the vase? | will it not fall off the vase?
+does it make any difference to what it hits? | does the outcome change?
+If the red ball falls off the shelf, will it hit the vase? | If the red ball falls, will it hit the vase?
+"""
+
+
+@pytest.mark.parametrize(("said", "plain"), rows(SAME))
+def test_a_paraphrase_asks_the_same(said: str, plain: str) -> None:
+    found, expected = asked_of(said), asked_of(plain)
+    assert expected is not None
+    assert found is not None
+    assert found.model_copy(update={"partly": expected.partly}) == expected
+
+
+UNREAD = """
+will it hit the vase before it hits the cube?
+will it hit the vase and the cube?
+will it hit all the objects?
+will it hit the object?
+will it hit anything but the vase?
+will it hit the vase by bouncing off the wall?
+will it not miss the vase?
+won't it hit the vase?
+will it be blocked by the vase?
+will the vase be hidden at the end?
+will it hit the vase after two seconds?
+will it disappear?
+is it impossible for it to hit the vase?
+how long will the vase be hidden?
+when will it miss the vase?
+how fast will it hit the vase?
+will they collide?
+when will it stop?
+how many objects will it knock over?
+which object does it touch last?
+will it not hit both mugs?
+will it hit them?
+is there a moment when it doesn't hide the vase?
+will it be in front of the vase or behind it?
+will it roll over the edge of the vase?
+does it avoid clearing the vase?
+If the red ball rolls left, will the vase be hit? And will the cube be hit?
+If the red ball moves left and the blue ball moves right, will it hit the cube?
+If the red ball is rolled straight at the cup, will that then hit the cube?
+The red ball rolls left and the vase slides right, both slowly. Do they meet?
+If the red ball rolls left and hits the cube, will it hit the vase?
+Will the red ball hit something if it rolls left, the vase or the cube?
+"""
+
+
+@pytest.mark.parametrize("question", UNREAD.strip().splitlines())
+def test_what_is_not_put_plainly_is_left_undecided(question: str) -> None:
+    assert asked_of(question) is None
+
+
+# Words that no rule reads, in the clause that asks or moves.
+TURNING = """
+If the ball rolls anywhere but left, does it hit the mug? | anywhere
+The ball and the mug are on the table. If it rolls left, does it hit the cone? | it
+The ball moves right, but the mug is glued to the floor. Does the mug move? | but the mug is glued
+Replace the ball with the cube. If the mug slides left, does it hit the vase? | Replace the ball with the cube
+Unless the ball rolls right, does it hit the mug? | Unless
+If the ball rolls right, will the ball at least hit the mug? | at least hit the mug
+If the red ball hits the white ball, where will the white ball go? | hits the white ball
+If the ball goes right while the mug goes left by 30 pixels, will they collide? | by 30 pixels
+If the ball and the mug both move right by 30 pixels, do they touch? | and the mug both
+If the ball rolls on the shelf to the left, does it hit the mug? | on the shelf
+If the ball rolls along the arrow, is it hit on its way against the arrow? | is it hit on its way against the arrow
+The ball rolls left and misses the cube. Does the cube hit the mug? | and misses the cube
+First shift the ball left by 90 px, in the air, and only then release it. Will it hit the mug? | in the air
+If the ball rolls left by twice the width of the mug, does it hit the cube? | by twice the width of the mug
+If the ball rolls right, does it still hit the mug at the end? | does it still hit the mug at the end
+True or false? The mug is on the table. If the ball rolls left, it hits the mug. | True or false
+If the ball moves right and the blue cube to the left, will the ball hit the cube? | and the blue cube
+If the ball rolls left, once the ball has bumped into the cup, will the cup tip the cube? | has bumped into the cup
+The ball flies on along its trail, the first of which is the leftmost. Is it hit? | first of which is the leftmost
+The ball rolls left, then it goes for 2 seconds. Does it hit the mug? | for 2 seconds
+If the ball mvoes left, will it hit it? | mvoes
+If the ball rolls to the rigth, is it hit? | rigth
+"""
+BESIDE = """
+The floor is icy. If the ball rolls right, does it hit the mug? | floor is icy
+The vase is very old. If the ball rolls right, does it hit the mug? | vase is very old
+"""
+PLAIN = """
+There is a red ball and a blue mug. If the ball rolls right, does it hit the mug?
+Please tell me: would the ball, rolling freely along the arrow on the floor, hit the mug?
+Remove the vase and then roll the ball gently to the right by 20 px. Does it still hit the mug?
+Excuse me, could you please tell me whether the ball is going to hit the mug if we give it a little push left?
+OK so what I'd like to know is whether the ball, rolling left, gets past the mug without touching it.
+The ball rolls left and strikes the bowl, right? Would the bowl be shoved into the cone by this?
+As the ball goes rolling off to the left, is there any risk of it hitting the mug?
+Given the direction of the arrow, would the ball manage to avoid the mug?
+What if nobody throws the ball and it just falls straight down, is the mug safe from being hit?
+Let's say the ball sets off to the left, though only by twice its own width. Has it gone out of the picture by then?
+First the ball rolls left, then down. Does it hit the mug?
+Within 2 seconds, will the ball rolling right reach the mug that is nearer to the camera?
+"""
+
+
+@pytest.mark.parametrize(("text", "words"), rows(TURNING))
+def test_words_that_may_turn_the_meaning_are_named_and_not_answered(text: str, words: str) -> None:
+    question = parse(text)
+    assert words in "\n".join(unread(question).turning)
+    assert read_asked(question) is None
+    assert words in answer_from((), None, None, phrases_of("en"), unread=unread(question)).reasoning
+
+
+def test_other_words_are_read_or_named_and_change_nothing() -> None:
+    for text, words in [*rows(BESIDE), *((text, "") for text in PLAIN.strip().splitlines())]:
+        left = unread(parse(text))
+        assert (left.turning, left.beside) == ((), (words,) if words else ()), text
+        assert read_asked(parse(text)) is not None
+
+
+# What is changed, then what moves and how.
+CHANGES = """
+If you take the vase away and push the car to the left, will it hit the mug? | remove vase | car push
+Will the car hit the mug if the vase is taken away and it rolls left? | remove vase | car roll
+If there were no vase and the ball rolled left, would it hit the cube? | remove vase | ball roll
+If the ball moves left without the vase, will it hit the cube? | remove vase | ball move
+If the apple is placed on top of the red box, will it fall off? | place apple onto red box | apple put
+If I put the box between the two cups, does it touch either of them? | place box between two cups | box put
+If I put the box between the vase and the cup, does it touch the cup? | place box between vase & cup | box put
+If the ball is put in front of the mug, will the mug be hidden? | place ball in-front-of mug | ball put
+Were the vase to vanish, would the car, rolling left, hit the mug? | remove vase | car roll
+Will the apple fit into the bowl? | place apple into bowl | apple put
+If the cup to the left of the vase is dropped, will it fall into the bowl? | | cup drop
+"""
+
+
+@pytest.mark.parametrize(("text", "changes", "motion"), rows(CHANGES))
+def test_changes(text: str, changes: str, motion: str) -> None:
+    question = parse(text)
+    said = [
+        " ".join([each.kind, each.object.text, each.relation or "", " & ".join(t.text for t in each.targets)]).strip()
+        for each in question.interventions
+    ]
+    assert ", ".join(said) == changes
+    assert question.mover is not None
+    assert f"{question.mover.text} {question.motion.verb}" == motion
+    removed = {change.object.text for change in question.interventions if change.kind == "remove"}
+    assert removed.isdisjoint(phrase.text for phrase in question.others)
+
+
+def test_words_that_belong_to_a_name_or_a_place_are_no_speed_and_no_distance() -> None:
+    slow, halfway = (
+        parse(f"If the {told}, will it hit the vase?")
+        for told in ("slow red ball rolls left", "red ball is put halfway between the mug and the vase")
+    )
+    assert slow.mover is not None
+    assert (slow.mover.text, slow.motion.quantities) == ("slow red ball", ())
+    assert ([change.relation for change in halfway.interventions], halfway.motion.quantities) == (["between"], ())
+
+
+def test_which_end_of_a_trail_is_the_present() -> None:
+    for said, near, side in (
+        ("the last of which is the one nearest to the pink cube", "pink cube", None),
+        ("the last of which is the leftmost", None, (-1.0, 0.0)),
+        ("the latest of which is on the right", None, (1.0, 0.0)),
+    ):
+        question = parse(f"If the orange ball flies on along the trail of positions, {said}, will it land?")
+        trail = question.motion.trail
+        assert trail is not None
+        assert (trail.near and trail.near.text, trail.side) == (near, side)
+        assert question.mover is not None
+        assert (question.mover.text, question.motion.kind) == ("orange ball", "projectile")
+
+
+def test_what_says_how_to_reply_is_no_part_of_the_question() -> None:
+    for form in (
+        "The entire content of your response should be of the following format: 'ANSWER: $LETTER' (without quotes) "
+        "where LETTER is one of A,B.",
+        "Write your response into this json template: {'Reasoning': '<your reasons>', 'Answer': '<Your answer>'}",
+        "Think. The last line of your response should be of the following format: 'ANSWER: $LETTER'.",
+    ):
+        plain = "If the ball rolls left, will it hit the mug?"
+        for text in (f"{plain} {form}", f"{form}\n\n{plain}\n\nA) Yes\nB) No"):
+            assert read_asked(parse(text)) == read_asked(parse(plain)) is not None
+            assert parse(text).interventions == ()
+            assert parse(text).motion == parse(plain).motion
+    assert without_reply_form("If your answer is read aloud, will it fall?").endswith("fall?")
+    assert without_reply_form("It goes 0.5 m... Give your answer as JSON.") == "It goes 0.5 m... "
+
+
+VOCABULARY = sorted({
+    word for line in (ASKED + UNREAD + TURNING + PLAIN).splitlines() for word in re.findall(r"[\w']+|[?,.:]", line)
+})  # fmt: skip
+
+
+@settings(deadline=None, max_examples=40)
+@example("If the ball rolls left this arrow indicate line, will it hit the mug?")  # half of a phrase is no adverbial
+@given(st.one_of(st.text(max_size=80), st.lists(st.sampled_from(VOCABULARY), max_size=30).map(" ".join)))
+def test_no_question_breaks_the_reading(text: str) -> None:
+    question = parse(text)
+    assert not (unread(question).turning and read_asked(question) is not None)
+    read_alternatives(question)
+    assert without_reply_form(text) == text or re.search(r"your|json|\$|answer|reply|respond|question|yes", text, re.I)
+    for option in read_choices(text, None):
+        assert option.letter
+        says_it_happens(option.text, Asked(relation="touches", target="vase"))
+        seconds_of(option.text)
+        count_of(option.text)
+
+
+EXTRA = ("not", "almost", "before", "and the cube", "twice", "unless it stops", "last", "hardly")
+
+
+@given(st.sampled_from(EXTRA), st.integers(0, 4), st.sampled_from(["hit", "touch", "hide", "reach"]))
+def test_no_further_word_is_passed_over(extra: str, place: int, verb: str) -> None:
+    words = f"will it {verb} the vase".split()
+    asked = asked_of(" ".join([*words[: place + 1], extra, *words[place + 1 :]]) + "?")
+    assert asked_of(" ".join(words) + "?") is not None
+    assert asked is None or asked.negated or asked.target not in {"vase", None}
+
+
+@given(st.text("bcdfghjklmnpqrstvwxz", min_size=6, max_size=12))
+def test_no_sense_is_made_of_what_has_none(word: str) -> None:
+    question = parse(f"If the red ball {word} left, does it hit the mug?")
+    assert question.mover is not None
+    named = " ".join(unread(question).turning).split()
+    assert word in question.mover.text or word in named  # a noun nobody knows, or named as unread

@@ -1,0 +1,112 @@
+"""How a motion goes as a request and a reader say it: lengths, turns, speeds, several movers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drawn
+import numpy as np
+import pytest
+from refusals import refused
+from runs import run_of
+
+from cow_service.readers.base import MotionReading, Quantity
+from cow_service.records import Grounding, LocatedObject, Motion, Trajectory
+from cow_service.stages.keys import StageResult
+from cow_service.stages.motion import read_motion
+from cow_service.stages.reconstruction import Situation, reconstruct
+from cow_service.stages.run import Run
+from cow_service.stages.trajectory import simulate_world
+
+IMAGE = drawn.block(drawn.ball(drawn.floor(), (150, 250), 25, (200, 40, 40)), (400, 190, 460, 280), (40, 40, 200))
+BALL, BLOCK = (125.0, 225.0, 175.0, 275.0), (400.0, 190.0, 460.0, 280.0)
+OTHER = LocatedObject(object="Blue block", bbox=BLOCK, source="request")
+GROUNDING = Grounding(object="ball", point=(150, 250), bbox=BALL, others=(OTHER,), source="request")
+PLACES = {"grounding": {"object": "ball", "bbox": BALL}, "objects": [{"object": "Blue block", "bbox": BLOCK}]}
+
+
+def run_with(reading: MotionReading | None, given_: dict[str, Any]) -> Run:
+    class Reader:
+        source = "embedded"
+
+        def read_motion(self, *_: Any) -> MotionReading:
+            assert reading is not None, "nobody is to be asked"
+            return reading
+
+    return run_of(IMAGE, reader=Reader, motion=given_, ensemble=0, num_frames=65, **PLACES)
+
+
+def read(reading: MotionReading | None, **given_: Any) -> StageResult[Motion]:
+    """The motion of a request, and of what a reader says."""
+    return read_motion(run_with(reading, given_), GROUNDING, None)
+
+
+def moved(reading: MotionReading | None = None, **given_: Any) -> Trajectory:
+    run_, found = run_with(reading, given_), read(reading, **given_).value
+    obstacles = run_.scene.obstacles(GROUNDING.bbox, GROUNDING.others)
+    situation = Situation(run_.scene, GROUNDING, found, run_.request, obstacles)
+    return simulate_world(situation, *reconstruct(situation))
+
+
+@pytest.mark.parametrize("law", ["contact", "ballistic"])
+def test_a_distance_and_a_turn_and_a_duration(law: str) -> None:
+    steps = [{"direction": (-1, 0), "distance": 30}]
+    path = np.array(moved(direction=(1, 0), speed=100, distance=60, steps=steps, law=law).path.points)
+    assert path[:, 0].max() == pytest.approx(210, abs=4)
+    assert path[-1, 0] == pytest.approx(180, abs=4)
+    words, lasts = MotionReading("linear", (0.0, -3.0), "text", speed="slow"), {"duration": 1, "speed": 40, "law": law}
+    found, path = read(words, **lasts).value, moved(words, **lasts).path.points
+    assert (found.direction, found.speed, found.speed_deviation) == ((0, -1), 40, 0), "what the request says counts"
+    assert path[-1][1] < 245
+    assert path[17] == pytest.approx(path[-1], abs=1)
+
+
+def test_two_movers_meet_half_way() -> None:
+    both = {
+        "direction": (1, 0),
+        "speed": 100,
+        "others": [{"object": "blue  BLOCK", "direction": (-1, 0), "speed": 100}],
+    }
+    assert read(None, **both).value.others[0].object.bbox == BLOCK
+    trajectory = moved(**both)
+    contact = next(each for each in trajectory.contacts if each.b is not None)
+    assert contact.time == pytest.approx((400 - 175) / 200, abs=0.25)
+    assert contact.point[0] == pytest.approx(287, abs=25)
+    assert {path.body for path in trajectory.paths} == {0, 1}
+    with refused("invalid-request", "/motion/others/0/object"):
+        read(None, direction=(1, 0), others=[{"object": "car", "direction": (1, 0)}])
+
+
+@pytest.mark.parametrize(
+    ("speed", "pixels", "deviation"),
+    [
+        (Quantity(50, "px/s"), 50, 0),
+        (Quantity(1, "m/s"), 640 / 3, 0.25),
+        (Quantity(0.5, "widths/s"), 320, 0),
+        ("slow", 0.13 * 640, 0.25),
+        ("fast", 0.52 * 640, 0.25),
+    ],
+)
+def test_speeds_as_they_are_said(speed, pixels: float, deviation: float) -> None:
+    found = read(MotionReading("linear", (1.0, 0.0), "text", speed=speed)).value
+    assert found.speed == pytest.approx(pixels)
+    assert found.speed_deviation == deviation
+
+
+def test_a_throw_has_no_length() -> None:
+    found = read(MotionReading("projectile", (1.0, -1.0), "text"), duration=2)
+    assert found.value.duration is None
+    assert len(found.warnings) == 2, "that it was not used, and that the speed was assumed"
+
+
+def test_the_sentence_tells_the_whole_motion() -> None:
+    steps = [{"direction": (0, 1)}, {"direction": (-1, 0), "distance": 30}]
+    others = [{"object": "blue block", "direction": (-1, 0)}]
+    told = read(None, direction=(1, 0), distance=60, steps=steps, others=others).value.sentence
+    assert told == (
+        "The ball sets off to the right, then down, then to the left, and then stops. "
+        "At the same time the Blue block moves to the left. The camera stays still."
+    )
+    assert "towards the camera" in read(None, direction=(0, 1), depth=-0.9).value.sentence
+    falls = read(None, kind="fall").value.sentence
+    assert falls == ("The ball falls straight down, faster and faster, pulled down by gravity. The camera stays still.")
