@@ -15,7 +15,6 @@ from cow_service.jobs.engine import JobEngine
 from cow_service.service import Service
 from cow_service.settings import Settings
 
-
 _contract: list[dict[str, Any]] = []  # that of the first app: it is the same for all, and takes long to make
 
 

@@ -36,12 +36,13 @@ TURNED: dict[type[ast.cmpop], type[ast.cmpop]] = {
 }  # fmt: skip
 DELETED = (ast.Expr, ast.Assign, ast.AugAssign, ast.Return, ast.Raise, ast.Continue, ast.Break)
 LOGGING = re.compile(r"^_?log(ger)?\.")
-# Folders of the tests of what has none of its own name.
+# Where the tests of a package are, if not in the folder of its name alone.
 FOLDERS = {
     "adaptive": ("readers",), "concurrency": ("service",), "errors": ("api", "client"), "net": ("service",),
-    "pipeline": ("service", "jobs"), "records": ("narration", "stages", "client"), "registry": ("service", "readers"),
-    "requests": ("api", "client"), "server": ("api", "project"), "service": ("service", "stages"),
-    "settings": ("api", "service", "project"),
+    "physics": ("physics", "stages", "vision"), "pipeline": ("service", "jobs"),
+    "records": ("narration", "stages", "client"), "registry": ("service", "readers"), "requests": ("api", "stages"),
+    "server": ("api", "project"), "service": ("service", "stages"), "settings": ("api", "service", "project"),
+    "stages": ("stages", "readers", "service"),
 }  # fmt: skip
 
 

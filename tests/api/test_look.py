@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from servers import IMAGE, QUESTION, SEEING, Served, data_url, problem
 
+pytestmark = pytest.mark.slow
 BALL, CUBE, FACE = [42, 62, 78, 98], [170, 60, 205, 98], [170, 69, 205, 98]
 
 

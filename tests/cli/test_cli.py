@@ -265,7 +265,6 @@ def test_bad_settings_are_named(cow: Any) -> None:
 
 @pytest.mark.slow
 def test_what_a_server_cannot_start_with_is_told_before_anything_is_loaded(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = str(other.getsockname()[1])
         result = cow_from_nothing(tmp_path, "serve", "--port", port)
@@ -275,9 +274,6 @@ def test_what_a_server_cannot_start_with_is_told_before_anything_is_loaded(tmp_p
     result = cow_from_nothing(tmp_path, "serve", "--port", "0", COW_GENERATOR="dream")
     assert result.returncode == 2
     assert "COW_GENERATOR='dream': known are " in result.stderr
-    result = cow_from_nothing(tmp_path, "serve", "--port", "0", COW_DATA_DIR=str(tmp_path / "file"))
-    assert result.returncode == 1
-    assert "storage-unavailable" in result.stderr
 
 
 # What there is
@@ -299,6 +295,19 @@ def test_models_and_doctor(cow: Any, tmp_path: Path) -> None:
     result = cow("doctor", COW_DATA_DIR=str(tmp_path / "file"))
     assert result.exit_code == 1
     assert "storage-unavailable" in result.stdout
+
+
+def test_tracks_are_those_of_a_whole_simulation(cow: Any, tmp_path: Path) -> None:
+    file = tmp_path / "simulation.json"
+    trajectory = SIMULATION["trajectory"]
+    for text, says in (
+        (json.dumps(SIMULATION | {"trajectory": {**trajectory, "states": [], "tracks": []}}), "minimal"),
+        ("{}", "simulation.json is not a simulation"),
+    ):
+        file.write_text(text)
+        found = cow("tracks", file, "--out", "tracks.npz")
+        assert found.exit_code == 1
+        assert says in found.stderr
 
 
 def test_weights_that_there_are_none_of(cow: Any) -> None:

@@ -286,8 +286,10 @@ def test_a_batch_that_is_left_ends_its_jobs_unless_its_folder_finds_them_again(
     served: Served, address: str, tmp_path: Path
 ) -> None:
     slow = {"generator": "slow", "generator_options": {"seconds": 60.0}, "num_frames": 80, "frames": {"count": 40}}
-    gone = {"image": "/nowhere.png", "question": QUESTION}  # fails here, and at once
-    items = [gone, *asked(2, **slow)]
+
+    def items(number: int) -> list[dict[str, Any]]:
+        gone = {"id": f"gone{number}", "image": "/nowhere.png", "question": QUESTION}  # fails here, and at once
+        return [gone, *asked(2, **slow)]
 
     def newest() -> set[str]:
         return {job["status"] for job in served.http.get("/jobs").json()["jobs"][:2]}
@@ -296,26 +298,25 @@ def test_a_batch_that_is_left_ends_its_jobs_unless_its_folder_finds_them_again(
         return newest() <= {"queued", "running"}
 
     with Client(address, timeout=4) as client:
-        outcomes = client.map(items, kind="simulate")
+        outcomes = client.map(items(0), kind="simulate")
         next(outcomes)
         eventually(begun)
         outcomes.close()  # as `break` and the end of the function do
         eventually(lambda: newest() == {"canceled"})
 
-    async def left(**how: Any) -> None:
-        async with AsyncClient(address) as client, aclosing(client.map(items, kind="simulate", **how)) as outcomes:
+    async def left(number: int, **how: Any) -> int:
+        asked = items(number)
+        async with AsyncClient(address) as client, aclosing(client.map(asked, kind="simulate", **how)) as outcomes:
             async for _ in outcomes:
                 await asyncio.to_thread(eventually, begun)
                 break
+        return job_count(served.http)
 
-    asyncio.run(left())
+    asyncio.run(left(1))
     eventually(lambda: newest() == {"canceled"})
-    for _ in range(2):
-        asyncio.run(left(out=tmp_path))
-        assert begun()
-        count = job_count(served.http)
-    asyncio.run(left(out=tmp_path))
-    assert job_count(served.http) == count, "it found its own jobs"
+    count = asyncio.run(left(2, out=tmp_path))
+    assert asyncio.run(left(3, out=tmp_path)) == count
+    assert begun()
     for job in served.http.get("/jobs").json()["jobs"][:2]:
         served.http.post(f"/jobs/{job['id']}/cancel").raise_for_status()
 

@@ -38,7 +38,7 @@ def test_the_blocking_twin_is_up_to_date(source: str) -> None:
 
 def _signature(member: Any) -> str:
     """As that of the blocking twin would be."""
-    return re.sub(r"Async(?=[A-Z])|async_(?=client)", "", str(inspect.signature(member)))
+    return re.sub(r"Async(?=[A-Z])", "", str(inspect.signature(member))).replace("async_", "sync_")
 
 
 def _members(kind: type) -> dict[str, Any]:

@@ -46,7 +46,13 @@ def test_names_are_short_and_best_of_k_is_k_votes() -> None:
     assert arm_of("best-of-3") == arm_of("always:vote-3") == arm_of("content=simulated,votes=3")
     assert arm_of("content=simulated,frames=initial,votes=3").name == "always:initial:vote-3"
     assert arm_of("placebo-still:no-image").with_content("simulated").name == "frames-only"
-    for wrong in ("always:initial:events", "content=still,content=true", "never:no-image"):
+    for wrong in (
+        "sometimes",
+        "always:initial:events",
+        "content=still,content=true",
+        "never:no-image",
+        "always:vote-17",
+    ):
         with refused("invalid-request"):
             arm_of(wrong)
     with pytest.raises(ValidationError):

@@ -31,12 +31,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> EvalRun:
     frames = (picture(folder, 77, "overlay"),)
     changed = {
         ("collision-0", "never"): {"read": "B", "reply": "The answer is B."},
-        ("collision-0", "always"): {
-            "read": "A",
-            "reply": "The answer is A.",
-            "probability": 0.83,
-            "overlay": frames[0],
-        },
+        ("collision-0", "always"): {"read": "A", "reply": "A.", "probability": 0.83, "overlay": frames[0]},
         (ODD, "never"): {"read": None, "reply": HOSTILE},
         (ODD, "always"): {"refusal": "object-<b>not</b>-found", "frames": (), "imaginations": 0},
         (ODD, "placebo-still"): {"read": None, "reply": None, "failure": "No answer within <i>120 s</i>."},
@@ -104,19 +99,15 @@ def test_the_search_reads_questions_and_where_asked_replies(report: Path, window
     expect(page.get_by_label("Search")).to_have_value("onerror")
 
 
-def test_the_table_links_to_the_questions_it_counts(report: Path, windows: Windows) -> None:
+def test_the_table_links_to_the_questions_it_counts_and_pictures_load(report: Path, windows: Windows) -> None:
     page = windows.open(report.as_uri())
     row = page.get_by_role("row", name=re.compile("^always")).first
     row.get_by_role("link").nth(2).click()
     assert "collision-0" in shown(page)
     assert page.locator("[name=outcome]").input_value() == "helped-any"
     expect(page.locator("#items-heading")).to_be_focused()
-
-
-def test_pictures_load_and_plots_stand_in_the_page(report: Path, windows: Windows) -> None:
     page = windows.open(f"{report.as_uri()}#item=collision-0")
-    images = page.locator(".card img")
-    assert images.count() == 1 + 4 + 1
+    expect(page.locator(".card img")).to_have_count(1 + 4 + 1)
     page.wait_for_function("[...document.images].every((each) => each.complete && each.naturalWidth > 0)")
     assert page.locator(".plot img[alt]").count() == 4
     expect(page.locator(".card")).to_contain_text("Told probability: 83%; it happens.")

@@ -12,6 +12,7 @@ from cow_service.records import AnswerOption
 OPTIONS = tuple(
     AnswerOption(letter=letter, text=text) for letter, text in zip("ABC", ("Yes", "No", "Not sure"), strict=True)
 )
+pytestmark = pytest.mark.slow  # what reads replies takes seconds to import
 SAME: dict[str, str | None] = {
     "{'Reasoning': 'It rolls on.', 'Answer': 'A'}": "A",
     "{'Reasoning': 'It rolls on.', 'Answer': '(B)'}": "B",

@@ -77,16 +77,19 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Template]:
 def environment() -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("COW_", "INSPECT_"))}
     # The server computes in its own process: a worker takes longer to start than it would have to do.
-    return {**kept, "LOCAL_API_KEY": "none", "COW_CONCURRENCY": "1", "COW_WORKERS": "false", "COW_WARMUP": "false"}
+    own = {"COW_CONCURRENCY": "1", "COW_WORKERS": "false", "COW_WARMUP": "false"}
+    return {**kept, **own, "LOCAL_API_KEY": "none", "PYTHONPATH": str(Path(__file__).parent)}
 
 
 def own(mllm: TruthMllm) -> tuple[str, ...]:
     return "--mllm", MODEL, "--base-url", mllm.address
 
 
-def evaluated(imported: Template, out: Path, *arguments: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+def evaluated(
+    imported: Template, out: Path, *arguments: str, code: int = 0, **settings: str
+) -> subprocess.CompletedProcess[str]:
     """A command `cow eval` that has ended."""
-    done = imported.begin(["eval", *arguments, "--out", str(out)], out.parent, environment()).done()
+    done = imported.begin(["eval", *arguments, "--out", str(out)], out.parent, environment() | settings).done()
     assert done.returncode == code, done.stdout[-2000:] + done.stderr[-4000:]
     assert "Traceback" not in done.stderr
     return done
@@ -121,7 +124,7 @@ def done(tmp_path_factory: pytest.TempPathFactory, items: list[Item], imported: 
     out = tmp_path_factory.mktemp("all") / "run"
     with truth_mllm(items, without=0.3, with_frames=1.0, seed=1) as mllm:
         asked = ("--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS), "--limit", str(LIMIT))
-        told = evaluated(imported, out, str(SAMPLE), *own(mllm), *asked)
+        told = evaluated(imported, out, str(SAMPLE), *own(mllm), *asked, PLOTS="drawn")
         run = read_run(out)
         found = summarize(run)
         yield Done(run, {each.arm: each for each in found.arms}, found, mllm, out, told.stdout)
@@ -226,6 +229,7 @@ def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None
     names = {path.relative_to(report).as_posix() for path in report.rglob("*") if path.is_file()}
     kinds = ("primary", "levels", "arms", "gains", "why", "doses", "cost")
     tables = {f"tables/{name}.{form}" for name in kinds for form in ("md", "csv", "tex")}
+    tables |= {f"plots/{name}.svg" for name in ("gains", "doses", "rates", "calibration", "cost")}
     assert {"index.html", "report.md", "manifest.json", "tables/replies.csv", *tables} <= names
     manifest = json.loads((report / "manifest.json").read_text())
     assert manifest["runs"][0]["versions"]["prompts/eval-question"].startswith("1 (sha256 ")
@@ -306,10 +310,6 @@ def test_failures_are_kept_with_their_reason_and_retried_on_request(
 # What is asked for, and what the refusal names.
 REFUSED: dict[str, dict[str, Any]] = {
     "sometimes": {"arms": ["sometimes"]},
-    "only one": {"arms": ["placebo-item"], "limit": 1},
-    "frames": {"arms": ["content=none,frames=initial"]},
-    "votes": {"arms": ["always:vote-99"]},
-    "physic": {"subsets": ["physic"]},
     "placebo-still": {"arms": ["placebo-still"], "ask": "answer", "mllm": None},
     "--temperature": {"ask": "answer", "mllm": None, "temperature": 0.0},
     "--max-tokens": {"ask": "answer", "mllm": None, "max_tokens": 9},
@@ -391,27 +391,3 @@ def test_inspects_own_command_runs_the_task(tmp_path: Path, mllm: TruthMllm) -> 
     assert [len(sample.messages[0].content) for sample in log.samples] == [5] * 4, "image, three frames, question"
     assert log.results is not None
     assert {score.name for score in log.results.scores} == {"right", "abstained", "unreadable"}
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(1800)
-def test_the_true_gain_lies_in_the_interval_of_whole_runs(
-    tmp_path: Path, items: list[Item], imported: Template
-) -> None:
-    """Through the whole service, twenty seeded runs; the same with drawn rows is in test_evals_statistics.py."""
-    runs, without, looking = 20, 0.4, 0.85
-    covered = nothing = 0
-    for seed in range(runs):
-        with truth_mllm(items, without=without, with_frames=looking, counted=True, seed=seed) as mllm:
-            out, arms = tmp_path / f"run{seed}", "never,always,placebo-still"
-            evaluated(imported, out, str(SAMPLE), *own(mllm), "--arm", arms, "--repeats", "5")
-        run = read_run(out)
-        gains = {each.arm: each.gain for each in summarize(run).arms}
-        always, placebo = gains["always"], gains["placebo-still"]
-        assert always is not None
-        assert placebo is not None
-        seeing = sum(each.refusal is None for each in run.of_arm("always")) / len(run.of_arm("always"))
-        covered += always.low <= seeing * (looking - without) <= always.high
-        nothing += placebo.low <= 0 <= placebo.high
-    assert covered >= 18
-    assert nothing >= 18

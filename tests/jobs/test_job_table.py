@@ -80,7 +80,7 @@ LISTS = [
 
 
 def fill(database: Database, count: int) -> None:
-    """Jobs of two keys: of a hundred one is an answer that failed, and 19 are simulations that did; ten are of alice."""
+    """Jobs of two keys: of a hundred, ten are alice's, one is an answer that failed, 19 are simulations that did."""
     add_job(database, "first", "alice")
     columns = [column.name for column in JOBS.columns]
     values = {

@@ -76,7 +76,7 @@ class TestFloor:
 
     def test_its_stated_deviation_covers_what_a_smooth_error_does(self) -> None:
         off = []
-        for seed in range(20 * SCALE):
+        for seed in range(12 * SCALE):
             found = floor_in(wavy(CAMERA.depth([NEAR]), 0.04, seed), NEAR, deviation=0.04)
             off.append((math.degrees(found.pitch) - 28) / math.degrees(found.sigma[0]))
         assert np.mean(np.abs(off) > 2) < 0.15, "it is honest"
@@ -157,6 +157,7 @@ def simulated(service: Service, map_: Floats | bytes, **also: Any) -> tuple[Simu
     return found, found.trajectory.outcome
 
 
+@pytest.mark.slow
 class TestRequest:
     def test_what_was_measured_is_recorded_and_answers(self, service: Service) -> None:
         found, outcome = simulated(service, CAMERA.depth([BALL, NEAR]))

@@ -17,6 +17,8 @@ from cow_service.settings import Settings
 from cow_service.weights.manifests import load_manifests
 from cow_service.weights.repositories import Lock, LockedFile, folder_of, write_lock
 
+pytestmark = pytest.mark.slow
+
 SIZES = {"ngf": 4, "n_blocks": 2, "ratio_gin": 0.75}
 FILE, REPOSITORY = "big-lama.safetensors", "michaelgold/big-lama"
 Load = Callable[[dict[str, Any] | None], Any]

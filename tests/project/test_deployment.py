@@ -56,6 +56,8 @@ def test_deployments_are_set_up(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     own = {one["name"]: one["value"] for one in container["env"]}
     settings = check_settings(monkeypatch, pairs(image, "ENV") | shared["data"] | own)
     check_cow(list(container["args"]))
+    assert [secret for secret in own if re.search("KEY|SECRET|PASSWORD|TOKEN|DATABASE_URL", secret)] == []
+    assert of_kind("Secret") == [], "they stand in no file"
     labels = spec["template"]["metadata"]["labels"]
     assert spec["selector"]["matchLabels"] == labels
     before = container.get("lifecycle", {}).get("preStop", {}).get("sleep", {}).get("seconds", 0)
@@ -84,8 +86,9 @@ def test_jobs_are_commands_and_one_of_them_alone_creates_the_tables() -> None:
     assert migrating["envFrom"] == container_of(DEPLOYMENTS["cow-api"])["envFrom"]
 
 
-def test_each_queue_is_scaled_by_its_own_jobs() -> None:
-    assert {one["metadata"]["name"] for one in of_kind("ScaledObject")} == DEPLOYMENTS.keys() - {"cow-api"}
+def test_every_deployment_is_scaled_by_one_thing_and_workers_by_the_jobs_of_their_queue() -> None:
+    scalers = of_kind("ScaledObject") + of_kind("HorizontalPodAutoscaler")
+    assert sorted(one["spec"]["scaleTargetRef"]["name"] for one in scalers) == sorted(DEPLOYMENTS)
     for scaled in of_kind("ScaledObject"):
         container = container_of(DEPLOYMENTS[scaled["spec"]["scaleTargetRef"]["name"]])
         (trigger,) = scaled["spec"]["triggers"]
@@ -93,17 +96,11 @@ def test_each_queue_is_scaled_by_its_own_jobs() -> None:
         assert f"queue = '{queue}'" in trigger["metadata"]["query"]
         given = {one["name"]: one["value"] for one in container["env"]}
         assert trigger["metadata"]["targetQueryValue"] == given.get("COW_CONCURRENCY", "1")
-
-
-def test_every_deployment_is_scaled_by_one_thing() -> None:
-    scaled = [
-        one["spec"]["scaleTargetRef"]["name"] for one in [*of_kind("ScaledObject"), *of_kind("HorizontalPodAutoscaler")]
-    ]
-    assert sorted(scaled) == sorted(DEPLOYMENTS)
     for name, workload in DEPLOYMENTS.items():
         assert "replicas" not in workload["spec"], f"{name}: each update would set the number back"
         assert container_of(workload)["resources"]["requests"]["cpu"], "a share of which the autoscaler looks at"
     (servers,) = of_kind("HorizontalPodAutoscaler")
+    assert servers["spec"]["scaleTargetRef"]["name"] == "cow-api"
     (budget,) = (one for one in of_kind("PodDisruptionBudget") if one["metadata"]["name"] == "cow-api")
     assert budget["spec"]["minAvailable"] < servers["spec"]["minReplicas"], "else no node can be emptied"
 
@@ -167,10 +164,3 @@ def test_the_dashboard_has_a_data_source_to_choose() -> None:
         for target in panel.get("targets", ()):
             assert target["datasource"]["uid"] == "${" + variable["name"] + "}"
             assert target["expr"].count("(") == target["expr"].count(")")
-
-
-def test_secrets_stand_in_no_file() -> None:
-    assert not [one for one in RESOURCES if one["kind"] == "Secret"]
-    for workload in DEPLOYMENTS.values():
-        names = {one["name"] for one in container_of(workload)["env"]}
-        assert not [name for name in names if re.search("KEY|SECRET|PASSWORD|TOKEN|DATABASE_URL", name)]

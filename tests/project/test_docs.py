@@ -9,16 +9,17 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import signal
 import socket
 import stat
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -26,6 +27,7 @@ import yaml
 from conftest import EXAMPLES, ROOT, SCALE
 from hub import Blob
 from hub import running as hub_running
+from waiting import TIME_LIMIT, eventually
 
 # Those whose commands take longest: they are run by `make soak`.
 LONG_PAGES = ("docs/benchmark.md", "docs/extending.md", "docs/sdk.md", "docs/video.md")
@@ -33,7 +35,6 @@ PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").gl
 LANGUAGES = {"sh", "python", "toml", "yaml", "json", "text"}
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SERVE = re.compile(r"(^|\s)(cow serve|make serve|cow mcp --transport)\b")
-READY = 60.0  # seconds
 NEEDS_A_GPU = "COW_GENERATOR=ati"
 RUN = ("python", "sh")  # the languages of blocks that do something
 HARNESS = "inspect_ai"  # its commands are run by `make soak`
@@ -41,10 +42,11 @@ DOCKER = """#!/bin/sh
 echo "$@" >> "$DOCKER_ASKED"
 """
 PIP = """#!/bin/sh
-# Its arguments are checked later. Downloads, and installs from downloads, are not done; all else is pip's.
+# Its arguments are checked later. Downloads, and installs from downloads, are not done; the project is installed once.
 echo "$@" >> "$PIP_ASKED"
 case " $* " in
   *" download "*|*" --no-index "*) ;;
+  *" -e "*) test "$(grep -c -e " -e " "$PIP_ASKED")" -gt 1 || exec python -m pip "$@" ;;
   *) exec python -m pip "$@" ;;
 esac
 """
@@ -90,32 +92,25 @@ class Checkout:
 
     def run(self, script: str) -> subprocess.CompletedProcess[str]:
         shell = ["bash", "-euo", "pipefail", "-c", self.adapted(script)]
-        return subprocess.run(
-            shell,
-            cwd=self.folder,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=500,
-            stdin=subprocess.DEVNULL,
-        )
+        pipes: dict[str, Any] = {"capture_output": True, "text": True, "stdin": subprocess.DEVNULL}
+        return subprocess.run(shell, cwd=self.folder, env=self.environment, check=False, **pipes)
 
     @contextmanager
     def serving(self, command: str) -> Iterator[None]:
         """A command that serves, until the block is over; then it must end in peace."""
         shell = ["bash", "-c", f"exec env {command}"]
         with subprocess.Popen(shell, cwd=self.folder, env=self.environment, start_new_session=True) as process:
+
+            def is_ready() -> bool:
+                assert process.poll() is None, f"{command} ended with {process.returncode}"
+                return self.answers(command)
+
             try:
-                until = time.monotonic() + READY
-                while not self.answers(command):
-                    assert process.poll() is None, f"{command} ended with {process.returncode}"
-                    assert time.monotonic() < until, f"{command} is not ready"
-                    time.sleep(0.1)
+                eventually(is_ready)
                 yield
             finally:
-                os.killpg(process.pid, 15)
-                process.wait(30)
+                os.killpg(process.pid, signal.SIGTERM)
+                process.wait(TIME_LIMIT)
 
     def answers(self, command: str) -> bool:
         if port := re.search(r"--port (\d+)", command):
@@ -125,12 +120,6 @@ class Checkout:
             return httpx.get(f"http://127.0.0.1:{self.port}/readyz").status_code == 200
         except httpx.HTTPError:
             return False
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def copied(folder: Path) -> None:
@@ -147,15 +136,12 @@ def copied(folder: Path) -> None:
 def toy_weights() -> dict[str, dict[str, Blob]]:
     """A few bytes for every file that `cow models pull ati` would bring."""
     manifest = yaml.safe_load((ROOT / "models" / "ati.yaml").read_text())
-    names = {
-        pattern: pattern.replace("/*", "/config.json").replace("*.safetensors*", "-00001.safetensors").replace("*", "x")
-        for source in manifest["sources"].values()
-        for pattern in source["files"]
-    }
-    return {
-        source["repository"]: {names[pattern]: Blob(b"{}") for pattern in source["files"]}
-        for source in manifest["sources"].values()
-    }
+
+    def file_of(pattern: str) -> str:
+        return pattern.replace("/*", "/config.json").replace("*.safetensors*", "-00001.safetensors").replace("*", "x")
+
+    sources = manifest["sources"].values()
+    return {one["repository"]: {file_of(pattern): Blob(b"{}") for pattern in one["files"]} for one in sources}
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +155,10 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Checkout]:
         (standins / name).write_text(text)
         (standins / name).chmod((standins / name).stat().st_mode | stat.S_IXUSR)
     shutil.copy(EXAMPLES / "falling-ball" / "image.jpg", folder / "photo.jpg")
-    venv, port = folder / ".venv" / "bin", free_port()
+    venv = folder / ".venv" / "bin"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("COW_", "PYTHON"))}
     environment |= {
         "PATH": f"{standins}:{venv}:{environment['PATH']}",
@@ -179,6 +168,9 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Checkout]:
         "COW_BASE_URL": f"http://127.0.0.1:{port}",
         "DOCKER_ASKED": str(aside / "docker-asked"),
         "PIP_ASKED": str(aside / "pip-asked"),
+        # Servers compute in their own process, from the first question on: workers take longer to start than all else.
+        "COW_WORKERS": "false",
+        "COW_WARMUP": "false",
         # All packages are here already: pip only sets up the project, with the build backend of the tests.
         "PIP_NO_DEPS": "1",
         "PIP_NO_BUILD_ISOLATION": "0",  # 0 is what turns the isolation off
@@ -241,12 +233,7 @@ def test_commands_and_programs_run_as_they_stand_there(checkout: Checkout, page:
     until = "## Run it for real" if page == "README.md" and SCALE == 1 else None
     for number, block in enumerate(blocks(page, until)):
         head = block.text.partition("\n")[0]
-        if (
-            block.language in ("toml", "yaml", "python")
-            and head.startswith("# ")
-            and "." in head
-            and " " not in head[2:]
-        ):
+        if block.language in ("toml", "yaml", "python") and re.fullmatch(r"# \S*\.\S*", head):
             path = checkout.folder / head[2:]
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(block.text)
@@ -274,9 +261,7 @@ def run_commands(checkout: Checkout, text: str) -> None:
                 checkout.stop()
                 refused = checkout.run(part)  # here, a GPU and the real weights are what is missing
                 assert refused.returncode != 0
-                assert re.search("checkpoint-invalid|generator-unavailable|weights-unavailable", refused.stderr), (
-                    refused
-                )
+                assert re.search("checkpoint-invalid|generator-unavailable|weights-unavailable", refused.stderr)
             elif SERVE.search(part):
                 checkout.stop()
                 running.close()

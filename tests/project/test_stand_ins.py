@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import EXAMPLES, ROOT
 
+pytestmark = pytest.mark.slow
 FOLDERS = sorted((ROOT / "cow-scenes" / "sample" / "truth").glob("*/*"))
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import ast
 import json
+import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
 from conftest import EXAMPLES
-from test_docs import free_port
 
 pytestmark = pytest.mark.slow
 
@@ -32,8 +32,11 @@ def test_it_is_committed_without_outputs() -> None:
 
 
 def test_every_cell_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
     monkeypatch.chdir(EXAMPLES)
-    monkeypatch.setenv("COW_BASE_URL", f"http://127.0.0.1:{free_port()}")  # where none is: the notebook starts one
+    monkeypatch.setenv("COW_BASE_URL", f"http://127.0.0.1:{port}")  # where none is: the notebook starts one
     monkeypatch.setenv("COW_WORKERS", "false")  # of the server that it starts: processes take long to start
     monkeypatch.setenv("COW_DATA_DIR", str(tmp_path / "own"))
     monkeypatch.delenv("COW_API_KEY", raising=False)

@@ -11,7 +11,7 @@ from conftest import SCALE, Example
 from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import scene_rows
+from rendered_scenes import scene_rows
 
 from cow_service.vision.scene import Scene
 

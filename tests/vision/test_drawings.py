@@ -18,6 +18,8 @@ from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 from cow_service.vision.side_view import find_side_view, pieces_of
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT, LEVEL = 640, 400, 330
 RED, BLUE, GREEN, ORANGE, BROWN, BLACK = (
     (220, 40, 40), (40, 80, 220), (40, 160, 60), (240, 140, 30), (139, 90, 43), (20, 20, 20)

@@ -55,6 +55,7 @@ def outcome_of(service: Service, image: bytes, question: str, **more) -> tuple[A
     return answer, answer.simulation.trajectory.outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("height", "in_way"), [(270, True), (370, False)])
 def test_an_answer_is_not_sure_where_the_way_leads_over_something_faint(
     service: Service, height: int, in_way: bool

@@ -10,7 +10,7 @@ import pytest
 from conftest import DATA, example
 from drawn import Image, ball, block, bowl, floor, jpeg, trail
 
-from cow_service.vision.forms import looks_like
+from cow_service.vision.forms import log_ratio, looks_like
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Scene
 from cow_service.vision.segmentation import mask_from_bbox
@@ -70,7 +70,7 @@ def figures(scene: Scene) -> list[tuple]:
     """A row for whatever was measured: its name and numbers, in px and shares."""
     rows: list[tuple] = []
     for region in scene.regions:
-        flags = region.roundness, region.confidence, region.is_disc, region.is_hidden
+        flags = region.is_disc, region.is_hidden, region.roundness, region.confidence, log_ratio(region, "vase")
         rows.append((f"{region.colour} {looks_like(region)}", *region.bbox, region.mask.area, *flags))
     rows += [("arrow", *arrow.tail, *arrow.tip, np.count_nonzero(arrow.mask), arrow.fit) for arrow in scene.arrows]
     rows += [("box", *box.bbox, np.count_nonzero(box.mask)) for box in scene.boxes]
@@ -94,9 +94,9 @@ def figures(scene: Scene) -> list[tuple]:
 
 MEASURED = {
     "ball-and-mug": [
-        ("white mug", 325, 257, 413, 348, 5632, 0.5955, 0.5261, 0, 0),
-        ("blue mug", 440, 216, 522, 299, 4868, 0.7335, 1, 0, 0),
-        ("yellow ball", 245, 195, 305, 255, 2743, 0.9546, 1, 1, 0),
+        ("white mug", 325, 257, 413, 348, 5632, 0, 0, 0.5955, 0.5261, -8.611),
+        ("blue mug", 440, 216, 522, 299, 4868, 0, 0, 0.7335, 1, -9.291),
+        ("yellow ball", 245, 195, 305, 255, 2743, 1, 0, 0.9546, 1, -14.63),
         ("arrow", 241.2, 217.1, 146.9, 199.7, 1704, 0.8682),
         ("painted", 1701, 159.1, 154.9, 152.2, 3.948),
         ("edges", 2537),
@@ -104,9 +104,9 @@ MEASURED = {
         ("opening", 2855, 0.8471, 0.8109, 1),
     ],
     "thrown-ball": [
-        ("white None", 496, 203, 590, 290, 6717, 0.6949, 0.6165, 0, 0),
-        ("blue None", 351, 174, 431, 246, 4976, 0.7278, 1, 0, 0),
-        ("pink ball", 198, 23, 270, 94, 4045, 0.961, 1, 1, 0),
+        ("white None", 496, 203, 590, 290, 6717, 0, 0, 0.6949, 0.6165, -9.131),
+        ("blue None", 351, 174, 431, 246, 4976, 0, 0, 0.7278, 1, -9.825),
+        ("pink ball", 198, 23, 270, 94, 4045, 1, 0, 0.961, 1, -14.63),
         ("arrow", 241.4, 54.84, 325.2, 10.43, 1500, 0.9144),
         ("painted", 1500, 150.7, 133.4, 129.9, 17.77),
         ("edges", 2215),
@@ -115,9 +115,9 @@ MEASURED = {
         ("opening", 3865, 0.8562, 0.8247, 1),
     ],
     "vase": [
-        ("blue None", 174, 330, 385, 480, 26340, 0.6036, 0.9969, 0, 0),
-        ("white vase", 263, 151, 349, 293, 7159, 0.3465, 0.6875, 0, 0),
-        ("purple ball", 522, 24, 613, 116, 6567, 0.9663, 1, 1, 0),
+        ("blue None", 174, 330, 385, 480, 26340, 0, 0, 0.6036, 0.9969, -7.92),
+        ("white vase", 263, 151, 349, 293, 7159, 0, 0, 0.3465, 0.6875, 2.155),
+        ("purple ball", 522, 24, 613, 116, 6567, 1, 0, 0.9663, 1, -14.63),
         ("arrow", 614, 74.41, 733, 85.62, 1855, 0.8926),
         ("painted", 1850, 129.1, 127.2, 125.3, 8.225),
         ("edges", 2621),
@@ -125,15 +125,15 @@ MEASURED = {
         ("opening", 6411, 0.8861, 0.8182, 1),
     ],
     "shelf": [
-        ("purple None", 639, 130, 861, 270, 28550, 0.5996, 1, 0, 0),
-        ("cyan None", 60, 79, 191, 261, 21760, 0.56, 1, 0, 0),
-        ("white None", 300, 68, 519, 201, 18520, 0.4623, 1, 0, 0),
-        ("green bowl", 60, 373, 242, 514, 18510, 0.7034, 1, 0, 0),
-        ("blue mug", 699, 400, 838, 541, 14440, 0.6285, 1, 0, 0),
-        ("pink None", 399, 559, 561, 640, 13110, 0.5146, 0.9941, 0, 0),
-        ("white cone", 311, 389, 411, 542, 9006, 0.3987, 0.4901, 0, 0),
-        ("orange ball", 99, 9, 201, 109, 7973, 0.9679, 1, 1, 0),
-        ("yellow cone", 531, 300, 600, 471, 7600, 0.3014, 1, 0, 0),
+        ("purple None", 639, 130, 861, 270, 28550, 0, 0, 0.5996, 1, -6.478),
+        ("cyan None", 60, 79, 191, 261, 21760, 0, 0, 0.56, 1, -9.579),
+        ("white None", 300, 68, 519, 201, 18520, 0, 0, 0.4623, 1, -0.2078),
+        ("green bowl", 60, 373, 242, 514, 18510, 0, 0, 0.7034, 1, -7.419),
+        ("blue mug", 699, 400, 838, 541, 14440, 0, 0, 0.6285, 1, -9.342),
+        ("pink None", 399, 559, 561, 640, 13110, 0, 0, 0.5146, 0.9941, -4.461),
+        ("white cone", 311, 389, 411, 542, 9006, 0, 0, 0.3987, 0.4901, -7.08),
+        ("orange ball", 99, 9, 201, 109, 7973, 1, 0, 0.9679, 1, -14.64),
+        ("yellow cone", 531, 300, 600, 471, 7600, 0, 0, 0.3014, 1, -4.861),
         ("arrow", 237.9, 61.1, 302.6, 28.75, 1520, 0.884),
         ("box", 601.1, 561.4, 698.6, 628.9, 4053),
         ("painted", 5472, 161.9, 161.7, 162, 3.496),
@@ -142,7 +142,7 @@ MEASURED = {
         ("opening", 17270, 0.93, 0.7, 0),
     ],
     "thrown": [
-        ("orange ball", 331, 111, 384, 164, 2180, 0.9493, 1, 1, 0),
+        ("orange ball", 331, 111, 384, 164, 2180, 1, 0, 0.9493, 1, -14.63),
         ("position", 160, 150, 25.97, 0.3409),
         ("position", 226, 110, 25.92, 0.4854),
         ("position", 291.9, 106, 25.9, 0.7429),
@@ -152,9 +152,9 @@ MEASURED = {
         ("shadow", 377.9, 300, 168, 30.53, 0.1036, 0.191),
     ],
     "drawing": [
-        ("blue cone", 403, 199, 602, 329, 13120, 0.2946, 1, 0, 0),
-        ("orange None", 80, 210, 320, 328, 6696, 0.123, 1, 0, 0),
-        ("red ball", 160, 168, 201, 209, 1313, 0.961, 1, 1, 0),
+        ("blue cone", 403, 199, 602, 329, 13120, 0, 0, 0.2946, 1, -5.13),
+        ("orange None", 80, 210, 320, 328, 6696, 0, 0, 0.123, 1, 0.1112),
+        ("red ball", 160, 168, 201, 209, 1313, 1, 0, 0.961, 1, -14.63),
         ("piece", 198, 129),
         ("piece", 240, 16),
         ("piece", 14, 102),

@@ -118,6 +118,7 @@ def fur() -> np.ndarray:
     return image
 
 
+@pytest.mark.slow
 def test_a_tuft_of_fur_is_refused_unless_something_stands_out_there() -> None:
     image = fur()
     with refused("cannot-ground"):

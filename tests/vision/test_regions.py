@@ -11,7 +11,7 @@ from conftest import Example
 from drawn import Image, ball, block, floor, jpeg
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import scene_rows
+from rendered_scenes import scene_rows
 
 from cow_service.records import LocatedObject
 from cow_service.vision.contrast import colour_name, colour_names

@@ -32,6 +32,7 @@ def told(simulation: Simulation) -> dict:
     return simulation.model_dump(exclude={"id", "created_at", "timings"})
 
 
+@pytest.mark.slow
 def test_other_questions_about_an_image_measure_nothing_again(monkeypatch: pytest.MonkeyPatch) -> None:
     alone = [told(asked(question, None)) for question in QUESTIONS]
     seen = SeenImages()

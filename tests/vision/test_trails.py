@@ -84,6 +84,7 @@ def grounded(image: np.ndarray, question: str) -> tuple[Run, Grounding]:
     return run, run.stage("grounding", ground)
 
 
+@pytest.mark.slow
 def test_the_question_tells_the_end_and_the_trail_the_motion() -> None:
     run, grounding = grounded(OPAQUE, ", the last of which is the rightmost")
     motion = run.stage("motion", read_motion, grounding, run.hints)
@@ -98,12 +99,14 @@ def test_the_question_tells_the_end_and_the_trail_the_motion() -> None:
     assert motion.speed_deviation < 0.15
 
 
+@pytest.mark.slow
 def test_an_end_that_nothing_tells_is_that_nearest_to_what_is_asked_about() -> None:
     run, grounding = grounded(OPAQUE, "")
     assert grounding.point == pytest.approx(PLACES[-1], abs=1.5)
     assert run.results["grounding"].warnings
 
 
+@pytest.mark.slow
 def test_an_end_that_is_as_far_as_the_other_and_a_trail_that_is_not_there_are_refused() -> None:
     cube = block(floor(), (310, 290, 370, 350), GREEN)
     with refused("cannot-ground"):

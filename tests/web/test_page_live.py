@@ -127,14 +127,12 @@ def test_worlds_are_told_only_where_they_are_asked_for_and_can_be_aimed(server: 
         assert posted(server, name, **request)["trajectory"]["live"] is None
 
 
-@pytest.fixture
-def answered(server: Server, windows: Windows) -> Page:
-    """A page that has answered a question about a picture that no other test asks about."""
-    page = windows.open(server.address, reduced_motion="no-preference")
+def answered(server: Server, windows: Windows, **options: str) -> tuple[Page, str]:
+    """A page that has answered a question about a picture that no other test asks about, and the job."""
+    page = windows.open(server.address, **options)
     drop(page, picture(next(SHIFTS)))
     ask(page, QUESTION)
-    result(page)
-    return page
+    return page, result(page)
 
 
 def foretold(page: Page) -> str:
@@ -144,8 +142,8 @@ def foretold(page: Page) -> str:
     return words.inner_text()
 
 
-def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(answered: Page) -> None:
-    page, first = answered, result(answered)
+def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(server: Server, windows: Windows) -> None:
+    page, first = answered(server, windows, reduced_motion="no-preference")
     assert said(page) == "Yes"
     page.get_by_role("slider", name="Frame of the clip").fill("0")  # stops the film
     start, *way = in_window(page, arrow_tip(page), (150, 40), (91, 10), (91, 10))
@@ -195,8 +193,8 @@ def test_examples_answer_at_once_what_the_start_page_says(server: Server, window
     expect(row.locator(".answered")).to_have_text(answer)
 
 
-def test_a_drag_is_broken_off_and_belongs_to_its_question(answered: Page) -> None:
-    page, first = answered, result(answered)
+def test_a_drag_is_broken_off_and_belongs_to_its_question(server: Server, windows: Windows) -> None:
+    page, first = answered(server, windows)
     tip = arrow_tip(page)
     start, end = in_window(page, tip, (93, 10))
     page.mouse.move(*start)
@@ -218,8 +216,8 @@ def test_a_drag_is_broken_off_and_belongs_to_its_question(answered: Page) -> Non
     expect(page.locator(".sentence")).to_contain_text("to the left")
 
 
-def test_a_result_without_frames_ends_what_is_foreseen(answered: Page) -> None:
-    page, first = answered, result(answered)
+def test_a_result_without_frames_ends_what_is_foreseen(server: Server, windows: Windows) -> None:
+    page, first = answered(server, windows)
 
     def without_simulation(route: Route) -> None:
         found = route.fetch()
