@@ -38,12 +38,21 @@ DELETED = (ast.Expr, ast.Assign, ast.AugAssign, ast.Return, ast.Raise, ast.Conti
 LOGGING = re.compile(r"^_?log(ger)?\.")
 # Where the tests of a package are, if not in the folder of its name alone.
 FOLDERS = {
-    "adaptive": ("readers",), "concurrency": ("service",), "errors": ("api", "client"), "net": ("service",),
-    "physics": ("physics", "stages", "vision"), "pipeline": ("service", "jobs"),
-    "records": ("narration", "stages", "client"), "registry": ("service", "readers"), "requests": ("api", "stages"),
-    "server": ("api", "project"), "service": ("service", "stages"), "settings": ("api", "service", "project"),
+    "adaptive": ("readers",),
+    "api": ("api", "jobs"),
+    "concurrency": ("service",),
+    "errors": ("api", "client"),
+    "net": ("service",),
+    "physics": ("physics", "stages", "vision"),
+    "pipeline": ("service", "jobs"),
+    "records": ("narration", "stages", "client"),
+    "registry": ("service", "readers"),
+    "requests": ("api", "stages"),
+    "server": ("api", "project"),
+    "service": ("service", "stages"),
+    "settings": ("api", "service", "project"),
     "stages": ("stages", "readers", "service"),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)

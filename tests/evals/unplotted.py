@@ -1,4 +1,4 @@
-"""Imported by the process that `cow eval` is forked from: reports have plots, which take seconds, where PLOTS is set."""
+"""Imported by the process that `cow eval` is forked from: a report has plots, which take seconds, if PLOTS is set."""
 
 import os
 from collections.abc import Sequence

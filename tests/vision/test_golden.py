@@ -13,7 +13,7 @@ from drawn import Image, ball, block, bowl, floor, jpeg, trail
 from cow_service.vision.forms import log_ratio, looks_like
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import Scene
-from cow_service.vision.segmentation import mask_from_bbox
+from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.side_view import pieces_of
 
@@ -88,7 +88,8 @@ def figures(scene: Scene) -> list[tuple]:
         rows.append(("shadow", *shadow.centre, *shadow.spread, shadow.shade))
     for region in scene.regions[1:3]:
         opening, cut = measure_opening(scene.clean, region.mask), mask_from_bbox(scene.clean, region.bbox)
-        rows.append(("opening", np.count_nonzero(cut), opening.inner, opening.bottom, opening.rim is not None))
+        rows.append(("opening", opening.inner, opening.bottom, opening.rim is not None))
+        rows.append(("cut", np.count_nonzero(cut), np.count_nonzero(mask_from_point(scene.clean, region.centre))))
     return rows
 
 
@@ -100,8 +101,10 @@ MEASURED = {
         ("arrow", 241.2, 217.1, 146.9, 199.7, 1704, 0.8682),
         ("painted", 1701, 159.1, 154.9, 152.2, 3.948),
         ("edges", 2537),
-        ("opening", 4661, 0.5781, 0.7292, 1),
-        ("opening", 2855, 0.8471, 0.8109, 1),
+        ("opening", 0.5781, 0.7292, 1),
+        ("cut", 4661, 4994),
+        ("opening", 0.8471, 0.8109, 1),
+        ("cut", 2855, 3283),
     ],
     "thrown-ball": [
         ("white None", 496, 203, 590, 290, 6717, 0, 0, 0.6949, 0.6165, -9.131),
@@ -111,8 +114,10 @@ MEASURED = {
         ("painted", 1500, 150.7, 133.4, 129.9, 17.77),
         ("edges", 2215),
         ("shadow", 352.5, 273.2, 312.9, 25.76, -5.265, 0.07065),
-        ("opening", 4818, 0.921, 0.9661, 1),
-        ("opening", 3865, 0.8562, 0.8247, 1),
+        ("opening", 0.921, 0.9661, 1),
+        ("cut", 4818, 4978),
+        ("opening", 0.8562, 0.8247, 1),
+        ("cut", 3865, 3950),
     ],
     "vase": [
         ("blue None", 174, 330, 385, 480, 26340, 0, 0, 0.6036, 0.9969, -7.92),
@@ -121,8 +126,10 @@ MEASURED = {
         ("arrow", 614, 74.41, 733, 85.62, 1855, 0.8926),
         ("painted", 1850, 129.1, 127.2, 125.3, 8.225),
         ("edges", 2621),
-        ("opening", 8964, 0.9084, 0.3419, 1),
-        ("opening", 6411, 0.8861, 0.8182, 1),
+        ("opening", 0.9084, 0.3419, 1),
+        ("cut", 8964, 8931),
+        ("opening", 0.8861, 0.8182, 1),
+        ("cut", 6411, 6598),
     ],
     "shelf": [
         ("purple None", 639, 130, 861, 270, 28550, 0, 0, 0.5996, 1, -6.478),
@@ -138,8 +145,10 @@ MEASURED = {
         ("box", 601.1, 561.4, 698.6, 628.9, 4053),
         ("painted", 5472, 161.9, 161.7, 162, 3.496),
         ("edges", 5260),
-        ("opening", 21310, 0.93, 0.7, 0),
-        ("opening", 17270, 0.93, 0.7, 0),
+        ("opening", 0.93, 0.7, 0),
+        ("cut", 21310, 21540),
+        ("opening", 0.93, 0.7, 0),
+        ("cut", 17270, 8451),
     ],
     "thrown": [
         ("orange ball", 331, 111, 384, 164, 2180, 1, 0, 0.9493, 1, -14.63),

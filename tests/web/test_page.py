@@ -15,6 +15,7 @@ import httpx
 import pytest
 from browser import (
     NARROW,
+    WIDE,
     Windows,
     arrow_tip,
     ask,
