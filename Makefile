@@ -37,7 +37,7 @@ soak-part: $(VENV)/.test ## PART=K/N: the K-th of N parts of what `make soak` ha
 	COW_TEST_SCALE=10 $(PYTEST) -m "soak or scaled" --part $(PART)
 
 chaos: $(VENV)/.test ## strike servers, databases, networks and disks at random; COW_CHAOS_SEED=N repeats a schedule
-	COW_TEST_SCALE=10 $(BIN)/python -m pytest tests/jobs/test_chaos.py --numprocesses 2 -rA
+	$(BIN)/python -m pytest tests/jobs/test_chaos.py --numprocesses 2 -rA
 
 lint: $(VENV)/.test ## style, layers and types
 	$(BIN)/ruff check .

@@ -14,6 +14,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import shutil
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -40,6 +41,8 @@ if TYPE_CHECKING:  # other tests do not need a browser
     from browser import Windows
     from playwright.sync_api import Browser
 
+# A shell lets what it runs in the background ignore interrupts, and its children do as well: tests interrupt some.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 # How much the chaos, fuzz and property tests do: 1 in CI, 10 in `make soak`.
 SCALE = int(os.environ.get("COW_TEST_SCALE", "1"))
 settings.register_profile("cow", deadline=None, derandomize=True, database=None, max_examples=12 * SCALE)
@@ -52,8 +55,13 @@ EXAMPLES = ROOT / "examples"
 SHARED_SCENES = ROOT.parent / "shared" / "scenes"
 # The longest files: begun last, they would keep one process alone at work.
 FIRST = (
-    *("test_docs.py", "test_chaos.py", "test_evals_run.py", "test_jobs.py", "test_workers.py"),
-    *("test_page.py", "test_client.py", "test_mcp.py", "test_slow_starts.py", "test_wan_speed.py"),
+    "test_docs.py",
+    "test_evals_run.py",
+    "test_chaos.py",
+    "test_jobs.py",
+    "test_page.py",
+    "test_slow_starts.py",
+    "test_workers.py",
 )
 SLOWEST = 10  # files that are listed at the end
 
@@ -87,13 +95,6 @@ def _meta(folder: Path) -> dict[str, Any]:
 
 def example(name: str) -> Example:
     return Example(EXAMPLES / name)
-
-
-def all_scenes() -> list[Path]:
-    """Our own examples, and where it is at hand a third of the larger shared set; all of it in `make soak`."""
-    folders = sorted(path.parent for path in EXAMPLES.glob("*/meta.json"))
-    shared = sorted(path.parent for path in SHARED_SCENES.glob("*/meta.json"))
-    return folders + shared[:: max(1, 3 // SCALE)]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

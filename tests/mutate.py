@@ -40,10 +40,12 @@ LOGGING = re.compile(r"^_?log(ger)?\.")
 FOLDERS = {
     "adaptive": ("readers",),
     "api": ("api", "jobs"),
+    "cli": ("cli", "evals"),
     "concurrency": ("service",),
     "errors": ("api", "client"),
+    "media": ("media", "jobs"),
     "net": ("service",),
-    "physics": ("physics", "stages", "vision"),
+    "physics": ("physics", "stages", "vision", "perception"),
     "pipeline": ("service", "jobs"),
     "records": ("narration", "stages", "client"),
     "registry": ("service", "readers"),
@@ -52,6 +54,7 @@ FOLDERS = {
     "service": ("service", "stages"),
     "settings": ("api", "service", "project"),
     "stages": ("stages", "readers", "service"),
+    "vision": ("vision", "readers"),
 }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import json
-import signal
 import socketserver
 import threading
 import time
@@ -75,14 +74,6 @@ def hurried(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> Connect:
     monkeypatch.setattr(BlockingIO, "sleep", lambda _, seconds: connect.sleep(seconds))
     monkeypatch.setattr(time, "monotonic", lambda: connect.now)
     return connect
-
-
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Ctrl-C is heard, here and in processes that are started, also where the tests run in a shell's background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,14 @@ import httpx
 import pytest
 from click.testing import Result
 from conftest import SCALE
-from sdk import Scripted, address, interruptible, served, told
+from sdk import Scripted, address, served, told
 from servers import BODY, IMAGE, QUESTION, Served
 from typer.testing import CliRunner
 from waiting import TIME_LIMIT, eventually
 
 from cow_service.cli.main import app
 
-__all__ = ["address", "interruptible", "served"]  # fixtures
+__all__ = ["address", "served"]  # fixtures
 
 COMMAND = [sys.executable, "-m", "cow_service.cli.main", "batch"]
 GIVEN = {name: value for name, value in BODY.items() if name not in ("image", "question")}
@@ -135,7 +135,6 @@ def test_a_key_that_is_wrong_is_said_to_be_that_of_the_environment(tmp_path: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_ends_at_once_and_loses_nothing(tmp_path: Path, served: Served, address: str) -> None:
     slow = {"generator": "slow", "generator_options": {"seconds": 200.0}, "num_frames": 80, "frames": {"count": 40}}
     path = written(tmp_path, 3, **slow, question="Will it be interrupted?")

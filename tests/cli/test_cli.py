@@ -23,7 +23,7 @@ from cow_service import __version__
 from cow_service.cli.main import app
 from cow_service.cli.options import COMMANDS, FIELDS, GROUPS, printable, request_body
 from cow_service.records import Models, Simulation
-from cow_service.requests import SimulateRequest
+from cow_service.requests import AnswerRequest, SimulateRequest
 
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 QUICK = ("--num-frames", "9", "--ensemble", "0", "--no-video")
@@ -180,6 +180,12 @@ def test_options_have_the_defaults_of_the_fields() -> None:
         assert sent[name] == default[name]
     for name in ("count", "max_side"):
         assert sent["frames"][name] == default["frames"][name]
+    for command, model in (("simulate", SimulateRequest), ("answer", AnswerRequest)):
+        own = {param.name: param.default for param in commands()[command].params}
+        fields = {name: field.default for name, field in model.model_fields.items() if name in own}
+        for name in ("image", "question", "frames"):
+            del fields[name]
+        assert fields.items() <= own.items()
     for path in FIELDS.values():
         record, _, field = path.partition("/")
         assert field in SimulateRequest.model_json_schema()["$defs"][f"{record.capitalize()}Request"]["properties"]

@@ -415,6 +415,17 @@ def test_what_limits_a_batch_is_shown(
     assert "; limited by the server's MLLM: 8 calls wait for it, of 6 at once" in capsys.readouterr().err
 
 
+def test_an_outage_is_shown_while_it_lasts(hurried: Connect, capsys: pytest.CaptureFixture[str]) -> None:
+    replies = iter([refusal("queue-full", 503)] * 2)
+    with answering(lambda _: next(replies, None) or httpx.Response(200, json=SIMULATION)) as http:
+        list(hurried("http://x", http_client=http, retries=0).map(asked(1), kind="simulate", progress=True))
+    assert hurried.slept == [2.0, 2.0]
+    waiting, over = capsys.readouterr().err.splitlines()
+    assert waiting.endswith("; waiting for the server (queue-full)")
+    assert over.startswith("0/1 done")
+    assert ";" not in over
+
+
 def load(queued: int = 0, **load: int) -> Workers:
     queue = QueueInfo(name="light", queued=queued, running=0, capacity=1, jobs_per_minute=0)
     none = {"cpu_waiting": 0, "mllm_calls": 0, "mllm_limit": 0, "mllm_waiting": 0}

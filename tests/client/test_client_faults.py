@@ -27,7 +27,6 @@ from sdk import (
     connect,
     event,
     hurried,
-    interruptible,
     stream,
     told,
 )
@@ -39,7 +38,7 @@ from cow_service.client import AsyncClient, Client, CowError, errors
 from cow_service.client.protocol import endpoint_of, pause_before_retry
 from cow_service.errors import FieldError, kinds
 
-__all__ = ["connect", "hurried", "interruptible"]  # fixtures
+__all__ = ["connect", "hurried"]  # fixtures
 
 OK = Reply(200, SIMULATION)
 ACCEPTED = Reply(202, JOB)
@@ -486,7 +485,6 @@ def test_the_environments_proxies_are_used(monkeypatch: pytest.MonkeyPatch) -> N
 # --- callers who leave ---
 
 
-@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("kind", ["sync", "async"])
 @pytest.mark.parametrize("alive", [True, False])
 def test_a_call_that_is_broken_off_before_its_job_is_known_ends_it(kind: str, alive: bool) -> None:
@@ -509,7 +507,6 @@ def test_a_call_that_is_broken_off_before_its_job_is_known_ends_it(kind: str, al
     assert second.headers["prefer"] == "respond-async"
 
 
-@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("kind", ["sync", "async"])
 def test_a_call_that_is_broken_off_later_ends_its_job(kind: str) -> None:
     looked = threading.Event()

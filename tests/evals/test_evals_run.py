@@ -78,18 +78,16 @@ def environment() -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("COW_", "INSPECT_"))}
     # The server computes in its own process: a worker takes longer to start than it would have to do.
     own = {"COW_CONCURRENCY": "1", "COW_WORKERS": "false", "COW_WARMUP": "false"}
-    return {**kept, **own, "LOCAL_API_KEY": "none", "PYTHONPATH": str(Path(__file__).parent)}
+    return {**kept, **own, "LOCAL_API_KEY": "none"}
 
 
 def own(mllm: TruthMllm) -> tuple[str, ...]:
     return "--mllm", MODEL, "--base-url", mllm.address
 
 
-def evaluated(
-    imported: Template, out: Path, *arguments: str, code: int = 0, **settings: str
-) -> subprocess.CompletedProcess[str]:
+def evaluated(imported: Template, out: Path, *arguments: str, code: int = 0) -> subprocess.CompletedProcess[str]:
     """A command `cow eval` that has ended."""
-    done = imported.begin(["eval", *arguments, "--out", str(out)], out.parent, environment() | settings).done()
+    done = imported.begin(["eval", *arguments, "--out", str(out)], out.parent, environment()).done()
     assert done.returncode == code, done.stdout[-2000:] + done.stderr[-4000:]
     assert "Traceback" not in done.stderr
     return done
@@ -124,7 +122,7 @@ def done(tmp_path_factory: pytest.TempPathFactory, items: list[Item], imported: 
     out = tmp_path_factory.mktemp("all") / "run"
     with truth_mllm(items, without=0.3, with_frames=1.0, seed=1) as mllm:
         asked = ("--arm", ",".join(ALL_ARMS), "--repeats", str(REPEATS), "--limit", str(LIMIT))
-        told = evaluated(imported, out, str(SAMPLE), *own(mllm), *asked, PLOTS="drawn")
+        told = evaluated(imported, out, str(SAMPLE), *own(mllm), *asked)
         run = read_run(out)
         found = summarize(run)
         yield Done(run, {each.arm: each for each in found.arms}, found, mllm, out, told.stdout)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Sequence
 from typing import Any
 
@@ -133,22 +132,6 @@ def test_looking_must_beat_every_placebo(statistics: Any) -> None:
     assert opposed.p == 1.0
     assert statistics.primary_gain({}) is None
     assert statistics.primary_gain({"still": (strong, 32), "other": (weak[:0], 0)}) is None, "one was not replied to"
-
-
-def test_votes_alone_gain_and_their_control_says_so(statistics: Any) -> None:
-    """A model that ignores frames gains by three votes over one, and nothing over three votes without frames."""
-    draws = random.Random("votes")
-
-    def of_votes(arm: str, votes: int) -> list[Observation]:
-        right = {scene: sum(draws.random() < 0.6 for _ in range(votes)) > votes / 2 for scene in range(5000)}
-        return [seen(f"scene {scene}", arm, 1, "A" if won else "B") for scene, won in right.items()]
-
-    looking, once, thrice = of_votes("always:vote-3", 3), of_votes("never", 1), of_votes("never:vote-3", 3)
-    over_one, over_votes = statistics.gain(looking, once), statistics.gain(looking, thrice)
-    assert over_one is not None
-    assert over_votes is not None
-    assert over_one.low > 0
-    assert over_votes.low < 0 < over_votes.high
 
 
 def test_a_plan_asks_for_as_many_scenes_as_the_normal_law_says(statistics: Any) -> None:

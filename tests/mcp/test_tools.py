@@ -159,6 +159,10 @@ def test_a_trajectory_is_told_in_words_to_a_tool_and_to_a_notebook() -> None:
         assert "the floor after" not in said  # where it stands from the start
     assert "Nothing moves in the image from 2.5 s on" in html
     assert "Nothing moves in the image from 2.50 s on" in text
+    assert (
+        "at [5.0, 5.0, 15.0, 15.0] in the image of 64 x 48 px; linear, direction [1, 0] (x right, y down), 10.0 px/s"
+        in text
+    )
     assert "\nVideo: cow://video\n" in text
     assert "leaves the image" not in text
 

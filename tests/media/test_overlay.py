@@ -157,7 +157,7 @@ def test_labels_stay_inside_and_apart(size: tuple[int, int], given_labels) -> No
         assert all(x1 <= a or c <= x0 or y1 <= b or d <= y0 for a, b, c, d in plates[:i])
 
 
-@pytest.mark.parametrize("side", [1, 20, 320, 4000])
+@pytest.mark.parametrize("side", [1, 20, 1600])
 def test_any_size_can_be_drawn_on(side: int) -> None:
     image = np.full((side, side, 3), 120, np.uint8)
     encounters = [{"object": "cube", "bbox": (0, 0, 10, 10), "kind": "touches", "first_frame": 3, "probability": 0.93}]

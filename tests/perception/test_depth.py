@@ -74,6 +74,7 @@ class TestFloor:
         assert (math.degrees(found.pitch), math.degrees(found.roll)) == pytest.approx((pitch, roll), abs=0.3)
         assert found.height == pytest.approx(height, rel=0.01)
 
+    @pytest.mark.slow
     def test_its_stated_deviation_covers_what_a_smooth_error_does(self) -> None:
         off = []
         for seed in range(12 * SCALE):

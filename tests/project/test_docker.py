@@ -85,7 +85,7 @@ def test_what_the_wheel_is_built_from_is_copied_and_nothing_else(dockerfile: Pat
     """`tests/cli/test_wheel.py` builds one, and looks at what is in it."""
     assert [path for path in KEPT_OUT if not ignored(path)] == []
     wheel = PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
-    built_from = {"pyproject.toml", "hatch_build.py", PROJECT["readme"], "LICENSE", *wheel["packages"]}
+    built_from = {"pyproject.toml", "hatch_build.py", "README.md", "LICENSE", *wheel["packages"]}
     locks = {f"docker/locks/{name}.txt" for name in ("build", dockerfile.stem)}
     sources = dict(copied(dockerfile))
     assert sources.keys() == built_from | wheel["force-include"].keys() | locks
@@ -297,35 +297,15 @@ SERVICES: dict[str, dict[str, Any]] = FILE["services"]
 WORKERS = ("worker", "gpu-worker")
 OURS = ("migration", "cow", "cow-mllm", "api", *WORKERS)
 SERVERS = ("cow", "cow-mllm", "api")  # that take requests
-# What a service may have, by the Compose specification, and how the values read where only some will do.
-PARTS: dict[str, str] = {
-    "image|build|profiles|command|init|user|environment|env_file|networks|logging|depends_on|healthcheck|deploy": "",
-    "stop_grace_period|interval|timeout|start_period": r"(\d+(h|m|s|ms))+",
-    "shm_size|max-size": r"\d+(b|k|m|g|kb|mb|gb)",
-    "restart": r"no|always|on-failure|unless-stopped",
-    "ports": r"\[('[\d.]+:\d+:\d+'(, )?)+\]",
-    "volumes": r"\[('[a-z]+:/[a-z/.]+'(, )?)+\]",
-    "tmpfs": r"\[('/[a-z/]+(:size=\d+[kmg])?'(, )?)+\]",
-    "configs": r"\[{'source': '\w+', 'target': '/docker-entrypoint-initdb\.d/[a-z]+\.sql'}\]",
-    "read_only": r"True",
-    "cap_drop": r"\['ALL'\]",
-    "security_opt": r"\['no-new-privileges:true'\]",
-    "condition": r"service_healthy|service_completed_successfully",
-}
-REQUIRED = {"image", "restart", "networks", "logging", "stop_grace_period", "cap_drop", "security_opt"}
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_a_service_is_what_compose_knows_and_gains_no_rights(name: str) -> None:
+def test_no_service_can_gain_rights_or_log_without_end(name: str) -> None:
     service = SERVICES[name]
-    assert service.keys() >= REQUIRED
-    needs = service.get("depends_on", {}).values()
-    for part in (service, service.get("healthcheck", {}), service["logging"]["options"], *needs):
-        for key, value in part.items():
-            forms = [form for keys, form in PARTS.items() if re.fullmatch(keys, key)]
-            assert forms or part is not service, key
-            assert all(re.fullmatch(form, str(value)) for form in forms if form), f"{key}: {value}"
+    assert (service["cap_drop"], service["security_opt"]) == (["ALL"], ["no-new-privileges:true"])
     assert service.get("user") != "root"
+    assert service["logging"]["options"].keys() == {"max-size", "max-file"}
+    assert seconds(service["stop_grace_period"]) > 0
     assert "healthcheck" in service or "build" in service, "the image has one"
 
 

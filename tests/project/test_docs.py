@@ -30,7 +30,7 @@ from hub import running as hub_running
 from waiting import TIME_LIMIT, eventually
 
 # Those whose commands take longest: they are run by `make soak`.
-LONG_PAGES = ("docs/benchmark.md", "docs/extending.md", "docs/sdk.md", "docs/video.md")
+LONG_PAGES = tuple(f"docs/{name}.md" for name in ("agents", "benchmark", "extending", "mllm", "sdk", "video"))
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
 LANGUAGES = {"sh", "python", "toml", "yaml", "json", "text"}
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -46,7 +46,7 @@ PIP = """#!/bin/sh
 echo "$@" >> "$PIP_ASKED"
 case " $* " in
   *" download "*|*" --no-index "*) ;;
-  *" -e "*) test "$(grep -c -e " -e " "$PIP_ASKED")" -gt 1 || exec python -m pip "$@" ;;
+  *" -e ."*) test "$(grep -c -e " -e [.]" "$PIP_ASKED")" -gt 1 || exec python -m pip "$@" ;;
   *) exec python -m pip "$@" ;;
 esac
 """

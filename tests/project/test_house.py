@@ -153,23 +153,25 @@ def test_the_pipeline_is_read_at_a_glance() -> None:
     assert lines(path) <= MAX_PIPELINE_LINES
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "import cow_service",
-        "import cow_service.cli.main",
-        "from cow_service.api.app import create_app; from cow_service.service import Service; "
-        "from cow_service.jobs.engine import JobEngine; from cow_service.settings import Settings; "
-        "s = Service(Settings(data_dir='x')); create_app(JobEngine(s)); s.models()",
-    ],
+APP = (
+    "from cow_service.api.app import create_app; from cow_service.service import Service; "
+    "from cow_service.jobs.engine import JobEngine; from cow_service.settings import Settings; "
+    "s = Service(Settings(data_dir='x')); create_app(JobEngine(s)); s.models()"
 )
-def test_nothing_heavy_and_no_extra_is_imported(statement: str) -> None:
-    assert imported_by(statement, (*HEAVY, *OF_EXTRAS)) == []
+LIGHT = {  # what is imported, and what does not come along
+    "cow_service": (*HEAVY, *OF_EXTRAS),
+    "cow_service.cli.main": (*HEAVY, *OF_EXTRAS, "fastapi", "uvicorn", "cv2", "numpy", "av"),
+    "cow_service.client": (*HEAVY, "fastapi", "uvicorn", "cv2", "numpy", "PIL", "av", "dbos", "sqlalchemy"),
+}
 
 
-def test_the_sdk_is_light() -> None:
-    suspects = ("fastapi", "uvicorn", "cv2", "numpy", "PIL", "av", "dbos", "sqlalchemy", *HEAVY)
-    assert imported_by("import cow_service.client", suspects) == []
+@pytest.mark.parametrize("module", LIGHT)
+def test_a_module_imports_nothing_heavy(module: str) -> None:
+    assert imported_by(f"import {module}", LIGHT[module]) == []
+
+
+def test_a_server_imports_nothing_heavy_and_no_extra() -> None:
+    assert imported_by(APP, (*HEAVY, *OF_EXTRAS)) == []
 
 
 def test_all_of_the_sdk_is_where_it_says() -> None:
@@ -178,12 +180,8 @@ def test_all_of_the_sdk_is_where_it_says() -> None:
     assert {name for name in client.__all__ if getattr(client, name) is None} == set()
     assert set(client.__all__) <= set(dir(client))
     assert imported_by("from cow_service.client import Client", ("fastapi", "cv2", "PIL", *HEAVY)) == []
-    with pytest.raises(AttributeError, match="no attribute 'Klient'"):
+    with pytest.raises(AttributeError):
         client.Klient  # noqa: B018
-
-
-def test_help_imports_no_server_and_no_vision() -> None:
-    assert imported_by("import cow_service.cli.main", ("fastapi", "uvicorn", "cv2", "numpy", "av")) == []
 
 
 def imported_by(statement: str, suspects: tuple[str, ...]) -> list[str]:

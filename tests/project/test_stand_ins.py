@@ -98,11 +98,3 @@ def test_errors_are_seeded_smooth_and_as_large_as_said(stand_ins: Any) -> None:
             assert np.diff(logs, axis=2).std() == pytest.approx(0.01 * np.sqrt(2), rel=0.05)
     small, large = (np.log(given(level, 9) / 3)[1:] for level in (0.03, 0.06))
     assert (2 * small - large).std() == pytest.approx(0.01, rel=0.1), "levels of a seed differ by their factor only"
-
-
-def test_the_motorcycle_stands_two_to_five_metres_away(stand_ins: Any) -> None:
-    pytest.importorskip("skimage", reason="needs scikit-image, whose wheel holds the photo")
-    scene = stand_ins.motorcycle()
-    assert (scene.image.shape, scene.depth.shape) == ((500, 741, 3), (500, 741))
-    assert 0.9 < np.isfinite(scene.depth).mean() < 0.95
-    assert 2 < np.nanmin(scene.depth) < np.nanmax(scene.depth) < 5.1

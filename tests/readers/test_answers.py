@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from conftest import EXAMPLES, all_scenes, example
+from conftest import EXAMPLES, SHARED_SCENES, example
 from drawn import ball, block, floor, png_bytes
 from outcomes import AT, CHOICES, COUNT, FIRST, HIT, NO, WHEN, YES, outcome, simulated
 from refusals import refused
+from rendered_scenes import folders_of
 from sdk import SIMULATION
 
 from cow_service.narration.words import phrases_of
@@ -234,9 +235,8 @@ def test_the_examples_are_answered_right(service: Service) -> None:
 
 
 @pytest.mark.soak
-@pytest.mark.scaled
 def test_further_scenes_are_answered_right_or_not_at_all(service: Service) -> None:
-    told = answers_of(service, all_scenes())
+    told = answers_of(service, folders_of(EXAMPLES) + folders_of(SHARED_SCENES))
     assert "wrong" not in told
     assert told.count("right") >= 0.7 * len(told)
 

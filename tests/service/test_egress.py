@@ -322,6 +322,7 @@ def test_what_is_not_asked(bad: str) -> None:
 @pytest.mark.usefixtures("unconnected")
 def test_a_url_may_be_so_long_and_no_longer() -> None:
     way = Egress(None, permitted=lambda ip: True)
+    assert (way.seconds, way.connect_seconds) == (10, 5)
     url = "http://8.8.8.8:65535/".ljust(4096, "a")
     way.check(url)
     with pytest.raises(NotAllowed):

@@ -57,6 +57,7 @@ def told_of(service: Service, folder: Path) -> tuple[Simulation, bool | None]:
     return simulation, yes == (meta["answer"] == "A") if asks else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", scene_rows())
 def test_scenes_with_known_truth(service: Service, folder: Path) -> None:
     meta, (simulation, is_right) = Example(folder).meta, told_of(service, folder)

@@ -27,7 +27,7 @@ COLOURS = {
 }
 
 
-@settings(max_examples=20 * SCALE, deadline=None, derandomize=True)
+@settings(max_examples=12 * SCALE, deadline=None, derandomize=True)
 @given(
     angle=st.floats(0, 2 * np.pi),
     length=st.floats(60, 180),
@@ -49,7 +49,8 @@ def test_any_arrow_on_a_floor_is_measured(
     assert math.dist(found.tip, arrow.tip) < 3 + thickness
 
 
-@settings(max_examples=12 * SCALE, deadline=None, derandomize=True)
+@pytest.mark.slow
+@settings(max_examples=8 * SCALE, deadline=None, derandomize=True)
 @given(
     angle=st.floats(0, 2 * np.pi),
     width=st.floats(9, 20),

@@ -175,6 +175,7 @@ def fit_drawn(camera: TrueCamera, shapes: tuple[str, ...], tiles: bool, rng: np.
     return narrowed(prior(0.0, max(camera.size) / width), things, camera.size, floor)
 
 
+@pytest.mark.slow
 class TestEdges:
     @pytest.mark.parametrize(
         ("shapes", "tiles", "most", "size"),

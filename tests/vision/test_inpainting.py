@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.vision.completion import as_disc
-from cow_service.vision.inpainting import erase_drawing, fill_hole, push_pull
+from cow_service.vision.inpainting import blend_fill, erase_drawing, fill_hole, push_pull, shadow_beside
 
 ROWS, COLUMNS = np.mgrid[:400, :640]
 
@@ -47,6 +47,25 @@ def test_what_is_to_be_avoided_does_not_bleed_in() -> None:
     image[away < 24] = (220, 20, 20)
     filled = fill_hole(image, away < 10, (away >= 10) & (away < 24))[away < 10].astype(int)
     assert (filled[:, 0] - filled[:, 1]).max() < 20
+
+
+def test_a_pattern_goes_on_through_a_hole() -> None:
+    tiles, hole = floor(), np.hypot(COLUMNS - 300, ROWS - 200) < 30
+    tiles[(ROWS // 24 + COLUMNS // 24) % 2 == 0] -= 40
+    filled = fill_hole(tiles, hole)[hole].astype(int)
+    assert np.abs(filled - tiles[hole]).mean() == pytest.approx(2.61, abs=0.1), "steps between tiles are of 40"
+    # What another painted is brought to the shading around the hole.
+    paler = blend_fill(tiles, tiles + np.uint8(20), hole, np.zeros_like(hole))[hole].astype(int)
+    assert np.abs(paler - tiles[hole]).mean() == pytest.approx(2.36, abs=0.1)
+
+
+def test_the_shadow_of_what_is_taken_out_lies_beside_its_hole() -> None:
+    image, hole = floor(), np.hypot(COLUMNS - 300, ROWS - 200) < 30
+    shaded = np.hypot((COLUMNS - 330) / 60, (ROWS - 225) / 18) < 1
+    image[shaded] //= 2
+    shadow = shadow_beside(image, hole, np.zeros_like(hole))
+    assert not (shadow & ~shaded).any()
+    assert shadow.sum() == pytest.approx(545, abs=10)
 
 
 def test_nothing_to_fill_is_no_work() -> None:

@@ -201,6 +201,7 @@ def test_a_plain_colour_is_found_and_named_on_a_dark_and_on_a_light_floor(grey: 
         assert name.split()[-1] in best.colours
 
 
+@pytest.mark.slow
 @given(
     st.tuples(st.floats(-50, 250), st.floats(-50, 200)),
     st.tuples(st.floats(2, 300), st.floats(2, 300)),

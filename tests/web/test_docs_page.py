@@ -8,6 +8,7 @@ import httpx
 import pytest
 from servers import problem
 
+pytestmark = pytest.mark.slow
 FILES = ("docs/swagger-ui.css", "docs/docs.css", "docs/swagger-ui-bundle.js", "docs/start.js")
 
 
