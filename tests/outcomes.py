@@ -65,6 +65,8 @@ CHOICES: list[tuple[Outcome, list[str], str | None]] = [
     (outcome(COUNT, count=4), ["1", "2 objects", "three or more"], "C"),
     (outcome(COUNT, count=0), ["none", "1", "2"], "A"),
     (outcome(COUNT, count=2), ["1-2", "2-3"], None),
+    (outcome(COUNT, count=2), ["1", "2-3"], "B"),
+    (outcome(COUNT, count=3), ["1-2", "3"], "B"),
     (outcome(HIT, 0.7, sure=False), ["Yes", "No"], None),
 ]  # fmt: skip
 

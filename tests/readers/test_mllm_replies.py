@@ -66,6 +66,13 @@ def told(case: dict[str, Any]) -> dict[str, Any]:
     return {"direction": ((x1 - x0) / length, (y1 - y0) / length), "cue": found.line.cue}
 
 
+@pytest.mark.parametrize(("reply", "reasoning"), [("B", ""), ("It rolls on.\nB", "It rolls on.\nB")])
+def test_a_bare_letter_is_no_reasoning(reply: str, reasoning: str) -> None:
+    from cow_service.readers.mllm.answer import read_answer
+
+    assert read_answer(reply, CHOICES).reasoning == reasoning
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['stage']}-{case['family']}-{case['id']}")
 def test_every_reply_is_read_right_or_refused(case: dict[str, Any]) -> None:
     found = told(case)
