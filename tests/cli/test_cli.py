@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from cow_service import __version__
 from cow_service.cli.main import app
 from cow_service.cli.options import COMMANDS, FIELDS, GROUPS, printable, request_body
-from cow_service.records import Models, Simulation
+from cow_service.records import Answer, Models, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
@@ -137,6 +137,17 @@ def test_an_answer_is_printed_with_what_it_rests_on(cow: Any, picture: Path) -> 
     result = cow("answer", picture, "Will it hit anything?")
     assert "--point X,Y" in result.stdout.replace("\n", " "), "what to give is named as options"
     assert "grounding.point" not in result.stdout
+
+
+@pytest.mark.slow
+def test_the_folder_of_an_answer(cow: Any, tmp_path: Path, picture: Path) -> None:
+    """`cow answer --out` leaves the simulation's files and answer.json; with --json and no folder, nothing."""
+    folder = tmp_path / "out"
+    cow("answer", picture, QUESTION, "--choice", "No", "--choice", "Yes", "--out", folder)
+    assert Answer.model_validate_json((folder / "answer.json").read_text()).answer == "B"
+    assert (folder / "overlay.jpg").exists()
+    told = Answer.model_validate_json(cow("answer", picture, QUESTION, "--no-imagine", "--votes", "2", "--json").stdout)
+    assert (told.simulation, told.not_sure, told.votes) == (None, True, {"not sure": 2})
 
 
 # Options
