@@ -1,17 +1,15 @@
 """Whatever is sent, the answer is a problem of the right code and pointer, at once and without much memory.
 
-One row each, against a real server. What is not HTTP at all is answered by the HTTP server itself, in plain text. What
-the problems say stands in test_error_table.py.
+Against a real server. What the problems say, and bodies that are no JSON object, stand in test_error_table.py.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-import os
-import socket
 from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -120,12 +118,6 @@ def still_well(server: Server, http: httpx.Client) -> Iterator[None]:
             "an EXIF directory of 24 MB, 10 times": (bad.with_segments(JPEG, bad.exif_bomb() * 10), 200),
             "5,000 scans": (bad.scans(PROGRESSIVE, 5000), 422),
         },
-        rest=[
-            (bad.bomb(20_000, 20_000), 413),
-            (bad.with_chunks(PNG, bad.texts(1, 300 * bad.MEBI)), 200),
-            (bad.with_chunks(PNG, [bad.chunk(b"tEXt", b"k\0" + b"a" * 1_500_000)]), 200),
-            (bad.with_segments(JPEG, EXIF * 9), 200),
-        ],
     ),
 )
 def test_bombs_cost_little(server: Server, http: httpx.Client, data: bytes, status: int) -> None:
@@ -158,62 +150,28 @@ def test_what_the_service_makes_holds_nothing_of_the_photographer(http: httpx.Cl
     assert http.get("/artifacts/" + simulation["image"]["sha256"]).content == photo
 
 
-@pytest.mark.parametrize(
-    ("image", "code", "pointers"),
-    [
-        ("data:image/png,raw", "invalid-request", ["/image"]),
-        (data_url(PNG).replace("image/png", "text/html"), "image-type-unsupported", []),
-        ("file:///etc/passwd", "image-url-not-allowed", []),
-        ({"url": "file:///etc/passwd"}, "image-url-not-allowed", []),
-        ({"artifact": "0" * 64}, "artifact-not-found", []),
-        ({"artifact": "../../etc/passwd"}, "invalid-request", ["/image", "/image/artifact", "/image/url"]),
-        ({"artifact": HEX + "\n"}, "invalid-request", ["/image", "/image/artifact", "/image/url"]),
-        (None, "invalid-request", ["/image"]),
-        ([1], "invalid-request", ["/image"]),
-    ],
-)
-def test_references_that_lead_to_no_image(http: httpx.Client, image: Any, code: str, pointers: list[str]) -> None:
-    status = {"image-type-unsupported": 415, "artifact-not-found": 404}.get(code, 422)
-    told(simulate(http, image=image), status, code, *pointers)
-
-
 # Fields
 
 
 ONE = {"point": [75, 100]}
+# What is declared of a field (its least and most, its values) stands in openapi.yaml: here is what code looks at.
 FIELDS: list[tuple[dict[str, Any], str]] = [
-    ({"question": "a" * 1_000_000}, "/question"),
+    ({"image": "data:image/png,raw"}, "/image"),
+    ({"image": None}, "/image"),
     ({"question": ""}, "/question"),
-    ({"question": "\u200b\u200c\u200d\u2060\ufeff"}, "/question"),
-    ({"question": None}, "/question"),
     ({"options": ["Yes", ""]}, "/options/1"),
-    ({"options": ["Yes"]}, "/options"),
-    ({"options": [f"option {i}" for i in range(27)]}, "/options"),
     ({"grounding": {"bbox": [60, 60, 61.5, 90]}}, "/grounding/bbox"),
     ({"grounding": {"bbox": [900, 60, 990, 90]}}, "/grounding/bbox"),
     ({"grounding": {"bbox": ["NaN", 0, 9, 9]}}, "/grounding/bbox/0"),
-    ({"grounding": {"point": [-1, 5]}}, "/grounding/point"),
     ({"grounding": ONE | {"object": "\0"}}, "/grounding/object"),
     ({"grounding": ONE | {"colour": 1}}, "/grounding/colour"),
     ({"motion": {"direction": [1, True]}}, "/motion/direction/1"),
-    ({"motion": {"direction": [1, 0], "speed": -1}}, "/motion/speed"),
     ({"motion": {"kind": "fall", "direction": [1, 0]}}, "/motion"),
     ({"motion": {"kind": "fall", "metres_per_pixel": 1e-300}}, "/motion/metres_per_pixel"),
-    ({"trajectory": {"points": [[1, 1]]}}, "/trajectory/points"),
-    ({"num_frames": 1}, "/num_frames"),
-    ({"num_frames": 482}, "/num_frames"),
     ({"num_frames": 10**300}, "/num_frames"),
-    ({"num_frames": 81.5}, "/num_frames"),
     ({"num_frames": True}, "/num_frames"),
-    ({"fps": 0}, "/fps"),
-    ({"seed": -1}, "/seed"),
-    ({"seed": 2**32}, "/seed"),
     ({"video": 1}, "/video"),
-    ({"reader": "n" * 100_000}, "/reader"),
     ({"generator": "../cutout"}, "/generator"),
-    ({"frames": {"count": 65}}, "/frames/count"),
-    ({"frames": {"policy": "best"}}, "/frames/policy"),
-    ({"frames": {"max_side": 15}}, "/frames/max_side"),
     ({"generator_options": {"a": {"b": ["x\0"]}}}, "/generator_options"),
     ({"generator_options": {"a": [[[[[[[[[1]]]]]]]]]}}, "/generator_options"),
     ({"x" * 100_000: 1}, "/" + "x" * 80 + "... (100000 characters)"),
@@ -223,14 +181,6 @@ FIELDS: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("given", "pointer"), FIELDS, ids=lambda value: value[:40] if isinstance(value, str) else "")
 def test_fields_out_of_range(http: httpx.Client, given: dict[str, Any], pointer: str) -> None:
     told(simulate(http, **given), 422, "invalid-request", pointer)
-
-
-def test_many_faults_are_named_and_not_all_of_them(http: httpx.Client) -> None:
-    told(http.post("/simulate", json={}), 422, "invalid-request", "/image", "/question")
-    body = BODY | {"frames": {"count": 0, "policy": "best"}}
-    told(http.post("/simulate", json=body), 422, "invalid-request", "/frames/policy", "/frames/count")
-    many = {f"field{i}": 1 for i in range(900)}
-    told(http.post("/simulate", json=BODY | many), 422, "invalid-request", *[f"/field{i}" for i in range(50)])
 
 
 values = st.recursive(
@@ -257,34 +207,11 @@ def test_random_values_are_refused_or_taken(http: httpx.Client, field: str, valu
 # Bodies
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        pytest.param(b"\xfe" + os.urandom(500), id="random bytes"),
-        pytest.param(TEXT[:-1], id="cut short"),
-        pytest.param(TEXT + TEXT, id="two objects"),
-        pytest.param('{"a":' * 100_000 + "1" + "}" * 100_000, id="100,000 objects"),
-        pytest.param('{"objects": [' + "{}," * 200_000 + "{}]}", id="200,000 empty objects"),
-    ],
-)
-def test_what_is_no_json_object(http: httpx.Client, body: bytes | str) -> None:
-    """More of it in the table of errors."""
-    told(post(http, body), 400, "malformed-body")
-
-
-def test_long_lists_that_nothing_reads(http: httpx.Client) -> None:
-    for name in ("a", "options"):
-        response = post(http, f'{{"{name}": [' + "0," * 1_400_000 + "0]}")
-        problem(response, 422, "invalid-request")
-        assert len(response.content) < 20_000
-
-
 def test_the_same_holds_of_the_rest_in_a_form(http: httpx.Client) -> None:
     def form(rest: str, **data: str) -> httpx.Response:
         return http.post("/simulate", data={"request": rest, **data}, files={"image": ("a.png", PNG, "image/png")})
 
-    for rest in ('{"seed": 1, "seed": 2}', '{"\\ud800": 1}', "[]", "{"):
-        told(form(rest, question=QUESTION), 400, "malformed-body")
+    told(form('{"seed": 1, "seed": 2}', question=QUESTION), 400, "malformed-body")
     told(form("{}", question=QUESTION, seed="3"), 422, "invalid-request", "/seed")
     told(form('{"question": "other"}', question=QUESTION), 422, "invalid-request", "/question")
     told(form('{"image": "x"}', question=QUESTION), 422, "invalid-request", "/image")
@@ -313,11 +240,9 @@ def test_media_types_that_nobody_reads(http: httpx.Client) -> None:
     form = "multipart/form-data; boundary=x; charset="
     for media_type in (
         "",
-        "text/plain",
         "application/json/x",
         "x" * 30_000,
         form + "punycode",
-        form + "unicode_escape",
     ):
         told(post(http, TEXT, media_type), 415, "body-type-unsupported")
 
@@ -331,7 +256,6 @@ def part(name: str | None, value: bytes, *, file: str | None = None, header: byt
 FILE = part("image", PNG, file="a.png")
 ASKED = part("question", QUESTION.encode())
 END = b"--x--\r\n"
-LONG_HEADER = b"X: " + b"a" * 1_000_000 + b"\r\n"
 # Malformed, or where there is a pointer, invalid.
 FORMS: dict[str, tuple[bytes, tuple[str, ...]]] = {
     "empty": (b"", ()),
@@ -339,10 +263,7 @@ FORMS: dict[str, tuple[bytes, tuple[str, ...]]] = {
     "no end": (FILE + ASKED, ()),
     "a part cut off": (FILE + ASKED + part("request", b'{"seed": 7}')[:-8], ()),
     "9 fields": (FILE + b"".join(part(f"f{i}", b"") for i in range(9)) + END, ()),
-    "4 files": (part("image", b"", file="a") * 4 + END, ()),
     "no name": (part(None, b"a") + END, ()),
-    "a part header of 1 MB": (part("image", PNG, file="a", header=LONG_HEADER) + END, ()),
-    "10,000 part headers": (part("image", PNG, file="a", header=b"X: y\r\n" * 10_000) + END, ()),
     "two images": (FILE + FILE + ASKED + END, ("/image",)),
     "two questions": (FILE + ASKED + ASKED + END, ("/question",)),
     "an endless name": (FILE + ASKED + part("s" * 3000, b"") + END, ("/" + "s" * 80 + "... (3000 characters)",)),
@@ -359,38 +280,22 @@ def test_forms_that_cannot_be_read(http: httpx.Client, name: str) -> None:
     told(post(http, body, "multipart/form-data; boundary=x"), status, code, *pointers)
 
 
-def test_the_boundary_of_a_form(http: httpx.Client) -> None:
-    whole = FILE + ASKED + part("request", b'{"num_frames": 5, "video": false}') + b"--x--"
-    assert post(http, whole, 'Multipart/Form-Data; Boundary="x"; odd=1').status_code == 200
-    for parameters in ("", "; boundary=", "; boundary=y", "; boundary=" + "y" * 5000):
-        told(post(http, whole, "multipart/form-data" + parameters), 400, "malformed-body")
-
-
 def chunks(body: bytes) -> Iterator[bytes]:
     yield from (body[at : at + 65536] for at in range(0, len(body), 65536))
 
 
-@pytest.mark.parametrize("form", [False, True], ids=["JSON", "multipart"])
 @pytest.mark.parametrize("announced", [True, False], ids=["announced", "chunked"])
-def test_the_limit_of_a_body(server: Server, http: httpx.Client, form: bool, announced: bool) -> None:
-    head, tail = (ASKED + part("image", b"", file="a")[:-2], b"\r\n--x--") if form else (SMALL.encode(), b"")
-    media_type = "multipart/form-data; boundary=x" if form else "application/json"
-    exact = head + b" " * (LIMIT - len(head) - len(tail)) + tail
-    for body, is_refused in ((exact, False), (head + b" " * (LIMIT + 1 - len(head) - len(tail)) + tail, True)):
+def test_the_limit_of_a_body(server: Server, http: httpx.Client, announced: bool) -> None:
+    exact = SMALL.encode().ljust(LIMIT)
+    for body, status, code in ((exact, 422, "invalid-request"), (exact + b" ", 413, "body-too-large")):
         with little_memory(server):
-            response = post(http, body if announced else chunks(body), media_type)
-        if is_refused:
-            told(response, 413, "body-too-large")
-        else:
-            assert len(body) == LIMIT
-            assert response.status_code in (415, 422), response.text
+            response = post(http, body if announced else chunks(body))
+        problem(response, status, code)
 
 
-@pytest.mark.parametrize("pieces", [[], [b"x"], [SMALL.encode()]], ids=["no body", "a byte", "no end"])
-def test_bodies_that_do_not_arrive(tmp_path: Path, pieces: list[bytes]) -> None:
+def test_a_body_whose_end_does_not_arrive(tmp_path: Path) -> None:
     async def body() -> AsyncIterator[bytes]:
-        for piece in pieces:
-            yield piece
+        yield SMALL.encode()
         await asyncio.Event().wait()
 
     (response,) = ask(app_of(tmp_path, body_timeout=0.2), ("POST", "/look", JSON, body()))
@@ -426,99 +331,25 @@ def test_slow_bytes_give_a_body_no_new_time_and_one_that_is_in_may_be_worked_on_
     asyncio.run(limited(whole))
 
 
-# Addresses
+# What clients do not send as it is written here
+
+
+def sent(server: Server, method: str, path: str, **headers: str) -> httpx.Response:
+    with closing(HTTPConnection(server.address.removeprefix("http://"), timeout=TIME_LIMIT)) as connection:
+        connection.request(method, path, headers=headers)
+        got = connection.getresponse()
+        return httpx.Response(got.status, headers=dict(got.headers), content=got.read())
 
 
 def test_addresses_with_nothing_there(server: Server) -> None:
     outside = ("/../../etc/passwd", "/..%2f..%2fetc%2fpasswd", "//etc/passwd", "/%2fetc%2fpasswd")
-    unnamed = ("/..", "/%2e%2e", "/..%5c..%5cetc", "/%00", f"/{HEX}%00", f"/{HEX}%0a", f"/{HEX.upper()}", f"/{HEX}0")
-    unnamed += (f"/{HEX[:-1]}", "/%ff%fe", "/" + "%D9%A3" * 64, f"/{HEX}")
-    addresses = {f"/artifacts{path}": "not-found" for path in outside} | {"/" + "a" * 50_000: "not-found"}
+    unnamed = ("/..", "/%2e%2e", "/..%5c..%5cetc", "/%00", f"/{HEX}%0a", "/%ff%fe", f"/{HEX}")
+    addresses = {f"/artifacts{path}": "not-found" for path in outside}
     addresses |= {f"/artifacts{path}": "artifact-not-found" for path in unnamed}
-    for path, code in addresses.items():  # sent as written: clients tidy dots away
-        told(talk(server, request(method="GET", path=path)), 404, code)
+    for path, code in addresses.items():
+        told(sent(server, "GET", path), 404, code)
 
 
-# The connection
-
-
-def connect(server: Server) -> socket.socket:
-    host, port = server.address.removeprefix("http://").split(":")
-    return socket.create_connection((host, int(port)), timeout=TIME_LIMIT)
-
-
-def received(connection: socket.socket) -> bytes:
-    """All that comes until the server closes the connection."""
-    pieces = []
-    try:
-        while piece := connection.recv(65536):
-            pieces.append(piece)
-    except ConnectionResetError:  # it closed while there was more to read
-        assert pieces
-    return b"".join(pieces)
-
-
-def parsed(data: bytes) -> httpx.Response:
-    """The first response of what came."""
-    head, _, body = data.partition(b"\r\n\r\n")
-    status, *lines = head.decode("latin-1").split("\r\n")
-    headers = dict(line.lower().split(": ", 1) for line in lines)
-    return httpx.Response(int(status.split()[1]), headers=headers, content=body[: int(headers["content-length"])])
-
-
-def talk(server: Server, sent: bytes) -> httpx.Response:
-    with connect(server) as connection:
-        connection.sendall(sent)
-        return parsed(received(connection))
-
-
-def request(*headers: str, method: str = "POST", path: str = "/simulate", version: str = "1.1") -> bytes:
-    lines = (f"{method} {path} HTTP/{version}", "Host: x", "Content-Type: application/json", *headers)
-    return "\r\n".join((*lines, "Connection: close", "", "")).encode()
-
-
-LENGTH = f"Content-Length: {len(SMALL)}"
-
-
-@pytest.mark.parametrize(
-    ("sent", "status", "code"),
-    [
-        (request("Content-Length: 20") + TEXT.encode(), 400, "malformed-body"),
-        (request("Content-Length: 5", "Transfer-Encoding: chunked") + b"2\r\n{}\r\n0\r\n\r\n", 400, "malformed-body"),
-        (request(LENGTH, version="1.0") + SMALL.encode(), 422, "invalid-request"),
-        (request("X-HTTP-Method-Override: POST", method="GET"), 405, "method-not-allowed"),
-        (request("X-HTTP-Method-Override: DELETE", LENGTH) + SMALL.encode(), 422, "invalid-request"),
-        (request(method="BREW"), 405, "method-not-allowed"),
-        (request("Expect: 100-continue", f"Content-Length: {LIMIT + 1}"), 413, "body-too-large"),
-    ],
-    ids=["short", "two lengths", "HTTP/1.0", "GET overridden", "POST overridden", "BREW", "expected too much"],
-)
-def test_odd_requests(server: Server, sent: bytes, status: int, code: str) -> None:
-    told(talk(server, sent), status, code, *(["/image"] if status == 422 else []))
-
-
-@pytest.mark.parametrize(
-    "sent",
-    [
-        pytest.param(request(path="/" + "a" * 100_000), id="a path of 100 KB"),
-        pytest.param(request("X-Long: " + "a" * 100_000), id="a header of 100 KB"),
-        pytest.param(request("Content-Length: -1"), id="negative length"),
-        pytest.param(request("Content-Length: 5", "Content-Length: 6") + b"{}", id="two lengths that differ"),
-        pytest.param(request("Transfer-Encoding: gzip"), id="unknown transfer encoding"),
-        pytest.param(b"GET / HTTP/1.1\r\nHost: x\r\nBad Header: y\r\n\r\n", id="a blank in a header's name"),
-        pytest.param(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(500), id="TLS"),
-    ],
-)
-def test_what_is_no_http_is_refused_before_the_app(server: Server, sent: bytes) -> None:
-    with connect(server) as connection:
-        connection.sendall(sent)
-        # A long line that comes in one piece gets through to the app.
-        assert received(connection).split()[1] in (b"400", b"404", b"415", b"431", b"501")
-
-
-def test_a_caller_may_ask_whether_to_go_on(server: Server) -> None:
-    with connect(server) as connection:
-        connection.sendall(request("Expect: 100-continue", LENGTH))
-        assert connection.recv(1000).startswith(b"HTTP/1.1 100 ")
-        connection.sendall(SMALL.encode())
-        assert parsed(received(connection)).status_code == 422
+def test_a_body_that_is_announced_too_large_is_refused_before_it_is_sent(server: Server) -> None:
+    headers = {"Expect": "100-continue", "Content-Type": "application/json", "Content-Length": str(LIMIT + 1)}
+    told(sent(server, "POST", "/simulate", **headers), 413, "body-too-large")
