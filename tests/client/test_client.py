@@ -9,7 +9,6 @@ import hashlib
 import html
 import importlib
 import io
-import json
 import os
 import pickle
 import pkgutil
@@ -33,6 +32,7 @@ from PIL import Image
 from refusals import refused
 from sdk import DIGEST, JOB, SIMULATION, address, client, connect, served
 from servers import BODY, IMAGE, QUESTION, Served, data_url, slow
+from tables import rows
 from waiting import TIME_LIMIT, eventually
 
 import cow_service.client
@@ -70,16 +70,6 @@ def slowly(seconds: float, seed: int = 0) -> dict[str, Any]:
 # --- images ---
 
 
-def picture(mode: str) -> Image.Image:
-    plain = Image.fromarray(PIXELS)
-    if mode.startswith("I;16"):
-        deep = Image.fromarray(np.asarray(plain.convert("L")).astype(np.uint16) * 257)
-        return deep if mode == "I;16" else deep.convert("I").convert(mode)
-    if mode in ("PA", "La", "RGBa"):
-        return plain.convert({"PA": "P", "La": "LA", "RGBa": "RGBA"}[mode]).convert(mode)
-    return plain.convert(mode)
-
-
 def test_images_in_every_form(tmp_path: Path) -> None:
     path = tmp_path / "a photo.png"
     path.write_bytes(IMAGE)
@@ -100,23 +90,26 @@ def test_images_in_every_form(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "sent_as"),
-    [
-        *((mode, mode) for mode in ("1", "L", "LA", "P", "RGB", "RGBA", "I;16")),
-        *(("I;16B", "I;16"), ("I;16L", "I;16"), ("PA", "RGBA"), ("RGBa", "RGBA"), ("La", "LA")),
-        *((mode, "RGB") for mode in ("CMYK", "YCbCr", "HSV", "RGBX")),
-    ],
+    ("mode", "made_as", "sent_as"),
+    rows(
+        {
+            "as it is, with a palette": ("P", "P", "P"),
+            "as it is, with alpha": ("RGBA", "RGBA", "RGBA"),
+            "16 bits, the other bytes first": ("I;16B", "I", "I;16"),
+            "alpha beside a palette": ("PA", "P", "RGBA"),
+            "grey that alpha has been applied to": ("La", "LA", "LA"),
+            "of printers": ("CMYK", "CMYK", "RGB"),
+        },
+        [("1", "1", "1"), ("I;16L", "I", "I;16"), ("RGBa", "RGBA", "RGBA"), ("HSV", "HSV", "RGB")],
+    ),
 )
-def test_pixels_of_pil_images_are_kept(mode: str, sent_as: str) -> None:
-    given = picture(mode)
-    sent = image_input(given)
-    assert isinstance(sent, bytes)
-    with Image.open(io.BytesIO(sent)) as came:
+def test_pixels_of_pil_images_are_kept(mode: str, made_as: str, sent_as: str) -> None:
+    deep = Image.fromarray(PIXELS[..., 0].astype(np.uint16) * 257)
+    given = (deep if mode.startswith("I;16") else Image.fromarray(PIXELS)).convert(made_as).convert(mode)
+    with Image.open(io.BytesIO(bytes(image_input(given)))) as came:
         assert (came.format, came.size, came.mode) == ("PNG", given.size, sent_as)
-        if sent_as == "I;16":
-            assert np.array_equal(np.asarray(came), np.asarray(given.convert("I")))
-        else:
-            assert np.array_equal(np.asarray(came.convert("RGBA")), np.asarray(given.convert(sent_as).convert("RGBA")))
+        kept, pixels = ("I", given) if sent_as == "I;16" else ("RGBA", given.convert(sent_as))
+        assert np.array_equal(np.asarray(came.convert(kept)), np.asarray(pixels.convert(kept)))
 
 
 def test_pil_images_stand_upright_and_hold_nothing_else() -> None:
@@ -135,10 +128,8 @@ def test_pil_images_stand_upright_and_hold_nothing_else() -> None:
 
 WRONG: list[Any] = [
     *(PIXELS.astype(np.float32), np.zeros((4, 4, 2), np.uint8), np.zeros((1, 4, 4, 3), np.uint8)),
-    *(np.zeros((0, 4, 3), np.uint8), np.uint8(3)),
-    *(Image.new("RGB", (0, 4)), Image.new("I", (4, 4)), Image.new("F", (4, 4))),
-    *(io.BytesIO(IMAGE), None, [[1]]),
-    records.Video(url="/x", sha256=DIGEST, fps=1, num_frames=1, width=1, height=1),
+    *(np.zeros((0, 4, 3), np.uint8), Image.new("RGB", (0, 4)), Image.new("I", (4, 4)), Image.new("F", (4, 4))),
+    *(io.BytesIO(IMAGE), None, records.Video(url="/x", sha256=DIGEST, fps=1, num_frames=1, width=1, height=1)),
 ]
 
 
@@ -151,8 +142,6 @@ def test_what_is_no_image_is_refused_by_its_name(client: Client, tmp_path: Path)
     with pytest.raises(IsADirectoryError):
         client.answer(tmp_path, QUESTION)
     for data, code in (
-        (b"", "image-unreadable"),
-        (b"GIF89a....", "image-type-unsupported"),
         (IMAGE[:500], "image-unreadable"),
         (os.urandom(3_100_000), "body-too-large"),
         ("https://example.org/a.png", "image-url-not-allowed"),
@@ -251,6 +240,9 @@ def test_options_of_every_kind_and_questions_arrive_as_they_are(client: Client, 
 
 
 def test_what_no_request_can_hold_is_refused() -> None:
+    for key in ("", "two words", "ä", "line\n", "x" * 256):  # no header holds it
+        with refused("invalid-request", ""):
+            job_request("simulate", IMAGE, QUESTION, {}, key, False)
     for image in (IMAGE, data_url(IMAGE)):
         with pytest.raises(TypeError, match="object"):
             job_request("simulate", image, QUESTION, {"generator_options": {"x": object()}}, None, False)
@@ -301,22 +293,6 @@ def test_pictures_are_downloaded_once_and_when_asked_for(address: str) -> None:
         assert len(seen) == before + 1 + 4 + 1 + 1
 
 
-def test_what_is_saved_is_the_result(client: Client, tmp_path: Path) -> None:
-    answer = client.answer(PHOTO, ASKED, video=True)
-    folder = tmp_path / "new" / "folder"
-    assert answer.save(str(folder)) == answer.save(folder) == folder
-    kept = {path.name for path in folder.iterdir()}
-    assert kept == {"answer.json", "simulation.json", "overlay.jpg", "video.mp4"} | {
-        f"frame_{frame.index:03d}.png" for frame in answer.simulation.frames
-    }
-    assert records.Answer.model_validate_json((folder / "answer.json").read_text()).option == "No"
-    again = Simulation.model_validate_json((folder / "simulation.json").read_text())
-    assert again.model_dump() == answer.simulation.model_dump()
-    with pytest.raises(ValueError, match="artifact"):
-        again.pil_frames()
-    assert again._repr_html_().count("not downloaded") == 6
-
-
 def test_results_can_be_copied_compared_and_sent_to_other_processes(client: Client, tmp_path: Path) -> None:
     box = {"object": "thing", "bbox": (20, 20, 60, 60)}
     removed = {"objects": [box], "interventions": [{"kind": "remove", "object": "thing"}]}
@@ -331,6 +307,10 @@ def test_results_can_be_copied_compared_and_sent_to_other_processes(client: Clie
     assert kept == {f"factual_{frame.index:03d}.png" for frame in simulation.factual_frames} != set()
     with pytest.raises(ValueError, match="video=True"):
         simulation.video_bytes()
+    again = Simulation.model_validate_json((tmp_path / "simulation.json").read_text())
+    assert again.model_dump() == simulation.model_dump()
+    with pytest.raises(ValueError, match="artifact"):
+        again.pil_frames()
 
 
 def test_reprs_are_short(client: Client) -> None:
@@ -338,11 +318,10 @@ def test_reprs_are_short(client: Client) -> None:
     simulation = handle.wait()
     assert repr(handle) == f"<JobHandle {handle.id}: simulate, succeeded>"
     assert re.fullmatch(rf"<Simulation {handle.id}: object hits blue object after [^;]+; 1 frames>", repr(simulation))
-    long = Simulation.model_validate({**SIMULATION, "grounding": {**SIMULATION["grounding"], "object": "a b\n" * 500}})
-    assert len(str(long)) == len("<Simulation j-1: ; 1 frames>") + 120
-    assert "\n" not in repr(long)
-    answer = records.Answer.model_construct(**{**JOB, "answer": "word " * 999, "option": None})
-    assert len(repr(cow_service.client.Answer.model_construct(**dict(answer)))) == len("<Answer j-1: >") + 120
+    answer = records.Answer.model_construct(**{**JOB, "answer": "word\n" * 999, "option": None})
+    shown = repr(cow_service.client.Answer.model_construct(**dict(answer)))
+    assert len(shown) == len("<Answer j-1: >") + 120
+    assert "\n" not in shown
 
 
 def test_notebooks_show_pictures_and_need_no_network(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -371,11 +350,6 @@ def test_models_are_a_table(client: Client) -> None:
     assert len(lines) == len(models.readers) + len(models.generators)
     assert "generator  cutout (default)    yes" in lines
     assert "generator  ati                 needs its weights; cow models pull ati" in lines
-    evil = "<img src=x onerror=alert(1)>\n"
-    backend = {"name": evil, "default": True, "ready": False, "summary": evil, "licence": evil, "weights": evil}
-    backend |= {"missing": [evil], "install": evil, "pull": evil}
-    models = cow_service.client.Models.model_validate({"readers": [backend], "generators": [], "mllms": [evil]})
-    assert len(str(models).splitlines()) == 1
 
 
 def test_what_callers_and_models_write_is_no_markup() -> None:
@@ -440,10 +414,6 @@ def test_a_handle_is_waited_for_and_found_again(client: Client) -> None:
     again = client.job(handle.id)
     assert again.job.status == "succeeded"
     assert len(again.wait(timeout=0).pil_frames()) == 1
-    failed = client.submit(IMAGE, "If the pink car turns, what happens?")
-    with refused("cannot-ground") as caught:
-        failed.wait()
-    assert caught.value.request_id
 
 
 def test_a_job_that_is_canceled_and_deleted(client: Client) -> None:
@@ -457,9 +427,8 @@ def test_a_job_that_is_canceled_and_deleted(client: Client) -> None:
         handle.wait()
     assert handle.id in caught.value.detail
     handle.delete()
-    for call in (handle.refresh, handle.delete, handle.cancel, handle.wait, lambda: list(handle.events())):
-        with refused("job-not-found"):
-            call()
+    with refused("job-not-found"):
+        handle.refresh()
 
 
 def test_events_are_told_to_the_end(client: Client) -> None:
@@ -469,8 +438,6 @@ def test_events_are_told_to_the_end(client: Client) -> None:
     assert {one.number for one in events if one.name == "progress"} <= {None}
     assert events[-1].name == "succeeded" == handle.job.status
     assert all(one.job.id == handle.id and one.job.result is None for one in events)
-    assert [one.number for one in handle.events(after=3)] == [4, 100]
-    assert list(handle.events(after=100)) == []
 
 
 def test_jobs_are_found_by_what_they_are_and_come_page_by_page(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -490,14 +457,7 @@ def test_jobs_are_found_by_what_they_are_and_come_page_by_page(client: Client, m
     assert [handle.id for handle in client.jobs(kind="answer")][:5] == ids[::-1]
 
 
-LISTS = {"states", "scale", "rotation", "turns", "band", "futures", "tracks", "tracks_visible"}
-
-
-def without_lists(trajectory: dict[str, Any]) -> dict[str, Any]:
-    paths = [{name: value for name, value in path.items() if name not in LISTS} for path in trajectory["paths"]]
-    factual = trajectory["factual"] and without_lists(trajectory["factual"])
-    lean = {name: value for name, value in trajectory.items() if name != "still_tracks"}
-    return lean | {"paths": paths, "factual": factual}
+LISTS = ("states", "scale", "rotation", "turns", "band", "futures", "tracks", "tracks_visible")
 
 
 def test_minimal_results_lack_the_long_lists_alone_and_the_job_keeps_them(
@@ -505,20 +465,20 @@ def test_minimal_results_lack_the_long_lists_alone_and_the_job_keeps_them(
 ) -> None:
     cube = {"object": "blue cube", "bbox": [170, 60, 205, 98]}
     body = {**BODY, "objects": [cube], "interventions": [{"kind": "remove", "object": "blue cube"}]}
-    for path in ("/simulate", "/answer"):
-        sent = served.http.post(path, json=body, headers={"Prefer": "return=minimal"})
-        assert sent.headers["preference-applied"] == "return=minimal"
-        told, asked = sent.json(), {"Prefer": "return=minimal, wait=1"}
-        kept, lean = (served.http.get(f"/jobs/{told['id']}", headers=headers).json() for headers in ({}, asked))
-        assert lean == kept | {"result": told}
-        whole = kept["result"]
-        simulation = whole["simulation"] if path == "/answer" else whole
-        assert simulation["trajectory"]["paths"][0]["states"]
-        assert simulation["trajectory"]["factual"]
-        simulation["trajectory"] = without_lists(simulation["trajectory"])
-        assert told == whole
-        (records.Answer if path == "/answer" else records.Simulation).model_validate(told)
-    assert "preference-applied" not in served.http.post(path, json=body).headers
+    sent = served.http.post("/answer", json=body, headers={"Prefer": "return=minimal"})
+    assert sent.headers["preference-applied"] == "return=minimal"
+    told, asked = sent.json(), {"Prefer": "return=minimal, wait=1"}
+    kept, lean = (served.http.get(f"/jobs/{told['id']}", headers=headers).json() for headers in ({}, asked))
+    assert lean == kept | {"result": told}
+    trajectory = kept["result"]["simulation"]["trajectory"]
+    assert trajectory["paths"][0]["states"]
+    for one in (trajectory, trajectory["factual"]):
+        one.pop("still_tracks", None)
+        for path in one["paths"]:
+            for name in LISTS:
+                path.pop(name, None)
+    assert told == kept["result"]
+    records.Answer.model_validate(told)
     (outcome,) = client.map([(IMAGE, QUESTION)], kind="simulate", out=tmp_path, minimal=True, **SMALL)
     for result in (
         outcome.result,
@@ -533,16 +493,14 @@ def test_minimal_results_lack_the_long_lists_alone_and_the_job_keeps_them(
 # --- progress ---
 
 
-def test_progress_is_told_to_a_function(client: Client) -> None:
+def test_progress_is_told_to_a_function_and_shown_also_in_many_threads(
+    client: Client, capsys: pytest.CaptureFixture[str]
+) -> None:
     heard: list[Job] = []
     client.simulate(IMAGE, QUESTION, progress=heard.append, fresh=True, **slowly(0.6, seed=11))
     assert heard[-1].status == "succeeded"
     assert [job.progress for job in heard] == sorted(job.progress for job in heard)
     assert len({job.progress for job in heard}) > 2
-
-
-def test_progress_is_shown_also_in_many_threads(client: Client, capsys: pytest.CaptureFixture[str]) -> None:
-    client.submit(IMAGE, QUESTION, **SMALL).wait(progress=True)
     with ThreadPoolExecutor(3) as pool:
         done = [pool.submit(client.simulate, IMAGE, QUESTION, progress=True, **SMALL, seed=n) for n in range(3)]
         assert len({one.result().id for one in done}) == 3
@@ -564,50 +522,6 @@ def test_examples_in_the_docs_are_true(client: Client, tmp_path: Path, monkeypat
     assert not {name: each for name, each in found.items() if each.failed}
     modules = {"sync_client", "sync_results", "display"}
     assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= modules
-
-
-USE = """
-from typing import assert_type
-
-from cow_service.client import Answer, AsyncClient, AsyncSimulation, Client, Event, JobHandle, Simulation, errors
-from cow_service.requests import FramesRequest
-
-client = Client(timeout=5, retries=2)
-assert_type(client.simulate("a.png", "What?", frames={"count": 5}, motion={"direction": [1, 0]}), Simulation)
-answer = client.answer(b"", "What?", votes=3, imagine="never", frames=FramesRequest(count=2))
-assert_type(answer.simulation, Simulation | None)
-assert_type(client.submit("a.png", "What?", kind="answer", votes=3), JobHandle[Answer])
-assert_type(client.submit("a.png", "What?").wait(timeout=3, progress=True), Simulation)
-assert_type(client.job("x").wait(), Simulation | Answer)
-assert_type([*client.job("x").events(after=2)], list[Event])
-assert_type([result.result for result in client.map([], kind="simulate")], list[Simulation | None])
-try:
-    client.simulate("a.png", "What?", progress=lambda job: print(job.progress))
-except errors.QueueFull as error:
-    print(error.request_id, error.status, error.errors[0].pointer)
-
-
-async def ask() -> None:
-    async with AsyncClient() as client:
-        assert_type(await client.simulate("a.png", "What?"), AsyncSimulation)
-        assert_type([one.id async for one in client.jobs()], list[str])
-
-
-print(ask)
-client.simulate("a.png", "What?", votes=3)  # pyright: ignore[reportCallIssue]
-client.submit("a.png", "What?", kind="answer", frame={})  # pyright: ignore[reportCallIssue]
-client.answer(3, "What?", imagine="sometimes")  # pyright: ignore[reportArgumentType]
-"""
-
-
-@pytest.mark.soak
-def test_types_are_told(tmp_path: Path) -> None:
-    (tmp_path / "use.py").write_text(USE)
-    settings = {"typeCheckingMode": "strict", "pythonVersion": "3.11", "extraPaths": [str(ROOT)], "include": ["use.py"]}
-    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings | {"reportUnnecessaryTypeIgnoreComment": True}))
-    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "-p", str(tmp_path)]
-    checked = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert checked.returncode == 0, checked.stdout
 
 
 LIGHT = """

@@ -8,7 +8,6 @@ import signal
 import socket
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -30,8 +29,8 @@ from sdk import (
     stream,
     told,
 )
-from servers import IMAGE, QUESTION, Served, slow
-from waiting import TIME_LIMIT, eventually
+from servers import IMAGE, QUESTION
+from waiting import TIME_LIMIT
 
 from cow_service import __version__
 from cow_service.client import AsyncClient, Client, CowError, errors
@@ -66,13 +65,6 @@ def test_a_call_has_one_key_and_one_body_however_often_it_is_sent(hurried: Conne
     assert len(first) >= 20
 
 
-def test_a_key_that_no_header_can_hold_is_refused(connect: Connect) -> None:
-    client = connect("http://127.0.0.1:1")
-    for key in ("", "two words", "ä", "line\n", "x" * 256):
-        with refused("invalid-request", ""):
-            client.simulate(IMAGE, QUESTION, idempotency_key=key)
-
-
 def test_a_problem_is_raised_as_the_class_of_its_code_and_only_refusals_at_the_door_are_tried_again(
     hurried: Connect,
 ) -> None:
@@ -80,8 +72,9 @@ def test_a_problem_is_raised_as_the_class_of_its_code_and_only_refusals_at_the_d
     fields = [{"pointer": "/fps", "detail": "too fast"}, {"pointer": "/seed", "detail": "odd"}]
     more = {"errors": fields, "headers": {"x-request-id": "r-9", "retry-after": "7"}}
     known = sorted(kinds().items())
-    replies = [told(code, kind.status, f"Wrong: {code}.", **more) for code, kind in known for _ in range(2)]
-    replies = [reply for reply, (code, _) in zip(replies[::2], known, strict=True) for _ in range(1 + (code in again))]
+    replies = [
+        told(code, kind.status, f"Wrong: {code}.", **more) for code, kind in known for _ in range(1 + (code in again))
+    ]
     with Scripted(*replies, OK) as server:
         client = hurried(server.url, retries=1)
         for code, kind in known:
@@ -98,23 +91,18 @@ def test_a_problem_is_raised_as_the_class_of_its_code_and_only_refusals_at_the_d
     assert all(7 <= pause <= 7.25 for pause in hurried.slept)
 
 
-@pytest.mark.parametrize("status", [301, 400, 500, 505])
-def test_a_proxys_own_refusals_are_not_tried_again(hurried: Connect, status: int) -> None:
-    headers = {**PAGE, "x-request-id": "p-1", "location": "https://x.example" if status == 301 else ""}
-    with Scripted(Reply(status, b"<html>no</html>", headers)) as server, refused("bad-response") as caught:
-        hurried(server.url).models()
-    assert len(server.asked) == 1
-    assert isinstance(caught.value, errors.BadResponse)
-    assert (caught.value.status, caught.value.request_id) == (status, "p-1")
-    assert all(part in caught.value.detail for part in (str(status), "<html>no", headers["location"]))
-
-
-def test_a_proxys_passing_refusals_are_tried_again(hurried: Connect) -> None:
-    passing = [408, 425, 429, 502, 503, 504]
-    replies = [Reply(status, body) for status in passing for body in (b"<html>", b"")]
-    with Scripted(*replies, MODELS) as server:
-        assert hurried(server.url, retries=len(replies)).models().readers == ()
-    assert len(server.asked) == len(replies) + 1
+def test_a_proxys_refusals_are_tried_again_where_they_pass(hurried: Connect) -> None:
+    passing = [Reply(status, b"<html>") for status in (408, 425, 429, 502, 503, 504)]
+    with Scripted(*passing, MODELS) as server:
+        assert hurried(server.url, retries=len(passing)).models().readers == ()
+        assert len(server.asked) == len(passing) + 1
+    for status in (301, 400, 500, 505):
+        headers = {**PAGE, "x-request-id": "p-1", "location": "https://x.example" if status == 301 else ""}
+        with Scripted(Reply(status, b"<html>no</html>", headers)) as server, refused("bad-response") as caught:
+            hurried(server.url).models()
+        assert len(server.asked) == 1
+        assert (caught.value.status, caught.value.request_id) == (status, "p-1")
+        assert all(part in caught.value.detail for part in (str(status), "<html>no", headers["location"]))
 
 
 NOW = 1_700_000_000.0
@@ -122,24 +110,18 @@ JITTER = 0.25
 
 
 @pytest.mark.parametrize(
-    ("retry_after", "least", "most"),
+    ("retry_after", "least"),
     [
-        ("0", 0, JITTER),
-        ("3", 3, 3 + JITTER),
-        ("3600", 60, 60 + JITTER),
-        ("9" * 400, 60, 60 + JITTER),
-        (email.utils.formatdate(NOW + 30, usegmt=True), 30, 30 + JITTER),
-        (time.asctime(time.gmtime(NOW + 30)), 30, 30 + JITTER),  # the old form, which is in GMT as well
-        (email.utils.formatdate(NOW - 50, usegmt=True), 0, JITTER),
-        ("soon", 0.375, 0.625),
-        ("1.5", 0.375, 0.625),
-        ("Fri, 99 Foo 2026 00:00:00 GMT", 0.375, 0.625),
-        ("", 0.375, 0.625),
+        ("0", 0),
+        ("3", 3),
+        ("3600", 60),
+        (email.utils.formatdate(NOW + 30, usegmt=True), 30),
+        (time.asctime(time.gmtime(NOW + 30)), 30),  # the old form, which is in GMT as well
+        (email.utils.formatdate(NOW - 50, usegmt=True), 0),
+        ("1.5", 0.375),  # no number of whole seconds
     ],
 )
-def test_retry_after_is_heeded_and_capped(
-    monkeypatch: pytest.MonkeyPatch, retry_after: str, least: float, most: float
-) -> None:
+def test_retry_after_is_heeded_and_capped(monkeypatch: pytest.MonkeyPatch, retry_after: str, least: float) -> None:
     monkeypatch.setattr(time, "time", lambda: NOW)
     monkeypatch.setenv("TZ", "Asia/Tokyo")
     time.tzset()
@@ -149,7 +131,7 @@ def test_retry_after_is_heeded_and_capped(
         monkeypatch.undo()
         time.tzset()
     assert pause is not None
-    assert least <= pause <= most
+    assert least <= pause <= least + JITTER
 
 
 def test_pauses_grow_where_the_server_asks_for_none_and_nobody_is_asked_for_ever(hurried: Connect) -> None:
@@ -183,20 +165,14 @@ def test_a_job_that_is_deleted_and_not_heard_of_is_deleted(hurried: Connect) -> 
             job.delete()
 
 
-def test_an_artifact_that_came_damaged_is_not_taken(hurried: Connect) -> None:
+def test_an_artifact_is_not_taken_damaged_and_is_missed_where_it_lies(hurried: Connect) -> None:
     with Scripted(Reply(200, b"other")) as server, refused("bad-response"):
         hurried(server.url).artifact(DIGEST)
-
-
-def test_an_artifact_may_lie_elsewhere_and_is_missed_there(hurried: Connect) -> None:
-    with (
-        Scripted(BROKEN) as store,
-        Scripted(Reply(307, b"", {"location": f"{store.url}/a"})) as server,
-        refused("server-unreachable") as caught,
-    ):
-        hurried(server.url, retries=0, api_key="cow_own").artifact(DIGEST)
-    assert "COW_ARTIFACTS_REDIRECT" in caught.value.detail
-    assert "authorization" not in store.asked[0].headers
+    with Scripted(BROKEN) as store, Scripted(Reply(307, b"", {"location": f"{store.url}/a"})) as server:
+        with refused("server-unreachable") as caught:
+            hurried(server.url, retries=0, api_key="cow_own").artifact(DIGEST)
+        assert "COW_ARTIFACTS_REDIRECT" in caught.value.detail
+        assert "authorization" not in store.asked[0].headers
 
 
 def test_ids_stay_where_they_belong_in_an_address(hurried: Connect) -> None:
@@ -221,6 +197,9 @@ def test_the_timeout_is_for_everything_together(hurried: Connect) -> None:
     assert isinstance(caught.value, errors.WaitTimeout)
     assert caught.value.job_id == "j-1"
     assert server.asked[0].headers["prefer"] == "wait=1"
+    with Scripted(told("queue-full", 503, headers={"retry-after": "30"})) as server, refused("queue-full"):
+        hurried(server.url).simulate(IMAGE, QUESTION, timeout=5)
+    assert len(server.asked) == 1, "no pause goes past the timeout"
 
 
 def test_looks_at_a_job_become_rarer_and_a_wait_can_go_on_after_a_timeout(hurried: Connect) -> None:
@@ -235,12 +214,6 @@ def test_looks_at_a_job_become_rarer_and_a_wait_can_go_on_after_a_timeout(hurrie
         assert handle.job.status == "succeeded"
     assert hurried.slept == pytest.approx([0.1, 0.15, 0.225, 0.3375, 0.50625, 0.759375, 1.1390625, 1.70859375])
     assert {asked.method for asked in server.asked[1:]} == {"GET"}, "who waits no longer cancels nothing"
-
-
-def test_no_pause_goes_past_the_timeout(hurried: Connect) -> None:
-    with Scripted(told("queue-full", 503, headers={"retry-after": "30"})) as server, refused("queue-full"):
-        hurried(server.url).simulate(IMAGE, QUESTION, timeout=5)
-    assert len(server.asked) == 1
 
 
 def test_how_long_the_server_may_say_nothing(connect: Connect) -> None:
@@ -289,37 +262,25 @@ def test_a_code_of_a_later_version_is_a_plain_error_with_that_code(hurried: Conn
     assert (error.usage, error.refusal) == (more["usage"], more["refusal"])
 
 
-@pytest.mark.parametrize(
-    "problem",
-    [
-        {"type": "urn:cow:problem:queue-full", "status": "many", "errors": 7, "detail": None, "title": "Full."},
-        {"errors": ["x", {"pointer": None}], "usage": 3, "refusal": []},
-    ],
-)
-def test_problems_that_are_odd_are_raised_all_the_same(hurried: Connect, problem: Any) -> None:
-    reply = Reply(400, problem, {"content-type": "Application/Problem+JSON; charset=utf-8"})
-    with Scripted(reply) as server, pytest.raises(CowError) as caught:
-        hurried(server.url, retries=0).models()
-    assert caught.value.detail == problem.get("title", "")
-    assert not isinstance(caught.value, errors.BadResponse)
+ODD: list[dict[str, Any]] = [
+    {"type": "urn:cow:problem:queue-full", "status": "many", "errors": 7, "detail": None, "title": "Full."},
+    {"errors": ["x", {"pointer": None}], "usage": 3, "refusal": []},
+]
+PROBLEM = {"content-type": "Application/Problem+JSON; charset=utf-8"}
 
 
-@pytest.mark.parametrize(
-    "reply",
-    [
-        Reply(200, b"<html>log in here</html>", PAGE),
-        Reply(200, b"\xff\xfe\x00"),
-        Reply(200, [1]),
-        Reply(200, {"readers": 3}),
-        Reply(418, b"not json", {"content-type": "application/problem+json"}),
-        Reply(418, b"[]", {"content-type": "application/problem+json"}),
-        Reply(200, b"none", {"content-encoding": "gzip"}),
-    ],
-)
-def test_what_is_none_of_cows_is_a_bad_response(hurried: Connect, reply: Reply) -> None:
-    with Scripted(reply) as server, refused("bad-response"):
-        hurried(server.url).models()
-    assert len(server.asked) == 1
+def test_what_is_none_of_cows_is_a_bad_response_and_an_odd_problem_a_problem(hurried: Connect) -> None:
+    pages = [Reply(200, b"<html>log in here</html>", PAGE), Reply(200, [1]), Reply(200, {"readers": 3})]
+    pages += [Reply(418, b"not json", PROBLEM), Reply(418, b"[]", PROBLEM)]
+    for reply in (*pages, Reply(200, b"none", {"content-encoding": "gzip"})):
+        with Scripted(reply) as server, refused("bad-response"):
+            hurried(server.url).models()
+        assert len(server.asked) == 1
+    for problem in ODD:
+        with Scripted(Reply(400, problem, PROBLEM)) as server, pytest.raises(CowError) as caught:
+            hurried(server.url, retries=0).models()
+        assert caught.value.detail == problem.get("title", "")
+        assert not isinstance(caught.value, errors.BadResponse)
 
 
 def test_a_job_whose_result_cannot_be_read_is_a_bad_response(hurried: Connect) -> None:
@@ -396,22 +357,14 @@ def test_a_stream_that_breaks_again_and_again_is_given_up(hurried: Connect) -> N
         assert len(server.asked) == 1 + 3
 
 
-@pytest.mark.parametrize(
-    ("reply", "code"),
-    [
-        (told("job-not-found", 404), "job-not-found"),
-        (Reply(200, b"<html>", PAGE), "bad-response"),
-        (stream("event: queued\ndata: {broken"), "bad-response"),
-        (stream("event: queued\ndata: [1]"), "bad-response"),
-        (stream(event("queued", 1, {"id": 3})), "bad-response"),
-    ],
-)
-def test_events_that_cannot_be_had(hurried: Connect, reply: Reply, code: str) -> None:
-    with Scripted(Reply(200, JOB), reply) as server:
-        handle = hurried(server.url).job("j-1")
-        with refused(code):
-            list(handle.events())
-    assert len(server.asked) == 2
+def test_events_that_cannot_be_had(hurried: Connect) -> None:
+    odd = [Reply(200, b"<html>", PAGE), stream("event: queued\ndata: {broken"), stream(event("queued", 1, {"id": 3}))]
+    for code, reply in (("job-not-found", told("job-not-found", 404)), *(("bad-response", reply) for reply in odd)):
+        with Scripted(Reply(200, JOB), reply) as server:
+            handle = hurried(server.url).job("j-1")
+            with refused(code):
+                list(handle.events())
+        assert len(server.asked) == 2
 
 
 # --- who is asked, and how ---
@@ -486,41 +439,31 @@ def test_the_environments_proxies_are_used(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("kind", ["sync", "async"])
-@pytest.mark.parametrize("alive", [True, False])
-def test_a_call_that_is_broken_off_before_its_job_is_known_ends_it(kind: str, alive: bool) -> None:
-    """Ctrl-C while the first request waits: the server may have made a job of it, or may be gone."""
-    waiting, left = threading.Event(), threading.Event()
-
-    def held(asked: Asked) -> Reply:
-        if asked.headers.get("prefer", "").startswith("wait="):
-            waiting.set()
-            left.wait(TIME_LIMIT)
-            return BROKEN
-        return BROKEN if not alive else ACCEPTED if asked.path == "/simulate" else CANCELED
-
-    with Scripted(held) as server:
-        _leave(kind, server.url, waiting)
-        left.set()
-    assert server.lines == ["POST /simulate"] * 2 + ["POST /jobs/j-1/cancel"] * alive
-    first, second = server.asked[:2]
-    assert first.headers["idempotency-key"] == second.headers["idempotency-key"]
-    assert second.headers["prefer"] == "respond-async"
-
-
-@pytest.mark.parametrize("kind", ["sync", "async"])
-def test_a_call_that_is_broken_off_later_ends_its_job(kind: str) -> None:
-    looked = threading.Event()
+@pytest.mark.parametrize("when", ["before its job is known", "when the server is gone", "while it looks at the job"])
+def test_a_call_that_is_broken_off_ends_its_job(kind: str, when: str) -> None:
+    """Ctrl-C; where the first request waits, the server may have made a job of it, or may be gone."""
+    reached, left = threading.Event(), threading.Event()
+    known = when == "while it looks at the job"
 
     def held(asked: Asked) -> Reply:
         if asked.method == "GET":
-            looked.set()
+            reached.set()
             return Reply(200, JOB)
-        return ACCEPTED if asked.path == "/simulate" else CANCELED
+        if asked.headers.get("prefer", "").startswith("wait=") and not known:
+            reached.set()
+            left.wait(TIME_LIMIT)
+            return BROKEN
+        return BROKEN if when == "when the server is gone" else ACCEPTED if asked.path == "/simulate" else CANCELED
 
     with Scripted(held) as server:
-        _leave(kind, server.url, looked)
-    assert server.lines.count("POST /simulate") == 1
-    assert server.lines[-1] == "POST /jobs/j-1/cancel"
+        _leave(kind, server.url, reached)
+        left.set()
+    posts = [line for line in server.lines if line.startswith("POST")]
+    assert posts == ["POST /simulate"] * (2 - known) + ["POST /jobs/j-1/cancel"] * (when != "when the server is gone")
+    if not known:
+        first, second = server.asked[:2]
+        assert first.headers["idempotency-key"] == second.headers["idempotency-key"]
+        assert second.headers["prefer"] == "respond-async"
 
 
 def _leave(kind: str, url: str, when: threading.Event) -> None:
@@ -611,27 +554,3 @@ def test_an_async_client_hears_events_and_pauses_between_looks() -> None:
     replies = [stream(event("queued", 1, JOB), event("succeeded", 100, JOB)), Reply(200, b"<html>", PAGE)]
     with Scripted(Reply(200, JOB), *replies, Reply(200, JOB), Reply(200, DONE)) as server:
         asyncio.run(ask(server.url))
-
-
-@pytest.mark.soak
-def test_a_wait_outlives_a_server_that_is_killed(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = str(free.getsockname()[1])
-    options = {name: value for name, value in slow(4, seed=5).items() if name not in ("image", "question")}
-    with Served(tmp_path, COW_PORT=port) as served, Client(f"http://127.0.0.1:{port}", retries=12) as client:
-        handle = client.submit(IMAGE, QUESTION, **options)
-
-        def accident() -> None:
-            eventually(served.clips)  # its clip is in the making
-            served.kill()
-            served.start()
-
-        thread = threading.Thread(target=accident)
-        thread.start()
-        events = [one.number for one in handle.events() if one.name != "progress"]
-        result = handle.wait(timeout=TIME_LIMIT)
-        thread.join()
-        assert result.id == handle.id
-        assert events == [1, 2, 3, 4, 100]
-        assert len(result.pil_frames()) == 40
-        assert client.submit(IMAGE, QUESTION, idempotency_key="k-1", **options).wait().generator.seed == 5

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import gzip
-import inspect
 import ipaddress
 import itertools
 import socket
@@ -36,21 +34,21 @@ from cow_service.net import (
     is_public,
     look_up,
 )
-from cow_service.settings import Settings, SettingsError, load_settings
+from cow_service.settings import Settings, SettingsError
 
 MOST = 100_000  # bytes
 BODY = b"not really an image" * 50
 
 
 class Site(ThreadingHTTPServer):
-    """A server on loopback that answers as told, by path, and remembers what it was asked."""
+    """A server on loopback that says what it is told, by path, and remembers what it was asked."""
 
     daemon_threads = True
 
     def __init__(self, tls: ssl.SSLContext | None = None) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.port = self.server_address[1]
-        self.pages: dict[str, Callable[[Handler], None]] = {"/image": lambda page: page.answer(BODY)}
+        self.pages: dict[str, Callable[[Handler], None]] = {"/image": saying(OK + BODY)}
         self.asked: list[tuple[str, str, dict[str, str], bytes]] = []
         self.tls = tls
 
@@ -76,25 +74,23 @@ class Handler(BaseHTTPRequestHandler):
 
     do_POST = do_GET
 
-    def answer(self, body: bytes, status: int = 200, **headers: str) -> None:
-        self.send_response(status)
-        for name, value in headers.items():
-            self.send_header(name.replace("_", "-"), value)
-        self.end_headers()
-        self.wfile.write(body)
-
-    def write(self, raw: bytes) -> None:
-        self.wfile.write(raw)
-
-    def drip(self, start: bytes, piece: bytes, pause: float = 0.0) -> None:
-        """A raw answer that goes on until nobody hears it any more."""
-        self.wfile.write(start)
-        while True:
-            self.wfile.write(piece)
-            time.sleep(pause)
-
     def log_message(self, *_: object) -> None:
         pass
+
+
+OK = b"HTTP/1.1 200 OK\r\n\r\n"
+
+
+def saying(start: bytes, piece: bytes = b"", pause: float = 0.0) -> Callable[[Handler], None]:
+    """An answer, word for word; with a `piece` it goes on until nobody hears it any more."""
+
+    def answer(page: Handler) -> None:
+        page.wfile.write(start)
+        while piece:
+            page.wfile.write(piece)
+            time.sleep(pause)
+
+    return answer
 
 
 def running(site: Site) -> Iterator[Site]:
@@ -128,8 +124,8 @@ def egress(site: Site, *, hosts: tuple[str, ...] = ("images.test",), **told: obj
     return Egress([f"{host}:{site.port}" for host in hosts], **told)
 
 
-def url(site: Site, path: str = "/image", host: str = "images.test") -> str:
-    return f"http://{host}:{site.port}{path}"
+def url(site: Site, path: str = "/image", host: str = "images.test", scheme: str = "http") -> str:
+    return f"{scheme}://{host}:{site.port}{path}"
 
 
 # What comes back
@@ -138,7 +134,8 @@ def url(site: Site, path: str = "/image", host: str = "images.test") -> str:
 def test_a_body_is_fetched(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY"):
         monkeypatch.setenv(name, "http://127.0.0.1:9")  # no server is there: a request to it would fail
-    assert egress(site).fetch(url(site), MOST) == BODY
+    site.pages["/a%20b%2Fc?x=1&y=%00"] = saying(OK + BODY)
+    assert egress(site).fetch(url(site, "/a b%2Fc?x=1&y=%00#part"), MOST) == BODY  # path and query as they were
     assert egress(site).fetch(url(site, host="IMAGES.test."), len(BODY)) == BODY
     method, path, headers, _ = site.asked[1]
     assert (method, path) == ("GET", "/image")
@@ -146,68 +143,44 @@ def test_a_body_is_fetched(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     assert headers["host"] == f"images.test:{site.port}"
     assert headers["accept-encoding"] == "identity"
     assert set(headers) == {"host", "accept-encoding", "user-agent", "connection"}
+    for length, sent in ((MOST, MOST), (10, 4 * MOST)):  # of more than was announced the rest is left
+        site.pages["/most"] = saying(OK[:-2] + b"content-length: %d\r\n\r\n" % length + b"x" * sent)
+        assert egress(site).fetch(url(site, "/most"), MOST) == b"x" * length
 
 
-def test_path_and_query_arrive_as_they_were(site: Site) -> None:
-    site.pages["/a%20b%2Fc?x=1&y=%00"] = lambda page: page.answer(b"yes")
-    assert egress(site).fetch(url(site, "/a b%2Fc?x=1&y=%00#part"), MOST) == b"yes"
+def headed(*headers: str) -> bytes:
+    return OK[:-2] + "".join(f"{header}\r\n" for header in headers).encode() + b"\r\n"
 
 
-def test_only_200_is_good(site: Site) -> None:
-    for status in (204, 206, 304, 404, 500):
-        site.pages["/status"] = lambda page: page.answer(b"", status)  # noqa: B023
-        with pytest.raises(Unreachable, match=str(status)):
-            egress(site).fetch(url(site, "/status"), MOST)
+NO_HTTP = "does not speak HTTP"
+WRONG = {  # what a server says, goes on saying, and is told to have done
+    "success without a body": (b"HTTP/1.1 204 No Content\r\n\r\n", b"", "HTTP 204"),
+    "a redirect to nowhere": (b"HTTP/1.1 302 Found\r\n\r\n", b"", "HTTP 302"),
+    "a body without end": (OK, b"x" * 65536, "100000 bytes"),
+    "chunks without end": (headed("transfer-encoding: chunked"), b"1\r\nx\r\n" * 4096, "100000 bytes"),
+    "too many bytes announced": (headed("content-length: 100001"), b"", "100000 bytes"),
+    "fewer bytes than announced": (headed("content-length: 50") + b"x" * 10, b"", NO_HTTP),
+    "a length that is no number": (headed("content-length: ten"), b"", NO_HTTP),
+    "compressed": (headed("content-encoding: gzip") + BODY, b"", "compressed"),
+    "compressed at last": (headed("content-encoding: identity, gzip") + BODY, b"", "compressed"),
+    "compressed on the way": (headed("transfer-encoding: gzip, chunked") + BODY, b"", NO_HTTP),
+    "nothing": (b"", b"", NO_HTTP),
+    "another protocol": (b"SSH-2.0-OpenSSH_9.6\r\n", b"", NO_HTTP),
+    "headers without end": (OK[:-2], b"a: " + b"b" * 9000 + b"\r\n", NO_HTTP),
+}
+SLOW = {
+    "a word": (b"", b"H"),
+    "words before the answer": (b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
+    "a body": (headed("content-length: 500"), b"x"),
+}
 
 
-def test_a_body_that_is_too_long(site: Site) -> None:
-    head, chunk = b"HTTP/1.1 200 OK\r\n", b"8000\r\n" + b"x" * 0x8000 + b"\r\n"
-    site.pages["/endless"] = lambda page: page.drip(head + b"\r\n", b"x" * 65536)
-    site.pages["/chunks"] = lambda page: page.drip(head + b"transfer-encoding: chunked\r\n\r\n", chunk)
-    site.pages["/honest"] = lambda page: page.answer(b"", content_length="100001")
-    for path in ("/endless", "/chunks", "/honest"):
-        with pytest.raises(Unreachable, match="100000 bytes"):
-            egress(site).fetch(url(site, path), MOST)
-    site.pages["/most"] = lambda page: page.answer(b"x" * MOST, content_length="100000")
-    assert egress(site).fetch(url(site, "/most"), MOST) == b"x" * MOST
-
-
-def test_a_length_that_lies(site: Site) -> None:
-    site.pages["/more"] = lambda page: page.answer(b"x" * MOST * 4, content_length="10")
-    site.pages["/fewer"] = lambda page: page.answer(b"x" * 10, content_length="50")
-    site.pages["/not"] = lambda page: page.answer(b"x" * 10, content_length="ten")
-    site.pages["/two"] = lambda page: page.write(b"HTTP/1.1 200 OK\r\ncontent-length: 1\r\ncontent-length: 2\r\n\r\n")
-    assert egress(site).fetch(url(site, "/more"), MOST) == b"x" * 10
-    for path in ("/fewer", "/not", "/two"):
-        with pytest.raises(Unreachable):
-            egress(site).fetch(url(site, path), MOST)
-
-
-def test_nothing_is_decompressed(site: Site) -> None:
-    bomb = gzip.compress(bytes(10_000_000))
-    for encoding in ("gzip", "br", "identity, gzip", "nonsense"):
-        site.pages["/bomb"] = lambda page: page.answer(bomb, content_encoding=encoding)  # noqa: B023
-        with pytest.raises(Unreachable, match="compressed"):
-            egress(site).fetch(url(site, "/bomb"), MOST)
-    site.pages["/transfer"] = lambda page: page.answer(bomb, transfer_encoding="gzip, chunked")
-    with pytest.raises(Unreachable, match="HTTP"):
-        egress(site).fetch(url(site, "/transfer"), MOST)
-
-
-@pytest.mark.parametrize(
-    ("start", "piece"),
-    [
-        (b"", b"H"),
-        (b"HTTP/1.1 200 OK\r\nx: ", b"y"),
-        (b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
-        (b"HTTP/1.1 200 OK\r\ncontent-length: 500\r\n\r\n", b"x"),
-        (b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n", b"1\r\nx\r\n"),
-    ],
-)
-def test_a_server_that_dawdles_is_left(site: Site, start: bytes, piece: bytes) -> None:
-    site.pages["/slow"] = lambda page: page.drip(start, piece, 0.05)
-    with pytest.raises(Unreachable):
-        egress(site, seconds=0.3).fetch(url(site, "/slow"), MOST)
+@pytest.mark.parametrize("said", [*WRONG, *SLOW])
+def test_what_is_no_answer_with_an_image_or_does_not_come_to_its_end(site: Site, said: str) -> None:
+    start, piece, told = WRONG.get(said) or (*SLOW[said], "too long")
+    site.pages["/said"] = saying(start, piece, 0.05 if said in SLOW else 0)
+    with pytest.raises(Unreachable, match=told):
+        egress(site, seconds=0.3 if said in SLOW else TIME_LIMIT).fetch(url(site, "/said"), MOST)
 
 
 def test_one_clock_for_name_and_redirects_together(site: Site) -> None:
@@ -221,7 +194,7 @@ def test_one_clock_for_name_and_redirects_together(site: Site) -> None:
         ended.wait(TIME_LIMIT)
         return ["127.0.0.1"]
 
-    site.pages["/again"] = lambda page: page.answer(b"", 302, location="/again")
+    redirect(site, "/again", "/again")
     with pytest.raises(Unreachable):
         egress(site, seconds=0.4, resolve=slowly).fetch(url(site, "/again"), MOST)
     assert len(site.asked) < 4, "the redirects did not end it"
@@ -235,7 +208,7 @@ def test_a_receiver_that_takes_no_bytes_is_left(site: Site) -> None:
         for _ in range(600):
             page.connection.recv(65536)
             time.sleep(0.004)
-        page.answer(b"")
+        page.wfile.write(OK)
 
     site.pages["/sips"] = sip
     with socket.create_server(("127.0.0.1", 0)) as deaf:
@@ -245,23 +218,16 @@ def test_a_receiver_that_takes_no_bytes_is_left(site: Site) -> None:
                 way.post(f"http://images.test:{port}{path}", bytes(40_000_000), {})
 
 
-def test_nobody_there(site: Site) -> None:
+def test_nobody_there_or_at_another_address(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     with pytest.raises(Unreachable):
         Egress(None, resolve=names(), permitted=lambda ip: True).fetch(f"http://images.test:{port}/", MOST)
     with pytest.raises(Unreachable, match="no address"):
         egress(site, resolve=lambda *_: []).fetch(url(site), MOST)
-
-
-def test_no_http(site: Site) -> None:
-    for raw in (b"", b"SSH-2.0-OpenSSH_9.6\r\n", b"\x15\x03\x01\x00\x02\x02\x28", b"HTTP/1.1 abc\r\n\r\n"):
-        site.pages["/raw"] = lambda page: page.write(raw)  # noqa: B023
-        with pytest.raises(Unreachable, match="does not speak HTTP"):
-            egress(site).fetch(url(site, "/raw"), MOST)
-    site.pages["/headers"] = lambda page: page.drip(b"HTTP/1.1 200 OK\r\n", b"a: " + b"b" * 9000 + b"\r\n")
-    with pytest.raises(Unreachable, match="does not speak HTTP"):
-        egress(site).fetch(url(site, "/headers"), MOST)
+    # At the first address no server listens.
+    way = egress(site, resolve=lambda *_: ["::1", "127.0.0.1"], permitted=lambda ip: True)
+    assert way.fetch(url(site), MOST) == BODY
 
 
 # What is not asked at all
@@ -311,33 +277,15 @@ def test_what_is_not_asked(bad: str) -> None:
         way = Egress(hosts, resolve=resolve_here)
         with pytest.raises(NotAllowed) as caught:
             way.fetch(bad, MOST)
-        told = str(caught.value)
-        assert told.endswith(".")
-        assert len(told) < 400
-        assert "hunter2" not in told
+        assert "hunter2" not in str(caught.value)
+        assert len(str(caught.value)) < 400
         with pytest.raises(NotAllowed):
             way.post(bad, b"{}", {})
 
 
 @pytest.mark.usefixtures("unconnected")
-def test_a_url_may_be_so_long_and_no_longer() -> None:
-    way = Egress(None, permitted=lambda ip: True)
-    assert (way.seconds, way.connect_seconds) == (10, 5)
-    url = "http://8.8.8.8:65535/".ljust(4096, "a")
-    way.check(url)
-    with pytest.raises(NotAllowed):
-        way.check(url + "a")
-
-
-@pytest.mark.usefixtures("unconnected")
 def test_every_address_of_a_name_must_be_permitted_and_none_is_told() -> None:
-    for answer in (
-        ["10.9.8.7"],
-        ["8.8.8.8", "127.0.0.1"],
-        ["::1", "8.8.8.8"],
-        ["8.8.8.8", "fe80::1%lo"],
-        ["", "8.8.8.8"],
-    ):
+    for answer in (["8.8.8.8", "127.0.0.1"], ["::1", "8.8.8.8"], ["8.8.8.8", "fe80::1%lo"], ["", "8.8.8.8"]):
         with pytest.raises(NotAllowed, match=r"'intranet\.example'") as caught:
             Egress(["*"], resolve=lambda *_: answer).fetch("http://intranet.example/", MOST)  # noqa: B023
         assert not [ip for ip in answer if ip and ip in str(caught.value)]
@@ -354,16 +302,9 @@ def test_a_name_that_changes_is_asked_once_and_held_to(site: Site) -> None:
     way = egress(site, resolve=rebinding)
     assert way.fetch(url(site), MOST) == BODY
     assert asked == ["images.test"]
-    site.pages["/once-more"] = lambda page: page.answer(b"", 302, location="/image")
     with pytest.raises(NotAllowed):
-        way.fetch(url(site, "/once-more"), MOST)
+        way.fetch(redirect(site, "/once-more", "/image"), MOST)
     assert len(site.asked) == 1
-
-
-def test_the_next_address_is_taken_where_one_does_not_answer(site: Site) -> None:
-    """No server listens on IPv6 there."""
-    way = egress(site, resolve=lambda *_: ["::1", "127.0.0.1"], permitted=lambda ip: True)
-    assert way.fetch(url(site), MOST) == BODY
 
 
 PRIVATE = ("127.0.0.0/8", "10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10")
@@ -399,13 +340,6 @@ def test_no_private_address_inside_another_is_public(inner: ipaddress.IPv4Addres
     assert not is_public(str(inner))
     for outer in (number, 0xFFFF << 32 | number, 0x64FF9B << 96 | number, 0x2002 << 112 | number << 80 | 1):
         assert not is_public(str(ipaddress.IPv6Address(outer)))
-
-
-@given(st.ip_addresses(v=4) | st.ip_addresses(v=6, network="2000::/3"))
-def test_public_is_never_more_than_python_holds_global(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
-    if is_public(str(address)):
-        kinds = ("private", "loopback", "link_local", "multicast", "unspecified", "reserved")
-        assert not [kind for kind in kinds if getattr(address, f"is_{kind}")]
 
 
 def test_public_addresses_are_public() -> None:
@@ -449,7 +383,7 @@ def test_entries_that_are_none() -> None:
 
 
 @pytest.mark.usefixtures("unconnected")
-def test_hosts_that_are_not_listed_are_not_even_looked_up() -> None:
+def test_what_can_be_told_from_a_url_is_told_without_a_look_up() -> None:
     def never(host: str, port: int) -> list[str]:
         raise AssertionError(host)
 
@@ -457,6 +391,13 @@ def test_hosts_that_are_not_listed_are_not_even_looked_up() -> None:
         Egress(["images.test"], resolve=never).fetch("https://evil.test/images.test", MOST)
     with pytest.raises(NotAllowed, match="at port 22"):
         Egress(["*"], resolve=never).fetch("http://images.test:22/", MOST)
+    way, longest = Egress(None, resolve=never), "https://8.8.8.8:65535/".ljust(4096, "a")
+    assert (way.seconds, way.connect_seconds) == (10, 5)
+    for good in ("https://hooks.example.org:8443/job?x=1", longest):
+        way.check(good)
+    for bad in ("hooks.example.org", "http://10.0.0.1/", "http://a:b@c.org/", longest + "a"):
+        with pytest.raises(NotAllowed):
+            way.check(bad)
 
 
 @given(st.text(max_size=20))
@@ -470,91 +411,55 @@ def test_a_host_name_is_plain_or_none(text: str) -> None:
 
 
 def redirect(site: Site, path: str, where: str, status: int = 302) -> str:
-    site.pages[path] = lambda page: page.answer(b"moved", status, location=where)
+    site.pages[path] = saying(f"HTTP/1.1 {status} Moved\r\nlocation: {where}\r\n\r\nmoved".encode())
     return url(site, path)
 
 
-def test_redirects_are_followed(site: Site) -> None:
+def test_redirects_are_followed_a_few_times(site: Site) -> None:
     for status in (301, 302, 303, 307, 308):
         site.asked.clear()
         redirect(site, "/2", "image", status)
         redirect(site, "/1", f"//images.test:{site.port}/2", status)
         assert egress(site).fetch(redirect(site, "/0", url(site, "/1"), status), MOST) == BODY
         assert [path for _, path, _, _ in site.asked] == ["/0", "/1", "/2", "/image"]
-
-
-def test_redirects_end(site: Site) -> None:
     with pytest.raises(Unreachable, match="more than 3 redirects"):
         egress(site).fetch(redirect(site, "/loop", "/loop"), MOST)
-    assert len(site.asked) == 4
-    site.pages["/nowhere"] = lambda page: page.answer(b"", 302)
-    with pytest.raises(Unreachable, match="HTTP 302"):
-        egress(site).fetch(url(site, "/nowhere"), MOST)
+    assert len(site.asked) == 8
+    site.pages["/bytes"] = saying(b"HTTP/1.1 302 Found\r\nlocation: /\xff\xfe\r\n\r\n")
+    with pytest.raises(EgressError, match="percent-encoded"):
+        egress(site).fetch(url(site, "/bytes"), MOST)
 
 
-HOPS = (
-    "file:///etc/passwd data:image/png;base64,AAAA http://user@images.test:{port}/image http://127.0.0.2:{port}/image"
-)
-HOPS += " http://[::1]:{port}/image http://localhost:{port}/image http://images.test/image http://[::1"
-HOPS += " http://evil.test:{port}/image //evil.test:{port}/image"
+HOPS = "file:///etc/passwd http://user@images.test:{port}/image http://127.0.0.2:{port}/image http://[::1"
+HOPS += " http://localhost:{port}/image http://images.test/image //evil.test:{port}/image"
 
 
 @pytest.mark.parametrize("where", HOPS.split())
 def test_every_hop_is_checked(site: Site, where: str) -> None:
-    hosts = ("images.test", "localhost", "127.0.0.2", "[::1]")
+    hosts = ("images.test", "localhost", "127.0.0.2")
     way = egress(site, hosts=hosts, resolve=names(localhost="127.0.0.3", evil_test="127.0.0.1"))
     with pytest.raises(NotAllowed, match=r"^A redirect"):
         way.fetch(redirect(site, "/away", where.format(port=site.port)), MOST)
     assert [path for _, path, _, _ in site.asked] == ["/away"]
 
 
-def test_a_location_that_is_no_text(site: Site) -> None:
-    site.pages["/bytes"] = lambda page: page.write(b"HTTP/1.1 302 Found\r\nlocation: /\xff\xfe\r\n\r\n")
-    with pytest.raises(EgressError, match="percent-encoded"):
-        egress(site).fetch(url(site, "/bytes"), MOST)
-
-
 # Posts
 
 
-def test_a_post_says_the_status(site: Site) -> None:
-    site.pages["/hook"] = lambda page: page.answer(b"x" * 1000, 202)
+def test_a_post_says_the_status_follows_nothing_and_reads_nothing(site: Site) -> None:
+    site.pages["/hook"] = saying(b"HTTP/1.1 202 Accepted\r\n\r\n", b"x" * 65536)
     headers = {"Content-Type": "application/json", "X-Signature": "abc", "Host": "evil.test", "Content-Length": "7"}
     assert egress(site).post(url(site, "/hook"), b'{"id": 1}', headers) == 202
     method, path, got, body = site.asked[0]
     assert (method, path, body) == ("POST", "/hook", b'{"id": 1}')
     got = {name.lower(): value for name, value in got.items()}
-    assert got["host"] == f"images.test:{site.port}"
-    assert got["content-type"] == "application/json"
-    assert got["x-signature"] == "abc"
-    assert got["content-length"] == "9"
-
-
-def test_a_post_follows_nothing_and_reads_nothing(site: Site) -> None:
+    named = {"host": f"images.test:{site.port}", "content-type": "application/json", "x-signature": "abc"}
+    assert got.items() >= (named | {"content-length": "9"}).items()
     assert egress(site).post(redirect(site, "/moved", "http://127.0.0.1/", 307), b"", {}) == 307
-    site.pages["/endless"] = lambda page: page.drip(b"HTTP/1.1 500 No\r\n\r\n", b"x" * 65536, 0)
-    assert egress(site).post(url(site, "/endless"), b"", {}) == 500
+    for wrong in ({"x": "a\r\ny: b"}, {"x\r\n": "a"}, {"x": "ü"}):
+        with pytest.raises(NotAllowed):
+            egress(site).post(url(site), b"", wrong)
     assert len(site.asked) == 2
-
-
-def test_headers_that_cannot_be_sent(site: Site) -> None:
-    for headers in ({"x": "a\r\ny: b"}, {"x\r\n": "a"}, {"x": "ü"}):
-        with pytest.raises(NotAllowed):
-            egress(site).post(url(site), b"", headers)
-    assert not site.asked
-
-
-@pytest.mark.usefixtures("unconnected")
-def test_a_url_can_be_checked_before_it_is_asked() -> None:
-    def never(host: str, port: int) -> list[str]:
-        raise AssertionError(host)
-
-    way = Egress(None, resolve=never)
-    way.check("https://hooks.example.org:8443/job?x=1")
-    way.check("https://8.8.8.8/")
-    for bad in ("hooks.example.org", "ftp://hooks.example.org/", "http://10.0.0.1/", "http://a:b@c.org/"):
-        with pytest.raises(NotAllowed):
-            way.check(bad)
 
 
 # TLS
@@ -593,18 +498,18 @@ def secure(certificate: Path) -> Iterator[Site]:
 def test_tls_is_of_the_name_although_the_address_is_asked(secure: Site, certificate: Path) -> None:
     trusting = ssl.create_default_context(cafile=str(certificate))
     way = egress(secure, hosts=("images.test", "other.test"), resolve=names(other_test="127.0.0.1"), tls=trusting)
-    assert way.fetch(url(secure).replace("http:", "https:"), MOST) == BODY
+    assert way.fetch(url(secure, scheme="https"), MOST) == BODY
     assert secure.asked[-1][2]["host"] == f"images.test:{secure.port}"
     with pytest.raises(Unreachable, match=r"certificate of 'other\.test'"):
-        way.fetch(url(secure, host="other.test").replace("http:", "https:"), MOST)
+        way.fetch(url(secure, host="other.test", scheme="https"), MOST)
     with pytest.raises(Unreachable, match="certificate"):
-        egress(secure).fetch(url(secure).replace("http:", "https:"), MOST)
+        egress(secure).fetch(url(secure, scheme="https"), MOST)
     assert len(secure.asked) == 1
 
 
 def test_no_tls_where_it_is_wanted(site: Site) -> None:
     with pytest.raises(Unreachable, match="The TLS connection"):
-        egress(site).fetch(url(site).replace("http:", "https:"), MOST)
+        egress(site).fetch(url(site, scheme="https"), MOST)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         way = Egress(None, seconds=0.3, resolve=names(), permitted=lambda ip: True)
@@ -615,42 +520,29 @@ def test_no_tls_where_it_is_wanted(site: Site) -> None:
 # The table
 
 
-def raised_by(module: object) -> list[type[Exception]]:
-    found = inspect.getmembers(module, inspect.isclass)
-    return [kind for name, kind in found if issubclass(kind, Exception) and not name.startswith("_")]
-
-
-FOREIGN = {
-    *raised_by(httpcore),
-    *raised_by(socket),
-    *raised_by(ssl),
-    *raised_by(idna),
-    *(kind for kind in OSError.__subclasses__() if kind.__module__ == "builtins"),
-    *(UnicodeEncodeError, UnicodeDecodeError, OSError, TimeoutError, httpx.InvalidURL),
-}
-
-
-def raising(error: Exception) -> Egress:
-    """Whose name server fails with this error."""
-
-    def resolve(host: str, port: int) -> list[str]:
-        raise error
-
-    return Egress(None, resolve=resolve)
-
-
-@pytest.mark.parametrize("kind", sorted(FOREIGN, key=lambda kind: f"{kind.__module__}.{kind.__name__}"))
-def test_every_foreign_exception_is_translated(kind: type[Exception]) -> None:
+def test_every_foreign_exception_is_translated_and_faults_of_our_own_are_not() -> None:
     arguments = {UnicodeEncodeError: ("ascii", "ü", 0, 1, "no"), UnicodeDecodeError: ("ascii", b"\xff", 0, 1, "no")}
-    with pytest.raises(EgressError, match=r"images\.test.*\.$"):
-        raising(kind(*arguments.get(kind, ("secret 10.0.0.1",)))).fetch("http://images.test/", MOST)
+    named = [kind for module in (httpcore, socket, ssl, idna) for name, kind in vars(module).items() if name[0] != "_"]
+    builtin = [kind for kind in OSError.__subclasses__() if kind.__module__ == "builtins"]
+    known = (*named, *builtin, *arguments, OSError, httpx.InvalidURL)
+    foreign = {kind for kind in known if isinstance(kind, type) and issubclass(kind, Exception)}
+    assert len(foreign) > 40
 
+    def raising(error: Exception) -> None:
+        """Fails at its name server."""
 
-def test_no_row_of_the_table_is_hidden_by_one_above_and_faults_of_our_own_are_not() -> None:
+        def resolve(host: str, port: int) -> list[str]:
+            raise error
+
+        Egress(None, resolve=resolve).fetch("http://images.test/", MOST)
+
+    for kind in foreign:
+        with pytest.raises(EgressError, match=r"images\.test.*\.$"):
+            raising(kind(*arguments.get(kind, ("secret 10.0.0.1",))))
+    with pytest.raises(KeyError):
+        raising(KeyError("x"))
     for (above, *_), (below, *_) in itertools.combinations(TRANSLATED, 2):
         assert not issubclass(below, above), f"{below} is never reached"
-    with pytest.raises(KeyError):
-        raising(KeyError("x")).fetch("http://images.test/", MOST)
 
 
 # Images
@@ -665,15 +557,4 @@ def test_images_are_fetched_up_to_the_size_of_a_body(site: Site) -> None:
     with refused("image-url-unreachable"):
         urls.fetch(url(site))
     with refused("image-url-not-allowed"):
-        urls.fetch("https://evil.test/")
-
-
-def test_the_setting_is_a_json_list(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COW_ALLOW_IMAGE_URLS", '["*.images.test"]')
-    settings = load_settings()
-    assert settings.allow_image_urls == ("*.images.test",)
-    with refused("image-url-not-allowed"):
-        ImageUrls(settings).fetch("https://images.test/")
-    monkeypatch.setenv("COW_ALLOW_IMAGE_URLS", "images.test")
-    with pytest.raises(SettingsError, match="COW_ALLOW_IMAGE_URLS"):
-        load_settings()
+        ImageUrls(Settings(allow_image_urls=("*.images.test",))).fetch("https://images.test/")
