@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 import yaml
-from asgi import app_of, ask, get
+from asgi import app_of, get
 from conftest import ROOT
 from fastapi import FastAPI
-from servers import problem
 
 from cow_service import errors
 from cow_service.errors import FieldError
@@ -58,11 +56,3 @@ def test_one_error_shape() -> None:
     }
     assert errors.pointer_part("a/b~" + "c" * 76) == "a~1b~0" + "c" * 76
     assert errors.pointer_part("c" * 81) == "c" * 80 + "... (81 characters)"
-
-
-def test_an_unready_service_says_why(tmp_path: Path) -> None:
-    (tmp_path / "data").write_text("a file")
-    (response,) = ask(app_of(tmp_path), ("GET", "/readyz"))
-    problem(response, 503, "storage-unavailable")
-    assert response.headers["retry-after"] == "5"
-    assert str(tmp_path) not in response.text

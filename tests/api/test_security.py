@@ -13,11 +13,11 @@ import pytest
 import yaml
 from asgi import app_of, ask
 from conftest import ROOT
-from fastapi import FastAPI, Request
+from fastapi import FastAPI
 from servers import problem
 from typer.testing import CliRunner
 
-from cow_service.api.middleware.access import Buckets, address_of, hash_of, key_owner, new_key
+from cow_service.api.middleware.access import Buckets, address_of, hash_of, key_owner
 from cow_service.cli.main import app as cow
 from cow_service.settings import SettingsError, load_settings
 
@@ -91,23 +91,6 @@ def test_how_a_key_is_sent(closed: FastAPI) -> None:
     assert [response.status_code for response in responses] == [404] * 2 + [401] * 8
 
 
-def test_routes_know_the_owner(tmp_path: Path) -> None:
-    for keys, headers, owner in ((KEYS, bearer(BOB), "bob"), ({}, bearer(BOB), None), ({}, {}, None)):
-        app = app_of(tmp_path, api_keys=keys)
-
-        @app.get("/whoami")
-        async def whoami(request: Request) -> dict[str, str | None]:
-            return {"owner": request.state.owner}
-
-        assert ask(app, ("GET", "/whoami", headers))[0].json() == {"owner": owner}
-
-
-def test_a_key_is_its_owners_only() -> None:
-    key, other = new_key(), new_key()
-    assert re.fullmatch(r"cow_[\w-]{43}", key)
-    assert [key_owner(each, {"a": hash_of(key)}) for each in (key, other, "")] == ["a", None, None]
-
-
 def test_cow_keys_new(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("COW_API_KEYS", raising=False)
     for name in ("alice", "bob"):
@@ -131,16 +114,13 @@ def test_plain_keys_stop_the_start_and_are_not_repeated(monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("COW_RATE_LIMIT", ["0", "often"]),
+        ("COW_RATE_LIMIT", ["0"]),
         ("COW_CORS_ORIGINS", [PAGE, *(f'["{each}"]' for each in (PAGE + "/", PAGE[8:], PAGE.upper(), "null", "*"))]),
         ("COW_WEBHOOK_SECRET", [SECRET + "!", "whsec_" + SECRET[10:], SECRET[1:], " ".join([SECRET] * 3)]),
         ("COW_ARTIFACTS", ["ftp://store", "s3://name:password@store"]),
         ("COW_ADMIN_KEYS", ['["eve"]']),
         ("COW_KEY_WEIGHTS", ['{"eve": 2}']),
-        ("COW_RATE_LIMITS", ["5"]),  # misspelled
         ("COW_MAX_BODY_MB", ["nan", "inf", "0"]),
-        ("COW_LOG_FORMAT", ["xml"]),
-        ("COW_LOG_LEVEL", ["loud"]),
     ],
 )
 def test_bad_settings_are_named(monkeypatch: pytest.MonkeyPatch, name: str, values: list[str]) -> None:
@@ -185,6 +165,8 @@ def test_without_keys_each_address_has_its_own_limit(tmp_path: Path) -> None:
     assert ask(app, ("GET", "/nowhere"), client="192.0.2.2")[0].status_code == 404
     assert ask(app, ("GET", "/nowhere"), client="2001:db8::1")[0].status_code == 404
     assert ask(app, ("GET", "/nowhere"), client="2001:db8::2")[0].status_code == 429
+    clients = [("fe80::1%eth0", 7), None, ("testclient", 1)]
+    assert [address_of({"client": client}) for client in clients] == ["fe80::/64", "unknown", "testclient"]
 
 
 @pytest.mark.parametrize(
@@ -228,12 +210,6 @@ def test_buckets_fill_again_and_are_bounded() -> None:
     for name in "bcdefg":
         buckets.take(name)
     assert len(buckets) == 3
-
-
-def test_addresses() -> None:
-    clients = [("192.0.2.1", 7), ("fe80::1%eth0", 7), None, ("testclient", 1)]
-    found = [address_of({"client": client}) for client in clients]
-    assert found == ["192.0.2.1", "fe80::/64", "unknown", "testclient"]
 
 
 # --- web pages ---
@@ -293,16 +269,9 @@ def test_a_listed_page_gets_cors_headers_whatever_comes_out(tmp_path: Path, monk
     assert responses[1].headers["access-control-expose-headers"] == "X-Request-Id, Location, Retry-After, traceparent"
 
 
-def test_every_page_may_come_where_keys_are_asked_for(tmp_path: Path) -> None:
-    app = app_of(tmp_path, cors_origins=("*",), api_keys=KEYS)
-    response = ask(app, ("GET", "/models", {"Origin": "https://any.example"} | bearer(ALICE)))[0]
-    assert response.headers["access-control-allow-origin"] == "*"
-
-
 @pytest.mark.parametrize(
     ("settings", "statuses"),
     [
-        ({"cors_origins": ()}, (403, 200)),
         ({"cors_origins": (PAGE,)}, (403, 200)),
         ({"host": "0.0.0.0"}, (200, 200)),
         ({"keys": True}, (200, 200)),

@@ -29,7 +29,10 @@ MAX_HELPERS_USED_ONCE, MAX_IMPORT_LINES = 0.12, 0.065  # of all functions; of al
 MAX_PIPELINE_LINES, MAX_PIPELINE_FUNCTION_LINES, MAX_FUNCTION_LINES = 150, 40, 85
 
 HEAVY = ("torch", "transformers", "diffusers", "accelerate")
-OF_EXTRAS = ("json_repair", "pydantic_ai", "tenacity", "openai", "mcp", "obstore", "inspect_ai", "pyarrow", "scipy")
+OF_EXTRAS = (
+    *("json_repair", "pydantic_ai", "tenacity", "openai", "mcp", "obstore", "inspect_ai", "pyarrow", "scipy"),
+    "opentelemetry.sdk",
+)
 
 
 def lines(path: Path) -> int:
