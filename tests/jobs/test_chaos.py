@@ -6,34 +6,29 @@ import os
 import random
 import secrets
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from chaos import TENANTS, Fault, Kept, Laboratory, Told, check, fleet, one_machine, schedule, seed_of
-from postgres import postgres
-from proxy import Proxy
-from servers import BODY, Served, problem
 from tables import rows
-from waiting import eventually
 
 Arrangement = Callable[[Path], AbstractContextManager[tuple[Laboratory, Fault, list[Fault]]]]
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 GIVEN = os.environ.get("COW_CHAOS_SEED")
 # The first two have shown faults, which were mended; 0 draws a new one.
-SEEDS = [int(GIVEN)] if GIVEN else [1, 21, 0]
+SEEDS = [int(GIVEN)] if GIVEN else [21, 1, 0]
 # Faults with a power cut or a crash of PostgreSQL, as many others, and the longest one, s: processes that say nothing
 # are given up after 8 or 15.
-FEW, MANY = (2, 2, 2.0), (6, 6, 16.0)
+FEW, MANY = (1, 2, 2.0), (6, 6, 16.0)
 
 
 @pytest.mark.parametrize(
     ("arrangement", "seed", "faults"),
     rows(
-        {"a fleet, short faults": (fleet, SEEDS[0], FEW)},
+        {"a fleet; PostgreSQL and a server are killed, disks fail, connections are cut": (fleet, SEEDS[0], FEW)},
         [(arrangement, seed, MANY) for arrangement in (fleet, one_machine) for seed in SEEDS],
     ),
 )
@@ -89,25 +84,3 @@ def test_the_checker_sees_what_is_wrong(finding: str, told: Told | None, kept: K
     history = HISTORY if told is None else [*HISTORY, told]
     kept_jobs = KEPT[1:] if kept is None else [kept, *(KEPT if kept.job_id == "doubled" else KEPT[1:])]
     assert finding in " ".join(check(history, kept_jobs, BEGUN))
-
-
-def test_a_network_that_loses_every_byte_is_an_error_and_no_silence(tmp_path: Path) -> None:
-    with (
-        postgres() as database,
-        Proxy(database.port) as network,
-        Served(tmp_path, COW_DATABASE_URL=database.url.replace(str(database.port), str(network.port))) as server,
-    ):
-        job_id = server.submit(BODY)["id"]
-        server.ended(job_id)
-        network.hold()
-        requests = [("GET", f"/jobs/{job_id}", None), ("POST", "/simulate", BODY | {"seed": 1}), ("GET", "/jobs", None)]
-        with ThreadPoolExecutor() as callers:
-            responses = list(callers.map(lambda one: server.http.request(one[0], one[1], json=one[2]), requests))
-        for response in responses:
-            problem(response, 503, "storage-unavailable")
-            assert response.headers["Retry-After"]
-        network.restore()
-        eventually(lambda: server.http.get("/readyz").is_success)
-        assert server.job(job_id)["status"] == "succeeded"
-        network.hold()
-        server.stop()

@@ -4,41 +4,47 @@ from __future__ import annotations
 
 import re
 import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
+from queue import Queue
 
 import pytest
 from postgres import postgres
+from proxy import Proxy
 from servers import BODY, SLOW_GENERATOR, Served, problem, slow
-from waiting import eventually
+from tables import rows
+from waiting import TIME_LIMIT, eventually
 from worker_processes import workers_of
 
-from cow_service.workers.pool import HEARTBEAT_TIMEOUT_SECONDS
+from cow_service.observability.metrics import Metrics
+from cow_service.settings import Settings
+from cow_service.workers import pool
 
 pytestmark = pytest.mark.slow
 
 # Runs at the start of every Python process of the server, before its imports.
 AT_START = """
-import os, pathlib, sys, time
+import os, pathlib, sys
 if "cow_service.workers" in sys.orig_argv:
     file = pathlib.Path(os.environ["STARTS"])
     start, _, left = file.read_text().partition("\\n")
     file.write_text(left)
     if start == "dies":
         os.kill(os.getpid(), 9)
-    time.sleep(float(start or 0))
 """
-# Another worker is started sooner than it would be.
+# Another worker is started sooner than it would be, and one that says nothing is given up sooner.
 IMPATIENT = """
 from cow_service.workers import pool
-pool.FIRST_PAUSE_SECONDS, pool.WATCH_SECONDS = 0.25, 0.2
+pool.FIRST_PAUSE_SECONDS, pool.WATCH_SECONDS, pool.HEARTBEAT_TIMEOUT_SECONDS = 0.25, 0.2, 6.0
 from cow_service.cli.main import app
 app(["serve"])
 """
 
 
 def bad_starts(folder: Path, *starts: str, **settings: str) -> Served:
-    """A server whose first worker processes start badly: each "dies", or takes a number of seconds longer."""
+    """A server whose first worker processes start badly: each "dies"."""
     (folder / "site").mkdir()
     (folder / "site" / "sitecustomize.py").write_text(AT_START)
     (folder / "starts").write_text("\n".join(starts))
@@ -52,18 +58,11 @@ def ends(served: Served, reason: str) -> int:
     return int(told[1]) if told else 0
 
 
-@pytest.mark.soak
-def test_a_worker_that_starts_slowly_is_waited_for(tmp_path: Path) -> None:
-    with bad_starts(tmp_path, f"{1.2 * HEARTBEAT_TIMEOUT_SECONDS}", COW_CONCURRENCY="1") as served:
-        assert served.http.post("/simulate", json=BODY).status_code == 200
-        assert sum(ends(served, reason) for reason in ("crashed", "frozen", "load")) == 0
-
-
 def test_no_job_fails_because_a_worker_cannot_start_or_freezes(tmp_path: Path) -> None:
-    # The server stays up, and is ready after the third start. With more than one worker, the second could start just
+    # The server stays up, and is ready after the second start. With more than one worker, the second could start just
     # when this looks for those to kill, and would do the job.
-    with bad_starts(tmp_path, "dies", "1000", COW_CONCURRENCY="1", COW_LOAD_TIMEOUT="25") as served:
-        assert (ends(served, "crashed"), ends(served, "load")) == (1, 1)
+    with bad_starts(tmp_path, "dies", COW_CONCURRENCY="1") as served:
+        assert ends(served, "crashed") == 1
         (tmp_path / "starts").write_text("dies\n" * 1000)
         for one in workers_of(served):
             one.kill()
@@ -71,6 +70,7 @@ def test_no_job_fails_because_a_worker_cannot_start_or_freezes(tmp_path: Path) -
         refused = eventually(lambda: None if (answer := served.http.get("/readyz")).is_success else answer)
         assert "signal 9" in problem(refused, 503, "not-ready")["detail"]
         eventually(lambda: ends(served, "crashed") >= 5)  # more than the crashes of its own that end a job
+        eventually(lambda: re.search("3 starts.* 1 s later", served.log()))  # they are tried more and more rarely
         assert served.job(job["id"])["status"] in ("queued", "running")
         (tmp_path / "starts").write_text("")
         assert served.ended(job["id"])["status"] == "succeeded"
@@ -83,30 +83,63 @@ def test_no_job_fails_because_a_worker_cannot_start_or_freezes(tmp_path: Path) -
         assert (ends(served, "frozen"), served.clips().count(7)) == (1, 2)
 
 
-def test_a_server_that_starts_while_its_database_is_away_waits_and_says_so(tmp_path: Path) -> None:
-    with postgres() as database:
+class Silent:
+    """A worker that was started long ago, and has said nothing for a while."""
+
+    is_alive, memory_bytes, jobs = True, 0, ()
+
+    def __init__(self, name: str, settings: Settings, on_end: object) -> None:
+        self.is_loaded, self.started = settings.load_timeout > 100, time.monotonic() - 100
+        self.heard = time.monotonic() - pool.HEARTBEAT_TIMEOUT_SECONDS - 1
+        self.ended = Queue[str]()
+
+    def kill(self, end_reason: str, reason: str) -> None:
+        self.ended.put(end_reason)
+
+    def close(self) -> None:
+        self.ended.put("stopped")
+
+
+@pytest.mark.parametrize(
+    ("load_timeout", "reason"), rows({"loading takes too long": (99, "load"), "it is frozen": (1000, "frozen")})
+)
+def test_a_worker_that_says_nothing_is_ended(load_timeout: float, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "Worker", Silent)
+    monkeypatch.setattr(pool, "WATCH_SECONDS", 0.01)
+    workers = pool.WorkerPool(Settings(load_timeout=load_timeout, concurrency=1), Metrics())
+    workers.start()
+    (worker,) = workers.groups[0].workers
+    assert isinstance(worker, Silent)
+    assert worker.ended.get(timeout=TIME_LIMIT) == reason
+    workers.close()
+
+
+def test_a_server_whose_database_is_away_says_so_from_its_start_on(tmp_path: Path) -> None:
+    """Also where the network loses every byte: that is an error and no silence."""
+    with postgres() as database, Proxy(database.port) as network, ExitStack() as stack:
         database.kill()
-        served = Served(tmp_path, COW_DATABASE_URL=database.url)
-        with ExitStack() as stack:
-            stack.callback(served.kill)
-            served.start("/livez")
-            problem(served.http.get("/readyz"), 503, "storage-unavailable")
-            refused = served.http.post("/simulate", json=BODY)
-            problem(refused, 503, "not-ready")
-            assert refused.headers["Retry-After"]
-            assert "COW_DATABASE_URL" in served.log()
-            database.start()
-            eventually(lambda: served.http.get("/readyz").is_success)
-            assert served.http.post("/simulate", json=BODY).is_success
-
-
-@pytest.mark.soak  # fifteen seconds of waiting
-def test_a_second_worker_that_cannot_start_is_tried_more_and_more_rarely(tmp_path: Path) -> None:
-    with bad_starts(tmp_path, COW_CONCURRENCY="2") as served:
-        both = eventually(lambda: found if len(found := workers_of(served)) == 2 else None)
-        eventually(lambda: len(served.http.get("/workers").json()["processes"][0]["workers"]) == 2)
-        (tmp_path / "starts").write_text("dies\n" * 1000)
-        both[1].kill()
-        served.http.post("/simulate", json=BODY).raise_for_status()  # by the first
-        eventually(lambda: re.search("3 starts.* 1 s later", served.log()))
-        assert served.http.get("/readyz").is_success
+        url = database.url.replace(str(database.port), str(network.port))
+        served = Served(tmp_path, COW_DATABASE_URL=url)
+        stack.callback(served.kill)
+        served.start("/livez")
+        problem(served.http.get("/readyz"), 503, "storage-unavailable")
+        refused = served.http.post("/simulate", json=BODY)
+        problem(refused, 503, "not-ready")
+        assert refused.headers["Retry-After"]
+        assert "COW_DATABASE_URL" in served.log()
+        database.start()
+        eventually(lambda: served.http.get("/readyz").is_success)
+        job_id = served.submit(BODY)["id"]
+        served.ended(job_id)
+        network.hold()
+        requests = [("GET", f"/jobs/{job_id}", None), ("POST", "/simulate", BODY | {"seed": 1}), ("GET", "/jobs", None)]
+        with ThreadPoolExecutor() as callers:
+            responses = list(callers.map(lambda one: served.http.request(one[0], one[1], json=one[2]), requests))
+        for response in responses:
+            problem(response, 503, "storage-unavailable")
+            assert response.headers["Retry-After"]
+        network.restore()
+        eventually(lambda: served.http.get("/readyz").is_success)
+        assert served.job(job_id)["status"] == "succeeded"
+        network.hold()
+        served.stop()

@@ -14,7 +14,6 @@ import yaml
 from conftest import ROOT
 from postgres import PostgresServer, postgres
 from servers import ASYNC, BODY, Served, Worker, problem, slow
-from tables import rows
 from waiting import TIME_LIMIT, eventually
 from worker_processes import workers_of
 
@@ -26,6 +25,14 @@ from cow_service.workers.pool import Group
 
 pytestmark = pytest.mark.slow
 
+# Each further try costs the start of a process.
+GIVES_UP_SOONER = """
+from cow_service.workers import pool
+pool.MAX_CRASHES = 2
+from cow_service.cli.main import app
+app(["serve"])
+"""
+
 
 def poison(how: str, seed: int = 0) -> dict[str, Any]:
     """A request whose clip does something to the process that makes it, after a moment."""
@@ -36,7 +43,7 @@ def poison(how: str, seed: int = 0) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     limits = {"COW_WORKER_MEMORY_MB": "1000", "COW_JOB_TIMEOUT": "25", "COW_CONCURRENCY": "1"}
-    with Served(tmp_path_factory.mktemp("workers"), COW_WORKERS="true", **limits) as one:
+    with Served(tmp_path_factory.mktemp("workers"), GIVES_UP_SOONER, COW_WORKERS="true", **limits) as one:
         yield one
 
 
@@ -50,17 +57,17 @@ def test_a_crash_harms_the_job_that_caused_it_and_no_other(served: Served) -> No
         served.http.post("/simulate", json=BODY).raise_for_status()
     eventually(lambda: told() == [("light-1", worker.pid)])
     assert workers_of(served) == [worker], "it is kept for the next job"
-    innocents = [served.submit(slow(0.3, seed=seed))["id"] for seed in range(1, 7)]
+    innocents = [served.submit(slow(0.3, seed=seed))["id"] for seed in (1, 2)]
     guilty = served.submit(poison("kill", seed=100))["id"]
-    innocents += [served.submit(slow(0.3, seed=seed))["id"] for seed in range(7, 13)]
+    innocents += [served.submit(slow(0.3, seed=seed))["id"] for seed in (3, 4)]
     ended = served.ended(guilty)
     assert ended["status"] == "failed"
     assert ended["problem"]["type"] == "urn:cow:problem:worker-ended"
     assert "signal 9" in ended["problem"]["detail"]
     others = [served.ended(one) for one in innocents]
     assert [one["problem"] for one in others if one["status"] != "succeeded"] == []
-    assert served.clips().count(100) == 3, "it is tried again: the crash may have been no fault of the job"
-    assert all(served.clips().count(seed) == 1 for seed in range(1, 13)), "nobody else was begun twice"
+    assert served.clips().count(100) == 2, "it is tried again: the crash may have been no fault of the job"
+    assert all(served.clips().count(seed) == 1 for seed in range(1, 5)), "nobody else was begun twice"
 
 
 def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
@@ -70,11 +77,10 @@ def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
     assert served.http.post("/simulate", json=slow(0.1, seed=102)).status_code == 200
 
 
-@pytest.mark.parametrize(("path", "seed"), rows({"a clip": ("/simulate", 120)}, [("/answer", 122)]))
-def test_a_worker_whose_device_fails_is_replaced(path: str, seed: int, served: Served) -> None:
+def test_a_worker_whose_device_fails_is_replaced(served: Served) -> None:
     before = {one.pid for one in workers_of(served)}
-    problem(served.http.post(path, json=poison("device", seed=seed)), 503, "device-failed")
-    assert served.clips().count(seed) == 3, "another process may be able to use it"
+    problem(served.http.post("/simulate", json=poison("device", seed=120)), 503, "device-failed")
+    assert served.clips().count(120) == 2, "another process may be able to use it"
     assert served.http.post("/simulate", json=slow(0.1, seed=121)).status_code == 200
     assert not before & {one.pid for one in workers_of(served)}
 
