@@ -45,8 +45,6 @@ SENTENCES: dict[str, Trajectory] = {
     ),
     "The ball rolls away from the camera and hits nothing.": world(paths=(path(to=(0.5, 0, 0.9)),)),
     "The ball rolls towards the camera and hits nothing.": world(paths=(path(to=(0.5, 0, -0.9)),)),
-    "The ball rolls down and hits nothing.": world(paths=(path(to=(0.5, 0.9, 0)),)),
-    "The ball flies up and hits nothing.": world(**FLIES, paths=(path(to=(0.5, -0.9, 0)),)),
     "The ball rises and hits nothing.": world(**FLIES, paths=(path(to=(0.009, -0.1, 0)),)),
     "The ball falls and hits nothing.": world(**FLIES, paths=(path(to=(0, 1, 0)),)),
     "The mug tips over and moves to the right and hits nothing.": world(
@@ -82,8 +80,6 @@ SENTENCES: dict[str, Trajectory] = {
     "The ball rolls to the right, hits the cube after about 1.1 s and hits the mug after about 1.5 s.": world(
         encounters=(touch("vase", 18), hiding("occludes", 0.5, "mug"), touch("mug", 15), touch())
     ),
-    "The ball rolls to the right, passes behind the vase (which hides 60% of it) from about 0.8 s on and hits "
-    "nothing.": world(encounters=(hiding("occluded-by", 0.6),)),
     "The ball rolls to the right, passes behind the vase from about 0.8 s on, passes in front of the mug from about "
     "0.8 s on and hits nothing.": world(encounters=(hiding("occluded-by", None), hiding("occludes", None, "mug"))),
     "The ball rolls to the right and hits and pushes the cube after about 0.4 s. The cube slides to the left and hits "
@@ -93,12 +89,7 @@ SENTENCES: dict[str, Trajectory] = {
     "The ball rolls to the right and hits nothing but the table and the mug.": world(
         **ON_TABLE, contacts=(ON, meeting(0.0, a=3, b=0))
     ),
-    "The ball rolls to the right, falls off the table onto the floor after about 0.8 s and hits nothing else.": world(
-        **ON_TABLE, contacts=(ON, OFF)
-    ),
     # Whether it hits something.
-    "The ball bounces once, rolls on and hits the cube after about 1.3 s. Yes, it hits the cube after about 1.3 s. 90 "
-    "of 100 simulated versions agree.": world(asks("touches", "cube", within=2.0, time=1.3), **BOUNCES),
     "The ball rolls to the right and misses the mug. No, it misses the mug within 2.0 s. 194 of 200 simulated versions "
     "agree.": world(asks("touches", "mug", 0.03, within=2.0), ensemble=200),
     "The ball rolls to the right and misses the mug. Yes, it misses the mug. All 2 simulated versions agree.": world(
@@ -107,17 +98,11 @@ SENTENCES: dict[str, Trajectory] = {
     "The ball rolls to the right and hits nothing. No, it hits nothing. 1 of 1 simulated versions agree.": world(
         asks("touches", None, 0.0), ensemble=1
     ),
-    "The ball rolls to the right and hits the cube after about 1.1 s. Yes, it hits something. 49 of 50 simulated "
-    "versions agree.": world(asks("touches", None, 0.99), ensemble=50, **HITS),
     "The ball rolls to the right and is on the table from the start. No, it is on the table from the start.": world(
         asks("touches", "table", 0.0), **ON_TABLE, contacts=(ON,)
     ),
-    "The ball rolls to the right, hits the cube after about 1.1 s and misses the mug and the vase. No, it misses the "
-    "mug and the vase.": world(asks("touches", None, 0.02, among=("mug", "vase")), **HITS),
     "The ball rolls to the right, hits the cube after about 1.1 s and hits the mug after about 1.5 s. Yes, it hits the "
     "mug or the vase.": world(asks("touches", among=("mug", "vase")), **HITS_BOTH),
-    "The ball rolls to the right, hits the cube after about 1.1 s and hits the mug after about 1.5 s. Yes, it hits the "
-    "cube and the mug.": world(asks("touches", among=EACH, every=True), **HITS_BOTH),
     "The ball rolls to the right and hits the cube after about 1.1 s. No, it misses the cube or it misses the "
     "mug.": world(asks("touches", None, 0.1, among=EACH, every=True), **HITS),
     "The ball rolls to the right and hits and pushes the cube after about 0.4 s. The cube slides to the right and "
@@ -144,9 +129,6 @@ SENTENCES: dict[str, Trajectory] = {
         asks("covered", partly=True)
     ),
     "The ball rolls to the right and hides nothing. Yes, it hides nothing.": world(asks("covers", negated=True)),
-    "The ball rolls to the right and is not hidden. No, it is not hidden.": world(
-        asks("covered", None, 0.1, partly=True)
-    ),
     # What falls, lands, leaves, is knocked over or set in motion.
     "The ball rolls to the right, falls off the table onto the floor after about 0.9 s and hits nothing else. Yes, it "
     "falls off the table onto the floor after about 0.9 s.": world(
@@ -160,8 +142,6 @@ SENTENCES: dict[str, Trajectory] = {
     "floor.": world(asks("lands", None, 0.1), **FLIES),
     "The ball rolls to the right, leaves the image after about 1.6 s and hits nothing. Yes, it leaves the "
     "image.": world(asks("leaves"), paths=(path(leaves=True),), moving_until=1.8),
-    "The ball rolls to the right, leaves the image after about 2.1 s (after the clip ends) and hits nothing. Yes, it "
-    "leaves the image after about 2.1 s (after the clip ends).": world(asks("leaves", time=2.1)),
     "The ball rolls to the right, does not leave the image and hits nothing. No, it does not leave the image.": world(
         asks("leaves", None, 0.1, time=3.0)
     ),
@@ -176,12 +156,8 @@ SENTENCES: dict[str, Trajectory] = {
     "The ball rolls to the right and hits nothing. Nothing is knocked over. No, nothing is knocked over.": world(
         asks("tips", None, 0.2)
     ),
-    "The ball rolls to the right and hits nothing. The mug is knocked over after about 0.9 s. Yes, the cube is knocked "
-    "over or the mug is knocked over.": world(asks("tips", among=EACH), paths=(*TIPS["paths"], path(2, tipped_at=0.9))),
     "The ball rolls to the right and hits nothing. No, the cube is not knocked over and the mug is not knocked "
     "over.": world(asks("tips", None, 0.1, among=EACH), paths=(path(), path(3, tipped_at=1))),
-    "The ball rolls to the right and hits nothing. The cube is set in motion after about 1.1 s. Yes, the cube is set "
-    "in motion.": world(asks("moves", "cube"), paths=(path(), path(1, moved_at=1.1))),
     "The ball rolls to the right and hits nothing. The cube is not set in motion. No, the cube is not set in "
     "motion.": world(asks("moves", "cube", 0.2)),
     "The ball rolls to the right and hits nothing. The cube is set in motion after about 1.1 s. Yes, something is set "
@@ -190,9 +166,6 @@ SENTENCES: dict[str, Trajectory] = {
         asks("moves", None, 0.2)
     ),
     # What is put somewhere.
-    "The ball is carried over, is released and goes in and stays inside. 8 of 10 simulated versions agree.": put(
-        "inside"
-    ),
     "The ball is carried over, is released and goes in but sticks out with 30% of its height above the rim. 8 of 10 "
     "simulated versions agree.": put("sticks-out", above_rim=0.3),
     "The ball is carried over, is released and does not go in and stays on the rim.": put(
@@ -244,7 +217,6 @@ SENTENCES: dict[str, Trajectory] = {
         asks("touches", form="where", first="cube"), ensemble=10, **HITS
     ),
     # Why there is no answer.
-    "Probably: in 35 of 50 simulated versions it hits the cube.": world(unsure("touches", "cube", 0.7), ensemble=50),
     "Probably not: in 40 of 50 simulated versions it misses the cube; it depends most on how fast it moves.": world(
         unsure("touches", "cube", 0.2, depends_on=("speed", "heading")), ensemble=50
     ),
@@ -264,12 +236,6 @@ SENTENCES: dict[str, Trajectory] = {
     "down.": world(unsure("leaves", None, 0.68, time=1.1, depends_on=("friction",)), ensemble=50),
     "Probably: in 34 of 50 simulated versions the first one is the mug.": world(
         unsure("touches", None, 0.68, form="which-first", first="mug"), ensemble=50
-    ),
-    "Probably: in 34 of 50 simulated versions it is 2 objects.": world(
-        unsure("touches", None, 0.68, form="how-many", count=2), ensemble=50
-    ),
-    "Probably: in 45 of 50 simulated versions it misses the cube.": world(
-        unsure("touches", "cube", 0.1, form="when"), ensemble=50
     ),
     "Not sure: what the question asks about was not found under that name, or may be one of several things; the "
     "warnings say more.": world(unsure("touches", "giraffe", 0.5, object=None), ensemble=50),

@@ -6,19 +6,16 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from drawn import bowl, floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import RADIUS, energy, rigid
+from worlds import RADIUS, rigid
 
 from cow_service.physics.draws import COLUMN, ensemble, likeliest
 from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, run_worlds
 from cow_service.physics.placement import PlacementGoal, carry, classify, hollow_of, settle
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.openings import SeenOpening, measure_opening
+from cow_service.vision.openings import SeenOpening
 
 INTO = PlacementGoal("into", (1,))
 HALF, HEIGHT = 0.2, 0.1  # m: half the width and half the height of the container
@@ -67,15 +64,8 @@ class TestFallingIn:
         run = dropped(ball, into)
         assert classify(INTO, (ball, into), run, (ball, into))[0] == "on-the-rim"
         assert run.positions[0, -1, 1] > 2 * HEIGHT
-
-    @given(share=st.floats(0.3, 1.5), base=st.floats(0.4, 1.0), shape=st.sampled_from(["sphere", "cylinder", "box"]))
-    def test_energy_does_not_grow(self, share, base, shape) -> None:
-        into = container(base=base)
-        body = over(into, share, shape)
-        run = dropped(body, into)
-        one = energy([body], WorldRun(run.positions[:1], run.velocities[:1], run.turns[:1], [], set()))
-        assert one.max() <= one[0] * 1.01
-        assert run.positions[1, :, 1].max() < HEIGHT * 1.1  # nor is the container thrown up
+        met = [each for each in run.meetings if (each.a, each.b) == (0, 1)]
+        assert 1 <= len(met) <= 4, "however many pieces touch"
 
     def test_a_cube_goes_through_a_round_opening_by_its_diagonal_and_a_bottle_sticks_out(self) -> None:
         round_one, square = container(base=1.0), container(base=1.0, sides=BOX_SIDES)
@@ -88,56 +78,6 @@ class TestFallingIn:
         ):
             found = classify(INTO, (body, into), dropped(body, into, 1.5), ())
             assert found[:2] == (result, pytest.approx(clearance))
-
-    def test_many_worlds_are_as_one_and_the_same_every_time(self) -> None:
-        into = container()
-        worlds = [[over(into, share), into] for share in (0.5, 1.3, 0.8)]
-        first, again = (run_worlds(worlds, 60, 30, 2, turns_wanted=True) for _ in range(2))
-        for a, b, bodies in zip(first, again, worlds, strict=True):
-            assert np.array_equal(a.positions, b.positions)
-            assert np.array_equal(a.turns, b.turns)
-            alone = dropped(bodies[0], into)
-            assert a.positions[0, -1, 1] == pytest.approx(alone.positions[0, -1, 1], abs=0.02)
-            met = [each for each in alone.meetings if (each.a, each.b) == (0, 1)]
-            assert 1 <= len(met) <= 4, "however many pieces touch"
-
-
-class TestOpenings:
-    @settings(max_examples=20, deadline=None)
-    @given(half=st.floats(25, 90), base=st.floats(0.4, 0.9), seed=st.integers(0, 3))
-    def test_the_rim_of_a_bowl_is_measured(self, half, base, seed) -> None:
-        plain = floor(seed=seed)
-        image = bowl(plain, (320, 180), half, 0.8 * half, (60, 160, 60), base)
-        mask = CroppedMask.of(np.abs(image.astype(int) - plain).max(axis=2) > 20)
-        seen = measure_opening(image, mask)
-        assert seen.rim is not None
-        assert seen.has_edge
-        assert seen.rim[2] == pytest.approx(half, abs=max(2.0, 0.05 * half))
-        assert seen.inner == pytest.approx(0.9, abs=max(0.04, 2 / half))
-        assert seen.bottom == pytest.approx(base, abs=0.12)
-
-    def test_a_handle_is_not_part_of_the_opening(self) -> None:
-        plain = floor()
-        image = bowl(plain, (320, 180), 60, 110, (60, 160, 60), 1.0)
-        cv2.ellipse(image, (385, 250), (25, 30), 0, -90, 90, (45, 120, 45), 10)
-        mask = CroppedMask.of(np.abs(image.astype(int) - plain).max(axis=2) > 20)
-        seen = measure_opening(image, mask)
-        x0, _, x1, _ = mask.bbox
-        assert x1 - x0 > 140
-        assert seen.inner * (x1 - x0) / 2 == pytest.approx(54, rel=0.06)
-
-    def test_what_is_too_small_or_has_no_rim_has_a_common_opening(self) -> None:
-        plain = floor()
-        for half in (4, 8):
-            image = bowl(plain, (320, 180), half, 2 * half, (60, 160, 60))
-            seen = measure_opening(image, CroppedMask.of(np.abs(image.astype(int) - plain).max(axis=2) > 20))
-            assert 0.8 < seen.inner < 1
-            assert not seen.has_edge
-        mask = np.zeros(plain.shape[:2], bool)
-        mask[100:200, 100:220] = True
-        seen = measure_opening(plain, CroppedMask.of(mask), square=True)
-        assert (seen.rim, seen.has_edge, seen.square) == (None, False, True)
-        assert 0.85 < seen.inner < 1
 
     def test_the_draw_decides_the_width(self) -> None:
         seen, row = SeenOpening(0.9, 0.05, 0.5), likeliest()[0]
@@ -178,12 +118,13 @@ def test_what_stays_where_it_is_put_begins_at_rest(
         assert np.linalg.norm(told.positions[2] - told.positions[2, :1], axis=1).max() < 0.25 * half
 
 
-# A mover far away, a cube 0.4 m wide three metres ahead, a small cylinder that is put somewhere, and another cube.
+# A mover far away, a cube 0.4 m wide three metres ahead, a small cylinder that is put somewhere, and two more cubes.
 SCENE = (
     rigid(position=(-3.0, RADIUS, 3.0)),
     rigid("box", 0.2, position=(0.0, 0.2, 3.0)),
     rigid("cylinder", 0.1, 0.15, position=(2.5, 0.15, 3.0)),
     rigid("box", 0.2, position=(0.8, 0.2, 3.0)),
+    rigid("box", 0.2, position=(1.35, 0.2, 3.0)),
 )
 
 
@@ -197,7 +138,7 @@ SCENE = (
         (PlacementGoal("in-front-of", (1,), body=2), (0.0, 0.15, 2.65), "beside"),
         (PlacementGoal("behind", (1,), body=2), (0.0, 0.15, 3.35), "beside"),
         (PlacementGoal("between", (1, 3), body=2), (0.4, 0.15, 3.0), "beside"),
-        (PlacementGoal("between", (1, 1), body=2), None, "overlaps"),
+        (PlacementGoal("between", (3, 4), body=2), None, "overlaps"),
         (PlacementGoal("onto", (0,), body=2), None, "falls-off"),
     ],
 )
@@ -209,8 +150,8 @@ def test_where_things_are_put_and_what_becomes_of_them(goal: PlacementGoal, plac
     if place is not None:
         assert settled.shapes[0][2].position == pytest.approx(place, abs=0.01)
         assert settled.shapes[0][1].position == pytest.approx(SCENE[1].position, abs=1e-3)
-    if goal.relation == "between" and place is not None:
-        assert found.clearance.tolist() == pytest.approx([0.5])
+    if goal.relation == "between":
+        assert found.clearance.tolist() == pytest.approx([0.5 if place is not None else -1 / 3])
 
 
 def test_what_is_carried_goes_up_over_and_down_and_is_released_there() -> None:

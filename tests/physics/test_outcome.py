@@ -81,11 +81,12 @@ def test_worlds_that_were_misread_tell_neither_way() -> None:
         assert answer.depends_on[:1] == ("place",)
 
 
-@pytest.mark.parametrize(("relation", "kind"), [("touches", "touches"), ("covers", "occludes"), ("covered", "covered")])
-def test_each_relation_looks_at_its_own_kind_of_event(relation: AskedRelation, kind: str) -> None:
-    found = events(**{kind: {1: 1.0}})
-    for other in ("touches", "covers", "covered"):
-        assert decided(asked(relation=other), 1, found).probability == (1.0 if other == relation else 0.0)
+def test_each_relation_looks_at_its_own_kind_of_event() -> None:
+    relations: dict[AskedRelation, str] = {"touches": "touches", "covers": "occludes", "covered": "covered"}
+    for relation, kind in relations.items():
+        found = events(**{kind: {1: 1.0}})
+        for other in relations:
+            assert decided(asked(relation=other), 1, found).probability == (1.0 if other == relation else 0.0)
 
 
 def test_of_anything_any_will_do_but_what_it_stands_on() -> None:
@@ -179,9 +180,6 @@ class TestDraws:
         assert DRAWS.std(axis=0) == pytest.approx(np.ones(len(NAMES)), abs=0.05)
         mixed = np.abs(np.corrcoef(DRAWS.T) - np.eye(len(NAMES)))
         assert mixed.max() < 0.4
-
-    def test_they_are_the_same_every_time(self) -> None:
-        assert ensemble(50).tobytes() == ensemble(50).tobytes()
 
 
 @pytest.mark.parametrize("agreeing", [0, 15, 34, 36, 44, 46])

@@ -79,13 +79,7 @@ def test_two_movers_meet_half_way() -> None:
 
 @pytest.mark.parametrize(
     ("speed", "pixels", "deviation"),
-    [
-        (Quantity(50, "px/s"), 50, 0),
-        (Quantity(1, "m/s"), 640 / 3, 0.25),
-        (Quantity(0.5, "widths/s"), 320, 0),
-        ("slow", 0.13 * 640, 0.25),
-        ("fast", 0.52 * 640, 0.25),
-    ],
+    [(Quantity(50, "px/s"), 50, 0), (Quantity(1, "m/s"), 640 / 3, 0.25), (Quantity(0.5, "widths/s"), 320, 0)],
 )
 def test_speeds_as_they_are_said(speed, pixels: float, deviation: float) -> None:
     found = read(MotionReading("linear", (1.0, 0.0), "text", speed=speed)).value

@@ -23,7 +23,6 @@ from cow_service.vision.types import Image
 
 MOVER = {"object": "red ball", "bbox": (80, 210, 130, 260)}
 BEFORE, BESIDE, BEHIND = (300, 270, 370, 350), (330, 190, 400, 268), (330, 150, 380, 200)
-TALL = (290, 190, 380, 350)  # stands before its way, and hides it
 
 
 def scene(*blocks: tuple[int, int, int, int]) -> Image:
@@ -75,35 +74,22 @@ def is_sane(trajectory: Trajectory, frames: int = 49) -> None:
 
 
 class TestWhatHappens:
-    def test_what_stands_on_its_way_is_hit_and_moves(self) -> None:
+    def test_what_stands_on_its_way_is_hit_and_what_stands_before_or_behind_is_passed(self) -> None:
         told = simulated(scene(BESIDE), [BESIDE])
         is_sane(told)
-        assert told.law == "contact"
         (hit,) = (encounter for encounter in told.encounters if encounter.kind == "touches")
-        assert (hit.object, hit.body) == ("cube", 1)
+        assert (told.law, hit.object, hit.body) == ("contact", "cube", 1)
         assert hit.probability == told.outcome.probability > 0.8
         assert told.outcome.sure
         assert [path.body for path in told.paths] == [0, 1]
-        met = next(contact for contact in told.contacts if contact.b == 1)
-        assert met.impulse > 0
-        assert 320 < met.point[0] < 410
         # The rims meet when the middle of the ball is 25 px before the block's near edge.
+        met = next(contact for contact in told.contacts if contact.b == 1)
         assert met.time == pytest.approx((330 - 25 - 105) / 160, abs=0.25)
-        assert hit.first_frame == pytest.approx(met.time * 16, abs=2)
-        assert told.paths[1].points[-1][0] > told.paths[1].points[0][0] + 1
-        assert told.path.points[0] == (105, 235)
-
-    def test_what_stands_before_or_behind_is_passed(self) -> None:
         told = simulated(scene(BEFORE, BEHIND), [BEFORE, BEHIND])
         is_sane(told)
         assert len(told.paths) == 1
         assert "touches" not in {encounter.kind for encounter in told.encounters}
         assert told.outcome.probability < 0.3
-        behind = simulated(
-            scene(TALL), [TALL], question="If the ball rolls to the right, will it be hidden by the cube?"
-        )
-        assert {encounter.kind for encounter in behind.encounters} == {"occluded-by"}
-        assert behind.outcome.probability > 0.7
 
     @pytest.mark.parametrize("partly", [False, True])
     def test_one_covering_has_one_probability(self, partly: bool) -> None:
@@ -147,7 +133,6 @@ class TestWhatHappens:
         is_sane(told)
         assert (told.law, len(told.paths)) == ("ballistic", 1)
         assert np.array(told.path.points) == pytest.approx(np.array([(105 + 10 * i, 235) for i in range(49)]))
-        assert [contact.impulse for contact in told.contacts] == pytest.approx([0], abs=1e-3)
         nearer = simulated(scene(), motion=ballistic | {"direction": (0, 1), "depth": -0.8, "speed": 60}).path
         spread = np.linalg.norm(np.array(nearer.tracks[1]) - np.array(nearer.points), axis=1)
         assert spread / spread[0] == pytest.approx(np.array(nearer.scale), abs=1e-3), "tracks grow with it"
@@ -158,20 +143,6 @@ class TestWhatHappens:
         assert [told.path.points[16], told.path.points[48]] == [pytest.approx((380, 235))] * 2
         assert len(told.paths) == 1
         assert any(encounter.kind == "touches" for encounter in told.encounters)
-
-    def test_the_same_request_gives_the_same_bytes(self) -> None:
-        first, again = (simulated(scene(BESIDE), [BESIDE], ensemble=5).model_dump_json() for _ in range(2))
-        assert first == again
-
-
-@pytest.mark.parametrize("law", ["contact", "ballistic"])
-def test_things_that_stand_on_each_other_in_a_circle(law: str) -> None:
-    objects = [
-        {"object": "tray", "bbox": (300, 200, 420, 300), "stands_on": "crate"},
-        {"object": "crate", "bbox": (320, 150, 400, 230), "stands_on": "tray"},
-    ]
-    stands = {"grounding": MOVER | {"stands_on": "crate"}, "motion": {"direction": (1, 0), "law": law}}
-    is_sane(computed(run_of(scene(BESIDE), objects=objects, ensemble=5, num_frames=33, **stands)).value, 33)
 
 
 boxes = st.tuples(st.floats(0, 600), st.floats(0, 360), st.floats(2.1, 400), st.floats(2.1, 300)).map(
@@ -210,7 +181,6 @@ BAD: dict[str, dict[str, Any]] = {
     "objects inside the mover": {"others": [(90, 220, 120, 250), (70, 200, 140, 270)]},
     "a mover as large as the image": {"mover": (8, 8, 632, 392), "others": [BESIDE]},
     "a sliver": {"mover": (100, 10, 102, 390), "others": [(0, 200, 640, 202)]},
-    "straight up": {"motion": {"direction": (0, -1), "speed": 200}},
     "thrown straight away": {"motion": {"kind": "projectile", "direction": (0, -1), "depth": 1, "speed": 400}},
     "straight at the camera": {"motion": {"direction": (0, 1), "depth": -1, "speed": 900}},
     "no speed": {"motion": {"direction": (1, 0), "speed": 0}},
@@ -239,14 +209,6 @@ def test_what_cannot_be_meant_is_cut_out_of_the_image_as_well() -> None:
     huge = {"object": "ball", "bbox": BAD["a mover as large as the image"]["mover"]}
     inside = BAD["objects inside each other"]["others"]
     is_sane(simulated(scene(BESIDE), inside, grounding=huge, num_frames=17, ensemble=2), 17)
-
-
-def test_forty_objects() -> None:
-    many = [(20 + i % 10 * 60, 60 + i // 10 * 80, 60 + i % 10 * 60, 120 + i // 10 * 80) for i in range(40)]
-    thrown = {"kind": "projectile", "direction": (1, -0.3), "speed": 300}
-    told = seen((80, 210, 130, 260), many, motion=thrown, num_frames=33)
-    is_sane(told, 33)
-    assert len(told.bodies) == 41
 
 
 @given(
