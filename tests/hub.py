@@ -41,14 +41,6 @@ class Blob:
         return entry
 
 
-@dataclass(frozen=True)
-class Asked:
-    """A request for a file's bytes."""
-
-    path: str
-    range: str | None
-
-
 @dataclass
 class Hub:
     """What the server holds, what it is to do wrong, and what it was asked."""
@@ -57,13 +49,15 @@ class Hub:
     commits: dict[str, dict[str, dict[str, Blob]]] = field(default_factory=dict)  # repository, commit, path
     main: dict[str, str] = field(default_factory=dict)
     refused: dict[str, tuple[int, str]] = field(default_factory=dict)  # status and error code, by part of the address
-    cut: dict[str, int] = field(default_factory=dict)  # bytes after which the connection breaks once, by path
     stall: dict[str, int] = field(default_factory=dict)  # bytes after which nothing more comes, by path
     stalled: threading.Event = field(default_factory=threading.Event)
     go_on: threading.Event = field(default_factory=threading.Event)
     spoilt: set[str] = field(default_factory=set)  # paths whose bytes differ from those listed
-    asked: list[Asked] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)  # paths of the files whose bytes were asked for
     listings: list[str] = field(default_factory=list)  # revisions
+
+    def downloads(self) -> list[str]:
+        return list(self.asked)
 
     @property
     def address(self) -> str:
@@ -76,9 +70,6 @@ class Hub:
         self.commits.setdefault(repository, {})[commit] = files
         self.main[repository] = commit
         return commit
-
-    def downloads(self) -> list[str]:
-        return [asked.path for asked in self.asked]
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -142,14 +133,10 @@ class Handler(BaseHTTPRequestHandler):
         data = blob.data[::-1] if path in self.hub.spoilt else blob.data
         if not body:
             return self.send(200, headers | {"Content-Length": str(len(data))})
-        wanted = self.headers.get("Range")
-        self.hub.asked.append(Asked(path, wanted))
-        start = int(wanted.removeprefix("bytes=").split("-")[0]) if wanted else 0
-        if wanted:
-            headers = headers | {"Content-Range": f"bytes {start}-{len(data) - 1}/{len(data)}"}
-        cut = self.hub.stall.get(path, self.hub.cut.pop(path, None))
-        self.send(206 if wanted else 200, headers, data[start:], cut=cut)
-        if self.hub.stall.pop(path, None) is not None:
+        self.hub.asked.append(path)
+        cut = self.hub.stall.pop(path, None)
+        self.send(200, headers, data, cut=cut)
+        if cut is not None:
             self.wfile.flush()
             self.hub.stalled.set()
             self.hub.go_on.wait()

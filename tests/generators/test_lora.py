@@ -104,6 +104,19 @@ def test_a_lora_in_the_names_of_diffusers(tmp_path: Path, original: Tensors) -> 
     assert_adds(tensors, tmp_path, {"blocks.0.attn1.to_q.weight": up @ down, "blocks.0.norm2.weight": down[0]})
 
 
+@pytest.mark.skipif(find_spec("peft") is None, reason="peft is not installed")
+def test_diffusers_and_peft_fuse_to_the_same_weights(toys, tmp_path: Path, original: Tensors) -> None:
+    ours, theirs = toys.toy(), toys.toy()
+    both = {name: tensor for name, tensor in original.items() if "k_img" not in name}  # they want v_img with k_img
+    file = saved(both | {"diffusion_model.blocks.0.self_attn.q.alpha": toys.torch.tensor(1.0)}, tmp_path)
+    toys.add_lora(ours.transformer, file)
+    theirs.load_lora_weights(str(file), adapter_name="one")
+    theirs.fuse_lora(adapter_names=["one"])
+    theirs.unload_lora_weights()
+    for name, weight in theirs.transformer.state_dict().items():
+        toys.torch.testing.assert_close(ours.transformer.state_dict()[name], weight, atol=1e-6, rtol=0)
+
+
 def test_a_lora_that_does_not_fit_is_named_and_changes_nothing(toys, tmp_path: Path, original: Tensors) -> None:
     transformer = toys.toy().transformer
     before = [weight.clone() for weight in transformer.parameters()]

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from pydantic import ValidationError
 from refusals import refused
-from tables import rows
 
-from cow_service.generators.wan.profiles import Acceleration
+from cow_service.generators.wan.profiles import Acceleration, profile_of
+from cow_service.weights.manifests import load_manifests
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -77,21 +77,9 @@ def test_a_cache_skips_blocks_and_keeps_nothing_for_the_next_clip(toys) -> None:
     assert not first[1].equal(exact[1])
     toys.reset_cache(pipeline.transformer)
     assert toys.same(toys.clip(pipeline.transformer), first)
-    toys.reset_cache(pipeline.transformer)
-    toys.forward(pipeline.transformer, seed=1)
-    toys.reset_cache(pipeline.transformer)  # after a clip that was stopped in the middle
-    assert toys.forward(pipeline.transformer, seed=9).equal(toys.forward(toys.toy().transformer, seed=9))
     with refused("generator-unavailable") as caught:  # it is accelerated once
         toys.accelerate(pipeline, Acceleration(**FIRST_BLOCK), toys.CPU)
     assert "cache: first-block" in caught.value.detail
-
-
-def test_guidance_branches_do_not_mix(toys) -> None:
-    alone, plain, both = (toys.accelerated(**FIRST_BLOCK) for _ in range(3))
-    for seed, time in toys.CLIP:  # as in a step: one branch after the other
-        assert toys.forward(both, seed, time).equal(toys.forward(alone, seed, time))
-        mixed = toys.forward(both, seed + 50, time, "uncond")
-        assert mixed.equal(toys.forward(plain, seed + 50, time, "uncond"))
 
 
 # Caches that count passes: whole clips
@@ -121,7 +109,18 @@ def test_magcache_skips_by_the_ratios_of_each_pass(toys) -> None:
         assert counts == [2 * (steps - first) - skipped] * toys.LAYERS, (steps, first)
         assert toys.same(ours[1::2], exact[1::2]), "the unconditional pass is computed each time"
         assert not toys.same(ours[::2], exact[::2])
-        assert all(toys.error(mine, theirs) < 0.05 for mine, theirs in zip(ours, exact, strict=True))
+
+
+def test_the_ratios_that_are_shipped_skip_about_half_of_the_steps(toys) -> None:
+    """A profile that skips nothing, or nearly all, has the ratios of another model."""
+    wanted = profile_of(load_manifests()["refine"], "fast-magcache")
+    assert len(wanted.acceleration.mag_ratios) == 2 * wanted.sampling.steps
+    pipeline = toys.toy()
+    counts = toys.counted(pipeline)
+    here = {"fp8": "none", "compile": "none", "attention": "native"}
+    toys.accelerate(pipeline, wanted.acceleration.model_copy(update=here), toys.CPU)
+    passes_of(toys, pipeline.transformer, 40)
+    assert 32 <= counts[0] <= 48, counts
 
 
 @with_cache_dit
@@ -129,8 +128,7 @@ def test_dbcache_skips_blocks_within_its_limits_and_forgets_between_clips(toys) 
     def cached(**options: Any) -> tuple[Any, list[int]]:
         pipeline = toys.toy()
         counts = toys.counted(pipeline)
-        wanted = {"cache": "dbcache", "cache_threshold": 1e9, **options}
-        toys.accelerate(pipeline, Acceleration.model_validate(wanted), toys.CPU)
+        toys.accelerate(pipeline, Acceleration(**{"cache": "dbcache", "cache_threshold": 1e9, **options}), toys.CPU)
         return pipeline.transformer, counts
 
     plain, (model, _) = toys.toy().transformer, cached(cache_taylor_order=1)
@@ -146,28 +144,21 @@ def test_dbcache_skips_blocks_within_its_limits_and_forgets_between_clips(toys) 
         assert toys.same(found[:warm], wanted[:warm]), "the first fifth"
         assert not toys.same(found[warm:], wanted[warm:])
         assert all(toys.error(*pair) < 0.05 for pair in zip(found, wanted, strict=True)), "branches are apart"
-    model, _ = cached(cache_threshold=0.0)
-    assert toys.same(passes_of(toys, model, 6), passes_of(toys, plain, 6))
 
 
 # Compiled blocks
 
 
-@pytest.mark.parametrize("options", rows({"with a cache around it": FIRST_BLOCK}, [{}]))
-def test_all_blocks_share_one_compiled_graph(toys, options, monkeypatch) -> None:
-    """Without inductor, whose C++ takes half a minute; what is compiled, and how often, is the same."""
+def test_all_blocks_share_one_compiled_graph(toys, monkeypatch) -> None:
+    """Also with a cache around it. Without inductor, whose C++ takes half a minute: what is compiled is the same."""
     graphs, compiler = list[Any](), toys.torch.compile
     backend = lambda graph, _: (graphs.append(graph), graph)[1]  # noqa: E731
     toys.torch.compiler.reset()
     monkeypatch.setattr(toys.torch, "compile", lambda function: compiler(function, backend=backend, fullgraph=True))
-    monkeypatch.setattr(
-        toys.acceleration, "detect_capabilities", lambda device: bare().model_copy(update={"compiler": True})
-    )
-    transformer, plain = toys.accelerated(compile="regional", **options), toys.accelerated(**options)
+    able = bare().model_copy(update={"compiler": True})
+    monkeypatch.setattr(toys.acceleration, "detect_capabilities", lambda device: able)
+    transformer, plain = toys.accelerated(compile="regional", **FIRST_BLOCK), toys.accelerated(**FIRST_BLOCK)
     assert toys.same(toys.clip(transformer), toys.clip(plain))
-    toys.acceleration.reset_cache(transformer)
-    toys.acceleration.reset_cache(plain)
-    assert toys.same(toys.clip(transformer, "uncond"), toys.clip(plain))
     assert len(graphs) == 1
     toys.torch.compiler.reset()
 
@@ -175,37 +166,22 @@ def test_all_blocks_share_one_compiled_graph(toys, options, monkeypatch) -> None
 # Float8
 
 
-@with_torchao
 def test_weights_become_float8_in_the_blocks_alone(toys) -> None:
     from torchao.quantization import Float8Tensor
 
-    pipeline = toys.toy()
-    before = sum(parameter.numel() for parameter in pipeline.transformer.blocks.parameters())
-    toys.accelerate(pipeline, Acceleration(fp8="weights"), toys.CPU)
-    transformer = pipeline.transformer
+    transformer = toys.accelerated(fp8="weights")
     small = {name for name, weight in transformer.named_parameters() if isinstance(weight, Float8Tensor)}
     assert small == {
         f"{name}.weight" for name, layer in transformer.named_modules()
         if isinstance(layer, toys.torch.nn.Linear) and name.startswith("blocks.")
     }  # fmt: skip
-    assert len(small) == toys.LAYERS * 12
-    assert all(transformer.get_parameter(name).qdata.dtype == toys.torch.float8_e4m3fn for name in small)
-    assert sum(parameter.numel() for parameter in transformer.blocks.parameters()) == before
     assert transformer.dtype == toys.torch.float32
     assert 1e-4 < toys.error(toys.forward(transformer), toys.forward(toys.toy().transformer)) < 0.05
-    exact = toys.clip(transformer)
-    assert toys.same(toys.clip(toys.accelerated(fp8="weights", **{**FIRST_BLOCK, "cache_threshold": 0.0})), exact)
-    assert not toys.same(toys.clip(toys.accelerated(fp8="weights", **FIRST_BLOCK)), exact), (
-        "a cache skips such blocks, too"
-    )
+    cached = toys.clip(toys.accelerated(fp8="weights", **FIRST_BLOCK))
+    assert not toys.same(cached, toys.clip(transformer)), "a cache skips such blocks, too"
 
 
-@with_torchao
 def test_what_a_library_raises_is_told_with_the_option_and_without_folders(toys, monkeypatch) -> None:
-    monkeypatch.setattr(toys.acceleration, "detect_capabilities", lambda device: machine())
-    with refused("generator-unavailable") as caught:
-        toys.acceleration.accelerate(toys.toy(), Acceleration(fp8="dynamic"), toys.CPU)
-    assert "fp8: dynamic" in caught.value.detail
     pipeline = toys.toy()
 
     def fail(backend: str) -> None:
@@ -213,7 +189,8 @@ def test_what_a_library_raises_is_told_with_the_option_and_without_folders(toys,
 
     monkeypatch.setattr(pipeline.transformer, "set_attention_backend", fail)
     with refused("generator-unavailable") as caught:
-        toys.acceleration.accelerate(pipeline, Acceleration(), toys.CPU)
+        toys.accelerate(pipeline, Acceleration(), toys.CPU)
+    assert "attention: native" in caught.value.detail
     assert "cannot open kernel.so for native" in caught.value.detail
     assert "secret" not in caught.value.detail
 
@@ -222,21 +199,15 @@ def test_what_a_library_raises_is_told_with_the_option_and_without_folders(toys,
 
 
 @with_accelerate
-@pytest.mark.parametrize(
-    ("offload", "options"),
-    rows(
-        {"whole parts": ("model", {}), "block by block, with a cache": ("group", FIRST_BLOCK)},
-        [("model", FIRST_BLOCK), ("group", {}), ("model", {"fp8": "weights"}), ("group", {"fp8": "weights"})],
-    ),
-)
-def test_offloaded_parts_compute_the_same(toys, offload, options, monkeypatch) -> None:
-    kept = toys.accelerated(**options)
+@pytest.mark.parametrize("offload", ["model", "group"])
+def test_offloaded_parts_compute_the_same(toys, offload, monkeypatch) -> None:
+    kept = toys.accelerated(**FIRST_BLOCK)
     monkeypatch.setattr(toys.acceleration, "detect_capabilities", lambda device: machine())
-    offloaded = toys.accelerated(offload=offload, **options)
+    offloaded = toys.accelerated(offload=offload, **FIRST_BLOCK)
     for _ in range(2):
         assert toys.same(toys.clip(offloaded), toys.clip(kept))
-        toys.acceleration.reset_cache(offloaded)
-        toys.acceleration.reset_cache(kept)
+        toys.reset_cache(offloaded)
+        toys.reset_cache(kept)
 
 
 def test_weights_are_pinned_one_by_one(toys, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,7 +288,6 @@ def test_the_machine_is_seen_as_it_is(toys, monkeypatch: pytest.MonkeyPatch) -> 
     found = toys.detect_capabilities(toys.CPU)
     assert (found.device, found.compute_capability) == ("cpu", None)
     assert found.memory > 1e8
-    assert ("torchao" in found.packages) == (find_spec("torchao") is not None)
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setenv("PATH", "")
     assert not toys.detect_capabilities(toys.CPU).compiler

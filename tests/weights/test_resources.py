@@ -35,9 +35,3 @@ def test_in_a_wheel_they_are_its_own_and_nothing_else(tmp_path: Path, monkeypatc
     for name in ("absent", "", "../models/toy", "hello.md", "notes"):
         with pytest.raises(LookupError, match="hello"):  # what exists is named
             PROMPTS.read(name)
-
-
-def test_shipped_folders_are_in_the_wheel_recipe() -> None:
-    recipe = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    for kind in (PROMPTS, MANIFESTS):
-        assert f'"{kind.folder}" = "cow_service/_shipped/{kind.folder}"' in recipe
