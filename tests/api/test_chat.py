@@ -41,13 +41,6 @@ def vlmevalkit_choices(model: str) -> dict[str, Any]:
     return {**vlmevalkit(model), "messages": [user(image(SCENE_URL, detail="high"), text(words))]}
 
 
-def lmms_eval_of_thinkers(model: str) -> dict[str, Any]:
-    """As lmms-eval asks models with `o3` or `gpt-5` in their names."""
-    content = [text(SCENE.meta["question"]), image(SCENE_URL)]
-    rest = {"max_completion_tokens": 1024, "reasoning_effort": "medium", "response_format": {"type": "text"}}
-    return {"model": model, "messages": [user(*content)], **rest}
-
-
 @pytest.fixture
 def chat(client: OpenAI) -> Any:
     return client.chat.completions.create
@@ -56,7 +49,7 @@ def chat(client: OpenAI) -> Any:
 # --- answers ---
 
 
-@pytest.mark.parametrize("payload", [vlmevalkit, vlmevalkit_choices, lmms_eval_of_thinkers])
+@pytest.mark.parametrize("payload", [vlmevalkit, vlmevalkit_choices])
 def test_what_harnesses_send_is_answered_with_a_letter(chat: Any, payload: Any) -> None:
     reply = chat(**payload(EMBEDDED))
     assert (reply.choices[0].message.content, reply.choices[0].finish_reason) == (SCENE.meta["answer"], "stop")
@@ -125,7 +118,6 @@ def test_the_same_key_is_the_same_job(served: Served, chat: Any) -> None:
     [
         ({"model": "embedded"}, "model"),
         ({"seed": -1}, "seed"),
-        ({"cow": {"votes": 99}}, "cow.votes"),
         ({"cow": {"vote": 1}}, "cow.vote"),
         ({"cow": {"reader": "mllm"}}, "cow.reader"),
         ({"cow": {"seed": 1}, "seed": 1}, "cow.seed"),
@@ -189,25 +181,14 @@ def test_fields_that_the_embedded_reader_cannot_use_are_named_and_not_refused(se
     assert len(told(post(served, body | SILENT))["cow"]["warnings"]) == len(reply["cow"]["warnings"]) - 1
 
 
-def test_bodies_and_images_that_cannot_be_read(served: Served) -> None:
-    def of_type(content: bytes, media_type: str) -> Any:
-        return post(served, content, **{"Content-Type": media_type})
-
-    def of_image(url: str) -> Any:
-        return post(served, {"model": EMBEDDED, "messages": [user(image(url), text("?"))]})
-
+def test_every_refusal_below_v1_has_openais_form(served: Served) -> None:
+    form = {"Content-Type": "multipart/form-data; boundary=x"}
     for response, status, code in (
         (post(served, b"{"), 400, "malformed-body"),
-        (of_type(b"{}", "text/plain"), 415, "body-type-unsupported"),
-        (of_type(b"--x", "multipart/form-data; boundary=x"), 415, "body-type-unsupported"),
+        (post(served, b"--x", **form), 415, "body-type-unsupported"),
         (post(served, b" " * 3_100_000), 413, "body-too-large"),
-        (of_image("data:image/gif;base64," + base64.b64encode(b"GIF89a.......").decode()), 415,
-         "image-type-unsupported"),
-        (of_image("https://example.org/a.png"), 422, "image-url-not-allowed"),
-        (served.http.get("/v1/chat/completions"), 405, "method-not-allowed"),
         (served.http.get("/v1/nothing"), 404, "not-found"),
-        (served.http.get("/v1/models", headers={"Origin": "http://evil.example"}), 403, "origin-not-allowed"),
-    ):  # fmt: skip
+    ):
         assert problem(response, status, code)["error"]["code"] == code
         assert response.headers["content-length"] == str(len(response.content))
     assert "error" not in problem(served.http.get("/nothing"), 404, "not-found")

@@ -145,15 +145,9 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
 CORE = {
     *("image", "question", "options", "language", "seed", "num_frames", "video", "ensemble", "imagine", "baseline"),
     *("votes", "grounding.mask", "grounding.size", "motion.kind", "motion.law", "motion.speed", "motion.until"),
-    *(
-        "motion.steps.distance",
-        "motion.others.speed",
-        "motion.speed_deviation",
-        "trajectory.points",
-        "trajectory.scale",
-    ),
-    *("objects.bbox", "objects.role", "interventions.relation", "asked.relation", "asked.among", "camera.focal"),
-    *("depth.scale", "frames.indices", "frames.factual"),
+    *("motion.steps.distance", "motion.others.speed", "motion.speed_deviation", "trajectory.points"),
+    *("trajectory.scale", "objects.bbox", "objects.role", "interventions.relation", "asked.relation", "asked.among"),
+    *("camera.focal", "depth.scale", "frames.indices", "frames.factual"),
 }
 # Tested where there is what they choose from: readers, generators, a queue, a receiver, a reader that draws votes.
 ELSEWHERE = {"reader", "generator", "generator_options", "priority", "webhook", "imagine_votes"}

@@ -109,16 +109,6 @@ def test_what_is_no_digest_never_reaches_the_disk(store, monkeypatch, name):
         store.get(name)
 
 
-def test_an_absent_digest_is_named_and_a_long_name_is_cut(store):
-    for find in (store.get, store.read, store.touch):
-        with refused("artifact-not-found") as caught:
-            find(SHA256)
-        assert SHA256 in caught.value.detail
-    with refused("artifact-not-found") as caught:
-        store.get("x" * 100_000)
-    assert len(caught.value.detail) < 200
-
-
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EACCES])
 def test_what_the_disk_refuses_is_told_without_its_path_and_leaves_nothing(store, folder, monkeypatch, number):
     monkeypatch.setattr(os, "fsync", failing(number))
@@ -127,21 +117,6 @@ def test_what_the_disk_refuses_is_told_without_its_path_and_leaves_nothing(store
             call()
         assert ("full" in caught.value.detail) == (number != errno.EACCES)
         assert "/" not in caught.value.detail
-    assert files(folder) == []
-
-
-def test_a_file_where_the_folder_should_be(tmp_path):
-    blocked = tmp_path / "data"
-    blocked.write_bytes(b"")
-    store = DiskArtifacts(blocked)
-    for call in (store.check, lambda: store.put(DATA, "image/png"), lambda: store.get(SHA256)):
-        with refused("storage-unavailable") as caught:
-            call()
-        assert str(tmp_path) not in caught.value.detail
-
-
-def test_check_leaves_nothing_behind(store, folder):
-    store.check()
     assert files(folder) == []
 
 

@@ -156,11 +156,5 @@ def test_alarms_and_panels_are_of_metrics_that_exist(http: httpx.Client) -> None
 def test_the_dashboard_has_a_data_source_to_choose() -> None:
     (variable,) = DASHBOARD["templating"]["list"]
     assert (variable["type"], variable["query"]) == ("datasource", "prometheus")
-    identifiers = [panel["id"] for panel in DASHBOARD["panels"]]
-    assert len(set(identifiers)) == len(identifiers)
-    for panel in DASHBOARD["panels"]:
-        place = panel["gridPos"]
-        assert place["x"] + place["w"] <= 24
-        for target in panel.get("targets", ()):
-            assert target["datasource"]["uid"] == "${" + variable["name"] + "}"
-            assert target["expr"].count("(") == target["expr"].count(")")
+    targets = [target for panel in DASHBOARD["panels"] for target in panel.get("targets", ())]
+    assert {target["datasource"]["uid"] for target in targets} == {"${" + variable["name"] + "}"}

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from conftest import EXAMPLES, ROOT
+from conftest import ROOT
 
 pytestmark = pytest.mark.slow
 FOLDERS = sorted((ROOT / "cow-scenes" / "sample" / "truth").glob("*/*"))
@@ -47,33 +44,6 @@ def test_depth_and_camera_lead_to_a_flat_floor_with_the_things_in_their_boxes_ab
     assert scene.thing_in((0, 0, 2, 2)) is None
     with pytest.raises(KeyError, match="pink"):
         scene.thing("pink")
-
-
-def test_other_forms_of_a_scene_are_read_alike(stand_ins: Any, tmp_path: Path) -> None:
-    """A table, which has no box of its own; and depth as float16 metres in depth.npz, with one box for each thing."""
-    known = stand_ins.read_truth(FOLDERS[0])
-    folder = shutil.copytree(FOLDERS[0], tmp_path / "scene")
-    meta = json.loads((folder / "meta.json").read_text())
-    (folder / "depth.png").unlink(missing_ok=True)
-    np.savez_compressed(folder / "depth.npz", depth=known.depth.astype(np.float16))
-    camera = {name: meta["camera"][name] for name in ("focal", "pitch", "height")}
-    boxes = {name: each[0] for name, each in meta["boxes"].items()}
-    (folder / "meta.json").write_text(json.dumps({"boxes": boxes, "camera": camera}))
-    read = stand_ins.read_truth(folder)
-    assert read.camera == known.camera
-    assert [(each.name, each.bbox) for each in read.things] == [(each.name, each.bbox) for each in known.things]
-    assert all((one.mask == other.mask).all() for one, other in zip(read.things, known.things, strict=True))
-    assert np.allclose(read.depth, known.depth, rtol=1e-3)
-
-    ids = cv2.imread(str(folder / "ids.png"), cv2.IMREAD_UNCHANGED)
-    ids[400:440, 100:200] = 9
-    cv2.imwrite(str(folder / "ids.png"), ids)
-    meta["id_of"]["table"] = 9
-    (folder / "meta.json").write_text(json.dumps(meta))
-    table = stand_ins.read_truth(folder).thing("table")
-    assert (table.bbox, table.mask.sum()) == ((100, 400, 200, 440), 4000)
-    with pytest.raises(FileNotFoundError, match="depth"):
-        stand_ins.read_truth(EXAMPLES / "ball-and-mug")
 
 
 def test_errors_are_seeded_smooth_and_as_large_as_said(stand_ins: Any) -> None:
