@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,8 @@ from engines import app_for
 from mllm_server import MllmServer
 from numpy.typing import NDArray
 from servers import data_url
-from waiting import TIME_LIMIT, eventually_async
+from waiting import TIME_LIMIT
 
-from cow_service.jobs.active import ActiveJobs
 from cow_service.media.images import encode_png
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -50,13 +48,9 @@ class Witness:
 
     def __init__(self, server: MllmServer) -> None:
         self.wrong: list[tuple[int, list[int]]] = []
-        self.is_asked, self.may_answer = threading.Event(), threading.Event()
-        self.may_answer.set()
         server.say(self.reply)
 
     def reply(self, handler: Any) -> None:
-        self.is_asked.set()
-        self.may_answer.wait(TIME_LIMIT)
         asked = int(re.findall(r"picture (\d+)", say.text_of(handler.body))[-1])
         seen = [number_in(pixels) for pixels in say.images_of(handler.body)]
         if seen != [asked]:
@@ -106,41 +100,3 @@ def test_no_request_gets_the_picture_or_the_answer_of_another(served: tuple[Serv
 
     assert asyncio.run(all_at_once()) == [(number, str(number)) for number in range(REQUESTS)]
     assert witness.wrong == []
-
-
-def test_a_late_message_about_a_deleted_job_is_not_taken_for_the_next_one(
-    served: tuple[Service, Witness], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A key that is used again after a deletion has the same job id: what is said of the first job may come late."""
-    service, witness = served
-    announce, is_first, held, told = ActiveJobs.notify_ended, threading.Lock(), threading.Event(), threading.Event()
-
-    def late(active: ActiveJobs, job_id: str, *refusal: Any) -> None:
-        is_late = is_first.acquire(blocking=False)
-        if is_late:
-            held.wait(TIME_LIMIT)
-        announce(active, job_id, *refusal)
-        if is_late:
-            told.set()
-
-    async def calls() -> str:
-        async with connected(service) as client:
-            key = {"Idempotency-Key": "late"}
-            first = (await client.post("/answer", json=body(1), headers=key | {"Prefer": "respond-async"})).json()["id"]
-
-            async def succeeded() -> bool:
-                return (await client.get(f"/jobs/{first}")).json()["status"] == "succeeded"
-
-            await eventually_async(succeeded)
-            await client.delete(f"/jobs/{first}")
-            witness.is_asked.clear()
-            witness.may_answer.clear()
-            second = asyncio.create_task(client.post("/answer", json=body(2), headers=key))
-            await asyncio.to_thread(witness.is_asked.wait, TIME_LIMIT)
-            held.set()
-            await asyncio.to_thread(told.wait, TIME_LIMIT)
-            witness.may_answer.set()
-            return (await second).json()["answer"]
-
-    monkeypatch.setattr(ActiveJobs, "notify_ended", late)
-    assert asyncio.run(calls()) == "2"

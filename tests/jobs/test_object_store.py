@@ -11,9 +11,7 @@ import httpx
 import pytest
 from callers import as_caller, new_keys
 from servers import BODY, IMAGE, Served, problem, slow
-from waiting import TIME_LIMIT, eventually
-
-from cow_service.client import Client
+from waiting import eventually
 
 if TYPE_CHECKING:
     from object_store import ObjectStore
@@ -77,20 +75,6 @@ def test_callers_are_sent_to_the_store(served, objects):
     # Ownership is checked first: other callers are not redirected.
     with as_caller(served, KEYS["bob"]) as bob:
         problem(bob.http.get(video["url"]), 404, "artifact-not-found")
-
-
-def test_the_sdk_follows_and_keeps_its_key_to_itself(served, objects):
-    requests: list[httpx.Request] = []
-    hooks = {"request": [requests.append]}
-    with httpx.Client(event_hooks=hooks, timeout=TIME_LIMIT) as http:
-        client = Client(str(served.http.base_url), api_key=KEYS["alice"], http_client=http)
-        sha256 = simulated(served, BODY)["frames"][0]["sha256"]
-        assert hashlib.sha256(client.artifact(sha256)).hexdigest() == sha256
-    asked, followed = requests
-    assert asked.headers["authorization"] == f"Bearer {KEYS['alice']}"
-    assert str(followed.url).startswith(objects.endpoint)
-    assert KEYS["alice"] not in str(followed.url) + str(followed.headers)
-    assert "authorization" not in followed.headers
 
 
 def test_what_is_damaged_is_made_again(served, objects):

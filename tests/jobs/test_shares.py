@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from callers import as_caller, new_keys
 from job_rows import add_job, open_database
-from servers import TERMINAL, Served, problem, slow
+from servers import Served, problem, slow
 from waiting import eventually
 
 from cow_service.jobs.job_table import JobTable
@@ -27,49 +27,33 @@ def alice(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield caller
 
 
-def order_of_ends(caller: Served, names: dict[str, str]) -> list[str]:
-    """The names of jobs by their ids, in the order in which they end; never do more run than may."""
-
-    def all_ended() -> list[str]:
-        jobs = caller.http.get("/jobs", params={"limit": 100}).json()["jobs"]
-        assert len([job for job in jobs if job["status"] == "running"]) <= LIMIT
-        ended = [job for job in jobs if job["id"] in names and job["status"] in TERMINAL]
-        assert {job["status"] for job in ended} <= {"succeeded"}
-        order = [names[job["id"]] for job in sorted(ended, key=lambda job: job["finished_at"])]
-        return order if len(order) == len(names) else []
-
-    return eventually(all_ended)
-
-
 @pytest.mark.slow
-def test_a_key_has_no_more_running_jobs_than_it_may_have(alice: Served) -> None:
-    first = alice.submit(slow(100, seed=1))
-    alice.rendering(first["id"])
-    waits = [alice.submit(slow(0.2, seed=seed)) for seed in (2, 3)]
-    with as_caller(alice, KEYS["bob"]) as bob:
-        assert bob.http.post("/simulate", json=slow(0.2)).status_code == 200, "there is a place for others"
-    assert [alice.job(job["id"])["status"] for job in waits] == ["queued"] * 2
-    alice.http.post(f"/jobs/{first['id']}/cancel")
-    assert order_of_ends(alice, {job["id"]: str(place) for place, job in enumerate(waits)}) == ["0", "1"]
-
-
-@pytest.mark.slow
-def test_a_job_of_higher_priority_comes_before_those_of_its_key_that_wait(alice: Served) -> None:
+def test_a_key_has_no_more_running_jobs_than_it_may_have_and_those_of_higher_priority_first(alice: Served) -> None:
     first = alice.submit(slow(100, seed=10))
     alice.rendering(first["id"])
     ranks = ("low", "low", "high", "normal")
     jobs = [alice.submit(slow(0.2, seed=11 + place, priority=rank)) for place, rank in enumerate(ranks)]
+    with as_caller(alice, KEYS["bob"]) as bob:
+        assert bob.http.post("/simulate", json=slow(0.2)).status_code == 200, "there is a place for others"
+    assert [alice.job(job["id"])["status"] for job in jobs] == ["queued"] * 4
     assert alice.job(jobs[2]["id"])["position"] < alice.job(jobs[1]["id"])["position"]
     alice.http.post(f"/jobs/{first['id']}/cancel")
     names = {job["id"]: f"{rank} {place}" for place, (job, rank) in enumerate(zip(jobs, ranks, strict=True))}
-    assert order_of_ends(alice, names) == ["high 2", "normal 3", "low 0", "low 1"]
+
+    def order_of_ends() -> list[str]:
+        """Once all have ended. Never do more run than may."""
+        listed = alice.http.get("/jobs", params={"limit": 100}).json()["jobs"]
+        assert len([job for job in listed if job["status"] == "running"]) <= LIMIT
+        ended = [job for job in listed if job["status"] == "succeeded"]
+        order = [names[job["id"]] for job in sorted(ended, key=lambda job: job["finished_at"])]
+        return order if len(order) == len(names) else []
+
+    assert eventually(order_of_ends) == ["high 2", "normal 3", "low 0", "low 1"]
     problem(alice.http.post("/simulate", json=slow(0.1, priority="urgent")), 422, "invalid-request")
     key = {"Idempotency-Key": "hurry"}  # which stands for the same request, whatever its priority
+    bodies = [slow(0.1, seed=30, priority=rank) for rank in ("low", "high")]
     replays = [
-        alice.http.post("/simulate", json=slow(0.1, seed=30, priority=rank), headers=key).headers.get(
-            "Idempotent-Replayed"
-        )
-        for rank in ("low", "high")
+        alice.http.post("/simulate", json=body, headers=key).headers.get("Idempotent-Replayed") for body in bodies
     ]
     assert replays == [None, "true"]
 
