@@ -31,10 +31,10 @@ RIGHT = {
 }
 
 
-def picture(folder: Path, number: int, name: str = "", size: tuple[int, int] = (96, 64)) -> str:
+def picture(folder: Path, number: int, name: str = "") -> str:
     """Draws a ball on a floor into `pictures`; returns its digest."""
-    centre = (size[0] * (0.2 + 0.6 * (number % 7) / 7), size[1] * 0.6)
-    content = png_bytes(ball(floor(*size, seed=number), centre, size[1] / 5, (200, 30 + 20 * (number % 10), 40)))
+    centre = (19 + 58 * (number % 7) / 7, 38)
+    content = png_bytes(ball(floor(96, 64, seed=number), centre, 13, (200, 30 + 20 * (number % 10), 40)))
     digest = hashlib.sha256(content + name.encode()).hexdigest()
     (folder / "pictures").mkdir(parents=True, exist_ok=True)
     (folder / "pictures" / f"{digest}.png").write_bytes(content)
@@ -60,14 +60,14 @@ def item(number: int, image: str, task: Task, level: str) -> Item:
     )
 
 
-def observation(of: Item, arm: str, repeat: int, frames: Sequence[str] = (), reply_length: int = 40) -> Observation:
+def observation(of: Item, arm: str, repeat: int, frames: Sequence[str] = ()) -> Observation:
     """Made up, the same for the same item, arm and repeat."""
     draw = random.Random(f"{of.id} {arm} {repeat}")
     happens = of.answer == "A"
     imagines = arm not in ("never", "placebo-still")
     told = min(1.0, max(0.0, random.Random(of.id).gauss(0.72 if happens else 0.28, 0.22)))
     read: str | None = of.answer if draw.random() < RIGHT.get(arm, 0.5) else draw.choice(LETTERS)
-    reply: str | None = f"{'The ball rolls on until it meets something. ' * (reply_length // 40)}The answer is {read}."
+    reply: str | None = f"The ball rolls on until it meets something. The answer is {read}."
     fate = draw.random()
     if fate < 0.03:
         read, reply = None, HOSTILE
@@ -128,7 +128,6 @@ def run(
     repeats: int = 2,
     tasks: Sequence[Task] = ("collision", "trajectory"),
     mllm: str = "openai/small",
-    reply_length: int = 40,
 ) -> EvalRun:
     """Asked about `count` items of these tasks in turn."""
     from cow_service.evals.runs import EvalRun
@@ -142,9 +141,7 @@ def run(
         level = levels[number // len(tasks) % len(levels)]
         items.append(item(number, picture(folder, number), task, level))
         observations += [
-            observation(items[-1], arm, repeat, frames, reply_length)
-            for arm in arms
-            for repeat in range(1, repeats + 1)
+            observation(items[-1], arm, repeat, frames) for arm in arms for repeat in range(1, repeats + 1)
         ]
     asked = info(arms, repeats, items, mllm)
     return EvalRun(folder, asked, {each.id: each for each in items}, tuple(observations))

@@ -9,14 +9,14 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from random_mllm import JsonHandler, serving
 
 Reply = Callable[["_Handler"], None]
 
@@ -82,14 +82,10 @@ def completion(text: str | None, finish_reason: str = "stop") -> dict[str, Any]:
     }
 
 
-class _Handler(BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"
+class _Handler(JsonHandler):
     server_state: MllmServer
     body: dict[str, Any]  # of the call that is being answered
     of_script: int
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
 
     def do_POST(self) -> None:
         state = self.server_state
@@ -106,25 +102,15 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self.send(200, completion(reply))
 
-    def send(self, status: int, body: object, headers: dict[str, str] | None = None, length: int | None = None) -> None:
-        data = body if isinstance(body, bytes) else json.dumps(body).encode()
-        self.send_response(status)
-        sent = {"content-type": "application/json", "content-length": str(len(data) if length is None else length)}
-        for name, value in (sent | (headers or {})).items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(data)
-
 
 def status(code: int, **headers: str) -> Reply:
     """An error of that status."""
-    named = {name.replace("_", "-"): value for name, value in headers.items()}
-    return lambda handler: handler.send(code, {"error": {"message": "no", "type": "error"}}, named)
+    return lambda handler: handler.send(code, {"error": {"message": "no", "type": "error"}}, **headers)
 
 
 def raw(body: bytes, content_type: str = "application/json") -> Reply:
     """Status 200 with any bytes."""
-    return lambda handler: handler.send(200, body, {"content-type": content_type})
+    return lambda handler: handler.send(200, body, content_type)
 
 
 def shaped(body: object) -> Reply:
@@ -142,16 +128,9 @@ def slow(seconds: float, text: str = "{}") -> Reply:
         with handler.server_state.lock:  # before the reply: who gets it may ask again at once
             # A caller of an earlier script may have left before its reply.
             handler.server_state.at_once -= handler.of_script == handler.server_state.scripts
-        with suppress(OSError):  # the caller may have given up
-            handler.send(200, completion(text))
+        handler.send(200, completion(text))
 
     return reply
-
-
-def half(handler: _Handler) -> None:
-    """Fewer bytes than were announced."""
-    handler.send(200, json.dumps(completion("x")).encode()[:60], length=4000)
-    handler.close_connection = True
 
 
 def dropped(handler: _Handler) -> None:
@@ -161,20 +140,9 @@ def dropped(handler: _Handler) -> None:
     handler.close_connection = True
 
 
-class _Quiet(ThreadingHTTPServer):
-    daemon_threads = True
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        pass  # callers that give up are what some tests are about
-
-
 @contextmanager
 def mllm_server() -> Iterator[MllmServer]:
     """Serves until the block ends."""
     state = MllmServer()
-    handler = type("Handler", (_Handler,), {"server_state": state})
-    with _Quiet(("127.0.0.1", 0), handler) as server:
-        state.address = f"http://127.0.0.1:{server.server_port}/v1"
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+    with serving(type("Handler", (_Handler,), {"server_state": state})) as state.address:
         yield state
-        server.shutdown()

@@ -1,7 +1,6 @@
 """An MLLM on loopback that knows the right answers, and gives them with a known probability: more where it sees frames.
 
-A frame that is the image again tells it nothing. What it replies is drawn from its seed, from what it is asked and,
-where `counted`, from how often it was asked the same before.
+A frame that is the image again tells it nothing. What it replies is drawn from its seed and from what it is asked.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ class TruthMllm:
     with_frames: float = 0.8
     seed: int = 0
     left: float = math.inf  # replies until it holds further ones back
-    counted: bool = False
     address: str = ""
     asked: Counter[str] = field(default_factory=Counter)
     waiting: Counter[str] = field(default_factory=Counter)  # what was asked and not replied to
@@ -50,8 +48,7 @@ class TruthMllm:
         with self.lock:
             self.asked[key] += 1
             self.waiting[key] += 1
-            number = self.asked[key] if self.counted else 0
-        draws = random.Random(f"{self.seed} {key} {number}")
+        draws = random.Random(f"{self.seed} {key} 0")
         looked = len(set(pictures[1:])) > 1
         options = split_options(text.partition("\n\n")[0]).options
         right = next(truth for question, truth in self.truth.items() if text.startswith(question))

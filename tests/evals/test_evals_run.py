@@ -43,7 +43,7 @@ ALL_ARMS = (
 )
 PICTURES_SHOWN = {"never": 1, "always": 4, "encounters": 1, "frames-only": 3, "oracle": 4}
 PICTURES_SHOWN |= {"placebo-still": 4, "placebo-item": 4, "oracle:error-2": 4}
-LIMIT, REPEATS = (6, 1) if SCALE == 1 else (12, 2)
+LIMIT, REPEATS = (4, 1) if SCALE == 1 else (12, 2)
 MODEL = "openai-api/local/fake"
 # What a run imports, Inspect's own parts among it.
 IMPORTED = (
@@ -236,26 +236,32 @@ def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None
     assert "GPT-5 (paper)" not in (report / "report.md").read_text(), "these are other data"
 
 
-def test_a_finished_run_asks_nothing_more_and_says_the_same(done: Done, imported: Template) -> None:
-    before = sum(done.mllm.asked.values())
-    asked = (str(SAMPLE), *own(done.mllm), "--arm", "never", "--limit", str(LIMIT))
-    again = evaluated(imported, done.out, *asked)
-    assert sum(done.mllm.asked.values()) == before
-    assert again.stdout == done.told
-    other = evaluated(imported, done.out, *asked, "--seed", "7", code=1)
-    assert "--seed 0, not 7" in other.stderr
-
-
-def test_a_plan_is_asked_and_followed(tmp_path: Path, mllm: TruthMllm, imported: Template) -> None:
+def test_a_plan_is_asked_and_followed_and_failures_are_retried_on_request(
+    tmp_path: Path, items: list[Item], mllm: TruthMllm, imported: Template
+) -> None:
     plan, run, limit = tmp_path / "plan.json", tmp_path / "run", ("--limit", "2")
     asked = (str(SAMPLE), *own(mllm), "--arm", "never,always,placebo-still", *limit)
+    planned = ("--plan", str(plan))
     assert "2,726 scenes" in evaluated(imported, plan, "plan", *asked).stdout
     assert not mllm.asked
-    assert "as planned" in evaluated(imported, run, "--plan", str(plan)).stdout
-    assert len(read_run(run).observations) == 6
-    assert "--seed" in evaluated(imported, run, "--plan", str(plan), "--seed", "4", code=1).stderr
-    departed = evaluated(imported, run, str(SAMPLE), *own(mllm), "--arm", "encounters", *limit).stdout
-    assert "as planned (explored besides: encounters)" in departed
+
+    def failures() -> set[str]:
+        return {str(each.failure) for each in read_run(run).observations if each.failure}
+
+    mllm.refuses = items[0].question[0][:40]
+    refused_items = [item for item in items[:2] if mllm.refuses in item.question[0]]
+    begun = evaluated(imported, run, *planned, code=3)
+    assert "--retry-failed" in begun.stderr
+    assert f"{3 * len(refused_items)} questions failed" in begun.stdout
+    assert failures()
+    assert all("The model is away." in reason for reason in failures())
+    before, mllm.refuses = mllm.asked.total(), ""
+    departed = evaluated(imported, run, str(SAMPLE), *own(mllm), "--arm", "encounters", *limit, code=3)
+    assert "explored besides: encounters" in departed.stdout
+    assert mllm.asked.total() == before + 2, "failures are not asked again by themselves"
+    assert "as planned" in evaluated(imported, run, *planned, "--retry-failed").stdout
+    assert (len(read_run(run).observations), mllm.asked.total(), failures()) == (8, 8, set())
+    assert "--seed" in evaluated(imported, run, *planned, "--seed", "4", code=1).stderr
 
 
 @pytest.mark.scaled
@@ -279,30 +285,15 @@ def test_killed_or_interrupted_no_reply_is_asked_for_twice(tmp_path: Path, mllm:
         assert mllm.asked.total() == number * (5 + in_flight)
         mllm.hold_after(math.inf)
         eventually(lambda: mllm.waiting.total() == 0)
-    evaluated(imported, out, *asked)
+    told = evaluated(imported, out, *asked).stdout
     assert lost.total() == 2 * in_flight
     assert mllm.asked.total() == arms * limit * repeats + lost.total()
     seen = read_run(out).observations
     assert len({(each.arm, each.item, each.repeat) for each in seen}) == len(seen) == arms * limit * repeats
     assert {each.failure for each in seen} == {None}
-
-
-def test_failures_are_kept_with_their_reason_and_retried_on_request(
-    tmp_path: Path, items: list[Item], mllm: TruthMllm, imported: Template
-) -> None:
-    mllm.refuses = items[0].question[0][:40]
-    first, limited = items[:4], (str(SAMPLE), *own(mllm), "--arm", "never", "--limit", "4")
-    failing = {item.id for item in first if mllm.refuses in item.question[0]}
-    assert "--retry-failed" in evaluated(imported, tmp_path / "run", *limited, code=3).stderr
-    failed = {each.item: str(each.failure) for each in read_run(tmp_path / "run").observations if each.failure}
-    assert failed.keys() == failing
-    assert all("The model is away." in reason for reason in failed.values())
-    mllm.refuses = ""
-    evaluated(imported, tmp_path / "run", *limited, code=3)
-    assert mllm.asked.total() == len(first) - len(failing), "failures are not asked again by themselves"
-    evaluated(imported, tmp_path / "run", *limited, "--retry-failed")
-    assert mllm.asked.total() == len(first)
-    assert [each.failure for each in read_run(tmp_path / "run").observations if each.failure] == []
+    assert evaluated(imported, out, *asked).stdout == told, "a finished run says the same"
+    assert mllm.asked.total() == arms * limit * repeats + lost.total(), "and asks nothing more"
+    assert "--seed 0, not 7" in evaluated(imported, out, *asked, "--seed", "7", code=1).stderr
 
 
 # What is asked for, and what the refusal names.

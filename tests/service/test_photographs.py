@@ -1,4 +1,4 @@
-"""The command that the README of our photograph gives."""
+"""Commands on our pictures: the one that the README of our photograph gives, and an answer that imagines if it must."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import shlex
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from conftest import EXAMPLES, ROOT
+from mllm_server import mllm_server
 from typer.testing import CliRunner
 
 from cow_service.cli.main import app
-from cow_service.records import Simulation
+from cow_service.records import Answer, Simulation
 
 pytestmark = pytest.mark.slow
 
@@ -33,3 +34,19 @@ def test_the_command_of_the_photograph_answers(tmp_path: Path, monkeypatch: pyte
     result = CliRunner().invoke(app, [*command[:3], *out], env=environment)
     assert result.exit_code == 1
     assert "cannot-ground" in result.output
+
+
+def test_an_answer_imagines_only_where_the_image_alone_does_not_tell(tmp_path: Path) -> None:
+    asked = [str(EXAMPLES / "ball-and-mug" / "image.jpg"), "Does the ball hit the mug? (A) Yes (B) No"]
+    command = ["answer", *asked, "--imagine", "auto", "--imagine-votes", "2", "--imagine-threshold", "0.6", "--json"]
+    with mllm_server() as mllm:
+        mllm.say('{"answer": "A"}')
+        own = {"COW_DATA_DIR": str(tmp_path), "COW_READER": "mllm"}
+        told = CliRunner().invoke(
+            app, command, env=own | {"COW_MLLM": "qwen3-vl-8b", "COW_MLLM_BASE_URL": mllm.address}
+        )
+    assert told.exit_code == 0, told.output
+    answer = Answer.model_validate_json(told.stdout)
+    assert (answer.answer, answer.simulation) == ("A", None)
+    assert answer.gate is not None
+    assert (answer.gate.threshold, answer.gate.votes, answer.gate.imagined) == (0.6, {"A": 2}, False)
