@@ -85,10 +85,6 @@ class Asked:
     headers: dict[str, str]
     body: bytes
 
-    @property
-    def line(self) -> str:
-        return f"{self.method} {self.path}"
-
 
 @dataclass(frozen=True)
 class Reply:
@@ -131,13 +127,8 @@ def event(name: str, number: int | None, job: dict[str, Any] | None) -> str:
 
 
 JOB: dict[str, Any] = {
-    "id": "j-1",
-    "kind": "simulate",
-    "status": "running",
-    "stage": "motion",
-    "progress": 0.25,
-    "created_at": "2026-01-01T00:00:00Z",
-    "generator": "cutout",
+    **{"id": "j-1", "kind": "simulate", "generator": "cutout", "created_at": "2026-01-01T00:00:00Z"},
+    **{"status": "running", "stage": "motion", "progress": 0.25},
 }
 
 
@@ -172,7 +163,7 @@ class Scripted:
 
     @property
     def lines(self) -> list[str]:
-        return [asked.line for asked in self.asked]
+        return [f"{asked.method} {asked.path}" for asked in self.asked]
 
     def __enter__(self) -> Scripted:
         self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.005})

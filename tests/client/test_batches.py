@@ -8,7 +8,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import aclosing, closing
 from pathlib import Path
 from typing import Any
@@ -274,10 +274,8 @@ def test_a_batch_that_is_left_ends_its_jobs_unless_its_folder_finds_them_again(
     served: Served, address: str, tmp_path: Path
 ) -> None:
     slow = {"generator": "slow", "generator_options": {"seconds": 60.0}, "num_frames": 80, "frames": {"count": 40}}
-
-    def items(number: int) -> list[dict[str, Any]]:
-        gone = {"id": f"gone{number}", "image": "/nowhere.png", "question": QUESTION}  # fails here, and at once
-        return [gone, *asked(2, **slow)]
+    gone = {"id": "gone", "image": "/nowhere.png", "question": QUESTION}  # fails here, and at once
+    items = [gone, *asked(2, **slow)]
 
     def newest() -> set[str]:
         return {job["status"] for job in served.http.get("/jobs").json()["jobs"][:2]}
@@ -286,24 +284,23 @@ def test_a_batch_that_is_left_ends_its_jobs_unless_its_folder_finds_them_again(
         return newest() <= {"queued", "running"}
 
     with Client(address, timeout=4) as client:
-        outcomes = client.map(items(0), kind="simulate")
+        outcomes = client.map(items, kind="simulate")
         next(outcomes)
         eventually(begun)
         outcomes.close()  # as `break` and the end of the function do
         eventually(lambda: newest() == {"canceled"})
 
-    async def left(number: int, **how: Any) -> int:
-        asked = items(number)
-        async with AsyncClient(address) as client, aclosing(client.map(asked, kind="simulate", **how)) as outcomes:
+    async def left(**how: Any) -> int:
+        async with AsyncClient(address) as client, aclosing(client.map(items, kind="simulate", **how)) as outcomes:
             async for _ in outcomes:
                 await asyncio.to_thread(eventually, begun)
                 break
         return job_count(served.http)
 
-    asyncio.run(left(1))
+    asyncio.run(left())
     eventually(lambda: newest() == {"canceled"})
-    count = asyncio.run(left(2, out=tmp_path))
-    assert asyncio.run(left(3, out=tmp_path)) == count
+    count = asyncio.run(left(out=tmp_path))
+    assert asyncio.run(left(out=tmp_path, retry_failed=True)) == count
     assert begun()
     for job in served.http.get("/jobs").json()["jobs"][:2]:
         served.http.post(f"/jobs/{job['id']}/cancel").raise_for_status()
@@ -423,10 +420,12 @@ def load(queued: int = 0, **load: int) -> Workers:
 
 def test_what_most_jobs_wait_for() -> None:
     assert describe_load(load()) == ""
-    assert describe_load(load(queued=3)) == "limited by the server: 3 jobs are queued"
-    cpu = load(queued=3, cpu_waiting=4, mllm_calls=3)
-    assert describe_load(cpu) == "limited by the server's CPU: 4 jobs wait for it"
-    assert "MLLM: 9 calls" in describe_load(load(cpu_waiting=9, mllm_calls=8, mllm_limit=8, mllm_waiting=1))
+    for words, waiting in {
+        "server: 3 jobs are queued": load(queued=3),
+        "CPU: 4 jobs wait for it": load(queued=3, cpu_waiting=4, mllm_calls=3),
+        "MLLM: 9 calls wait for it, of 8 at once": load(cpu_waiting=9, mllm_calls=8, mllm_limit=8, mllm_waiting=1),
+    }.items():
+        assert words in describe_load(waiting)
 
 
 @pytest.mark.parametrize("cancel", [200, 404])
@@ -464,17 +463,6 @@ def test_pictures_that_cannot_be_saved_lose_no_answer(connect: Connect, tmp_path
     assert outcome.unsaved.code == "bad-response"
     (kept,) = lines_of(tmp_path)
     assert (kept["status"], kept["unsaved"]) == ("succeeded", outcome.unsaved.detail)
-
-
-def test_the_callers_iterator_is_used_where_it_lives(connect: Connect) -> None:
-    def items() -> Iterator[dict[str, Any]]:
-        for item in asked(12):
-            assert threading.current_thread() is threading.main_thread()
-            yield item
-
-    with answering(lambda _: httpx.Response(200, json=SIMULATION)) as http:
-        outcomes = connect("http://x", http_client=http).map(items(), kind="simulate", concurrency=2)
-        assert sum(o.succeeded for o in outcomes) == 12
 
 
 # Patience and progress

@@ -47,7 +47,7 @@ def create(settings):
 def lazy(folder: Path) -> dict[str, str]:
     """Settings with which the generator `lazy` is installed."""
     known = folder / "lazy-1.0.dist-info"
-    known.mkdir()
+    known.mkdir(parents=True)
     (known / "METADATA").write_text("Metadata-Version: 2.1\nName: lazy\nVersion: 1.0\n")
     (known / "entry_points.txt").write_text("[cow_service.generators]\nlazy = lazy_generator:create\n")
     (folder / "lazy_generator.py").write_text(LAZY)
@@ -157,21 +157,12 @@ class Raw:
     """`cow mcp` over stdio, spoken to in lines, in a process group of its own."""
 
     def __init__(self, folder: Path) -> None:
-        settings = {"COW_DATA_DIR": str(folder / "data"), "COW_LOG_LEVEL": "debug"}
-        pipe = subprocess.PIPE
-        self.process = subprocess.Popen(
-            COMMAND,
-            env=environment(**settings, **lazy(folder)),
-            stdin=pipe,
-            stdout=pipe,
-            stderr=pipe,
-            start_new_session=True,
-        )
+        own = environment(COW_DATA_DIR=str(folder / "data"), COW_LOG_LEVEL="debug", **lazy(folder))
+        pipes: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        self.process = subprocess.Popen(COMMAND, env=own, start_new_session=True, **pipes)
         self.ids = iter(range(1, 100))
         hello = {"protocolVersion": "2025-06-18", "capabilities": {}, "clientInfo": {"name": "test", "version": "0"}}
         self.send("initialize", hello)
-        assert self.read()["result"]["serverInfo"]["name"] == "cow"
-        self.send("notifications/initialized", None)
 
     def __enter__(self) -> Raw:
         return self
@@ -193,6 +184,8 @@ class Raw:
 
     def begin(self, **arguments: Any) -> None:
         """A call whose clip is in the making."""
+        assert self.read()["result"]["serverInfo"]["name"] == "cow"
+        self.send("notifications/initialized", None)
         meta = {"progressToken": "t"}
         self.send("tools/call", {"name": "simulate", "arguments": arguments, "_meta": meta})
         while self.read()["params"]["message"] != "generation":

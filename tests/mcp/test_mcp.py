@@ -10,16 +10,16 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
-from conftest import EXAMPLES
+from conftest import EXAMPLES, Server
 from PIL import Image
-from sdk import Scripted, address, served, told
+from sdk import Scripted, told
 from servers import data_url, picture
-from tables import rows
 from waiting import TIME_LIMIT, eventually
 
 from cow_service import __version__
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from mcp_types import CallToolResult
     from sessions import Session
 
-__all__ = ["address", "served"]  # fixtures
 pytestmark = pytest.mark.slow
 SCENE = EXAMPLES / "ball-and-mug" / "image.jpg"
 SIZE = (832, 480)
@@ -184,12 +183,11 @@ def test_unknown_tools_and_resources_are_errors_of_the_protocol(here: tuple[Sess
     from mcp_types import INVALID_PARAMS
 
     session, _ = here
-    with pytest.raises(MCPError) as caught:
-        session.call("imagine")
-    assert caught.value.error.code == INVALID_PARAMS
-    for uri in ("cow://artifacts/..%2Fjobs", f"cow://artifacts/{'0' * 64}"):
+    read = partial(session.portal.call, session.client.read_resource)
+    artifacts = [partial(read, f"cow://artifacts/{name}") for name in ("..%2Fjobs", "0" * 64)]
+    for wrong in (partial(session.call, "imagine"), *artifacts):
         with pytest.raises(MCPError) as caught:
-            session.portal.call(session.client.read_resource, uri)
+            wrong()
         assert caught.value.error.code == INVALID_PARAMS
 
 
@@ -210,10 +208,11 @@ def test_a_call_that_is_canceled_cancels_its_job(here: tuple[Session, Path]) -> 
     assert session.tools()
 
 
-def test_before_a_server_that_runs(tmp_path: Path, address: str) -> None:
+def test_before_a_server_that_runs(tmp_path: Path, server: Server) -> None:
     """By the protocol's handshake of earlier versions."""
     from sessions import over_stdio
 
+    address = server.address
     with over_stdio(tmp_path, "--url", address, mode="legacy") as there:
         result = there.call("answer", image=str(SCENE), question=QUESTION)
         answer = there.data("answer", result)
@@ -256,46 +255,37 @@ def test_foreign_pages_and_names_are_refused(keyed: str) -> None:
     assert {status(), status(Origin=keyed), status(Host=f"localhost:{port}")}.isdisjoint({421, 403})
 
 
-@pytest.mark.parametrize(
-    "listening", rows({"an open address": ["--host", "0.0.0.0"]}, [["--allow-host", "cow.example.org"]])
-)
-def test_callers_from_elsewhere_bring_their_own_key(tmp_path: Path, listening: list[str]) -> None:
+def test_callers_from_elsewhere_bring_their_own_key(tmp_path: Path) -> None:
     from sessions import over_http, serving
 
     with (
         Scripted(told("unauthorized", 401)) as door,
-        serving(tmp_path, *listening, "--url", door.url, COW_API_KEY="ours") as address,
+        serving(tmp_path, "--host", "0.0.0.0", "--url", door.url, COW_API_KEY="ours") as address,
     ):
         for key in (None, BOB):
             with over_http(address, key) as session:
                 result = session.call("answer", image=data_url(SCENE.read_bytes()), question=QUESTION)
                 assert failure(result).startswith("unauthorized")
     assert [asked.headers["authorization"] for asked in door.asked] == [f"Bearer {BOB}"]
-    assert ("0.0.0.0" in listening) == ("Anyone who can reach 0.0.0.0" in (tmp_path / "log").read_text())
+    assert "Anyone who can reach 0.0.0.0" in (tmp_path / "log").read_text()
 
 
-def test_it_ends_when_standard_input_does(tmp_path: Path) -> None:
+def test_it_ends_with_standard_input_or_by_a_signal_after_which_its_job_goes_on_at_the_next_start(
+    tmp_path: Path,
+) -> None:
     from sessions import Raw
 
-    with Raw(tmp_path) as raw:
-        raw.begin(**SLOWLY)
-        code, log = raw.ended()
-    assert code == 0, log
-    assert "Traceback" not in log
-    assert statuses(tmp_path) == ["canceled"]
-
-
-def test_a_signal_ends_it_and_the_job_goes_on_at_the_next_start(tmp_path: Path) -> None:
-    from sessions import Raw
-
-    with Raw(tmp_path) as raw:
-        raw.begin(**SLOWLY)
-        raw.process.send_signal(signal.SIGTERM)
-        raw.process.wait(TIME_LIMIT)  # with standard input still open
-        code, log = raw.ended()
-    assert code == 128 + signal.SIGTERM, log
-    assert "Traceback" not in log
-    assert statuses(tmp_path) == ["queued"]
+    folders = [tmp_path / name for name in ("closed", "stopped")]
+    with Raw(folders[0]) as closed, Raw(folders[1]) as stopped:  # begun together: their imports take seconds
+        closed.begin(**SLOWLY)
+        ends = [closed.ended()]
+        stopped.begin(**SLOWLY)
+        stopped.process.send_signal(signal.SIGTERM)
+        stopped.process.wait(TIME_LIMIT)  # with standard input still open
+        ends.append(stopped.ended())
+    assert [code for code, _ in ends] == [0, 128 + signal.SIGTERM], ends
+    assert not any("Traceback" in log for _, log in ends)
+    assert [statuses(folder) for folder in folders] == [["canceled"], ["queued"]]
 
 
 def test_without_the_protocols_package_it_says_what_to_install(tmp_path: Path) -> None:
