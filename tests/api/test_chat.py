@@ -145,12 +145,9 @@ def test_what_cannot_be_done_is_refused_by_name(served: Served, given: dict[str,
 
 
 def test_errors_are_raised_by_openais_client(openai: ModuleType, chat: Any) -> None:
-    with pytest.raises(openai.UnprocessableEntityError) as caught:
-        chat(model=EMBEDDED, messages=[])
-    assert (caught.value.code, caught.value.param) == ("invalid-request", "messages")
-    assert caught.value.request_id
-    with pytest.raises(openai.NotFoundError):  # before a stream
+    with pytest.raises(openai.NotFoundError) as before:  # before a stream
         chat(model="nobody", messages=what_if(), stream=True)
+    assert before.value.request_id
     with pytest.raises(openai.APIError) as caught:  # in a stream
         list(
             chat(

@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import AsyncIterator, Callable
 from importlib.metadata import EntryPoint
-from pathlib import Path
 from typing import Any
 
 import bad_images
@@ -18,8 +17,8 @@ import httpx
 import pytest
 from asgi import app_of, ask
 from chats import HELLO, WITHOUT, saying
-from random_mllm import RandomMllm, failing
-from servers import BODY, IMAGE, QUESTION, Served, picture, slow
+from random_mllm import failing
+from servers import BODY, IMAGE, QUESTION, picture, slow
 
 from cow_service import errors, registry
 from cow_service.api.app import create_app
@@ -39,38 +38,17 @@ SHA = "0" * 64
 KEYS = {"alice": f"sha256:{SHA}"}
 
 
-class Doors:
-    """Where an error is provoked: a server, one with an MLLM, and applications and services in this process."""
-
-    def __init__(self, request: pytest.FixtureRequest) -> None:
-        self._request = request
-        self.folder: Path = request.getfixturevalue("tmp_path")
-
-    @property
-    def http(self) -> httpx.Client:
-        return self._request.getfixturevalue("http")
-
-    @property
-    def chats(self) -> Served:
-        return self._request.getfixturevalue("served")
-
-    @property
-    def mllm(self) -> RandomMllm:
-        return self._request.getfixturevalue("mllm")
-
-    def registers(self, *points: EntryPoint) -> None:
-        """Backends of some package."""
-        self._request.getfixturevalue("monkeypatch").setattr(registry, "entry_points", lambda group: points)
-
-    def service(self, **settings: Any) -> Service:
-        return Service(Settings(data_dir=self.folder / "data", **settings))
-
-
+# Where an error is provoked, by the name of a fixture: `http` is a server, `served` one with an MLLM, which is `mllm`.
+Doors = Callable[[str], Any]
 Provoke = Callable[[Doors], httpx.Response | None]
 
 
+def service(doors: Doors, **settings: Any) -> Service:
+    return Service(Settings(data_dir=doors("tmp_path") / "data", **settings))
+
+
 def called(method: str, path: str, **options: Any) -> Provoke:
-    return lambda doors: doors.http.request(method, path, **options)
+    return lambda doors: doors("http").request(method, path, **options)
 
 
 def simulated(**fields: Any) -> Provoke:
@@ -91,47 +69,47 @@ def read(text: bytes | str) -> Provoke:
 
 def in_app(*request: Any, **settings: Any) -> Provoke:
     def provoke(doors: Doors) -> httpx.Response:
-        return ask(app_of(doors.folder, **settings), *[request] * (1 + settings.get("rate_limit", 0)))[-1]
+        return ask(app_of(doors("tmp_path"), **settings), *[request] * (1 + settings.get("rate_limit", 0)))[-1]
 
     return provoke
 
 
 def chatted(reply: Any) -> Provoke:
     def provoke(doors: Doors) -> httpx.Response:
-        doors.mllm.next_replies = [reply]
-        return doors.chats.http.post("/v1/chat/completions", json={"model": WITHOUT, "messages": HELLO})
+        doors("mllm").next_replies = [reply]
+        return doors("served").http.post("/v1/chat/completions", json={"model": WITHOUT, "messages": HELLO})
 
     return provoke
 
 
 def out_of_range(doors: Doors) -> httpx.Response:
-    image = doors.http.post("/simulate", json=BODY).json()["image"]["sha256"]
-    return doors.http.get(f"/artifacts/{image}", headers={"Range": "bytes=999999-"})
+    image = doors("http").post("/simulate", json=BODY).json()["image"]["sha256"]
+    return doors("http").get(f"/artifacts/{image}", headers={"Range": "bytes=999999-"})
 
 
 def reused_key(doors: Doors) -> httpx.Response:
     key = {"Idempotency-Key": "of-the-table"}
-    assert doors.http.post("/simulate", json=BODY, headers=key).status_code == 200
-    return doors.http.post("/simulate", json=BODY | {"seed": 1}, headers=key)
+    assert doors("http").post("/simulate", json=BODY, headers=key).status_code == 200
+    return doors("http").post("/simulate", json=BODY | {"seed": 1}, headers=key)
 
 
 def film_of_a_still(doors: Doors) -> httpx.Response:
-    job = doors.http.post("/simulate", json=BODY).json()["id"]
-    return doors.http.get(f"/jobs/{job}/download?format=film")
+    job = doors("http").post("/simulate", json=BODY).json()["id"]
+    return doors("http").get(f"/jobs/{job}/download?format=film")
 
 
 def canceled(doors: Doors) -> httpx.Response:
     key = {"Idempotency-Key": "of-the-table"}
-    job = doors.chats.submit(slow(30), **key)["id"]
-    doors.chats.http.post(f"/jobs/{job}/cancel")
-    return doors.chats.http.post("/simulate", json=slow(30), headers=key)
+    job = doors("served").submit(slow(30), **key)["id"]
+    doors("served").http.post(f"/jobs/{job}/cancel")
+    return doors("served").http.post("/simulate", json=slow(30), headers=key)
 
 
 def read_by_the_mllm(reply: Any, question: str) -> Provoke:
     def provoke(doors: Doors) -> httpx.Response:
-        doors.mllm.next_replies = [reply]
+        doors("mllm").next_replies = [reply]
         body = {"image": BODY["image"], "question": question}
-        return doors.chats.http.post("/simulate", json=body, headers={"Cache-Control": "no-cache"})
+        return doors("served").http.post("/simulate", json=body, headers={"Cache-Control": "no-cache"})
 
     return provoke
 
@@ -142,32 +120,32 @@ def body_that_does_not_come(doors: Doors) -> httpx.Response:
         await asyncio.Event().wait()
 
     headers = {"Content-Type": "application/json"}
-    return ask(app_of(doors.folder, body_timeout=0.1), ("POST", "/look", headers, parts()))[0]
+    return ask(app_of(doors("tmp_path"), body_timeout=0.1), ("POST", "/look", headers, parts()))[0]
 
 
 def full_queue(doors: Doors) -> None:
-    engine = JobEngine(doors.service())
+    engine = JobEngine(service(doors))
     engine.jobs.count_open = lambda owner: (1000, 0)  # type: ignore[method-assign]
     engine.check_capacity(None)
 
 
 def not_started(doors: Doors) -> httpx.Response:
-    return ask(create_app(JobEngine(doors.service()), starting=False), ("GET", "/models"))[0]
+    return ask(create_app(JobEngine(service(doors)), starting=False), ("GET", "/models"))[0]
 
 
 def stopping(doors: Doors) -> None:
-    engine = JobEngine(doors.service())
+    engine = JobEngine(service(doors))
     engine.drain()
     engine.check_capacity(None)
 
 
 def no_folder(doors: Doors) -> httpx.Response:
-    (doors.folder / "data").write_text("a file")
-    return ask(app_of(doors.folder), ("GET", "/readyz"))[0]
+    (doors("tmp_path") / "data").write_text("a file")
+    return ask(app_of(doors("tmp_path")), ("GET", "/readyz"))[0]
 
 
 def broken(doors: Doors) -> httpx.Response:
-    app = app_of(doors.folder)
+    app = app_of(doors("tmp_path"))
 
     @app.get("/broken")
     async def fail() -> None:
@@ -177,19 +155,20 @@ def broken(doors: Doors) -> httpx.Response:
 
 
 def unreachable(doors: Doors) -> None:
-    doors.service(allow_image_urls=("nosuch.invalid",)).fetch(ImageUrl(url="http://nosuch.invalid/a.png"))
+    service(doors, allow_image_urls=("nosuch.invalid",)).fetch(ImageUrl(url="http://nosuch.invalid/a.png"))
 
 
 def damaged_record(doors: Doors) -> None:
-    lock = folder_of(doors.folder, "owner/weights") / LOCK_NAME
+    lock = folder_of(doors("tmp_path"), "owner/weights") / LOCK_NAME
     lock.parent.mkdir(parents=True)
     lock.write_text("{")
-    read_lock(doors.folder, "owner/weights")
+    read_lock(doors("tmp_path"), "owner/weights")
 
 
 def without_its_package(kind: type[CowError]) -> Provoke:
     def provoke(doors: Doors) -> None:
-        doors.registers(EntryPoint("far", "no_such_package.far:create", "none"))
+        far = EntryPoint("far", "no_such_package.far:create", "none")
+        doors("monkeypatch").setattr(registry, "entry_points", lambda group: (far,))
         Registry("none", kind, Settings()).get("far")
 
     return provoke
@@ -378,7 +357,7 @@ def test_an_error_says_what_was_wrong_and_what_to_do(
 ) -> None:
     kind = errors.kinds()[code]
     try:
-        response = provoke(Doors(request))
+        response = provoke(request.getfixturevalue)
         assert response is not None, "nothing was refused"
         assert response.headers["content-type"] == "application/problem+json", response.text
         told, status = response.json(), response.status_code

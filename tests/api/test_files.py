@@ -1,6 +1,6 @@
 """Files that the server sends: parts of a download, and the page for people.
 
-The formats of downloads: client/test_downloads.py. Artifacts of an object store: jobs/test_object_store.py.
+The formats of downloads: client/test_downloads.py. Artifacts of an object store: jobs/test_artifact_stores.py.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from asgi import app_of, get
+from asgi import app_of, ask
 from servers import BODY, problem
 
 pytestmark = pytest.mark.slow
@@ -23,13 +23,13 @@ def test_a_part_of_a_download(http: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("redirects", [True, False])
-def test_the_page_may_load_from_where_it_is_sent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, redirects: bool
-) -> None:
+def test_artifacts_of_a_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, redirects: bool) -> None:
     app = app_of(tmp_path, artifacts_redirect=redirects)
-    monkeypatch.setattr(app.state.engine.service.artifacts, "signed_url", lambda *_: "https://store.example/x?900")
-    policy = get(app, "/").headers["content-security-policy"]
-    assert ("https://store.example" in policy) is redirects
+    store = app.state.engine.service.artifacts
+    monkeypatch.setattr(store, "signed_url", lambda *_: "https://store.example/x?900")
+    found, page = ask(app, ("GET", f"/artifacts/{store.put(b'a picture', 'image/png').sha256}"), ("GET", "/"))
+    assert (found.status_code, found.content) == ((307, b"") if redirects else (200, b"a picture"))
+    assert ("https://store.example" in page.headers["content-security-policy"]) is redirects
 
 
 def test_the_page_and_its_files(http: httpx.Client) -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from concurrent.futures import ThreadPoolExecutor
 
 import httpx
-import numpy as np
 from drawn import ball, block, floor, png_bytes
 from servers import QUESTION, data_url, problem
 
-from cow_service.records import Models, Simulation
+from cow_service.records import Simulation
 
 IMAGE = png_bytes(block(ball(floor(), (150, 200), 40, (210, 20, 20)), (430, 160, 510, 250), (50, 80, 200)))
 BODY = {"image": data_url(IMAGE), "question": QUESTION, "num_frames": 17}
@@ -74,27 +72,3 @@ def test_artifacts_are_cached_forever_and_served_in_parts(http: httpx.Client) ->
     head = http.head(url)
     assert (head.status_code, head.content) == (200, b"")
     assert int(head.headers["content-length"]) == len(whole.content)
-
-
-def test_probes_and_models(http: httpx.Client) -> None:
-    assert http.get("/livez").json() == {"status": "ok"}
-    assert http.get("/readyz").json() == {"status": "ok"}
-    models = Models.model_validate(http.get("/models").json())
-    assert [(m.name, m.default) for m in models.readers] == [("embedded", True), ("local", False), ("mllm", False)]
-    assert models.readers[0].ready
-    assert {"qwen3-vl-8b", "gpt-5", "generic"} <= set(models.mllms)
-    assert [(m.name, m.ready, m.needs) for m in models.generators if m.default] == [
-        ("cutout", True, ("cv2", "numpy", "av"))
-    ]
-
-
-def test_requests_side_by_side_do_not_mix(http: httpx.Client) -> None:
-    def ask(shift: int) -> float:
-        image = png_bytes(ball(floor(320, 240), (60 + shift, 120), 25, (210, 20, 20)))
-        body = {"image": data_url(image), "question": "If the red ball moves left, what happens?", "video": False}
-        return http.post("/simulate", json=body).json()["grounding"]["point"][0]
-
-    shifts = list(range(0, 200, 25))
-    with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(ask, shifts))
-    assert np.allclose(found, [60 + shift for shift in shifts], atol=2)

@@ -40,7 +40,7 @@ def known(served: Served) -> dict[str, str]:
     return {"artifact": response.json()["image"]}
 
 
-def test_at_a_point(served: Served) -> None:
+def test_at_a_point_and_in_a_box(served: Served) -> None:
     (ball,) = things(look(served, point=[60, 80]))
     assert ball["bbox"] == BALL
     assert ball["score"] == 0.9
@@ -49,9 +49,6 @@ def test_at_a_point(served: Served) -> None:
     assert (mask[80, 60], mask[80, 20]) == (255, 0)
     assert [each["bbox"] for each in things(look(served, point=[187, 85]))] == [CUBE, FACE]
     assert things(look(served, point=[20, 20])) == []
-
-
-def test_in_a_box(served: Served) -> None:
     assert [each["bbox"] for each in things(look(served, bbox=[165, 58, 208, 100]))] == [CUBE]
 
 

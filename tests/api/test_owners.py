@@ -7,15 +7,14 @@ import hashlib
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import dataclass
+from copy import copy
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-from servers import ASYNC, BODY, TERMINAL, Served, data_url, events_of, picture, problem, slow
-from waiting import TIME_LIMIT, eventually
+from servers import ASYNC, BODY, Served, data_url, events_of, picture, problem, slow
+from waiting import TIME_LIMIT
 
 from cow_service.api.middleware.access import hash_of, new_key
 from cow_service.media.images import encode_png
@@ -23,59 +22,51 @@ from cow_service.media.images import encode_png
 pytestmark = pytest.mark.slow
 
 
-@dataclass(frozen=True)
-class Caller:
-    """A caller with a key."""
+def post(caller: Served, body: dict[str, Any], **headers: str) -> httpx.Response:
+    return caller.http.post("/simulate", json=body, headers=headers)
 
-    http: httpx.Client
 
-    def post(self, body: dict[str, Any], **headers: str) -> httpx.Response:
-        return self.http.post("/simulate", json=body, headers=headers)
+def submit(caller: Served, body: dict[str, Any], **headers: str) -> str:
+    return caller.submit(body, **headers)["id"]
 
-    def submit(self, body: dict[str, Any], **headers: str) -> str:
-        response = self.post(body, **ASYNC, **headers)
-        assert response.status_code == 202, response.text
-        return response.json()["id"]
 
-    def job(self, job_id: str) -> dict[str, Any]:
-        response = self.http.get(f"/jobs/{job_id}")
-        assert response.status_code == 200, response.text
-        return response.json()
+def ended(caller: Served, body: dict[str, Any], **headers: str) -> dict[str, Any]:
+    return caller.ended(submit(caller, body, **headers))
 
-    def ended(self, body: dict[str, Any], **headers: str) -> dict[str, Any]:
-        job_id = self.submit(body, **headers)
-        return eventually(lambda: job if (job := self.job(job_id))["status"] in TERMINAL else None)
 
-    def ids(self, **query: Any) -> list[str]:
-        return [job["id"] for job in self.http.get("/jobs", params={"limit": 500} | query).json()["jobs"]]
+def ids(caller: Served, **query: Any) -> list[str]:
+    return [job["id"] for job in caller.http.get("/jobs", params={"limit": 500} | query).json()["jobs"]]
 
-    def sees(self, sha256: str) -> bool:
-        status = self.http.get(f"/artifacts/{sha256}").status_code
-        assert status in (200, 404)
-        assert self.http.head(f"/artifacts/{sha256}").status_code == status
-        return status == 200
+
+def sees(caller: Served, sha256: str) -> bool:
+    status = caller.http.get(f"/artifacts/{sha256}").status_code
+    assert status in (200, 404)
+    assert caller.http.head(f"/artifacts/{sha256}").status_code == status
+    return status == 200
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Caller]]:
+def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Served]]:
     """Two callers of a server of their own."""
     keys = {name: new_key() for name in ("alice", "bob")}
     hashes = json.dumps({name: hash_of(key) for name, key in keys.items()})
-    with ExitStack() as stack:
-        one = stack.enter_context(Served(tmp_path_factory.mktemp("owners"), COW_API_KEYS=hashes))
-        clients = [httpx.Client(base_url=one.http.base_url, timeout=TIME_LIMIT) for _ in keys]
-        for client, key in zip(clients, keys.values(), strict=True):
-            stack.enter_context(client).headers["Authorization"] = f"Bearer {key}"
-        yield [Caller(client) for client in clients]
+    with Served(tmp_path_factory.mktemp("owners"), COW_API_KEYS=hashes) as one:
+        callers = [copy(one) for _ in keys]
+        for caller, key in zip(callers, keys.values(), strict=True):
+            headers = {"Authorization": f"Bearer {key}"}
+            caller.http = httpx.Client(base_url=one.http.base_url, timeout=TIME_LIMIT, headers=headers)
+        yield callers
+        for caller in callers:
+            caller.http.close()
 
 
 @pytest.fixture
-def alice(both: list[Caller]) -> Caller:
+def alice(both: list[Served]) -> Served:
     return both[0]
 
 
 @pytest.fixture
-def bob(both: list[Caller]) -> Caller:
+def bob(both: list[Served]) -> Served:
     return both[1]
 
 
@@ -86,8 +77,8 @@ def artifacts(job: dict[str, Any]) -> set[str]:
     return {one["sha256"] for one in shown if one}
 
 
-def test_a_job_and_its_artifacts_are_its_owners_alone(alice: Caller, bob: Caller) -> None:
-    job = alice.ended({**BODY, "video": True})
+def test_a_job_and_its_artifacts_are_its_owners_alone(alice: Served, bob: Served) -> None:
+    job = ended(alice, {**BODY, "video": True})
     assert job["status"] == "succeeded"
     url = f"/jobs/{job['id']}"
     strangers = [bob.http.get(f"{url}{part}") for part in ("", "/request", "/download", "/events")]
@@ -97,101 +88,94 @@ def test_a_job_and_its_artifacts_are_its_owners_alone(alice: Caller, bob: Caller
         told = problem(response, 404, "job-not-found")
         assert told["detail"].replace(job["id"], "ID") == never.json()["detail"].replace(never.url.path[6:], "ID")
     assert alice.job(job["id"]) == job
-    running = alice.submit(slow(30, seed=1))
+    running = submit(alice, slow(30, seed=1))
     problem(bob.http.post(f"/jobs/{running}/cancel"), 404, "job-not-found")
     assert alice.http.post(f"/jobs/{running}/cancel").json()["status"] == "canceled"
     assert events_of(alice.http.get(f"{url}/events"))[-1]["event"] == "succeeded"
-    assert job["id"] in alice.ids()
-    assert not set(alice.ids()) & set(bob.ids())
+    assert job["id"] in ids(alice)
+    assert not set(ids(alice)) & set(ids(bob))
     assert len(artifacts(job)) >= 5
     for sha256 in artifacts(job):
-        assert alice.sees(sha256)
-        assert not bob.sees(sha256)
+        assert sees(alice, sha256)
+        assert not sees(bob, sha256)
         for headers in ({"If-None-Match": f'"{sha256}"'}, {"Range": "bytes=0-0"}):
             problem(bob.http.get(f"/artifacts/{sha256}", headers=headers), 404, "artifact-not-found")
     assert "private" in alice.http.get(job["result"]["overlay"]["url"]).headers["cache-control"]
 
 
-def test_pages_hold_ones_own_jobs(alice: Caller, bob: Caller) -> None:
-    made = [(alice.ended(BODY)["id"], bob.ended(BODY)["id"]) for _ in range(4)]
-    page = alice.http.get("/jobs", params={"limit": 3}).json()
-    assert [job["id"] for job in page["jobs"]] == [job for job, _ in made][:0:-1]
-    assert not set(bob.ids(cursor=page["next"])) & set(alice.ids())
-
-
-def test_masks_are_their_owners_alone_and_stay_while_the_job_does(alice: Caller, bob: Caller) -> None:
+def test_masks_are_their_owners_alone_and_stay_while_the_job_does(alice: Served, bob: Served) -> None:
     mask = np.zeros((160, 240), np.uint8)
     mask[60:98, 170:205] = 255
     sent = encode_png(mask, level=9)  # other bytes than those of the mask that the first stage stores
     body = {**BODY, "objects": [{"object": "cube", "mask": data_url(sent)}]}
-    assert alice.ended(body)["result"]["grounding"]["others"][0]["bbox"] == [170, 60, 205, 98]
+    assert ended(alice, body)["result"]["grounding"]["others"][0]["bbox"] == [170, 60, 205, 98]
     sha256 = hashlib.sha256(sent).hexdigest()
-    assert alice.sees(sha256)
+    assert sees(alice, sha256)
     kept = {**BODY, "objects": [{"object": "cube", "mask": {"artifact": sha256}}]}
-    assert alice.ended(kept)["status"] == "succeeded"
-    problem(bob.post(kept), 404, "artifact-not-found")
-    problem(bob.post({**BODY, "grounding": kept["objects"][0]}), 404, "artifact-not-found")
+    assert ended(alice, kept)["status"] == "succeeded"
+    problem(post(bob, kept), 404, "artifact-not-found")
+    problem(post(bob, {**BODY, "grounding": kept["objects"][0]}), 404, "artifact-not-found")
 
 
-def test_an_image_is_its_owners_alone(alice: Caller, bob: Caller) -> None:
-    job = alice.ended({**BODY, "image": data_url(picture(2))})
+def test_an_image_is_its_owners_alone(alice: Served, bob: Served) -> None:
+    job = ended(alice, {**BODY, "image": data_url(picture(2))})
     mine = {**BODY, "image": {"artifact": job["result"]["image"]["sha256"]}}
     for headers in (ASYNC, {}):
-        told = problem(bob.post(mine, **headers), 404, "artifact-not-found")
-        never = bob.post({**BODY, "image": {"artifact": "0" * 64}}, **headers).json()
+        told = problem(post(bob, mine, **headers), 404, "artifact-not-found")
+        never = post(bob, {**BODY, "image": {"artifact": "0" * 64}}, **headers).json()
         shas = (job["result"]["image"]["sha256"], "0" * 64)
         assert told["detail"].replace(shas[0], "ID") == never["detail"].replace(shas[1], "ID")
-    assert alice.ended(mine)["status"] == "succeeded"
+    assert ended(alice, mine)["status"] == "succeeded"
     other = {**BODY, "image": {"artifact": job["result"]["overlay"]["sha256"]}, "grounding": {"point": [60, 80]}}
-    assert alice.ended(other)["status"] == "succeeded"
-    problem(bob.post(other), 404, "artifact-not-found")
+    assert ended(alice, other)["status"] == "succeeded"
+    problem(post(bob, other), 404, "artifact-not-found")
 
 
-def test_an_image_is_there_for_its_owner_at_once_and_after_a_failure(alice: Caller) -> None:
+def test_an_image_is_there_for_its_owner_at_once_and_after_a_failure(alice: Served) -> None:
     pink = {"grounding": None, "motion": None, "question": "If the pink car turns?"}
     lost = {**BODY, **pink, "image": data_url(picture(3))}
-    job = alice.ended(lost)
+    job = ended(alice, lost)
     assert job["status"] == "failed"
     sha256 = image_of(lost)
-    assert alice.sees(sha256)
-    assert alice.ended({**BODY, "image": {"artifact": sha256}})["status"] == "succeeded"
-    alice.submit(body := slow(1, seed=3, image=data_url(picture(4))))
-    assert alice.sees(image_of(body))
+    assert sees(alice, sha256)
+    assert ended(alice, {**BODY, "image": {"artifact": sha256}})["status"] == "succeeded"
+    submit(alice, body := slow(1, seed=3, image=data_url(picture(4))))
+    assert sees(alice, image_of(body))
 
 
 def image_of(body: dict[str, Any]) -> str:
     return hashlib.sha256(base64.b64decode(body["image"].partition(",")[2])).hexdigest()
 
 
-def test_what_both_sent_stays_while_one_of_them_needs_it(alice: Caller, bob: Caller) -> None:
+def test_what_both_sent_stays_while_one_of_them_needs_it(alice: Served, bob: Served) -> None:
     body = {**BODY, "image": data_url(picture(5))}
-    first, second = alice.ended(body), bob.ended(body)
+    first, second = ended(alice, body), ended(bob, body)
     assert artifacts(first) == artifacts(second)
     assert second["result"]["reused"] == [], "what another key asked is not told"
-    assert bob.ended(body)["result"]["reused"] == ["grounding", "motion", "trajectory", "generation"]
+    assert ended(bob, body)["result"]["reused"] == ["grounding", "motion", "trajectory", "generation"]
     assert alice.http.delete(f"/jobs/{first['id']}").status_code == 204
     for sha256 in artifacts(first):
-        assert bob.sees(sha256)
-        assert not alice.sees(sha256)
-    assert bob.ended({**BODY, "image": {"artifact": second["result"]["image"]["sha256"]}})["status"] == "succeeded"
-    problem(alice.post({**BODY, "image": {"artifact": image_of(body)}}), 404, "artifact-not-found")
-    for job_id in bob.ids():
+        assert sees(bob, sha256)
+        assert not sees(alice, sha256)
+    assert ended(bob, {**BODY, "image": {"artifact": second["result"]["image"]["sha256"]}})["status"] == "succeeded"
+    problem(post(alice, {**BODY, "image": {"artifact": image_of(body)}}), 404, "artifact-not-found")
+    for job_id in ids(bob):
         bob.http.delete(f"/jobs/{job_id}")
-    assert not any(caller.sees(sha256) for caller in (alice, bob) for sha256 in artifacts(first))
+    assert not any(sees(caller, sha256) for caller in (alice, bob) for sha256 in artifacts(first))
 
 
-def test_the_same_keys_are_different_jobs(alice: Caller, bob: Caller) -> None:
+def test_the_same_keys_are_different_jobs(alice: Served, bob: Served) -> None:
     key = {"Idempotency-Key": "the-same"}
     with ThreadPoolExecutor(8) as pool:
-        jobs = list(pool.map(lambda caller: caller.submit(BODY, **key), [alice, bob] * 4))
+        jobs = list(pool.map(lambda caller: submit(caller, BODY, **key), [alice, bob] * 4))
     assert len(set(jobs)) == 2
     other = {**BODY, "seed": 4}
-    problem(alice.post(other, **key), 422, "idempotency-key-reused")
-    mine, others = alice.ended(BODY, **key)["id"], bob.ended(BODY, **key)["id"]
+    problem(post(alice, other, **key), 422, "idempotency-key-reused")
+    mine, others = ended(alice, BODY, **key)["id"], ended(bob, BODY, **key)["id"]
     assert {mine, others} == set(jobs)
-    assert alice.post(BODY, **key).headers["idempotent-replayed"] == "true"
-    assert "idempotent-replayed" not in alice.post(BODY).headers
+    assert post(alice, BODY, **key).headers["idempotent-replayed"] == "true"
+    assert "idempotent-replayed" not in post(alice, BODY).headers
     alice.http.delete(f"/jobs/{mine}")
-    assert alice.post(other, **key).json()["generator"]["seed"] == 4
+    assert post(alice, other, **key).json()["generator"]["seed"] == 4
     assert bob.job(others)["status"] == "succeeded"
-    problem(bob.post(other, **key), 422, "idempotency-key-reused")
+    problem(post(bob, other, **key), 422, "idempotency-key-reused")

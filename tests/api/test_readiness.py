@@ -12,7 +12,7 @@ from servers import problem
 from waiting import TIME_LIMIT
 
 from cow_service.api.app import create_app
-from cow_service.errors import GeneratorUnavailable, StorageUnavailable
+from cow_service.errors import StorageUnavailable
 from cow_service.jobs import readiness
 from cow_service.jobs.readiness import Readiness
 from cow_service.service import Service
@@ -39,19 +39,6 @@ def test_not_while_loading_and_not_without_a_database(service: Service, monkeypa
 
     monkeypatch.setattr(running_engine().database, "check", is_away)
     problem(get(app, "/readyz"), 503, "storage-unavailable")
-
-
-def test_what_cannot_be_loaded_is_told(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    def check() -> None:
-        raise GeneratorUnavailable("It has no GPU.")
-
-    monkeypatch.setattr(service, "check", check)
-    told = threading.Event()
-    ready = Readiness(service)
-    ready.start(told.set)
-    assert told.wait(TIME_LIMIT)
-    with refused("generator-unavailable"):
-        ready.wait(0)
 
 
 def test_not_on_a_full_disk(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from chats import COW, EMBEDDED, HELLO, NAME, image, post
-from random_mllm import RandomMllm, cut, failing
+from random_mllm import RandomMllm, cut
 from servers import QUESTION, Served, data_url, picture, problem
 
 if TYPE_CHECKING:
@@ -101,10 +101,8 @@ def test_a_response_of_a_model_without_an_mllm(client: OpenAI) -> None:
     ("given", "param"),
     [
         ({"previous_response_id": "resp_1"}, "previous_response_id"),
-        ({"conversation": "conv_1"}, "conversation"),
         ({"store": True}, "store"),
         ({"background": True}, "background"),
-        ({"prompt": {"id": "p"}}, "prompt"),
         ({"truncation": "auto"}, "truncation"),
         ({"include": ["file_search_call.results"]}, "include"),
         ({"tools": [{"type": "web_search"}]}, "tools[0].type"),
@@ -120,12 +118,3 @@ def test_a_response_of_a_model_without_an_mllm(client: OpenAI) -> None:
 def test_what_needs_state_is_refused_by_name(served: Served, given: dict[str, Any], param: str) -> None:
     response = post(served, {"model": NAME, "input": "hello", **given}, "responses")
     assert problem(response, 422, "invalid-request")["error"]["param"] == param
-
-
-def test_errors_of_responses_are_those_of_chats(served: Served, mllm: RandomMllm) -> None:
-    mllm.next_replies = [failing(429, {"error": {"message": "slow down"}}, retry_after="0")]
-    response = post(served, {"model": NAME, "input": "hello"}, "responses")
-    assert (response.status_code, response.headers["retry-after"]) == (429, "0")
-    problem(post(served, {"model": "nobody", "input": "hello"}, "responses"), 404, "model-not-found")
-    keyed = post(served, {"model": NAME, "input": "x"}, "responses", **{"Idempotency-Key": "k"})
-    problem(keyed, 422, "invalid-request")

@@ -221,13 +221,11 @@ SLEEPERS = {
     "mllm_server.py reply": "a model that is slow",
     "random_mllm.py reply": "a model that is slow",
     "api/test_bad_input.py trickle": "a caller whose bytes come slowly",
-    "client/test_batches.py blocking": "a server that has requests at the same time",
-    "client/test_batches.py awaited": "as `blocking`",
+    "client/test_batches.py answer": "a server that has requests at the same time",
+    "client/test_batches.py awaited_answer": "as `answer`",
     "client/test_client_faults.py held": "a server from which a client that does not wait would leave",
-    "jobs/test_counts.py wakeups_per_second": "counts what happens in a while",
-    "readers/test_local.py one": "callers that come and give up one after another",
     "service/test_concurrency.py work": "threads that hold something at the same time",
-    "service/test_egress.py drip": "an answer that never ends",
+    "service/test_egress.py answer": "an answer that never ends",
     "service/test_egress.py sip": "a receiver that takes no bytes",
     "service/test_egress.py slowly": "a name server that is slow",
 }
@@ -239,23 +237,11 @@ def trees_of_tests() -> dict[str, ast.Module]:
     return {path.relative_to(TESTS).as_posix(): ast.parse(path.read_text()) for path in TESTS.rglob("*.py")}
 
 
-def imported_at_top(body: list[ast.stmt]) -> Iterator[str]:
-    """What a file imports when it is imported itself."""
-    for node in body:
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        elif isinstance(node, ast.Try) or (isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test)):
-            yield from imported_at_top(node.body)
-
-
-def test_no_test_imports_what_is_heavy_at_its_top_or_another_test() -> None:
-    banned = re.compile(rf"({'|'.join(map(re.escape, HEAVY_IN_TESTS))})(\.|$)|test_\w+\.")
-    tests = {place: tree for place, tree in trees_of_tests().items() if re.search(r"\b(test_\w+|conftest)\.py$", place)}
-    tops = {place: [name for name in imported_at_top(tree.body) if banned.match(name)] for place, tree in tests.items()}
-    assert {place: names for place, names in tops.items() if names} == {}
-    assert [place for place in tests if place.endswith("/conftest.py")] == [], "`from conftest import` means the one"
+def test_no_test_imports_another_test() -> None:
+    for place, tree in trees_of_tests().items():
+        named = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        assert not [name for name in named if re.fullmatch(r"(\w+\.)*test_\w+", name)], place
+    assert [place for place in trees_of_tests() if place.endswith("/conftest.py")] == [], "there is the one"
 
 
 @pytest.mark.slow

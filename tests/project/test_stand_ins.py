@@ -48,16 +48,11 @@ def test_depth_and_camera_lead_to_a_flat_floor_with_the_things_in_their_boxes_ab
 
 def test_errors_are_seeded_smooth_and_as_large_as_said(stand_ins: Any) -> None:
     depth = np.full((240, 416), 3.0, np.float32)
-    for factor in stand_ins.FOCAL_FACTORS:
-        given, focal = stand_ins.with_errors(depth, 800.0, 0.0, factor, seed=4)
-        assert (given == depth).all()
-        assert focal == pytest.approx(800 * factor)
     depth[0, 0] = np.nan
 
     def given(level: float, seed: int) -> Any:
         return stand_ins.with_errors(depth, 800.0, level, seed=seed)[0]
 
-    assert given(0.03, 1).dtype == np.float32
     assert np.isnan(given(0.03, 1)[0, 0])
     assert np.array_equal(given(0.03, 1), given(0.03, 1), equal_nan=True)
     for level in stand_ins.LEVELS:
@@ -66,5 +61,3 @@ def test_errors_are_seeded_smooth_and_as_large_as_said(stand_ins: Any) -> None:
             assert np.sqrt((logs**2).mean()) == pytest.approx(np.hypot(0.743 * level, 0.01), rel=0.1)
             # Neighbours differ by the white noise alone: a cell of the grid is some 60 px wide.
             assert np.diff(logs, axis=2).std() == pytest.approx(0.01 * np.sqrt(2), rel=0.05)
-    small, large = (np.log(given(level, 9) / 3)[1:] for level in (0.03, 0.06))
-    assert (2 * small - large).std() == pytest.approx(0.01, rel=0.1), "levels of a seed differ by their factor only"
