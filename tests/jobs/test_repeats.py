@@ -249,30 +249,6 @@ def test_what_the_gate_saw_and_what_it_cost_is_shown_everywhere(
     assert all(count in summary for count in ("6 calls", "600 tokens", "7 calls", "700 tokens"))
 
 
-def test_the_place_is_not_looked_for_again_where_the_motion_is_given(service: Service, mllm: MllmServer) -> None:
-    """What the model said of the motion, here of a trail, then changes nothing."""
-    image = floor(240, 160)
-    for x in (40, 100, 160):
-        image = ball(image, (x, 80), 15, (210, 20, 20))
-    scene, given = {"image": data_url(png_bytes(image))}, {"motion": {"direction": [0, -1]}}
-    place = {"label": "red ball", "bbox_2d": [604, 406, 729, 594], "cue": "trail", "direction": [167, 500, 667, 500]}
-
-    def reply(handler: Any) -> None:
-        prompt = say.text_of(handler.body)
-        said = BALL if "sets in motion" in prompt else place
-        handler.send(200, say.completion(json.dumps({"answer": "A"} if "`answer`" in prompt else said)))
-
-    mllm.say(reply)
-    (read,) = asked(service, **scene)
-    assert (read["simulation"]["motion"]["cue"], len(mllm.asked)) == ("trail", 3)
-    (kept,) = asked(service, **scene, **given)
-    assert (kept["reused"], kept["usage"]["calls"], len(mllm.asked)) == (["grounding"], 1, 4)
-    (fresh,) = asked(service, headers={"Cache-Control": "no-cache"}, **scene, **given)
-    assert (fresh["reused"], len(mllm.asked)) == ([], 7)
-    for part in ("grounding", "motion", "trajectory", "frames", "warnings"):
-        assert kept["simulation"][part] == fresh["simulation"][part], part
-
-
 @pytest.mark.parametrize(("ends_in", "drawn_again"), [("generation", False), ("answering", True)])
 def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
     ends_in: Stage, drawn_again: bool, service: Service, mllm: MllmServer, tmp_path: Path

@@ -176,18 +176,6 @@ class TestLayout:
         assert [placed.stands for placed in scene.bodies] == [True, False, True], "which is nobody else's concern"
         assert scene.bodies[1].centre[0, 1] > scene.cameras.height[0]
 
-    def test_the_metres_are_those_of_the_mover(self) -> None:
-        camera = TrueCamera(height=1.2)
-        half = 0.1
-        ball = camera.sphere_box((0.2, half, 3.0), half)
-        bodies = body(ball, "sphere"), body(camera.box(outline("cylinder", (-0.6, 4.0), 0.15, 0.5)), "cylinder")
-        scale = camera.positions(np.array([[0.2, half, 3.0]]))[0, 2] / camera.focal
-        there = motion().model_copy(update={"metres_per_pixel": MetresPerPixel(value=scale, source="reference")})
-        scene = lay_out(bodies, there, known(camera), camera.size, likeliest())
-        assert scene.cameras.height[0] == pytest.approx(1.2, rel=0.03)
-        assert scene.bodies[0].centre[0] == pytest.approx((0.2, half, 3.0), abs=0.05)
-        assert scene.bodies[1].centre[0, [0, 2]] == pytest.approx((-0.6, 4.0), abs=0.1)
-
     @pytest.mark.parametrize("direction", [(1.0, 0.0), (-0.6, 0.8), (0.0, -1.0)])
     def test_along_the_floor_it_goes_where_it_is_seen_to_go(self, direction) -> None:
         given_ = motion("linear", direction, speed=100)

@@ -56,15 +56,6 @@ class TestRolling:
         assert kinds(self.roll(post(0.2, 6.0, height=0.2))) == set(), "far behind its way"
         assert kinds(self.roll(post(-2.0))) == set(), "it rolls away from it"
 
-    def test_an_ensemble_knows_how_sure_it_is(self) -> None:
-        on, beside, edge = (
-            self.roll(post(0.0, ahead), draws=ensemble(60), every=2, doubt=0.08).share("touches", 1)
-            for ahead in (3.0, 3.9, 3.24)
-        )
-        assert on > 0.9
-        assert beside < 0.1
-        assert 0.1 < edge < 0.9
-
     def test_a_ball_turns_as_it_rolls_and_states_agree_with_points(self) -> None:
         worlds, _ = happened(ball(-1.2))
         rolled = np.degrees(SPEED * np.arange(FRAMES) / FPS / HALF)

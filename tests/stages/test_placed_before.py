@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drawn import Image, ball, block, bowl, floor
+from drawn import Image, ball, block, floor
 from refusals import refused
 from runs import run_of
 from staged import BLUE, GREEN, RED, YELLOW, VideoModel, clip_of, computed, is_green, is_red, pixels
@@ -18,7 +18,6 @@ from cow_service.stages.run import Run
 pytestmark = pytest.mark.slow
 
 MOVER, CUBE, POST = (80, 255, 130, 305), (430, 230, 510, 330), (300, 90, 350, 150)
-BOWL = (349.0, 204.0, 492.0, 309.0)
 OBJECTS = ({"object": "cube", "bbox": CUBE, "shape": "box"}, {"object": "post", "bbox": POST, "shape": "box"})
 RIGHT = {"kind": "linear", "direction": (1, 0), "speed": 200}
 
@@ -151,25 +150,6 @@ class TestFrames:
         marked = (np.abs(pixels(wanted, clip.overlay).astype(int) - (130, 255, 130)) < 30).all(axis=2)
         assert marked[old].any()
         assert marked[y0 - 24 : y1 + 2, x0 - 2 : x1 + 2].any(), "its new place is named or drawn"
-
-    def test_what_is_in_a_container_is_behind_its_front_and_goes_with_it(self) -> None:
-        objects = ({"object": "bowl", "bbox": BOWL}, {"object": "egg", "bbox": (310, 110, 350, 150), "shape": "sphere"})
-        image = ball(bowl(floor(), (420, 240), 70, 50, BLUE), (330, 130), 20, GREEN)
-        image = ball(image, (105, 280), 25, RED)
-        frames = {"indices": [0, 48], "max_side": None}
-        fast = RIGHT | {"speed": 1000}
-        wanted = run(put("egg", "into", "bowl"), image=image, objects=objects, video=False, frames=frames, motion=fast)
-        told, clip = clip_of(wanted)
-        assert told.placed[0].result == "inside"
-        egg, pushed = told.placed[0].body, next(each for each in told.paths if told.bodies[each.body].object == "bowl")
-        (x0, y0, x1, _), (x, y) = told.bodies[egg].bbox, pushed.points[0]
-        assert 349 < x0 < x1 < 492
-        assert pushed.points[48][0] > x + 15
-        for frame in clip.frames:
-            shown, right = pixels(wanted, frame), round(pushed.points[frame.index][0] - x)
-            down = round(pushed.points[frame.index][1] - y)
-            assert is_green(shown[int(y0) + 6 + down, int((x0 + x1) / 2) + right])
-            assert not is_green(shown[285 + down, 385 + right : 455 + right]).any(), "the wall below the nearer rim"
 
     def test_a_video_model_is_given_the_changed_scene(self) -> None:
         model = VideoModel()

@@ -205,12 +205,6 @@ def test_what_cannot_be_meant_gives_a_sane_result(name: str) -> None:
     is_sane(seen(**given_), given_["num_frames"])
 
 
-def test_what_cannot_be_meant_is_cut_out_of_the_image_as_well() -> None:
-    huge = {"object": "ball", "bbox": BAD["a mover as large as the image"]["mover"]}
-    inside = BAD["objects inside each other"]["others"]
-    is_sane(simulated(scene(BESIDE), inside, grounding=huge, num_frames=17, ensemble=2), 17)
-
-
 @given(
     boxes,
     st.lists(boxes, max_size=8, unique=True),

@@ -7,11 +7,10 @@ import math
 import cv2
 import numpy as np
 import pytest
-from conftest import SCALE, Example
+from conftest import SCALE
 from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rendered_scenes import scene_rows
 
 from cow_service.vision.scene import Scene
 
@@ -76,15 +75,6 @@ def test_a_hollow_arrow_is_measured(
     assert len(scene.arrows) == 1
     assert angle_between(scene.arrows[0].direction, (along[0], along[1])) < 2.5
     assert np.abs(scene.clean.astype(int) - floor())[scene.cues].mean() < 12
-
-
-@pytest.mark.scaled
-@pytest.mark.parametrize("folder", scene_rows())
-def test_images_without_a_drawing_have_no_cues(folder) -> None:
-    scene = Scene(Example(folder).pixels("clean.jpg"))
-    assert scene.arrows == scene.boxes == ()
-    assert not scene.cues.any()
-    assert scene.clean is scene.image
 
 
 def test_things_shaped_like_arrows_are_none() -> None:

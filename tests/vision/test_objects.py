@@ -17,8 +17,6 @@ from cow_service.records import LocatedObject
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.stages.grounding import ground
-from cow_service.stages.motion import read_motion
-from cow_service.stages.trajectory import compute_trajectory
 
 MOVER = (160, 160, 240, 240)
 CUBE = (400, 220, 480, 300)
@@ -87,12 +85,11 @@ def test_the_mover_may_be_given_by_mask(pixels: np.ndarray) -> None:
         ({"mask": np.zeros((400, 640), np.uint8)}, "/objects/1/mask"),
         ({"mask": np.full((400, 640), 255, np.uint8)}, "/objects/1/mask"),
         ({"mask": circle((100, 100), 30, (320, 200))}, "/objects/1/mask"),
-        ({"mask": circle((100, 100), 30, (1280, 800))}, "/objects/1/mask"),
         ({"bbox": (700, 10, 800, 90)}, "/objects/1/bbox"),
         ({"point": (10, 400)}, "/objects/1/point"),
         ({"point": (440, 260)}, "/objects/1"),
     ],
-    ids=["an empty mask", "all of it", "a smaller one", "a larger one", "a box outside", "a point outside", "again"],
+    ids=["an empty mask", "all of it", "another size", "a box outside", "a point outside", "again"],
 )
 def test_an_object_that_is_none_of_the_image_or_given_twice_is_refused(
     pixels: np.ndarray, given: dict, pointer: str
@@ -165,18 +162,3 @@ def test_what_is_asked_about_and_was_not_located_is_warned_of(
     warnings = ground(run_of(pixels, **given)).warnings
     assert len(warnings) == len(missing)
     assert all(f"'{name}'" in warning for name, warning in zip(missing, warnings, strict=True))
-
-
-def test_what_is_asked_about_is_found_whatever_its_determiner(pixels: np.ndarray) -> None:
-    run = run_of(
-        pixels,
-        question="?",
-        grounding={"bbox": MOVER, "object": "ball"},
-        objects=[{"object": "crate", "bbox": CUBE}],
-        asked={"relation": "touches", "target": "A  Crate"},
-        motion={"direction": (1, 0.3)},
-    )
-    grounding = ground(run).value
-    outcome = compute_trajectory(run, grounding, read_motion(run, grounding, run.hints).value).value.outcome
-    assert outcome is not None
-    assert (outcome.object, outcome.sure) == ("crate", True)

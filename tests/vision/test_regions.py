@@ -7,11 +7,9 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from conftest import Example
 from drawn import Image, ball, block, floor, jpeg
 from hypothesis import given
 from hypothesis import strategies as st
-from rendered_scenes import scene_rows
 
 from cow_service.records import LocatedObject
 from cow_service.vision.contrast import colour_name, colour_names
@@ -147,19 +145,6 @@ def test_what_is_found_in_a_picture(
     assert found.keys() == expected.keys()
     for name, bbox in expected.items():
         assert iou(found[name], bbox) > 0.8, name
-
-
-@pytest.mark.scaled
-@pytest.mark.parametrize("folder", scene_rows())
-def test_objects_of_rendered_scenes(folder) -> None:
-    scene = Example(folder)
-    regions = find_regions(scene.pixels("clean.jpg"))
-    for name, boxes in scene.meta["boxes"].items():
-        x0, y0, x1, y1 = boxes[0]
-        seen = (max(0, x0), max(0, y0), min(832, x1), min(480, y1))
-        best = max(regions, key=lambda region: iou(region.bbox, seen))
-        assert iou(best.bbox, seen) > 0.6, name
-        assert name.startswith(best.colour), name
 
 
 @given(st.floats(0, 100), st.floats(-120, 120), st.floats(-120, 120))
