@@ -25,9 +25,7 @@ def ignore(done: float) -> None:
     """There is no listener."""
 
 
-def shot(
-    image, points, scale=None, depths=None, clean: bool = True, kind: str = "linear", bbox=None, named=(), **more
-) -> GeneratorInput:
+def shot(image, points, scale=None, depths=None, clean: bool = True, bbox=None, named=(), **more) -> GeneratorInput:
     """A clip of what is at `CENTRE`, or in a box, along points (px), without a camera."""
     scene = Scene(image)
     bbox = scene.bbox_at(CENTRE) if bbox is None else bbox
@@ -35,7 +33,7 @@ def shot(
     middle = ((bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2)
     grounding = Grounding(object="thing", point=middle, bbox=bbox, others=others, source="request")
     motion = Motion.model_validate(
-        {"kind": kind, "direction": (1, 0) if kind != "fall" else None, "cue": "request", "speed": 1, "sentence": "",
+        {"kind": "linear", "direction": (1, 0), "cue": "request", "speed": 1, "sentence": "",
          "metres_per_pixel": {"value": 0.01, "source": "default"}, "source": "request"}
     )  # fmt: skip
     count = len(points)

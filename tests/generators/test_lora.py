@@ -32,12 +32,11 @@ def original() -> Tensors:
     """Pairs in the original's names."""
     down, up = drawn(2, WIDTH), drawn(WIDTH, 2, seed=1)
     wide = (drawn(3, WIDTH, seed=2), drawn(32, 3, seed=3))
-    layers = {"0.self_attn.q": (down, up), "1.cross_attn.k_img": (down, up), "2.ffn.0": wide}
-    return {
-        f"diffusion_model.blocks.{layer}.lora_{part}.weight": tensor
-        for layer, pair in layers.items()
-        for part, tensor in zip(("down", "up"), pair, strict=True)
-    }
+    found: Tensors = {}
+    for layer, pair in {"0.self_attn.q": (down, up), "1.cross_attn.k_img": (down, up), "2.ffn.0": wide}.items():
+        found[f"diffusion_model.blocks.{layer}.lora_down.weight"] = pair[0]
+        found[f"diffusion_model.blocks.{layer}.lora_up.weight"] = pair[1]
+    return found
 
 
 @pytest.fixture(scope="module")

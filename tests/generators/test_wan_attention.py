@@ -100,17 +100,7 @@ def test_the_fastest_that_computes_the_same_is_chosen(toys, others: list[tuple[f
     assert toys.fastest([toys.TimedBackend("native", None, None, "memory")]) == "native"
 
 
-def test_a_profile_names_what_was_chosen(toys, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that a clip's description and its fingerprint do."""
-    monkeypatch.setattr(toys.attention, "backends_for_auto", lambda *_: ("native", "_native_math"))
-    as_it_is = profile_of(TINY, "exact")
-    assert toys.attention.with_attention(as_it_is, TINY.architecture, 64, 32, toys.CPU) is as_it_is
-    found = toys.attention.with_attention(AUTO, TINY.architecture, 64, 32, toys.CPU).acceleration
-    assert found.attention in {"native", "_native_math"}
-    assert found == Acceleration(attention=found.attention, vae_tiling=True)
-
-
-def test_the_next_start_chooses_the_same(toys, attends, tmp_path, monkeypatch) -> None:
+def test_the_next_start_chooses_the_same(toys, tmp_path, monkeypatch) -> None:
     """Whatever the second timing would say; another set of backends, or a damaged file, is timed again."""
     kept, asked = tmp_path / "data" / "attention.json", list[tuple[str, ...]]()
     lacking: set[str] = set()
@@ -127,7 +117,9 @@ def test_the_next_start_chooses_the_same(toys, attends, tmp_path, monkeypatch) -
 
     def chosen(*names: str) -> str:
         monkeypatch.setattr(toys.attention, "backends_for_auto", lambda *_: names)
-        return toys.attention.with_attention(AUTO, TINY.architecture, 64, 32, toys.CPU, kept).acceleration.attention
+        found = toys.attention.with_attention(AUTO, TINY.architecture, 64, 32, toys.CPU, kept).acceleration
+        assert found == AUTO.acceleration.model_copy(update={"attention": found.attention}), "so that a clip names it"
+        return found.attention
 
     assert [chosen("native", "_native_math") for _ in range(3)] == ["native"] * 3
     assert len(asked) == 1
@@ -135,28 +127,20 @@ def test_the_next_start_chooses_the_same(toys, attends, tmp_path, monkeypatch) -
     assert chosen("native", "_native_math") == "native"
     assert chosen("native") == "native"
     assert len(asked) == 2, "there is nothing to choose of one"
-
-    @contextmanager
-    def fetch(name: str) -> Generator[None]:
-        if name == "native":
-            raise OSError("offline")
-        yield
-
-    monkeypatch.setattr(toys.attention, "attention_backend", fetch)
-    chosen("native", "_native_math", "_native_flash")
-    assert asked[2:] == [("_native_math", "_native_flash")], "one that cannot be fetched is not among them"
     kept.write_text("{damaged")
-    chosen("xformers", "_native_math", "_native_flash")
-    assert len(asked) == 4
+    chosen("_native_efficient", "_native_math", "_native_flash")
+    assert len(asked) == 3
     assert sorted(each.name for each in kept.parent.iterdir()) == ["attention.json"]
     before = kept.read_text()
-    lacking.add("flash")  # which may be there the next time: such a choice is not kept
-    assert chosen("_native_math", "flash") == "_native_math"
+    lacking.add("_native_flash")  # which may be there the next time: such a choice is not kept
+    assert chosen("_native_math", "_native_flash") == "_native_math"
     assert kept.read_text() == before
+    as_it_is = profile_of(TINY, "exact")
+    assert toys.attention.with_attention(as_it_is, TINY.architecture, 64, 32, toys.CPU) is as_it_is
 
 
 def test_kernels_of_the_hub_are_fetched_beforehand(toys, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The GPU, and what diffusers does to fetch them, are fakes."""
+    """The GPU, and what diffusers does to fetch them, are fakes. One that cannot be fetched is not chosen."""
     asked: list[str] = []
 
     @contextmanager
@@ -172,8 +156,11 @@ def test_kernels_of_the_hub_are_fetched_beforehand(toys, monkeypatch: pytest.Mon
     reason = "OSError: no build of it for this version of torch"
     assert fetched == {"flash_hub": reason, "_flash_3_hub": None, "flash_4_hub": None}
     assert sorted(asked) == sorted(fetched), "each once"
-    only = Acceleration(attention="sage_hub"), Acceleration(attention="native"), Acceleration(attention="flash")
-    assert toys.attention.fetch_kernels(only, toys.CPU) == {"sage_hub": None}
+    timed = list[str]()
+    monkeypatch.setattr(toys.attention, "time_backends", lambda names, *_: timed.extend(names) or ())
+    toys.attention.with_attention(AUTO, TINY.architecture, 64, 32, toys.CPU)
+    assert "_flash_3_hub" in timed
+    assert "flash_hub" not in timed
 
 
 def test_only_what_is_exact_and_there_is_tried_at_the_shape_of_the_transformer(toys) -> None:

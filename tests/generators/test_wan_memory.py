@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from refusals import refused
@@ -41,21 +42,19 @@ def needs(toys) -> dict[str, Need]:
 
 
 @pytest.fixture
-def machine(toys, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleNamespace:
-    """There is no GPU here: one that can do all is a fake, `room` bytes large; its container has `host` bytes."""
-
-    class Machine(SimpleNamespace):
-        def __setattr__(self, name: str, value: object) -> None:
-            super().__setattr__(name, value)
-            if name == "host":
-                (tmp_path / "memory.max").write_text(f"{value}\n")
-
-    has = Machine(room=10**12, host="max")
-    monkeypatch.setattr(toys.memory, "CGROUP", tmp_path / "memory.max")
+def machine(toys, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int, int | str], None]:
+    """There is no GPU here: one that can do all is a fake. Sets its bytes, and those of its container."""
+    container, room = tmp_path / "memory.max", [10**12]
+    monkeypatch.setattr(toys.memory, "CGROUP", container)
     monkeypatch.setattr(toys.memory, "refusals", lambda wanted, machine: ())
     monkeypatch.setattr(toys.torch.cuda, "device_count", lambda: 1)
     gpu = partial(SimpleNamespace, name="GPU", major=9, minor=0)
-    monkeypatch.setattr(toys.torch.cuda, "get_device_properties", lambda device: gpu(total_memory=has.room))
+    monkeypatch.setattr(toys.torch.cuda, "get_device_properties", lambda device: gpu(total_memory=room[0]))
+
+    def has(device: int = 10**12, host: int | str = "max") -> None:
+        room[0] = device
+        container.write_text(f"{host}\n")
+
     return has
 
 
@@ -78,57 +77,52 @@ def test_what_weights_take_is_what_the_loaded_parts_do(toys, checkpoint: Path, n
     assert needs["exact"].device == pytest.approx(taken, rel=0.03)
 
 
+def refusal(*how: Any) -> str:
+    with refused("generator-unavailable") as caught:
+        check(*how)
+    return caught.value.detail
+
+
 def test_what_does_not_fit_is_refused_and_what_fits_is_named(checkpoint, needs, machine, tmp_path) -> None:
     for name in ("exact", "fast"):
-        machine.room = needs[name].device
+        machine(needs[name].device)
         check(name, checkpoint, checkpoint)
-        machine.room -= 1
-        with refused("generator-unavailable"):
-            check(name, checkpoint, checkpoint)
-    machine.room, machine.host = needs["fast"].device, needs["small"].host
-    with refused("generator-unavailable") as caught:
-        check("exact", checkpoint, checkpoint)
+        machine(needs[name].device - 1)
+        refusal(name, checkpoint, checkpoint)
+    room, host = needs["fast"].device, needs["small"].host
+    machine(room, host)
+    told = refusal("exact", checkpoint, checkpoint)
     able = {
-        name
-        for name, need in needs.items()
-        if need.device <= machine.room and need.host <= machine.host
-        and not profile_of(ATI, name).acceleration.keeps_float8
+        name for name, need in needs.items()
+        if need.device <= room and need.host <= host and not profile_of(ATI, name).acceleration.keeps_float8
     }  # fmt: skip
     assert {"fast", "small"} <= able
-    assert set(re.findall(r"[\w-]+", caught.value.detail)) & needs.keys() == able | {"exact"}
+    assert set(re.findall(r"[\w-]+", told)) & needs.keys() == able | {"exact"}
     check("small", checkpoint, checkpoint)
-    machine.host -= 1
-    with refused("generator-unavailable"):
-        check("small", checkpoint, checkpoint)
-    machine.room = 1
-    with refused("generator-unavailable") as caught:
-        check("turbo", checkpoint, checkpoint)
-    assert "COW_PROFILE" not in caught.value.detail, "none would do"
-    machine.host = max(needs["portable"].device, needs["portable"].host)
+    machine(room, host - 1)
+    refusal("small", checkpoint, checkpoint)
+    machine(1)
+    assert "COW_PROFILE" not in refusal("turbo", checkpoint, checkpoint), "none would do"
+    both = max(needs["portable"].device, needs["portable"].host)
+    machine(1, both)
     check("portable", checkpoint, checkpoint, "cpu")
-    machine.host -= 1
-    with refused("generator-unavailable"):
-        check("portable", checkpoint, checkpoint, "cpu")
-    with refused("generator-unavailable") as caught:  # also where weights are missing, which are told, too
-        machine.host = "max"
-        check("small-float8", tmp_path, tmp_path)
-    assert "cow models pull ati" in caught.value.detail
+    machine(1, both - 1)
+    refusal("portable", checkpoint, checkpoint, "cpu")
+    assert "cow models pull ati" in refusal("small-float8", tmp_path, tmp_path), "missing weights are told, too"
 
 
 def test_float8_is_kept_only_where_there_is_some(toys, checkpoint, tmp_path, machine) -> None:
-    with refused("generator-unavailable") as caught:
-        check("small-float8", checkpoint, checkpoint)
-    assert "COW_CHECKPOINTS" in caught.value.detail
+    machine()
+    assert "COW_CHECKPOINTS" in refusal("small-float8", checkpoint, checkpoint)
     weights = toys.load_file(next((checkpoint / "transformer").glob("*.safetensors")))
     small = {name: each.to(toys.torch.float8_e4m3fn) for name, each in weights.items()}
     toys.save_file(small, tmp_path / "one.safetensors")
     check("small-float8", tmp_path / "one.safetensors", checkpoint)
 
 
-def test_what_cannot_be_read_is_left_to_loading(checkpoint: Path, tmp_path: Path, machine: SimpleNamespace) -> None:
-    machine.room = 1
+def test_what_cannot_be_read_is_left_to_loading(checkpoint: Path, tmp_path: Path, machine) -> None:
+    machine(1)
     check("exact", tmp_path, checkpoint)
-    check("exact", checkpoint, tmp_path)
     (tmp_path / "text_encoder").mkdir()
     (tmp_path / "text_encoder" / "model.safetensors").write_bytes(b"damaged")
     check("exact", checkpoint, tmp_path)

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import pytest
 from conftest import ROOT
 
-from cow_service.generators.wan.profiles import Profile
 from cow_service.weights.manifests import load_manifests
-
-if TYPE_CHECKING:
-    from wan_models import Case
 
 pytest_plugins = "toy_fixtures"
 pytestmark = pytest.mark.slow
@@ -27,13 +19,6 @@ BENCHMARKS = ROOT / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 ATI, TINY = load_manifests()["ati"], load_manifests()["tiny-ati"]
 CLIP = ("--model", "tiny-ati", "--num-frames", "5", "--width", "32", "--height", "32")
-
-
-def smallest() -> Case:
-    import toys
-    from wan_models import Case
-
-    return Case(TINY, toys.CPU, num_frames=5, width=32, height=32, steps=2, runs=1)
 
 
 @pytest.fixture
@@ -52,11 +37,7 @@ def wan_speed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     return run
 
 
-def results(file: Path) -> dict[str, dict[str, Any]]:
-    return {result["name"]: result for result in json.loads(file.read_text())["results"]}
-
-
-def test_the_figures_of_profiles_and_of_diffusers_own_pipeline_hang_together(toys, wan_speed, tmp_path) -> None:
+def test_the_figures_of_profiles_and_of_diffusers_own_pipeline_hang_together(wan_speed, tmp_path) -> None:
     from wan_table import PARTS
 
     file = tmp_path / "found.json"
@@ -64,8 +45,7 @@ def test_the_figures_of_profiles_and_of_diffusers_own_pipeline_hang_together(toy
     code, told = wan_speed(*CLIP, "--steps", "3", "--runs", "2", *profiles, "--json", str(file))
     assert code == 0, told
     found = json.loads(file.read_text())
-    figures = {name: result["figures"] for name, result in results(file).items()}
-    assert list(figures) == ["exact", "fast", "plain"]
+    figures = {result["name"]: result["figures"] for result in found["results"]}
     for name, each in figures.items():
         parts = each["parts_s"]
         assert set(parts) == {*PARTS} - ({"condition"} if name == "plain" else set())
@@ -78,55 +58,16 @@ def test_the_figures_of_profiles_and_of_diffusers_own_pipeline_hang_together(toy
     assert fast["pflop"] < exact["pflop"] == plain["pflop"], "what a cache skips is not counted"
     ratio = fast["times_as_fast_as_plain"]["clip"]
     assert ratio == pytest.approx(plain["total_s"] / fast["total_s"], rel=0.01)
-    whole = exact["total_s"] + exact["parts_s"]["denoising"] / 3  # of four steps
-    assert exact["computed"]["total_s"] == pytest.approx(whole, rel=0.01)
     assert max(found["golden"]["float32"].values()) < 1e-5
     assert 1e-4 < max(found["golden"]["bfloat16"].values()) < 0.1, "that is the precision, and it was really used"
     attention = {row["name"]: row for row in found["attention"]}
-    assert {"native", "_native_math"} <= set(attention)
     assert attention["native"]["error"] == 0
 
 
-@pytest.mark.soak  # half a minute; what a budget leaves out is tested below
-def test_every_row_of_a_budget_is_measured_or_refused(wan_speed, tmp_path, monkeypatch, toys) -> None:
-    """Nothing is compiled."""
-    monkeypatch.setattr(toys.torch, "compile", lambda function: function)
-    code, told = wan_speed("--model", "tiny-ati", "--budget", "500", "--json", str(tmp_path / "found.json"))
-    assert code == 0, told
-    found = {name: each["status"] for name, each in results(tmp_path / "found.json").items()}
-    refused = set() if toys.torch.cuda.is_available() else {"cuDNN", "fp8", "group offload"}
-    assert found == {name: "refused" if name in refused else "measured" for name in found}
-    assert len(found) > 10
+def test_a_budget_plans_what_it_would_measure(wan_speed) -> None:
     code, planned = wan_speed("--model", "tiny-ati", "--budget", "500", "--plan")
     assert code == 0
-    assert all(name in planned for name in set(found) - {"build"})
-
-
-def test_what_fails_is_a_result_and_takes_no_other_with_it(toys, tmp_path, monkeypatch) -> None:
-    """A real allocation that no machine can serve, a fault of the code, an option that needs a GPU; one that works."""
-    import wan_models
-    import wan_speed as script
-
-    file, build = tmp_path / "found.json", wan_models.build
-    offloaded = {**TINY.profiles["exact"], "acceleration": {"offload": "model"}}
-    profiles = {"offloaded": offloaded, **TINY.profiles}
-    case = replace(smallest(), manifest=TINY.model_copy(update={"profiles": profiles}))
-
-    def fail(case: Case, profile: Profile) -> Any:
-        if profile.acceleration.cache == "none" and profile.sampling.solver == "unipc":
-            toys.torch.empty(2**50, dtype=toys.torch.float64)
-        if profile.acceleration.cache != "none":
-            raise ZeroDivisionError("a fault")
-        return build(case, profile)
-
-    monkeypatch.setattr(wan_models, "build", fail)
-    monkeypatch.setattr(script, "time_attention", lambda case: ())
-    monkeypatch.setattr(script, "distances", lambda *_: {})
-    script.survey(case, ["offloaded", "exact", "fast", "turbo"], file)
-    found = results(file)
-    assert [result["status"] for result in found.values()] == ["refused", "failed", "failed", "measured"]
-    assert "ZeroDivisionError: a fault" in found["fast"]["reason"]
-    assert found["turbo"]["figures"]["passes"] == 2
+    assert len(planned.splitlines()) > 10
 
 
 def test_the_formula_counts_what_pytorch_counts(toys) -> None:
@@ -141,16 +82,3 @@ def test_the_formula_counts_what_pytorch_counts(toys) -> None:
     one = pass_flops(ATI.architecture, 81, 832, 480)
     assert 80 * one == pytest.approx(135e15, rel=0.03)
     assert pass_flops(ATI.architecture, 81, 832, 480, layers=0) < 0.002 * one
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(600)
-def test_first_contact_goes_the_whole_way(toys, tmp_path: Path) -> None:
-    given = ("--toy", "--num-frames", "5", "--profile", "exact", "--json", str(tmp_path / "found.json"))
-    subprocess.run([sys.executable, str(BENCHMARKS / "first_contact.py"), *given], check=True, capture_output=True)
-    found = {row["name"]: row for row in json.loads((tmp_path / "found.json").read_text())["rows"]}
-    assert found["portable"]["exit"] == 0
-    assert found["exact"]["exit"] == (0 if toys.torch.cuda.is_available() else 1)
-    assert found["exact"].get("grey_levels_off_portable", 0) < 2
-    assert found["serve: cancel"]["status"] == "canceled"
-    assert [found[f"serve: {clip}"]["status"] for clip in ("first clip", "after a cancel")] == [200, 200]

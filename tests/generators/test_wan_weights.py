@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import example
 from hub import Blob, Hub, running
 from refusals import refused
 
-from cow_service.records import Simulation
 from cow_service.weights.manifests import load_manifests
 from cow_service.weights.repositories import download, resolve
 
 pytest_plugins = "toy_fixtures"
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
-BALL = example("ball-and-mug")
 TOY = load_manifests()["tiny-ati"].architecture
 ATI = load_manifests()["ati"]
 SHARD = "diffusion_pytorch_model-00002-of-00002.safetensors"
@@ -68,33 +62,6 @@ def pulled(tmp_path_factory: pytest.TempPathFactory, hub: Hub) -> Path:
     for source in ATI.sources.values():
         download([resolve(source, folder / "models", endpoint=hub.address)], folder / "models", endpoint=hub.address)
     return folder
-
-
-@pytest.mark.soak  # five processes with the models' libraries
-def test_pulled_checked_loaded_and_used_by_commands(tmp_path: Path, hub: Hub) -> None:
-    environment = {
-        "COW_DATA_DIR": str(tmp_path / "data"), "COW_PROFILE": "portable", "COW_DEVICE": "cpu",
-        "HF_ENDPOINT": hub.address, "HF_HOME": str(tmp_path / "hub"), "NO_COLOR": "1",
-    }  # fmt: skip
-
-    def cow(*arguments: str, fails: bool = False) -> str:
-        command = [sys.executable, "-m", "cow_service.cli.main", *arguments]
-        settings = {"env": os.environ | environment, "cwd": tmp_path, "capture_output": True, "text": True}
-        done = subprocess.run(command, check=False, **settings)
-        assert (done.returncode != 0) == fails, done.stderr
-        return done.stdout
-
-    (tmp_path / "image.jpg").write_bytes(BALL.image)
-    assert "bytedance-research/ATI" in cow("models", "check", "ati", fails=True)
-    cow("models", "pull", "ati")
-    cow("models", "check", "ati")
-    models = json.loads(cow("models", "--json"))["generators"]
-    assert [(m["ready"], m["pull"]) for m in models if m["name"] == "ati"] == [(True, None)]
-    options = ("--generator", "ati", "--num-frames", "5", "--no-video", "--out", "out", "--option", "steps=2")
-    cow("simulate", "image.jpg", BALL.meta["question"], *options)
-    made_by = Simulation.model_validate_json((tmp_path / "out" / "simulation.json").read_bytes()).generator
-    repository = ATI.sources["transformer"].repository
-    assert (made_by.model, made_by.revision, made_by.steps) == (repository, hub.main[repository], 2)
 
 
 def test_what_was_pulled_is_loaded_and_named(toys, pulled: Path, hub: Hub) -> None:

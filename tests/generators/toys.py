@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.profiler import profile
 
 from cow_service.generators.wan import acceleration, attention, generator, loading, memory, ranks
-from cow_service.generators.wan.acceleration import accelerate, cached_pass, check_device, pin, reset_cache
+from cow_service.generators.wan.acceleration import accelerate, cached_pass, pin, reset_cache
 from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
 from cow_service.generators.wan.capabilities import (
     EXACT_BACKENDS,
@@ -37,15 +37,14 @@ from cow_service.generators.wan.capabilities import (
 )
 from cow_service.generators.wan.checkpoints import add_lora, diffusers_config, load_transformer
 from cow_service.generators.wan.conditioning import ati_condition, wan_move, wan_move_latent
-from cow_service.generators.wan.generator import WanGenerator, compile_for, latent_mask
+from cow_service.generators.wan.generator import WanGenerator, latent_mask
 from cow_service.generators.wan.loading import Weights, assemble
 from cow_service.generators.wan.memory import check_machine, need_of, wait_until_done
 from cow_service.generators.wan.pipeline import Conditioning, denoise, latent_shape, make_schedule
 from cow_service.generators.wan.profiles import Acceleration, Sampling
-from cow_service.generators.wan.ranks import MODULE, RankGroup, Share, Sharing
+from cow_service.generators.wan.ranks import Share, Sharing
 from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
-from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import load_manifests
 
 CPU = torch.device("cpu")
@@ -169,16 +168,10 @@ def conditioned(noise: Tensor) -> Conditioning:
     return Conditioning(*texts, torch.randn(1, 17, sizes["image_dim"], generator=drawn), *conditions)
 
 
-def clips_of(transformer: Any, sharing: Sharing | None = None) -> dict[str, Tensor]:
-    """Latents of a clip of each size, shared with other ranks or not."""
-    sampling, found = Sampling(steps=4, shift=5.0, guidance_scale=5.0), dict[str, Tensor]()
-    for tokens, noise in NOISES.items():
-        how = {}
-        if sharing is not None:
-            sharing.prepare(noise)
-            how = {"share": sharing}
-        found[tokens] = denoise(transformer, CPU, noise, conditioned(noise), sampling, lambda done, total: None, **how)
-    return found
+def clip_of(transformer: Any, noise: Tensor, **how: Sharing) -> Tensor:
+    """Latents of a clip, shared with other ranks or not."""
+    sampling = Sampling(steps=4, shift=5.0, guidance_scale=5.0)
+    return denoise(transformer, CPU, noise, conditioned(noise), sampling, lambda done, total: None, **how)
 
 
 def be_a_rank(folder: str) -> None:
@@ -188,5 +181,10 @@ def be_a_rank(folder: str) -> None:
     wanted, rank = Acceleration(context_parallel=2, guidance_parallel=True), int(os.environ["RANK"])
     transformer = make_tiny(TINY.architecture).transformer
     store = torch.distributed.FileStore(f"{folder}/store", wanted.ranks)
-    torch.save(clips_of(transformer, Sharing(transformer, wanted, rank, CPU, store)), f"{folder}/{rank}.pt")
+    sharing = Sharing(transformer, wanted, rank, CPU, store)
+    found: list[Tensor] = []
+    for noise in NOISES.values():
+        sharing.prepare(noise)
+        found.append(clip_of(transformer, noise, share=sharing))
+    torch.save(found, f"{folder}/{rank}.pt")
     torch.distributed.destroy_process_group()

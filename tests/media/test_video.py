@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageSequence
 from refusals import refused
 
-from cow_service.media.video import YuvFrames, animation, write_mp4
+from cow_service.media.video import YuvFrames, animation, frames_of, write_mp4
 
 
 def scene(index: int, width: int = 96, height: int = 64) -> np.ndarray:
@@ -212,3 +213,15 @@ def test_pictures_that_are_made_of_a_clip(path, format: str, size: tuple[int, in
     frames = [(frame.convert("L").getpixel((9, 9)), frame.info["duration"]) for frame in shown]
     assert [time for _, time in frames] == times
     assert np.abs(np.array([grey for grey, _ in frames]) - levels[::every]).max() < 20
+
+
+def test_clips_are_decoded_in_many_threads_at_once(path: Path) -> None:
+    """Each thread has its own frames, of clips of different sizes."""
+    clips: list[bytes] = []
+    for width in (64, 96, 128):
+        write_mp4([scene(i, width) for i in range(12)], path, fps=16, width=width, height=64)
+        clips.append(path.read_bytes())
+    alone = [np.stack(frames_of(clip)[0]) for clip in clips]
+    with ThreadPoolExecutor(6) as pool:
+        together = list(pool.map(lambda clip: np.stack(frames_of(clip)[0]), clips * 8))
+    assert all(np.array_equal(found, alone[i % 3]) for i, found in enumerate(together))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +15,7 @@ from floors import Floats, TrueCamera, depth_png
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refused
+from servers import data_url
 
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.geometry import DepthMap, Floor, Footprint, find_floor, measure
@@ -146,10 +146,6 @@ def request(map_: Floats | bytes, **also: Any) -> dict[str, Any]:
     png = map_ if isinstance(map_, bytes) else depth_png(map_)
     depth = {"map": data_url(png), "scale": 0.001, "focal": 640}
     return {"image": data_url(png_bytes(PICTURE)), "question": QUESTION, "depth": depth, "num_frames": 33} | also
-
-
-def data_url(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
 def simulated(service: Service, map_: Floats | bytes, **also: Any) -> tuple[Simulation, Outcome]:

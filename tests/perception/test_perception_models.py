@@ -171,40 +171,28 @@ PROMPTS = (
 )  # fmt: skip
 
 
-def segmenter_of(kit: ModuleType, networks: Any) -> tuple[Any, Any]:
+def test_prompts_reach_the_segmenter_and_one_embedding_serves_many_as_if_each_were_alone(
+    kit: ModuleType, networks: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = networks[0]["sam2-tiny"]
-    return kit.sam.SamSegmenter(model), model.network
-
-
-def test_prompts_reach_the_segmenter_at_their_places(kit: ModuleType, networks: Any) -> None:
-    toy, network = segmenter_of(kit, networks)
-    heard = listen(network.prompt_encoder.shared_embedding)
+    toy, encoded = kit.sam.SamSegmenter(model), listen(model.network.vision_encoder)
+    heard = listen(model.network.prompt_encoder.shared_embedding)
     embedding = toy.embed(picture())
-    found = toy.segment(embedding, PROMPTS)
+    together = toy.segment(embedding, PROMPTS)
     places = [call["args"][0][0, :, :-1].numpy() / kit.SIDE * (WIDTH, HEIGHT) for call in heard[:2]]  # the last pads
     np.testing.assert_allclose(places[0][:, 0], [(30, 60), (90.5, 20)], atol=1e-4)
     np.testing.assert_allclose(places[1].reshape(2, 4), [(10, 20, 60, 70), (0, 0, 120, 80)], atol=1e-4)
     box = kit.torch.tensor([[[10 / WIDTH, 20 / HEIGHT, 60 / WIDTH, 70 / HEIGHT]]]) * kit.SIDE - 0.5
     with kit.torch.inference_mode():  # as transformers makes one
-        own = network(image_embeddings=embedding.maps, input_boxes=box, multimask_output=False)
-    np.testing.assert_allclose(found[1][0].logits, own.pred_masks[0, 0, 0], atol=1e-4)
-
-
-def test_one_embedding_serves_many_prompts_as_if_each_were_alone(
-    kit: ModuleType, networks: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    toy, network = segmenter_of(kit, networks)
-    encoded = listen(network.vision_encoder)
-    embedding = toy.embed(picture())
-    together = toy.segment(embedding, PROMPTS)
-    monkeypatch.setattr(kit.sam, "MOST_TOGETHER", 1)
+        own = model.network(image_embeddings=embedding.maps, input_boxes=box, multimask_output=False)
+    np.testing.assert_allclose(together[1][0].logits, own.pred_masks[0, 0, 0], atol=1e-4)
     assert [len(each) for each in together] == [3, 1, 3, 1]
     assert (together[0][0].score, together[0][0].logits.std()) == pytest.approx((0.5484, 0.1547), rel=0.01)
+    monkeypatch.setattr(kit.sam, "MOST_TOGETHER", 1)
     for candidates, (alone,) in zip(together, (toy.segment(embedding, [each]) for each in PROMPTS), strict=True):
         assert [each.score for each in candidates] == sorted((each.score for each in candidates), reverse=True)
         for one, other in zip(candidates, alone, strict=True):
             assert one.score == pytest.approx(other.score, abs=1e-5)
-            assert 0 <= one.score <= 1
             np.testing.assert_allclose(one.logits, other.logits, atol=1e-5)
     assert len(encoded) == 1
     assert np.abs(together[0][0].logits - together[2][0].logits).max() > 0.1, "another point, another mask"

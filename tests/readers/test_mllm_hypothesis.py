@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 from outcomes import simulated
 
 from cow_service.readers.base import Imagined
@@ -51,22 +50,6 @@ def test_the_outcome_is_told_as_a_hypothesis_that_names_no_option() -> None:
     assert "hypothesis" in text
     told = text[text.index("The simulation came to") : text.index("- `answer`")]
     assert not any(f"({option.letter})" in told or option.text in told.split() for option in OPTIONS)
-
-
-@pytest.mark.parametrize(
-    ("fields", "told"),
-    [
-        ({"asked": {"relation": "covers", "negated": True}}, "it leaves the white cube in view"),
-        ({"asked": {"target": None, "negated": True}, "object": None}, "it hits nothing"),
-        ({"asked": {"form": "which-first"}, "first": "red\nbox"}, "the first one is the red box"),
-        ({"asked": {"form": "how-many"}, "count": 2}, "it is 2 objects"),
-        ({"asked": {"within": 1.0}}, "it hits the white cube within 1.0 s"),
-    ],
-)
-def test_the_outcome_of_each_form_of_question_is_one_line(fields: dict[str, Any], told: str) -> None:
-    text = prompt(outcome=outcome(probability=0.5, **fields))
-    assert f"> In 100 of 200 simulated versions {told}." in text.splitlines()
-    assert "depends" not in text
 
 
 def test_encounters_are_told_where_there_is_no_outcome() -> None:

@@ -72,19 +72,13 @@ def test_a_prompt_shows_the_fields_of_its_schema_in_their_order() -> None:
         assert fields[0] == "reasoning"
 
 
-def test_an_unknown_prompt_names_those_that_exist() -> None:
-    with pytest.raises(LookupError, match="motion-sentence"):
-        load_prompt("no-such-prompt")
-
-
 def test_values_are_data_and_blocks_leave_no_blank_lines() -> None:
     prompt = parse_prompt("p", HEAD + "Hello {{ name }}")
     value = "{{ 7 * 7 }} {% if %} <b> & {# no #}"
     assert prompt.render(name=value) == f"Hello {value}"
     assert parse_prompt("p", HEAD + "a\n{% if name %}\nb\n{% endif %}\nc").render(name=1) == "a\nb\nc"
-    for inputs, named in (({"name": "x", "colour": "red"}, "colour"), ({"nme": "x"}, "name.*nme")):
-        with pytest.raises(TypeError, match=named):
-            prompt.render(**inputs)
+    with pytest.raises(TypeError, match="nme"):
+        prompt.render(nme="x")
 
 
 @pytest.mark.parametrize(("body", "value"), [("{{ name.__class__.__mro__ }}", "x"), ("{{ name.append(1) }}", [])])
@@ -93,28 +87,16 @@ def test_a_body_is_sandboxed(body: str, value: object) -> None:
         parse_prompt("p", HEAD + body).render(name=value)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "Hello",
-        "---\nversion: 1\n",
-        "---\n- a\n---\nHello",
-        "---\nversion: 1\nother: 2\n---\nHello",
-        "---\nversion: one\n---\nHello",
-        "---\nversion: true\n---\nHello",
-    ],
-)
-def test_a_file_without_a_whole_number_as_its_version_is_no_prompt(text: str) -> None:
+@pytest.mark.parametrize("head", ["- a", "version: 1\nother: 2", "version: true", None])
+def test_a_file_without_a_whole_number_as_its_version_is_no_prompt(head: str | None) -> None:
     with pytest.raises(ValueError, match="'p'"):
-        parse_prompt("p", text)
+        parse_prompt("p", "Hello" if head is None else f"---\n{head}\n---\nHello")
 
 
-def test_the_sentence_of_a_motion_is_one_line_that_names_the_object_and_the_way() -> None:
+def test_the_sentence_of_a_motion_is_one_line_that_names_the_object_and_says_what_stops_it() -> None:
     for kind in ("linear", "projectile", "fall", "static"):
         sentence = motion_sentence("the orange\n ball", kind, "contact", (1.0, 0.0), 0.0)
         assert sentence.startswith("The orange ball ")
-        assert ("to the right" in sentence) is (kind != "static")
         assert len(sentence.splitlines()) == 1
-    free = motion_sentence("ball", "linear", "ballistic", (1.0, 0.0), 0.0)
-    assert "constant speed" in free, "nothing stops it"
-    assert "constant speed" not in motion_sentence("ball", "linear", "contact", (1.0, 0.0), 0.0)
+        assert "constant speed" not in sentence
+    assert "constant speed" in motion_sentence("ball", "linear", "ballistic", (1.0, 0.0), 0.0), "nothing stops it"

@@ -31,9 +31,7 @@ ASKED = """
 will it hit the yellow cube? | whether touches yellow cube
 does the ball bump into the vase? | whether touches vase
 will the vase be hit by the ball? | whether touches vase
-Will the vase be hit if the red ball rolls left? | whether touches vase
 will there be a collision between the ball and the cube? | whether touches cube
-will the ball and the cube touch each other? | whether touches cube
 will it hit the cube or not? | whether touches cube
 will it land in the bowl? | whether inside bowl
 will it knock the vase over? | whether tips vase
@@ -44,7 +42,6 @@ will it leave the image? | whether leaves -
 will it hit the floor? | whether lands -
 will it stay visible? | whether covered - not
 is it true that it hits the vase? | whether touches vase
-would the red ball rolling left collide with the vase? | whether touches vase
 where does it come down? | where touches -
 what happens? | what-happens touches -
 what will happen to the vase? | what-happens touches vase
@@ -57,23 +54,19 @@ will it miss the vase, yes or no? | whether touches vase not
 will it avoid hitting the vase? | whether touches vase not
 will it pass the vase without touching it? | whether touches vase not
 will it hit nothing? | whether touches - not
-will it avoid all the objects? | whether touches - not
 will the vase not be hidden? | whether covers vase not
 will it not be hidden by the vase? | whether covered vase not
 which object will it hit first? | which-first touches -
 Which object will the red ball hit if it moves left? | which-first touches -
-which object will it hide first? | which-first covers -
 how long until the vase is hit? | when touches vase
 when will the vase be hidden? | when covers vase
 how many of the other objects are hit? | how-many touches -
-If the fan blows the leaf to the left, will it reach the pond? | whether touches pond
 There is a red ball next to a blue cup. If it rolls left, will the cup be hit? | whether touches blue cup
 If the red ball moves opposite to where the arrow points will it hit the vase? Answer yes or no. | whether touches vase
 Suppose the vase were not there. If the red ball rolls left, will it hit the cube? | whether touches cube
 If I put the cyan cube into the pink bowl, will it fit inside? | whether inside pink bowl
 If the orange ball flies on along the trail of positions that is shown, will it hit the cube? | whether touches cube
 will part of it be hidden behind the vase? | whether covered vase
-will it stay completely visible? | whether covered - not
 would it stay there? | whether moves red ball not
 Sent straight towards the vase, does the red ball hit it? | whether touches vase
 If the red ball slides halfway towards the blue one and stops, will it touch the blue ball? | whether touches blue ball
@@ -81,7 +74,6 @@ Red ball rolls left - hits the vase? | whether touches vase
 The red ball rolls left and at the same time the blue ball goes up. Will the two collide? | whether touches blue ball
 Which mug is hit first by the red ball if it rolls left? | which-first touches -
 True or false? If the red ball rolls left, it misses the vase. | whether touches vase not
-The vase slides left by 20 pixels while the red ball drops. Does the ball land on the vase? | whether touches red ball
 Will the falling ball hit the vase? | whether touches vase
 """
 
@@ -109,9 +101,7 @@ will it hit the cup behind the vase? | {"relation": "touches", "target": "cup"}
 will it hit both mugs? | {"relation": "touches", "among": ["both mugs"], "every": true}
 will it avoid both mugs? | {"relation": "touches", "among": ["both mugs"], "negated": true}
 will either mug be hit? | {"relation": "touches", "among": ["either mug"]}
-will it hit neither of the two cubes? | {"relation": "touches", "among": ["neither two cubes"], "negated": true}
 is it hidden by any of the cones? | {"relation": "covered", "among": ["cones"]}
-does it touch all the other balls? | {"relation": "touches", "among": ["other balls"], "every": true}
 will both cones stay visible? | {"relation": "covers", "among": ["both cones"], "negated": true}
 will any of the cones stay visible? | {"relation": "covers", "among": ["cones"], "every": true, "negated": true}
 will it hit a cube? | {"relation": "touches", "among": ["a cube"]}
@@ -134,11 +124,9 @@ will it hit the red cube or the blue mug? | red cube, blue mug
 which will it hit first, the red cube or the blue mug? | red cube, blue mug
 Which of these will the red ball hit first if it moves left: a cube, a vase, or a mug? | cube, vase, mug
 Which object does the red ball hit first if it falls? The cube or the mug? | cube, mug
-which ball will it hit first? | ball
 Which mug is hit first by the ball if it rolls left, the blue or the white? | blue, white
 which cube will it hit first, the red one or the blue one? | red cube, blue cube
 which object will it hit first? |
-will it hit the vase? |
 """
 
 
@@ -171,32 +159,26 @@ def test_a_paraphrase_asks_the_same(said: str, plain: str) -> None:
 
 UNREAD = """
 will it hit the vase before it hits the cube?
-will it hit the vase and the cube?
 will it hit all the objects?
 will it hit the object?
 will it hit anything but the vase?
 will it hit the vase by bouncing off the wall?
 will it not miss the vase?
-won't it hit the vase?
 will it be blocked by the vase?
-will the vase be hidden at the end?
 will it hit the vase after two seconds?
 will it disappear?
 is it impossible for it to hit the vase?
 how long will the vase be hidden?
-when will it miss the vase?
 how fast will it hit the vase?
 will they collide?
 when will it stop?
 how many objects will it knock over?
 which object does it touch last?
 will it not hit both mugs?
-will it hit them?
 is there a moment when it doesn't hide the vase?
 will it be in front of the vase or behind it?
 will it roll over the edge of the vase?
 does it avoid clearing the vase?
-If the red ball rolls left, will the vase be hit? And will the cube be hit?
 If the red ball moves left and the blue ball moves right, will it hit the cube?
 If the red ball is rolled straight at the cup, will that then hit the cube?
 The red ball rolls left and the vase slides right, both slowly. Do they meet?
@@ -223,34 +205,28 @@ If the ball goes right while the mug goes left by 30 pixels, will they collide? 
 If the ball and the mug both move right by 30 pixels, do they touch? | and the mug both
 If the ball rolls on the shelf to the left, does it hit the mug? | on the shelf
 If the ball rolls along the arrow, is it hit on its way against the arrow? | is it hit on its way against the arrow
-The ball rolls left and misses the cube. Does the cube hit the mug? | and misses the cube
 First shift the ball left by 90 px, in the air, and only then release it. Will it hit the mug? | in the air
 If the ball rolls left by twice the width of the mug, does it hit the cube? | by twice the width of the mug
 If the ball rolls right, does it still hit the mug at the end? | does it still hit the mug at the end
 True or false? The mug is on the table. If the ball rolls left, it hits the mug. | True or false
-If the ball moves right and the blue cube to the left, will the ball hit the cube? | and the blue cube
 If the ball rolls left, once the ball has bumped into the cup, will the cup tip the cube? | has bumped into the cup
 The ball flies on along its trail, the first of which is the leftmost. Is it hit? | first of which is the leftmost
 The ball rolls left, then it goes for 2 seconds. Does it hit the mug? | for 2 seconds
 If the ball mvoes left, will it hit it? | mvoes
-If the ball rolls to the rigth, is it hit? | rigth
 """
 BESIDE = """
 The floor is icy. If the ball rolls right, does it hit the mug? | floor is icy
-The vase is very old. If the ball rolls right, does it hit the mug? | vase is very old
 """
 PLAIN = """
 There is a red ball and a blue mug. If the ball rolls right, does it hit the mug?
 Please tell me: would the ball, rolling freely along the arrow on the floor, hit the mug?
 Remove the vase and then roll the ball gently to the right by 20 px. Does it still hit the mug?
-Excuse me, could you please tell me whether the ball is going to hit the mug if we give it a little push left?
 OK so what I'd like to know is whether the ball, rolling left, gets past the mug without touching it.
 The ball rolls left and strikes the bowl, right? Would the bowl be shoved into the cone by this?
 As the ball goes rolling off to the left, is there any risk of it hitting the mug?
 Given the direction of the arrow, would the ball manage to avoid the mug?
 What if nobody throws the ball and it just falls straight down, is the mug safe from being hit?
 Let's say the ball sets off to the left, though only by twice its own width. Has it gone out of the picture by then?
-First the ball rolls left, then down. Does it hit the mug?
 Within 2 seconds, will the ball rolling right reach the mug that is nearer to the camera?
 """
 
@@ -273,8 +249,6 @@ def test_other_words_are_read_or_named_and_change_nothing() -> None:
 # What is changed, then what moves and how.
 CHANGES = """
 If you take the vase away and push the car to the left, will it hit the mug? | remove vase | car push
-Will the car hit the mug if the vase is taken away and it rolls left? | remove vase | car roll
-If there were no vase and the ball rolled left, would it hit the cube? | remove vase | ball roll
 If the ball moves left without the vase, will it hit the cube? | remove vase | ball move
 If the apple is placed on top of the red box, will it fall off? | place apple onto red box | apple put
 If I put the box between the two cups, does it touch either of them? | place box between two cups | box put
