@@ -9,6 +9,7 @@ import hashlib
 import html
 import importlib
 import io
+import json
 import os
 import pickle
 import pkgutil
@@ -522,6 +523,38 @@ def test_examples_in_the_docs_are_true(client: Client, tmp_path: Path, monkeypat
     assert not {name: each for name, each in found.items() if each.failed}
     modules = {"sync_client", "sync_results", "display"}
     assert {name.rpartition(".")[2] for name, each in found.items() if each.attempted} >= modules
+
+
+USE = """
+from typing import assert_type
+
+from cow_service.client import Answer, AsyncClient, AsyncSimulation, Client, JobHandle, Simulation
+
+client = Client(timeout=5, retries=2)
+assert_type(client.simulate("a.png", "What?", frames={"count": 5}, motion={"direction": [1, 0]}), Simulation)
+assert_type(client.answer(b"", "What?", votes=3, imagine="never").simulation, Simulation | None)
+assert_type(client.submit("a.png", "What?", kind="answer", votes=3), JobHandle[Answer])
+assert_type([result.result for result in client.map([], kind="simulate")], list[Simulation | None])
+
+
+async def ask() -> None:
+    assert_type(await AsyncClient().simulate("a.png", "What?"), AsyncSimulation)
+
+
+print(ask)
+client.simulate("a.png", "What?", votes=3)  # pyright: ignore[reportCallIssue]
+client.answer(3, "What?", imagine="sometimes")  # pyright: ignore[reportArgumentType]
+"""
+
+
+@pytest.mark.soak
+def test_types_are_told(tmp_path: Path) -> None:
+    (tmp_path / "use.py").write_text(USE)
+    settings = {"typeCheckingMode": "strict", "pythonVersion": "3.11", "extraPaths": [str(ROOT)], "include": ["use.py"]}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings | {"reportUnnecessaryTypeIgnoreComment": True}))
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "-p", str(tmp_path)]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert checked.returncode == 0, checked.stdout
 
 
 LIGHT = """

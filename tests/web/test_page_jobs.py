@@ -41,7 +41,7 @@ def asked(served: Served, path: str = "/answer", **fields: Any) -> dict[str, Any
     return served.ended(served.submit(BODY | fields, path=path)["id"])
 
 
-def test_a_link_to_a_job_opens_the_same_view(served: Served, windows: Windows) -> None:
+def test_a_link_to_a_job_opens_the_same_view_and_one_to_no_job_says_so(served: Served, windows: Windows) -> None:
     job = asked(served, motion=LEFT, objects=[{"object": "blue cube", "bbox": [170, 60, 205, 98]}])
     page = windows.open(address(served, f"/?job={job['id']}"), NARROW)
     for _ in range(2):
@@ -53,13 +53,8 @@ def test_a_link_to_a_job_opens_the_same_view(served: Served, windows: Windows) -
         assert arrow_tip(page)[0] < 60
         assert_fits(page)
         page.reload()
-
-
-def test_a_link_to_no_job_says_so(served: Served, windows: Windows) -> None:
     page = windows.open(address(served, "/?job=00000000-0000-0000-0000-000000000000"), NARROW, requests_fail=True)
-    notice = page.locator(".notice.problem")
-    expect(notice).to_contain_text("There is no job")
-    expect(notice).to_contain_text("It was deleted, or belongs to another key.")
+    expect(page.locator(".notice.problem")).to_contain_text("It was deleted, or belongs to another key.")
     expect(page.get_by_role("button", name="Choose a picture")).to_be_visible()
     assert_fits(page)
 
@@ -112,7 +107,7 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, windows: Windows
         one.bind(("127.0.0.1", 0))
         port = one.getsockname()[1]
     with Served(tmp_path, COW_PORT=str(port)) as served:
-        job = served.submit(slow(60))
+        done, job = asked(served, frames={"count": 4}), served.submit(slow(60))
         page = windows.open(address(served, f"/?job={job['id']}"), requests_fail=True)
         generating = page.locator("[data-stage=generation][data-state=now]")
         expect(generating).to_be_visible()
@@ -124,6 +119,9 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, windows: Windows
         expect(generating).to_be_visible()
         served.http.delete(f"/jobs/{job['id']}")
         expect(page.locator(".stages")).to_have_count(0)  # it goes on with what the new process says
+        page.goto(address(served, f"/?job={done['id']}"))  # what had ended before the restart is there, pictures too
+        assert (result(page), said(page)) == (done["id"], done["result"]["answer"] or "Not sure")
+        expect_pictures(page, ".filmstrip img")
 
 
 def test_a_server_with_keys(tmp_path: Path, windows: Windows) -> None:
