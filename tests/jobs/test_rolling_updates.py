@@ -1,4 +1,4 @@
-"""Two versions of COW on one job database, for as long as servers are replaced one by one; what cannot be is refused.
+"""Versions of the job database: two of COW on one, for as long as servers are replaced one by one; who may change it.
 
 The older version is that of `data/schema_1.sql`, whose rows are written here as it wrote them.
 """
@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import psycopg
 import pytest
 import sqlalchemy as sa
 from command_line import cow_from_nothing
-from conftest import DATA
+from conftest import DATA, ROOT
 from job_rows import add_job, open_database
 from postgres import postgres
 from pydantic import SecretStr
@@ -269,3 +270,35 @@ def test_a_result_of_a_later_version_is_handed_on_as_it_is(tmp_path: Path) -> No
         found = JobTable(database).find("job", None)
         assert found is not None
         assert found.content == written
+
+
+ROLES = ROOT / "docker" / "postgres" / "roles.sql"
+REFUSED = (
+    "CREATE TABLE mine (id int)",
+    "ALTER TABLE cow_jobs ADD COLUMN mine int",
+    "DROP TABLE cow_jobs",
+    "TRUNCATE cow_jobs",
+    "CREATE ROLE mine",
+    "COPY cow_jobs TO PROGRAM 'true'",
+)
+
+
+@pytest.mark.slow
+def test_a_server_runs_on_tables_that_it_may_not_create(tmp_path: Path) -> None:
+    with postgres() as server:
+        owner = {"COW_DATABASE_URL": server.url}
+        server.run_script(ROLES, COW_SERVING_PASSWORD="it's secret")
+        early = cow_from_nothing(tmp_path, "serve", "--port", "0", COW_MIGRATE="false", **owner)
+        assert (early.returncode, "`cow migrate`" in early.stderr) == (1, True)
+        told = cow_from_nothing(tmp_path, "migrate", **owner)
+        assert told.returncode == 0, told.stderr
+        with psycopg.connect(server.url) as connection:
+            connection.execute("CREATE TABLE of_a_later_version (id int)")
+        weak = server.url.replace("cow@", "cow_serving@")
+        with Served(tmp_path, COW_DATABASE_URL=weak, COW_MIGRATE="false") as one:
+            assert one.ended(one.submit(BODY)["id"])["status"] == "succeeded"
+        with psycopg.connect(weak, autocommit=True) as connection:
+            connection.execute("INSERT INTO of_a_later_version VALUES (1)")
+            for statement in REFUSED:
+                with pytest.raises(psycopg.errors.InsufficientPrivilege):
+                    connection.execute(statement)

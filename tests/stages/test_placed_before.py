@@ -9,7 +9,7 @@ import pytest
 from drawn import Image, ball, block, floor
 from refusals import refused
 from runs import run_of
-from staged import BLUE, GREEN, RED, YELLOW, VideoModel, clip_of, computed, is_green, is_red, pixels
+from staged import BLUE, GREEN, RED, YELLOW, clip_of, computed, is_green, is_red, pixels
 
 from cow_service.generators.cutout import create
 from cow_service.settings import Settings
@@ -150,16 +150,3 @@ class TestFrames:
         marked = (np.abs(pixels(wanted, clip.overlay).astype(int) - (130, 255, 130)) < 30).all(axis=2)
         assert marked[old].any()
         assert marked[y0 - 24 : y1 + 2, x0 - 2 : x1 + 2].any(), "its new place is named or drawn"
-
-    def test_a_video_model_is_given_the_changed_scene(self) -> None:
-        model = VideoModel()
-        wanted = run(put("post", "left-of", "cube"), generator=model, frames={"indices": [0, 5]}, video=False)
-        told, clip = clip_of(wanted)
-        assert (len(model.given), clip.factual_frames) == (1, ())
-        x0, y0, x1, y1 = (round(side) for side in told.bodies[told.placed[0].body].bbox)
-        (given_to_model,) = model.given
-        for image in (given_to_model.scene.clean, given_to_model.scene.image):
-            assert is_green(image[y0 + 25 : y1 - 25, x0 + 30 : x1 - 30]).mean() > 0.95
-            assert not is_green(image[POST[1] + 5 : POST[3] - 5, POST[0] + 5 : POST[2] - 5]).any()
-        obstacle = next(each for each in given_to_model.obstacles if each.name == "post")
-        assert obstacle.mask.contains((x0 + x1) // 2, (y0 + y1) // 2)

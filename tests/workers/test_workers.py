@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+import re
 import socket
 from collections.abc import Iterator
 from functools import cache
@@ -11,6 +13,7 @@ import httpx
 import psycopg
 import pytest
 import yaml
+from callers import as_caller, new_keys
 from conftest import ROOT
 from postgres import PostgresServer, postgres
 from servers import ASYNC, BODY, Served, Worker, problem, slow
@@ -25,6 +28,7 @@ from cow_service.workers.pool import Group
 
 pytestmark = pytest.mark.slow
 
+SETTINGS, KEYS = new_keys("root", "alice")
 # Each further try costs the start of a process.
 GIVES_UP_SOONER = """
 from cow_service.workers import pool
@@ -42,14 +46,68 @@ def poison(how: str, seed: int = 0) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    limits = {"COW_WORKER_MEMORY_MB": "1000", "COW_JOB_TIMEOUT": "25", "COW_CONCURRENCY": "1"}
-    with Served(tmp_path_factory.mktemp("workers"), GIVES_UP_SOONER, COW_WORKERS="true", **limits) as one:
-        yield one
+    """A server with one worker, asked by its administrator."""
+    own = {"COW_WORKER_MEMORY_MB": "1000", "COW_JOB_TIMEOUT": "25", "COW_CONCURRENCY": "1", **SETTINGS}
+    own |= {"COW_WORKERS": "true", "COW_ADMIN_KEYS": '["root"]'}
+    folder = tmp_path_factory.mktemp("workers")
+    with Served(folder, GIVES_UP_SOONER, **own) as one, as_caller(one, KEYS["root"]) as caller:
+        yield caller
+
+
+def told_by(served: Served) -> dict[str, Any]:
+    response = served.http.get("/workers")
+    assert response.status_code == 200, response.text
+    return response.json()
+
+
+def light(served: Served) -> dict[str, Any]:
+    """The queue of light jobs."""
+    return next(queue for queue in told_by(served)["queues"] if queue["name"] == "light")
+
+
+def busy(served: Served) -> dict[str, Any] | None:
+    """A worker that makes a clip, and that has told how much memory it takes."""
+    workers = [one for process in told_by(served)["processes"] for one in process["workers"]]
+    making = [one for one in workers if one["memory_mb"] and [job["stage"] for job in one["jobs"]] == ["generation"]]
+    return making[0] if making else None
+
+
+def test_a_server_shows_its_workers_and_queues(served: Served) -> None:
+    first = served.submit(slow(100, seed=300))
+    served.rendering(first["id"])
+    waits = served.submit(slow(0.1, seed=301))
+    worker = eventually(lambda: busy(served))
+    (process,) = told_by(served)["processes"]
+    assert served.process is not None
+    assert (process["role"], process["host"], process["pid"]) == ("all", platform.node(), served.process.pid)
+    assert process["queues"]["light"] == 1
+    assert (worker["name"], worker["queue"]) == ("light-1", "light")
+    assert worker["memory_mb"] > 20
+    at_hand = worker["jobs"][0]
+    assert (at_hand["id"], at_hand["kind"], at_hand["stage"]) == (first["id"], "simulate", "generation")
+    queue = eventually(lambda: found if (found := light(served))["queued"] == 1 else None)
+    assert (queue["running"], queue["capacity"]) == (1, 1)
+    assert queue["oldest_seconds"] >= 0
+    metrics = served.http.get("/metrics").text
+    assert 'cow_workers{queue="light",state="busy"} 1.0' in metrics
+    assert 'cow_queue_depth{generator="slow",queue="light",state="queued"} 1.0' in metrics
+    memory = re.search(r'cow_worker_memory_bytes\{worker="light-1"\} (\S+)', metrics)
+    assert memory is not None
+    assert float(memory[1]) > 20e6
+    with as_caller(served, KEYS["alice"]) as alice:
+        (shown,) = told_by(alice)["processes"]
+    (own,) = shown["workers"]
+    hidden = [shown["host"], shown["pid"], own["pid"], own["jobs"][0]["id"]]
+    assert (hidden, own["jobs"][0]["kind"]) == ([None] * 4, "simulate"), "places are told to administrators alone"
+    served.http.post(f"/jobs/{first['id']}/cancel")
+    assert served.ended(waits["id"])["status"] == "succeeded"
+    eventually(lambda: light(served)["queued"] == light(served)["running"] == 0)
+    eventually(lambda: light(served)["jobs_per_minute"] == 0.2)  # one in five minutes: canceled ones do not count
 
 
 def test_a_crash_harms_the_job_that_caused_it_and_no_other(served: Served) -> None:
     def told() -> list[tuple[str, int]]:
-        (process,) = served.http.get("/workers").json()["processes"]
+        (process,) = told_by(served)["processes"]
         return [(one["name"], one["pid"]) for one in process["workers"]]
 
     (worker,) = workers_of(served)
@@ -143,8 +201,12 @@ def test_an_api_server_computes_nothing_and_hears_of_jobs_that_two_workers_share
 
     def at_work() -> dict[int, str]:
         """The jobs of each process."""
-        processes = api.http.get("/workers").json()["processes"]
-        return {one["pid"]: job["id"] for one in processes for each in one["workers"] for job in each["jobs"]}
+        return {
+            one["pid"]: job["id"]
+            for one in told_by(api)["processes"]
+            for each in one["workers"]
+            for job in each["jobs"]
+        }
 
     wanted = {job["id"] for job in jobs}
     shared = eventually(lambda: found if {*(found := at_work()).values()} == wanted else None)
