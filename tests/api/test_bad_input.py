@@ -160,6 +160,8 @@ FIELDS: list[tuple[dict[str, Any], str]] = [
     ({"image": None}, "/image"),
     ({"question": ""}, "/question"),
     ({"options": ["Yes", ""]}, "/options/1"),
+    ({"options": ["Yes"]}, "/options"),
+    ({"grounding": {"point": [-1, 5]}}, "/grounding/point"),
     ({"grounding": {"bbox": [60, 60, 61.5, 90]}}, "/grounding/bbox"),
     ({"grounding": {"bbox": [900, 60, 990, 90]}}, "/grounding/bbox"),
     ({"grounding": {"bbox": ["NaN", 0, 9, 9]}}, "/grounding/bbox/0"),

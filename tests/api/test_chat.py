@@ -75,9 +75,7 @@ def test_open_questions_and_those_that_are_not_sure(chat: Any) -> None:
     assert reply.choices[0].message.content == "Not sure"
     assert reply.cow["answer"] is None
     assert "1 tokens" in reply.cow["warnings"][0]  # answers are not cut
-    reply = chat(
-        model=WITHOUT, messages=what_if(2, "What does the red ball hit?"), max_tokens=3, max_completion_tokens=2
-    )
+    reply = chat(model=WITHOUT, messages=what_if(2, "What does the red ball hit?"), max_tokens=3)
     assert len(reply.cow["warnings"]) < 2
 
 

@@ -225,7 +225,6 @@ def test_its_own_pages_may_use_the_server(app_with: Callable[..., FastAPI]) -> N
         ("http://COW:8000", "cow:8000"),
         ("http://localhost", "localhost:80"),
         ("https://localhost", "localhost"),
-        ("http://127.0.0.1:8000", "127.0.0.1:8000"),
         ("http://[::1]:8000", "[::1]:8000"),
     ]
     app = app_with(cors_origins=())

@@ -315,25 +315,17 @@ def test_a_jpeg_keeps_the_colours_of_thin_lines() -> None:
     assert np.abs(decode(encode_jpeg(pixels)).pixels[32, 31].astype(int) - (255, 0, 0)).max() < 30
 
 
-@pytest.mark.parametrize(
-    ("size", "max_side", "expected"),
-    [
+def test_fit_within_keeps_the_form_averages_and_takes_grey() -> None:
+    for size, most, expected in (
         ((100, 50), 40, (40, 20)),
         ((50, 100), 40, (20, 40)),
         ((1000, 1), 10, (10, 1)),
         ((30, 20), 30, (30, 20)),
         ((30, 20), None, (30, 20)),
-    ],
-)
-def test_fit_within(size: tuple[int, int], max_side: int | None, expected: tuple[int, int]) -> None:
-    width, height = size
-    fitted = fit_within(np.full((height, width, 3), 9, np.uint8), max_side)
-    assert fitted.shape == (expected[1], expected[0], 3)
-    assert fitted.dtype == np.uint8
-    assert (fitted == 9).all()
-
-
-def test_fit_within_averages_and_takes_grey() -> None:
+    ):
+        fitted = fit_within(np.full((*size, 3), 9, np.uint8), most)
+        assert (fitted.shape, fitted.dtype) == ((*expected, 3), np.uint8)
+        assert (fitted == 9).all()
     checks = np.indices((64, 64)).sum(axis=0).astype(np.uint8) % 2 * np.uint8(200)
     assert np.abs(fit_within(checks, 16).astype(int) - 100).max() <= 1
 
