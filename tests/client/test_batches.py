@@ -337,32 +337,29 @@ class Crowded:
     def __init__(self, accepts: int) -> None:
         self.accepts = accepts
         self.at_once = self.most_at_once = self.refused = 0
-        self._lock = threading.Lock()
 
     def begin(self) -> bool:
-        with self._lock:
-            if accepted := self.at_once < self.accepts:
-                self.at_once += 1
-            self.refused += not accepted
-            self.most_at_once = max(self.most_at_once, self.at_once)
-            return accepted
+        if accepted := self.at_once < self.accepts:
+            self.at_once += 1
+        self.refused += not accepted
+        self.most_at_once = max(self.most_at_once, self.at_once)
+        return accepted
 
     def end(self, accepted: bool) -> httpx.Response:
-        if not accepted:
-            return refusal("queue-full", 503)
-        with self._lock:
-            self.at_once -= 1
-        return httpx.Response(200, json=SIMULATION)
+        self.at_once -= accepted
+        return httpx.Response(200, json=SIMULATION) if accepted else refusal("queue-full", 503)
 
 
 @pytest.mark.parametrize("blocking", [True, False])
 def test_as_many_questions_are_asked_at_once_as_the_server_takes(connect: Connect, blocking: bool) -> None:
-    crowded, items = Crowded(20), asked(200)
+    crowded, items, turn = Crowded(20), asked(200), threading.Lock()
 
     def answer(_: httpx.Request) -> httpx.Response:
-        if accepted := crowded.begin():
-            time.sleep(0.02)
-        return crowded.end(accepted)
+        with turn:
+            accepted = crowded.begin()
+        time.sleep(0.02 * accepted)
+        with turn:
+            return crowded.end(accepted)
 
     async def awaited_answer(_: httpx.Request) -> httpx.Response:
         if accepted := crowded.begin():
