@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from cow_service.generators.wan.generator import WanGenerator
+    from cow_service.generators.wan.ranks import RankGroup
 
 pytest_plugins = "toy_fixtures"
 pytestmark = pytest.mark.slow
@@ -133,19 +134,26 @@ def test_two_processes_make_the_same_clip_until_one_fails(toys, alone, shared, r
     assert not toys.torch.distributed.is_initialized()
 
 
-def test_a_rank_that_dies_before_it_is_met_is_noticed(toys, ranks, tmp_path, monkeypatch) -> None:
-    """It has loaded, and dies when it is told where to go: no other rank waits for it."""
-    note = toys.ranks.spawn
+def group_of(toys, folder: Path) -> RankGroup:
+    return toys.ranks.RankGroup("ati", profile_of(TINY, "exact-2"), Settings(data_dir=folder, device="cpu"), toys.CPU)
+
+
+def test_a_rank_that_dies_before_it_is_met_is_noticed(toys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says that it has loaded, and dies when it is told where to go: rank 0 would wait there for minutes."""
 
     def doomed(module: str) -> Rank:
-        rank = note(module)
+        ours, theirs = Pipe()
+        with theirs:
+            theirs.send("loaded")
+            command = [sys.executable, "-c", "input()"]
+            process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=[theirs.fileno()])
+        rank = Rank(Spawned(process, ours))
         rank.kill_at = int  # the port
         return rank
 
     monkeypatch.setattr(toys.ranks, "spawn", doomed)
     with refused("worker-ended"):
-        toys.model("tiny-ati", tmp_path, profile="exact-2")
-    assert ranks[0].process.poll() is not None
+        group_of(toys, tmp_path).join(toys.torch.nn.Linear(1, 1))
 
 
 def test_a_rank_that_cannot_load_says_why(toys, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,12 +166,11 @@ def test_a_rank_that_cannot_load_says_why(toys, tmp_path: Path, monkeypatch: pyt
         return Spawned(subprocess.Popen([sys.executable, "-c", ""]), ours)
 
     monkeypatch.setattr(toys.ranks, "spawn", refuse)
-    profile, noise = profile_of(TINY, "exact-2"), toys.NOISES["even"]
-    group = toys.ranks.RankGroup("ati", profile, Settings(data_dir=tmp_path, device="cpu"), toys.CPU)
+    group, noise = group_of(toys, tmp_path), toys.NOISES["even"]
     with refused("checkpoint-invalid"):
         group.join(toys.torch.nn.Linear(1, 1))
     with refused("checkpoint-invalid"):
-        group.denoise(noise, toys.conditioned(noise), profile.sampling, lambda done, total: None)
+        group.denoise(noise, toys.conditioned(noise), profile_of(TINY, "exact").sampling, lambda done, total: None)
 
 
 @pytest.mark.soak  # no test with two processes splits tokens

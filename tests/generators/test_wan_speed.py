@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from conftest import ROOT
@@ -82,3 +84,16 @@ def test_the_formula_counts_what_pytorch_counts(toys) -> None:
     one = pass_flops(ATI.architecture, 81, 832, 480)
     assert 80 * one == pytest.approx(135e15, rel=0.03)
     assert pass_flops(ATI.architecture, 81, 832, 480, layers=0) < 0.002 * one
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+def test_first_contact_goes_the_whole_way(toys, tmp_path: Path) -> None:
+    given = ("--toy", "--num-frames", "5", "--profile", "exact", "--json", str(tmp_path / "found.json"))
+    subprocess.run([sys.executable, str(BENCHMARKS / "first_contact.py"), *given], check=True, capture_output=True)
+    found = {row["name"]: row for row in json.loads((tmp_path / "found.json").read_text())["rows"]}
+    assert found["portable"]["exit"] == 0
+    assert found["exact"]["exit"] == (0 if toys.torch.cuda.is_available() else 1)
+    assert found["exact"].get("grey_levels_off_portable", 0) < 2
+    assert found["serve: cancel"]["status"] == "canceled"
+    assert [found[f"serve: {clip}"]["status"] for clip in ("first clip", "after a cancel")] == [200, 200]

@@ -74,6 +74,7 @@ Red ball rolls left - hits the vase? | whether touches vase
 The red ball rolls left and at the same time the blue ball goes up. Will the two collide? | whether touches blue ball
 Which mug is hit first by the red ball if it rolls left? | which-first touches -
 True or false? If the red ball rolls left, it misses the vase. | whether touches vase not
+The vase slides left by 20 pixels while the red ball drops. Does the ball land on the vase? | whether touches red ball
 Will the falling ball hit the vase? | whether touches vase
 """
 
@@ -249,6 +250,7 @@ def test_other_words_are_read_or_named_and_change_nothing() -> None:
 # What is changed, then what moves and how.
 CHANGES = """
 If you take the vase away and push the car to the left, will it hit the mug? | remove vase | car push
+If there were no vase and the ball rolled left, would it hit the cube? | remove vase | ball roll
 If the ball moves left without the vase, will it hit the cube? | remove vase | ball move
 If the apple is placed on top of the red box, will it fall off? | place apple onto red box | apple put
 If I put the box between the two cups, does it touch either of them? | place box between two cups | box put
