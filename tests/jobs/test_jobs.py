@@ -328,11 +328,9 @@ def test_silence_is_filled_with_comments(emptied: Served) -> None:
 def test_the_place_of_a_job_that_is_ended_is_free_at_once(emptied: Served) -> None:
     job = emptied.submit(slow(ENDLESS, seed=30))
     emptied.rendering(job["id"])
-    emptied.submit(slow(ENDLESS, seed=31))
-    queued = emptied.submit(slow(ENDLESS, seed=32))
-    assert (queued["status"], queued["stage"], queued["progress"]) == ("queued", None, 0)
-    for each in emptied.http.get("/jobs", params={"status": "queued"}).json()["jobs"]:
-        assert cancel(emptied, each)["status"] == "canceled"
+    behind = [emptied.submit(slow(ENDLESS, seed=seed)) for seed in (31, 32)]
+    assert [behind[1][name] for name in ("status", "stage", "progress")] == ["queued", None, 0]
+    assert [cancel(emptied, each)["status"] for each in behind] == ["canceled"] * 2
     canceled = cancel(emptied, job)
     assert (canceled["status"], canceled["result"]) == ("canceled", None)
     assert emptied.http.post("/simulate", json=slow(0.1, seed=33)).status_code == 200
