@@ -70,15 +70,13 @@ def test_the_tensor_is_finite_and_in_the_public_units(some: Tracks, width: int, 
     np.testing.assert_allclose(tensor[0, :, 1:3], first, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize(("fps", "frames"), [(16, 81), (8, 81), (24, 17), (16, 5)])
+@pytest.mark.parametrize(("fps", "frames"), [(8, 81), (24, 17), (16, 5)])
 def test_straight_motion_keeps_its_clock(fps: float, frames: int) -> None:
     """Frame k of the clip is sample 1.5 k of the file, whatever the rate at which it is played."""
     some = straight(frames)
     file = to_ati_file(some)[:, :, 0] / 8
     even = np.arange(0, frames, 2)
     np.testing.assert_allclose(file[:, (1.5 * even).astype(int), :2], some.points[even].transpose(1, 0, 2), atol=1e-3)
-    rest = file[:, int(1.5 * frames) :, :2]
-    np.testing.assert_allclose(rest, np.broadcast_to(some.points[-1][:, None], rest.shape))
     assert (file[..., 2] == 1).all()
 
 

@@ -95,9 +95,8 @@ def test_the_option_that_says_what_the_world_says(world: Outcome, options: list[
     assert unsure.answer == (answer or "ABCDEF"[len(options)] if "Not sure" not in options else unsure.answer)
 
 
-@pytest.mark.parametrize(
-    ("world", "said"),
-    [
+def test_an_open_question_is_answered_in_words() -> None:
+    for world, said in (
         (YES, "Yes"),
         (NO, "No"),
         (outcome(FIRST, first="red cube"), "red cube"),
@@ -105,14 +104,12 @@ def test_the_option_that_says_what_the_world_says(world: Outcome, options: list[
         (AT, "After about 1.1 s"),
         (outcome(WHEN, 0.04, time=0.9), "Never"),
         (outcome(COUNT, count=2), "2"),
-    ],
-)
-def test_an_open_question_is_answered_in_words(world: Outcome, said: str) -> None:
-    assert chosen(world, ()) == AnswerReading(said, False, simulated(world).narration.summary)
-    unsure = world.model_copy(update={"sure": False})
-    why = simulated(unsure).narration.summary
-    assert chosen(unsure, ()) == AnswerReading(None, True, why)
-    assert chosen(unsure, YES_NO) == AnswerReading("C", True, why)
+    ):
+        assert chosen(world, ()) == AnswerReading(said, False, simulated(world).narration.summary)
+        unsure = world.model_copy(update={"sure": False})
+        why = simulated(unsure).narration.summary
+        assert chosen(unsure, ()) == AnswerReading(None, True, why)
+        assert chosen(unsure, YES_NO) == AnswerReading("C", True, why)
 
 
 def test_what_no_world_can_tell_is_said_so() -> None:

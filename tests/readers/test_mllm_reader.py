@@ -357,24 +357,21 @@ def test_failures_without_end_are_typed(reply: Any, code: str, mllm, make) -> No
     assert "127.0.0.1" not in caught.value.detail
 
 
-@pytest.mark.parametrize(
-    ("status", "code", "named"),
-    [
+def test_what_cannot_pass_is_not_repeated(mllm, reader) -> None:
+    """The error tells every reason, not only the last one; calls that fail count, too."""
+    for status, code, named in (
         (401, "mllm-unavailable", "COW_MLLM_API_KEY"),
         (404, "mllm-unavailable", "COW_MLLM_MODEL"),
         (400, "mllm-refused", "400"),
-    ],
-)
-def test_what_cannot_pass_is_not_repeated(status: int, code: str, named: str, mllm, reader) -> None:
-    """The error tells every reason, not only the last one; calls that fail count, too."""
-    mllm.say(say.status(429, retry_after="0"), say.status(status))
-    calls = CallLog()
-    with refused(code) as caught:
-        answers(reader, calls=calls)
-    assert named in caught.value.detail
-    assert "429" in caught.value.detail
-    assert calls.usage.calls == len(mllm.asked) == 2
-    assert calls.prompts.keys() == {"answer-from-image", "looking"}
+    ):
+        mllm.say(say.status(429, retry_after="0"), say.status(status))
+        calls = CallLog()
+        with refused(code) as caught:
+            answers(reader, calls=calls)
+        assert named in caught.value.detail
+        assert "429" in caught.value.detail
+        assert calls.usage.calls == len(mllm.asked) == 2
+        assert calls.prompts.keys() == {"answer-from-image", "looking"}
 
 
 def test_a_server_that_is_not_there() -> None:
