@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from waiting import TIME_LIMIT
+
 
 def settings_in(tmp_path: Path, **environment: str) -> dict[str, str]:
     plain = {"COW_DATA_DIR": str(tmp_path / "data"), "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
@@ -21,4 +23,5 @@ def cow_from_nothing(tmp_path: Path, *arguments: str, **environment: str) -> sub
         capture_output=True,
         text=True,
         check=False,
+        timeout=TIME_LIMIT,
     )
