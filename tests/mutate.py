@@ -40,7 +40,7 @@ LOGGING = re.compile(r"^_?log(ger)?\.")
 FOLDERS = {
     "adaptive": ("readers",),
     "api": ("api", "jobs"),
-    "cli": ("cli", "evals"),
+    "cli": ("cli", "evals", "service"),
     "concurrency": ("service",),
     "errors": ("api", "client"),
     "media": ("media", "jobs"),
