@@ -12,6 +12,7 @@ from cow_service import records
 from cow_service.errors import shortened
 from cow_service.records import Language, Record
 from cow_service.requests.values import (
+    WHOLE,
     Finite,
     Flag,
     Flags,
@@ -379,10 +380,10 @@ class FramesRequest(Record):
         "initial: frames 1, 3, 5, ..., as in the paper.",
     )
     count: Whole = Field(default=4, ge=1, le=64, description="How many pictures.")
-    indices: tuple[Annotated[Whole, Field(ge=0)], ...] | None = Field(
+    indices: tuple[Annotated[int, Field(ge=0), WHOLE], ...] | None = Field(
         default=None, min_length=1, max_length=MAX_FRAMES, description="Exactly these frames; overrides the policy."
     )
-    max_side: Annotated[Whole, Field(ge=16, le=8192)] | None = Field(
+    max_side: Annotated[int, Field(ge=16, le=8192), WHOLE] | None = Field(
         default=512, description="Longest side of the pictures, px; null for the clip's own size."
     )
     factual: Flag | None = Field(
@@ -444,7 +445,7 @@ class SimulateRequest(Record):
     generator: Name | None = Field(default=None, description="Part that makes the frames; default: the server's.")
     num_frames: Whole = Field(default=81, ge=2, le=MAX_FRAMES, description="Frames of the clip.")
     fps: Finite = Field(default=16, ge=1, le=60, description="Frames of the clip per second.")
-    seed: Annotated[Whole, Field(ge=0, le=2**32 - 1)] | None = Field(
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1), WHOLE] | None = Field(
         default=None,
         description="Random seed. By default 0 for the clip, and none for a multimodal LLM, whose repeats would "
         "otherwise all be the same.",

@@ -45,7 +45,8 @@ def has_more_values(value: Any, most: int) -> bool:
 
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # strict: no strings, no booleans
-Whole = Annotated[int, BeforeValidator(_number)]
+WHOLE = BeforeValidator(_number)  # after an integer's limits: in a union the JSON schema shows only what stands before
+Whole = Annotated[int, WHOLE]
 Flag = Annotated[bool, Field(strict=True)]
 Words = Annotated[str, AfterValidator(writable), AfterValidator(_says_something)]
 Name = Annotated[str, Field(max_length=MAX_NAME)]

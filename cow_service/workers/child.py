@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 
 import cv2
@@ -122,11 +122,13 @@ class WorkerProcess:
             messages.send(self._pipe, message)
 
     def _beat(self) -> None:
+        """Until the pipe ends, which `run` sees as well."""
         this = psutil.Process()
         while True:
             if not self._jobs and time.monotonic() - self._busy_at > QUIET_SECONDS:
                 self._database.close_idle()
-            self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
+            with suppress(OSError):
+                self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
             time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:
