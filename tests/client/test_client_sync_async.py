@@ -37,8 +37,9 @@ def test_the_blocking_twin_is_up_to_date(source: str) -> None:
 
 
 def _signature(member: Any) -> str:
-    """As that of the blocking twin would be."""
-    return re.sub(r"Async(?=[A-Z])", "", str(inspect.signature(member))).replace("async_", "sync_")
+    """As that of the blocking twin would be, types by name alone: pydantic tells those of records in several ways."""
+    names = re.sub(r"['\"]|\b(?:\w+\.)+(?=[A-Z])", "", str(inspect.signature(member)))
+    return re.sub(r"Async(?=[A-Z])", "", names).replace("async_", "sync_")
 
 
 def _members(kind: type) -> dict[str, Any]:

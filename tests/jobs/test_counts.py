@@ -27,6 +27,7 @@ import pytest
 import rapier3d
 from conftest import DATA, example
 from fastapi.testclient import TestClient
+from sqlalchemy import event
 from waiting import TIME_LIMIT
 
 from cow_service.api.app import create_app
@@ -40,6 +41,7 @@ TABLE: dict[str, float] = json.loads((DATA / "counts.json").read_text())
 # What depends on versions of libraries is held less exactly.
 TOLERANCE = {"artifact_bytes": 0.02, "row_bytes": 0.02, "modules_of_a_server": 0.05}
 BY_THE_CLOCK = ("cow-notifications", "cow-maintenance", "cow-clean-up", "cow-processes", "cow-dispatcher")
+AT_THE_START = "asyncio-portal"  # the thread of the event loop
 BALL = example("ball-and-mug")
 HALF = math.prod(BALL.meta["image_size"]) / 2
 
@@ -71,18 +73,17 @@ def ask(client: TestClient) -> dict[str, Any]:
 
 @pytest.fixture
 def statements(client: TestClient) -> Counter[str]:
-    """How often each kind of statement is sent while a question is answered, but by the clock."""
+    """How often each kind of statement is sent while a question is answered, but by the clock and as it starts."""
     said: Counter[str] = Counter()
 
     def note(statement: str) -> None:
-        if not threading.current_thread().name.startswith(BY_THE_CLOCK):
+        if not threading.current_thread().name.startswith((*BY_THE_CLOCK, AT_THE_START)):
             said[statement.split(maxsplit=1)[0].upper()] += 1
 
-    pool = client.app.state.engine.database.engine  # type: ignore[attr-defined]
-    held = [pool.raw_connection() for _ in range(16)]  # all that it keeps
-    for one in held:
-        one.dbapi_connection.set_trace_callback(note)
-        one.close()
+    def trace(connection: sqlite3.Connection, *_: object) -> None:
+        connection.set_trace_callback(note)
+
+    event.listen(client.app.state.engine.database.engine, "checkout", trace)  # type: ignore[attr-defined]
     return said
 
 
