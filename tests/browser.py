@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
 
+import httpx
 import pytest
 from waiting import TIME_LIMIT
 
@@ -102,6 +103,11 @@ class Windows:
         page = context.new_page()
         page.goto(address)
         return page
+
+
+def got(address: str, path: str) -> Any:
+    """What a server answers, as JSON."""
+    return httpx.get(f"{address}{path}", timeout=TIME_LIMIT).json()
 
 
 def drop(page: Page, content: bytes, name: str = "picture.png", media_type: str = "image/png") -> None:

@@ -25,13 +25,12 @@ from faults import Fault, Machine, Station, faults_of, faults_of_network, power_
 from postgres import postgres
 from proxy import Proxy
 from servers import BODY, TERMINAL, Served, Worker, data_url, picture
-from waiting import eventually
+from waiting import TIME_LIMIT, eventually
 
 from cow_service.api.middleware.access import hash_of, new_key
 
 TENANTS = ("alice", "bob", "carol")
 PAUSE = (0.05, 0.3)  # seconds between two calls of a tenant
-CALL_SECONDS = 60.0  # for an answer, whatever is struck but the server itself
 OWN, OTHERS = (200, 202, 503), (404, 503)  # what callers may be told of their own jobs, and of those of others
 
 
@@ -224,7 +223,7 @@ class Laboratory:
         return check(self.history, kept, self.begun() if self._journal else None) + self.unanswered
 
     def client(self, tenant: str) -> httpx.Client:
-        return httpx.Client(headers={"Authorization": f"Bearer {self._keys[tenant]}"}, timeout=CALL_SECONDS)
+        return httpx.Client(headers={"Authorization": f"Bearer {self._keys[tenant]}"}, timeout=TIME_LIMIT)
 
     def _kept_of(self, tenant: str) -> list[Kept]:
         with self.client(tenant) as http:
@@ -354,7 +353,7 @@ class Caller(threading.Thread):
         except httpx.TransportError as error:
             is_late = isinstance(error, httpx.TimeoutException)
             if is_late and not was_halted and not server.is_halted and server.halts == halts:
-                self._laboratory.unanswered.append(f"no answer of {server.url} in {CALL_SECONDS:g} s: {method} {path}")
+                self._laboratory.unanswered.append(f"no answer of {server.url} in {TIME_LIMIT:g} s: {method} {path}")
             return None
 
 

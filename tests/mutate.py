@@ -179,7 +179,7 @@ def caught_by(change: Change, copy: Path) -> tuple[str | None, str]:
             code, output = run_tests(copy, files)
             while code not in (0, 5):  # 5: none of these files has a test that runs here
                 if code is None:
-                    return "(hangs)", output
+                    return f"(not done after {TIME_LIMIT} s)", output
                 failed = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", output, re.M)
                 if failed is None or run_tests(copy, [failed[1]])[0] != 0:
                     return (failed[1] if failed else "(pytest)"), output
@@ -200,6 +200,8 @@ def main() -> None:
     given = parser.parse_args()
     part, parts = map(int, given.part.split("/"))
     changes = list(enumerate(draw(given.seed, given.count), 1))
+    if given.only is not None and not 1 <= given.only <= given.count:
+        parser.error(f"there is no change {given.only} of {given.count}")
     chosen = [
         (number, change)
         for number, change in changes
@@ -210,6 +212,8 @@ def main() -> None:
         copy = Path(folder) / "repository"
         ignored = shutil.ignore_patterns(".git", ".venv", ".tools", "__pycache__", "site", "dist", "demo")
         shutil.copytree(ROOT, copy, ignore=ignored)
+        for command in (["git", "init", "--quiet"], ["git", "add", "--all"]):  # which some tests ask what belongs to it
+            subprocess.run(command, cwd=copy, check=True)
         for number, change in chosen:
             test, output = caught_by(change, copy)
             missed += test is None

@@ -12,6 +12,7 @@ import httpx
 import obstore
 from moto.server import ThreadedMotoServer
 from obstore.store import S3Store
+from waiting import TIME_LIMIT
 
 
 @dataclass
@@ -59,10 +60,10 @@ class ObjectStore:
 
     def refuse_everybody(self) -> None:
         """From now on keys are looked at, and there is none."""
-        assert httpx.post(f"{self.endpoint}/moto-api/reset-auth", content=b"0").status_code == 200
+        assert httpx.post(f"{self.endpoint}/moto-api/reset-auth", content=b"0", timeout=TIME_LIMIT).status_code == 200
 
     def accept_everybody(self) -> None:
-        httpx.post(f"{self.endpoint}/moto-api/reset-auth", content=b"inf")
+        httpx.post(f"{self.endpoint}/moto-api/reset-auth", content=b"inf", timeout=TIME_LIMIT)
 
     @property
     def _objects(self) -> S3Store:
@@ -104,8 +105,8 @@ def serving(bucket: str = "bucket") -> Iterator[ObjectStore]:
     try:
         logger.addHandler(counting)
         logger.setLevel(logging.INFO)
-        httpx.post(f"{store.endpoint}/moto-api/reset").raise_for_status()
-        httpx.put(f"{store.endpoint}/{bucket}").raise_for_status()
+        httpx.post(f"{store.endpoint}/moto-api/reset", timeout=TIME_LIMIT).raise_for_status()
+        httpx.put(f"{store.endpoint}/{bucket}", timeout=TIME_LIMIT).raise_for_status()
         store.requests.clear()
         yield store
     finally:

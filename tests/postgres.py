@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 from servers import send
+from waiting import TIME_LIMIT
 
 REQUIRED = "COW_TEST_POSTGRES"  # set where a missing PostgreSQL is a fault and not a reason to skip
 
@@ -54,7 +55,7 @@ class PostgresServer:
     def run_script(self, file: Path, **variables: str) -> None:
         """Has psql run a file as the owner of the database."""
         command = [str(self._programs / "psql"), "--set", "ON_ERROR_STOP=1", "--file", str(file), self.url]
-        subprocess.run(command, check=True, env=os.environ | variables, stdout=subprocess.DEVNULL, timeout=60)
+        subprocess.run(command, check=True, env=os.environ | variables, stdout=subprocess.DEVNULL, timeout=TIME_LIMIT)
 
     def stop(self) -> None:
         command = [*self._as_user, str(self._programs / "pg_ctl"), "-D", self._data, "-m", "immediate", "stop"]
@@ -63,7 +64,7 @@ class PostgresServer:
     def _run(self, program: str, *arguments: str) -> None:
         # The server's output is not read: it would keep a pipe open.
         command = [*self._as_user, str(self._programs / program), *arguments]
-        subprocess.run(command, check=True, cwd="/", stdout=subprocess.DEVNULL, timeout=60)
+        subprocess.run(command, check=True, cwd="/", stdout=subprocess.DEVNULL, timeout=TIME_LIMIT)
 
 
 @contextmanager
@@ -83,10 +84,3 @@ def postgres() -> Iterator[PostgresServer]:
     finally:
         server.stop()
         shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def postgres_server() -> Iterator[str]:
-    """The URL of an empty database; the server is gone afterwards. Skips the test where there is no PostgreSQL."""
-    with postgres() as server:
-        yield server.url

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import random
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -178,14 +177,6 @@ def silent(handler: _Handler) -> None:
         if handler.connection.recv(1) == b"":
             handler.mllm.left.set()
     handler.close_connection = True
-
-
-def paused(seconds: float) -> Instead:
-    def reply(handler: _Handler) -> None:
-        time.sleep(seconds)
-        handler.send(200, handler.mllm.completion(handler.asked))
-
-    return reply
 
 
 class _Quiet(ThreadingHTTPServer):

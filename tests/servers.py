@@ -78,8 +78,8 @@ class Program:
         self.process: subprocess.Popen[bytes] | None = None
 
     def launch(self) -> int:
-        """Starts the process, and does not wait for it; returns how long its log was before, in bytes."""
-        said = self._log_file.stat().st_size if self._log_file.exists() else 0
+        """Starts the process, and does not wait for it; returns how long its log was before."""
+        said = len(self.log()) if self._log_file.exists() else 0
         if self.process is not None:
             self.process.wait()
         with self._log_file.open("ab") as log:

@@ -220,6 +220,7 @@ def test_more_idle_connections_than_files_lock_nobody_out(served: Served) -> Non
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 2 * FILES + 100)), hard))
     with ExitStack() as stack:
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
         for _ in range(2 * FILES):  # all at once
             one = stack.enter_context(socket.socket())
             one.setblocking(False)

@@ -337,12 +337,15 @@ class Crowded:
     def __init__(self, accepts: int) -> None:
         self.accepts = accepts
         self.at_once = self.most_at_once = self.refused = 0
+        self.nine = threading.Event()  # that many were there at once
 
     def begin(self) -> bool:
         if accepted := self.at_once < self.accepts:
             self.at_once += 1
         self.refused += not accepted
         self.most_at_once = max(self.most_at_once, self.at_once)
+        if self.most_at_once > 8:
+            self.nine.set()
         return accepted
 
     def end(self, accepted: bool) -> httpx.Response:
@@ -357,13 +360,14 @@ def test_as_many_questions_are_asked_at_once_as_the_server_takes(connect: Connec
     def answer(_: httpx.Request) -> httpx.Response:
         with turn:
             accepted = crowded.begin()
-        time.sleep(0.02 * accepted)
+        if accepted:  # all wait for the ninth, which comes only after some were answered
+            crowded.nine.wait(1)
         with turn:
             return crowded.end(accepted)
 
     async def awaited_answer(_: httpx.Request) -> httpx.Response:
         if accepted := crowded.begin():
-            await asyncio.sleep(0.02)
+            await asyncio.to_thread(crowded.nine.wait, 1)
         return crowded.end(accepted)
 
     async def awaited() -> int:

@@ -17,7 +17,7 @@ from callers import as_caller, new_keys
 from job_rows import add_job, open_database
 from refusals import refused
 from servers import BODY, IMAGE, Served, problem, slow
-from waiting import eventually
+from waiting import TIME_LIMIT, eventually
 
 from cow_service.jobs.database import StoredResult
 from cow_service.jobs.job_table import JobTable
@@ -241,7 +241,7 @@ def test_callers_are_sent_to_the_store(served, objects):
     assert sent.status_code == 307
     assert sent.headers["cache-control"] == "private, max-age=600"
     assert sent.headers["location"].startswith(objects.endpoint)
-    part = httpx.get(sent.headers["location"], headers={"Range": "bytes=0-99"})
+    part = httpx.get(sent.headers["location"], headers={"Range": "bytes=0-99"}, timeout=TIME_LIMIT)
     assert (part.status_code, len(part.content), part.headers["content-type"]) == (206, 100, "video/mp4")
     whole = served.http.get(video["url"], follow_redirects=True).content
     assert hashlib.sha256(whole).hexdigest() == video["sha256"]

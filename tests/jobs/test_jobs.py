@@ -123,7 +123,7 @@ def test_a_caller_who_waits_too_short_gets_the_job(served: Served) -> None:
     assert response.status_code == 202
     assert response.headers["preference-applied"] == "wait=1"
     assert response.headers["location"] == f"/jobs/{response.json()['id']}"
-    assert response.json()["status"] == "running"
+    assert served.rendering(response.json()["id"])["status"] == "running"
     assert cancel(served, response.json())["status"] == "canceled"
 
 
@@ -264,7 +264,7 @@ def lasting(events: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 @pytest.mark.slow
 def test_the_events_of_a_job(served: Served) -> None:
-    job = served.submit(slow(1, seed=20, image=data_url(picture(5))))
+    job = served.submit(slow(3, seed=20, image=data_url(picture(5))))
     url = f"/jobs/{job['id']}/events"
     events = events_of(served.http.get(url))
     told = [(event["event"], event["data"]["stage"]) for event in lasting(events)]
@@ -498,8 +498,9 @@ def test_two_of_the_same_at_the_same_time_are_rendered_once(served: Served) -> N
 
 @pytest.mark.slow
 def test_whoever_waits_for_the_same_goes_on_when_the_first_is_canceled(served: Served) -> None:
-    first, second = (served.submit(slow(ENDLESS, seed=63)) for _ in range(2))
+    first = served.submit(slow(ENDLESS, seed=63))
     eventually(lambda: 63 in served.clips())
+    second = served.submit(slow(ENDLESS, seed=63))
     served.until(second["id"], "running")
     cancel(served, first)
     eventually(lambda: served.clips().count(63) == 2)
@@ -610,7 +611,7 @@ def hear_until_cut(served: Served, job_id: str, heard: list[str]) -> None:
 def test_after_a_crash_jobs_go_on_where_they_were(emptied: Served) -> None:
     key = {"Idempotency-Key": "crash"}
     done = emptied.ended(emptied.submit(BODY)["id"])
-    body = slow(2, seed=96, image=data_url(picture(7)))
+    body = slow(6, seed=96, image=data_url(picture(7)))
     job = emptied.submit(body, **key)
     eventually(lambda: 96 in emptied.clips())
     before = stage_results(emptied, job["id"])  # what was done is stored before a clip is begun

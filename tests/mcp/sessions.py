@@ -17,6 +17,7 @@ from typing import Any
 import httpx2
 import pytest
 from anyio.from_thread import BlockingPortal, start_blocking_portal
+from conftest import ROOT
 from jsonschema import Draft202012Validator
 from mcp import Client, StdioServerParameters
 from mcp.client.stdio import stdio_client
@@ -51,7 +52,7 @@ def lazy(folder: Path) -> dict[str, str]:
     (known / "METADATA").write_text("Metadata-Version: 2.1\nName: lazy\nVersion: 1.0\n")
     (known / "entry_points.txt").write_text("[cow_service.generators]\nlazy = lazy_generator:create\n")
     (folder / "lazy_generator.py").write_text(LAZY)
-    return {"PYTHONPATH": os.pathsep.join((str(SLOW_GENERATOR), str(folder)))}
+    return {"PYTHONPATH": os.pathsep.join((str(ROOT), str(SLOW_GENERATOR), str(folder)))}
 
 
 def environment(**settings: str) -> dict[str, str]:
@@ -70,9 +71,10 @@ class Session:
         return {tool.name: tool for tool in self.portal.call(self.client.list_tools).tools}
 
     def call(self, tool: str, **arguments: Any) -> CallToolResult:
-        return self.portal.call(self._call, tool, arguments)
+        return self.start(tool, **arguments).result()
 
     def start(self, tool: str, **arguments: Any) -> Future[CallToolResult]:
+        self.told.clear()
         return self.portal.start_task_soon(self._call, tool, arguments)
 
     def data(self, tool: str, result: CallToolResult) -> dict[str, Any]:
@@ -85,7 +87,6 @@ class Session:
         return result.structured_content
 
     async def _call(self, tool: str, arguments: dict[str, Any]) -> CallToolResult:
-        self.told.clear()
         result = await self.client.call_tool(tool, arguments, progress_callback=self._hear)
         assert isinstance(result, CallToolResult)
         return result

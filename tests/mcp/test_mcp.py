@@ -217,9 +217,9 @@ def test_before_a_server_that_runs(tmp_path: Path, server: Server) -> None:
         result = there.call("answer", image=str(SCENE), question=QUESTION)
         answer = there.data("answer", result)
         assert there.told
-        assert httpx.get(f"{address}/jobs/{answer['id']}").json()["kind"] == "answer"
+        assert httpx.get(f"{address}/jobs/{answer['id']}", timeout=TIME_LIMIT).json()["kind"] == "answer"
         simulation = there.data("simulate", there.call("simulate", image=str(SCENE), question=MOVES, video=True))
-        assert httpx.get(simulation["video"]["url"]).headers["content-type"] == "video/mp4"
+        assert httpx.get(simulation["video"]["url"], timeout=TIME_LIMIT).headers["content-type"] == "video/mp4"
 
 
 def test_over_http_the_caller_has_the_key_and_no_file_is_read(keyed: str) -> None:
@@ -249,7 +249,7 @@ def test_foreign_pages_and_names_are_refused(keyed: str) -> None:
     port = keyed.rpartition(":")[2]
 
     def status(**headers: str) -> int:
-        return httpx.post(f"{keyed}/mcp", json=ping, headers=accept | headers).status_code
+        return httpx.post(f"{keyed}/mcp", json=ping, headers=accept | headers, timeout=TIME_LIMIT).status_code
 
     assert [status(Host=f"evil.example:{port}"), status(Origin="https://evil.example")] == [421, 403]
     assert {status(), status(Origin=keyed), status(Host=f"localhost:{port}")}.isdisjoint({421, 403})

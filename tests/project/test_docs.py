@@ -117,7 +117,7 @@ class Checkout:
             with socket.socket() as probe:
                 return probe.connect_ex(("127.0.0.1", int(port[1]))) == 0
         try:
-            return httpx.get(f"http://127.0.0.1:{self.port}/readyz").status_code == 200
+            return httpx.get(f"http://127.0.0.1:{self.port}/readyz", timeout=TIME_LIMIT).status_code == 200
         except httpx.HTTPError:
             return False
 

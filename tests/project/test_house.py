@@ -219,10 +219,7 @@ SLEEPERS = {
     "waiting.py eventually_async": "the one way to wait",
     "chaos.py run": "faults last for a while, and come after a while",
     "mllm_server.py reply": "a model that is slow",
-    "random_mllm.py reply": "a model that is slow",
     "api/test_bad_input.py trickle": "a caller whose bytes come slowly",
-    "client/test_batches.py answer": "a server that has requests at the same time",
-    "client/test_batches.py awaited_answer": "as `answer`",
     "client/test_client_faults.py held": "a server from which a client that does not wait would leave",
     "service/test_concurrency.py work": "threads that hold something at the same time",
     "service/test_egress.py answer": "an answer that never ends",
@@ -250,6 +247,16 @@ def test_nothing_heavy_is_loaded_when_the_tests_are_collected() -> None:
     command = [sys.executable, "-c", COLLECT, *HEAVY_IN_TESTS]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.rpartition("\n\n")[2].split() == ["loaded:", "0"], done.stdout[-2000:]
+
+
+def test_no_call_has_another_time_limit() -> None:
+    """httpx gives up after 5 s where nothing is said."""
+    for place, tree in trees_of_tests().items():
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        brief = [
+            one for one in calls if re.fullmatch(r"httpx\.(get|post|put|patch|delete|head)", ast.unparse(one.func))
+        ]
+        assert [one.lineno for one in brief if "timeout" not in {each.arg for each in one.keywords}] == [], place
 
 
 def is_private(name: str) -> bool:
@@ -284,4 +291,4 @@ def sleepers(tree: ast.Module) -> Iterator[str]:
 
 def test_no_test_sleeps_and_then_looks() -> None:
     found = {f"{place} {name}" for place, tree in trees_of_tests().items() for name in sleepers(tree)}
-    assert found - SLEEPERS.keys() == set()
+    assert found == SLEEPERS.keys()

@@ -25,6 +25,7 @@ from browser import (
     drop,
     expect,
     faults_for_some,
+    got,
     in_window,
     path,
     result,
@@ -37,7 +38,7 @@ from drawn import clutter, png_bytes
 from PIL import Image
 from servers import ASYNC, BODY, QUESTION, TERMINAL, picture
 from tables import rows
-from waiting import eventually
+from waiting import TIME_LIMIT, eventually
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Request
@@ -147,7 +148,7 @@ def test_pictures_that_the_server_does_not_take_are_sent_as_jpeg(
     drop(page, made.getvalue(), f"picture.{kind.lower()}", f"image/{kind.lower()}")
     ask(page, asked)
     sent = eventually(lambda: request if (request := newest(server)).get("question") == asked else None)
-    jpeg = httpx.get(f"{server.address}/artifacts/{sent['image']['artifact']}")
+    jpeg = httpx.get(f"{server.address}/artifacts/{sent['image']['artifact']}", timeout=TIME_LIMIT)
     assert jpeg.headers["content-type"] == "image/jpeg"
     with Image.open(io.BytesIO(jpeg.content)) as opened:
         assert opened.width == (side if kind == "BMP" else pytest.approx(12e6**0.5 * 1.5**0.5, abs=1))
@@ -185,7 +186,7 @@ def test_the_film_plays_in_step_with_its_overlay(server: Server, windows: Window
     page.evaluate("addEventListener('play', (event) => { event.target.playbackRate = 0.1; }, true)")
     drop(page, picture(3))
     ask(page, QUESTION)
-    trajectory = httpx.get(f"{server.address}/jobs/{result(page)}").json()["result"]["simulation"]["trajectory"]
+    trajectory = got(server.address, f"/jobs/{result(page)}")["result"]["simulation"]["trajectory"]
     points, fps = trajectory["paths"][0]["points"], trajectory["fps"]
 
     def shown() -> tuple[int, int, list[float]]:
@@ -237,9 +238,10 @@ def tab_to(page: Page, selector: str) -> None:
 
 def newest(server: Server) -> dict[str, Any]:
     """The request of the newest job."""
-    (job,) = httpx.get(f"{server.address}/jobs", params={"limit": 1}).json()["jobs"]
-    told = httpx.get(f"{server.address}/jobs/{job['id']}/request").json()
-    return told.get("request", {})  # of one that was just deleted there is none
+    for job in got(server.address, "/jobs?limit=1")["jobs"]:
+        told = got(server.address, f"/jobs/{job['id']}/request")
+        return told.get("request", {})  # of one that was just deleted there is none
+    return {}
 
 
 def test_the_first_view_is_light(server: Server, windows: Windows) -> None:
@@ -318,8 +320,8 @@ def test_questions_and_names_are_text(server: Server, windows: Windows, text: st
         "objects": [{"object": f"{name[:190]} 2", "bbox": [170, 60, 205, 98], "role": "obstacle"}],
         "options": [text[:100], "No"],
     }
-    made = httpx.post(f"{server.address}/answer", json=request, headers=ASYNC).json()
-    eventually(lambda: httpx.get(f"{server.address}/jobs/{made['id']}").json()["status"] in TERMINAL)
+    made = httpx.post(f"{server.address}/answer", json=request, headers=ASYNC, timeout=TIME_LIMIT).json()
+    eventually(lambda: got(server.address, f"/jobs/{made['id']}")["status"] in TERMINAL)
     page = windows.open(f"{server.address}/?job={made['id']}", NARROW)
     title = page.title()
     assert result(page) == made["id"]

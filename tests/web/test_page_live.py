@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
-from browser import Windows, arrow_tip, ask, drag_in_picture, drop, expect, in_window, result, said
+from browser import Windows, arrow_tip, ask, drag_in_picture, drop, expect, got, in_window, result, said
 from conftest import EXAMPLES, Server
 from live_worlds import LOAD, RUN, given_again
 from servers import QUESTION, picture
@@ -41,7 +41,7 @@ def simulated(server: Server, name: str, **corrected: Any) -> tuple[dict[str, An
     """The result of an example, and its worlds."""
     found = posted(server, name, **{"live": True} | corrected)
     live = found["trajectory"]["live"]
-    return found, {} if live is None else httpx.get(f"{server.address}{live['url']}").raise_for_status().json()
+    return found, {} if live is None else got(server.address, live["url"])
 
 
 def column(value: Any, count: int) -> list[float]:
@@ -166,10 +166,10 @@ def test_the_world_answers_while_the_arrow_is_dragged_and_then_the_film_plays(se
 
 def test_a_page_that_was_passed_on_computes_without_a_network(server: Server, windows: Windows, tmp_path: Path) -> None:
     found, _ = simulated(server, "ball-and-mug")
-    (job,) = (each for each in httpx.get(f"{server.address}/jobs").json()["jobs"][:1])
-    assert httpx.get(f"{server.address}/jobs/{job['id']}").json()["result"]["id"] == found["id"]
+    job, *_ = got(server.address, "/jobs")["jobs"]
+    assert got(server.address, f"/jobs/{job['id']}")["result"]["id"] == found["id"]
     file = tmp_path / "world.html"
-    file.write_bytes(httpx.get(f"{server.address}/jobs/{job['id']}/download?format=page").content)
+    file.write_bytes(httpx.get(f"{server.address}/jobs/{job['id']}/download?format=page", timeout=TIME_LIMIT).content)
     page = windows.open(file.as_uri(), offline=True)
     told = page.get_by_role("status")
     expect(told).to_have_text("Yes: 50 of 50 simulated versions")

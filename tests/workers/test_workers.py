@@ -47,7 +47,7 @@ def poison(how: str, seed: int = 0) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A server with one worker, asked by its administrator."""
-    own = {"COW_WORKER_MEMORY_MB": "1000", "COW_JOB_TIMEOUT": "25", "COW_CONCURRENCY": "1", **SETTINGS}
+    own = {"COW_WORKER_MEMORY_MB": "1000", "COW_JOB_TIMEOUT": "90", "COW_CONCURRENCY": "1", **SETTINGS}
     own |= {"COW_WORKERS": "true", "COW_ADMIN_KEYS": '["root"]'}
     folder = tmp_path_factory.mktemp("workers")
     with Served(folder, GIVES_UP_SOONER, **own) as one, as_caller(one, KEYS["root"]) as caller:
@@ -212,7 +212,7 @@ def test_an_api_server_computes_nothing_and_hears_of_jobs_that_two_workers_share
     shared = eventually(lambda: found if {*(found := at_work()).values()} == wanted else None)
     assert {*shared} == {one.process and one.process.pid for one in workers}
     assert workers_of(api) == []
-    metrics = httpx.get(f"http://127.0.0.1:{metrics_port()}/metrics").text
+    metrics = httpx.get(f"http://127.0.0.1:{metrics_port()}/metrics", timeout=TIME_LIMIT).text
     assert 'cow_workers{queue="light",state="busy"} 1.0' in metrics
     with psycopg.connect(database.url) as connection:  # what KEDA asks
         numbers = [connection.execute(query).fetchone() for query in queries()]
