@@ -40,7 +40,7 @@ LOGGING = re.compile(r"^_?log(ger)?\.")
 FOLDERS = {
     "adaptive": ("readers",),
     "api": ("api", "jobs"),
-    "cli": ("cli", "evals", "service"),
+    "cli": ("cli", "evals", "service", "workers"),
     "concurrency": ("service",),
     "errors": ("api", "client"),
     "media": ("media", "jobs"),

@@ -69,6 +69,12 @@ class TestOneBody:
         assert np.abs(found.velocities[0] - [x, 0, z])[:, [0, 2]].max() < 2e-3
         assert found.positions[0, -1] == pytest.approx([5 * x, height, 5 * z], abs=0.01)
 
+    def test_a_ball_that_glides_rolls(self) -> None:
+        found = run(rigid(velocity=(1.0, 0, 0), starts=True, glides=True), frames=5)
+        angle = 2 * np.arcsin(np.abs(found.turns[0, :, 2]))  # about the axis across its way alone
+        assert angle == pytest.approx(np.arange(5) / FPS / RADIUS, abs=0.02)
+        assert np.abs(found.turns[0, :, :2]).max() < 1e-3
+
     def test_what_does_not_glide_comes_to_rest(self) -> None:
         body = rigid("box", velocity=(1.5, 0, 0), starts=True, friction=1.0)
         found = run(body, frames=65)

@@ -328,3 +328,18 @@ def test_arrows_that_may_not_be_the_movers_are_not_followed() -> None:
     twins = Scene(jpeg(ball(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED), (300, 270), 30, BLUE)))
     with refused("cannot-read-direction"):
         read(twins, "If the blue ball moves towards the red ball, what happens?")
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "opening"),
+    [
+        ("blue mug", "cylinder", "round"),
+        ("wooden box", "box", "square"),
+        ("brick", "box", "none"),
+        ("tray", None, "square"),
+        ("gizmo", None, None),
+    ],
+)
+def test_a_name_says_what_its_noun_does(name: str, shape: str | None, opening: str | None) -> None:
+    read = reader.read_name(name)
+    assert (read.shape, read.opening) == (shape, opening)
