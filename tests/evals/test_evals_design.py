@@ -61,6 +61,8 @@ def test_names_are_short_and_best_of_k_is_k_votes() -> None:
 
 def test_every_preset_can_be_asked_where_there_is_what_it_shows() -> None:
     items = [item(number, DIGEST, "collision", "L1") for number in (0, 3)]
+    errors = [arm_of(name).error for name in PRESETS["dose"].arms if name.startswith("oracle")]
+    assert errors == [0, 0.5, 1, 2, 4]
     for name in PRESETS.keys() - {"dose"}:
         arms = PRESETS[name].arms
         assert [arm.name for arm in check_arms(arms, "prompt", items)] == list(arms)

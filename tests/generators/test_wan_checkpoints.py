@@ -188,7 +188,7 @@ def test_files_that_are_damaged_or_missing_are_named(toys, tmp_path: Path) -> No
         assert_refused(shard.parent, SHARD)
     shard.write_bytes(whole)
     (shard.parent / "z.safetensors").symlink_to(tmp_path / "nowhere")
-    assert_refused(shard.parent, "z.safetensors")
+    assert_refused(shard.parent, "z.safetensors", "unreadable")
     sharded = toys.original_folder(tmp_path / "sharded", shards=3)
     (sharded / "diffusion_pytorch_model-00002-of-00003.safetensors").unlink()
     assert_refused(sharded, "diffusion_pytorch_model-00002-of-00003")
