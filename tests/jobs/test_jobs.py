@@ -442,11 +442,19 @@ def test_the_same_key_from_many_at_the_same_time_is_one_job(served: Served) -> N
 
 @pytest.mark.slow
 def test_a_key_is_free_as_soon_as_its_running_job_is_deleted(served: Served) -> None:
-    """The end of the old job does not notify callers who wait for the new one."""
-    key = {"Idempotency-Key": "free"}
+    """It is canceled. Its end does not notify callers who wait for the new one."""
+
+    def canceled() -> float:
+        told = re.search(
+            r'^cow_jobs_total{kind="simulate",outcome="canceled"} (\S+)', served.http.get("/metrics").text, re.M
+        )
+        return float(told[1]) if told else 0.0
+
+    before, key = canceled(), {"Idempotency-Key": "free"}
     old = served.submit(slow(ENDLESS, seed=51), **key)
     served.rendering(old["id"])
     assert served.http.delete(f"/jobs/{old['id']}").status_code == 204
+    assert canceled() == before + 1
     new = served.http.post("/simulate", json=slow(2, seed=52), headers=key)
     assert new.status_code == 200, new.text
     assert (new.json()["id"], new.json()["generator"]["seed"]) == (old["id"], 52)
