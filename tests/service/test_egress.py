@@ -342,6 +342,13 @@ def test_no_private_address_inside_another_is_public(inner: ipaddress.IPv4Addres
         assert not is_public(str(ipaddress.IPv6Address(outer)))
 
 
+@given(st.ip_addresses(v=4) | st.ip_addresses(v=6, network="2000::/3"))
+def test_public_is_never_more_than_python_holds_global(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
+    if is_public(str(address)):
+        kinds = ("private", "loopback", "link_local", "multicast", "unspecified", "reserved")
+        assert not [kind for kind in kinds if getattr(address, f"is_{kind}")]
+
+
 def test_public_addresses_are_public() -> None:
     for ip in ("8.8.8.8", "172.32.0.1", "100.128.0.1", "2606:4700:4700::1111", "64:ff9b::808:808", "::ffff:8.8.8.8"):
         assert is_public(ip), ip
