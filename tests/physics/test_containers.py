@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import RADIUS, rigid
+from worlds import RADIUS, energy, rigid
 
 from cow_service.physics.draws import COLUMN, ensemble, likeliest
 from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, run_worlds
@@ -66,6 +66,15 @@ class TestFallingIn:
         assert run.positions[0, -1, 1] > 2 * HEIGHT
         met = [each for each in run.meetings if (each.a, each.b) == (0, 1)]
         assert 1 <= len(met) <= 4, "however many pieces touch"
+
+    @given(share=st.floats(0.3, 1.5), base=st.floats(0.4, 1.0), shape=st.sampled_from(["sphere", "cylinder", "box"]))
+    def test_energy_does_not_grow(self, share, base, shape) -> None:
+        into = container(base=base)
+        body = over(into, share, shape)
+        run = dropped(body, into)
+        one = energy([body], WorldRun(run.positions[:1], run.velocities[:1], run.turns[:1], [], set()))
+        assert one.max() <= one[0] * 1.01
+        assert run.positions[1, :, 1].max() < HEIGHT * 1.1  # nor is the container thrown up
 
     def test_a_cube_goes_through_a_round_opening_by_its_diagonal_and_a_bottle_sticks_out(self) -> None:
         round_one, square = container(base=1.0), container(base=1.0, sides=BOX_SIDES)

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from floors import known, outline
+from hypothesis import given
+from hypothesis import strategies as st
 from worlds import CAMERA, FPS, FRAMES, HALF, SPEED, ball, happened, post, rigid, rolling, seen
 
 from cow_service.physics.bodies import SeenBody
@@ -134,6 +136,14 @@ class TestChains:
         _, beside = happened(*bodies[:2], ball(0.4, 3.8, name="three"))
         assert answer(beside, "touches", subject=1, target=2) == 0
         assert (answer(beside, "moves", target=2), answer(beside, "moves", target=1)) == (0, 1)
+
+    @given(st.floats(-0.16, 0.16))
+    def test_a_struck_ball_goes_along_the_line_between_the_middles(self, aside: float) -> None:
+        run = happened(ball(-0.9), ball(0.0, 3.0 + aside))[0].runs[0]
+        gone = (run.positions[1, -1] - run.positions[1, 0])[[0, 2]]
+        drop = run.positions[1, 0, 2] - run.positions[0, 0, 2]
+        normal = math.asin(max(-1.0, min(1.0, drop / (2 * HALF))))
+        assert math.atan2(gone[1], gone[0]) == pytest.approx(normal, abs=math.radians(6))
 
     def test_who_set_what_in_motion_and_when(self) -> None:
         shapes = [rigid(starts=True), *[rigid()] * 5]
