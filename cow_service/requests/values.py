@@ -45,7 +45,7 @@ def has_more_values(value: Any, most: int) -> bool:
 
 
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # strict: no strings, no booleans
-WHOLE = BeforeValidator(_number)  # after an integer's limits: in a union the JSON schema shows only what stands before
+WHOLE = BeforeValidator(_number)  # comes after the limits of an integer: in a union, the JSON schema omits later ones
 Whole = Annotated[int, WHOLE]
 Flag = Annotated[bool, Field(strict=True)]
 Words = Annotated[str, AfterValidator(writable), AfterValidator(_says_something)]

@@ -118,17 +118,16 @@ class WorkerProcess:
                     pass  # about a job that has just ended
 
     def _send(self, message: FromWorker) -> None:
-        with self._sending:
+        """Does nothing once the pipe has ended, which `run` sees as well."""
+        with self._sending, suppress(OSError):
             messages.send(self._pipe, message)
 
     def _beat(self) -> None:
-        """Until the pipe ends, which `run` sees as well."""
         this = psutil.Process()
         while True:
             if not self._jobs and time.monotonic() - self._busy_at > QUIET_SECONDS:
                 self._database.close_idle()
-            with suppress(OSError):
-                self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
+            self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
             time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:
