@@ -32,6 +32,7 @@ from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import RigidShape, run_worlds
 from cow_service.physics.ensemble import SURE
 from cow_service.physics.events import find_world_events
+from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, Shape
 from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed
@@ -169,6 +170,7 @@ def probability(throw: Throw, size: int) -> tuple[float, bool]:
         kind="projectile",
         law="contact",
         direction=throw.direction,
+        direction_deviation=DIRECTION_DEVIATIONS["arrow"],
         depth_deviation=THROW_DEPTH_DEVIATION,
         cue="arrow",
         speed=throw_speed(box, scale),

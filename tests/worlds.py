@@ -87,7 +87,15 @@ def rolling(speed: float = SPEED, above: float = 0.0, **changes: Any) -> Motion:
     scale = CAMERA.positions(np.array([[0.0, above + HALF, 3.0]]))[0, 2] / CAMERA.focal
     given = {"kind": "linear", "direction": (1.0, 0.0), "speed": speed / scale} | changes
     metres = MetresPerPixel(value=scale, source="reference")
-    return Motion(law="contact", cue="request", sentence="", metres_per_pixel=metres, source="request", **given)
+    return Motion(
+        law="contact",
+        cue="request",
+        direction_deviation=1.0,
+        sentence="",
+        metres_per_pixel=metres,
+        source="request",
+        **given,
+    )
 
 
 def happened(

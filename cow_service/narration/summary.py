@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-6  # of a count of versions, which is rounded down: one that was misread counts half
 LEANING = 2 / 3  # share of the simulated versions from which an answer that is not sure is called probable
-_UNSEEN: tuple[Doubt, ...] = ("identity", "outline", "faint")  # doubts of what is seen, which no simulation weighs
+_UNSEEN: tuple[Doubt, ...] = ("reading", "identity", "outline", "faint")  # doubts that no simulation weighs
 _FITTING = ("inside", "on-top", "beside")  # results of a thing that ends as it was meant to
 _TOLD_BY_STORY = ("where", "what-happens")  # forms whose answer is the story
 

@@ -24,6 +24,15 @@ def depth_motion(sense: float) -> tuple[tuple[float, float], float]:
     return (0.0, -1.0 if sense > 0 else 1.0), math.copysign(math.cos(FREE_PITCH), sense)
 
 
+def way_to(goal: BBox, mover: BBox, is_on_floor: bool) -> tuple[float, float]:
+    """From the mover to a thing in the image: from foot to foot on the floor, else between the middles."""
+    (x0, y0, x1, y1), (left, top, right, bottom) = goal, mover
+    across = (x0 + x1 - left - right) / 2
+    if is_on_floor and (across, y1) != (0.0, bottom):
+        return across, y1 - bottom
+    return across, (y0 + y1 - top - bottom) / 2
+
+
 NEAREST = 1e-3  # of the camera's height: depths below it project as if they were there
 HORIZON = 0.02  # sine of the angle below the horizon from which a ray meets the floor at a sane distance
 

@@ -24,7 +24,7 @@ CUT = 0.3  # of the height of a body that the lower border of the image cuts off
 SLIMMEST, TALLEST = 0.2, 12.0  # half heights, in half widths
 
 # Degrees, one standard deviation of a direction in the image, by where it was read.
-TURN_SIGMA: dict[Cue, float] = {
+DIRECTION_DEVIATIONS: dict[Cue, float] = {
     "arrow": 1.5, "trail": 1.5, "orientation": 6.0, "text": 4.0, "gravity": 0.0, "request": 1.0,
 }  # fmt: skip
 TOWARDS_SIGMA = math.radians(2)  # of the heading of what moves towards another thing: it is aimed at its middle
@@ -197,7 +197,7 @@ def velocity_towards(
     if motion.direction is None or motion.speed == 0:
         return np.zeros((len(draws), 3))
     speed = motion.speed * motion.metres_per_pixel.value * speed_factors(motion, draws, speed_name)
-    turn = np.radians(TURN_SIGMA[motion.cue]) * draws[:, COLUMN["turn"]]
+    turn = math.radians(motion.direction_deviation) * draws[:, COLUMN["turn"]]
     # Words such as "to the right" say how it goes over the floor: seen at a low angle, a little in the image is a lot.
     is_over_floor = motion.cue == "text" and mover.stands and motion.kind == "linear" and not motion.rises
     direction = _turned(np.tile(motion.direction, (len(draws), 1)), np.zeros_like(turn) if is_over_floor else turn)

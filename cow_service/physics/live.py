@@ -48,7 +48,7 @@ CONSTANTS: dict[str, float] = {
     "unusual": lift.UNUSUAL,
     "widest_turn": float(lift.TURNS[-1]),
     "turns": len(lift.TURNS),
-    "turn_sigma": math.radians(lift.TURN_SIGMA["request"]),
+    "turn_sigma": math.radians(lift.DIRECTION_DEVIATIONS["request"]),
     "sure": SURE,
     "sure_of_miss": SURE_OF_MISS,
     "farthest": FARTHEST,

@@ -52,6 +52,7 @@ class OtherMotionReading:
     object: LocatedObject
     kind: MotionKind
     direction: Vector | None  # any length, px
+    direction_deviation: float | None = None  # degrees; null: as that of the mover
     depth: float = 0.0
     speed: SpeedWord | Quantity | None = None
     towards: LocatedObject | None = None  # see `Motion.towards`
@@ -133,6 +134,15 @@ class NamedChange:
 
 
 @dataclass(frozen=True)
+class WayReading:
+    """What the words of a question say of the way of what moves; None where they say nothing."""
+
+    along_arrow: bool | None = None  # else against it
+    direction: Vector | None = None  # unit vector in the image
+    towards: str | None = None  # name of the thing that it moves towards
+
+
+@dataclass(frozen=True)
 class QuestionReading:
     """What the words of a question say, without a look at the image and without a model."""
 
@@ -141,6 +151,7 @@ class QuestionReading:
     trail_named: bool = False  # the question speaks of a trail
     nouns: tuple[str, ...] = ()  # of the things that it names, each once
     drawings_named: frozenset[str] = frozenset()  # "arrow" and "box", where the question speaks of one
+    way: WayReading = WayReading()
 
 
 @dataclass(frozen=True)
@@ -151,6 +162,7 @@ class GroundingReading:
     bbox: BBox  # px of the upright image
     point: Point | None = None  # where the reader pointed, if it gave no box; by default the centre of the box
     others: tuple[LocatedObject, ...] = ()
+    is_complete: bool = False  # the others are all that could matter
     warnings: tuple[str, ...] = ()
     interventions: tuple[records.Intervention, ...] = ()
     hints: MotionHints | None = None
@@ -170,6 +182,8 @@ class MotionReading:
     direction: Vector | None  # any length; px of the upright image
     cue: records.Cue
     along_arrow: bool | None = None
+    direction_deviation: float | None = None  # degrees; null: as is usual for the cue
+    is_doubtful: bool = False  # see `Motion.is_doubtful`
     depth: float = 0.0  # see `Motion.depth`
     depth_deviation: float | None = None  # degrees; null if the reader says nothing of the depth
     towards: LocatedObject | None = None  # see `Motion.towards`

@@ -113,9 +113,7 @@ class LocatedObject(Record):
     mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
     prior: ObjectPrior | None = None
     source: Source | None = Field(default=None, description="Who located it; null in results of older versions.")
-    is_doubtful: bool = Field(
-        default=False, description="The object there may not be the named one, so no answer about it is sure."
-    )
+    is_doubtful: bool = Field(default=False, description="It may not be the named one: no answer about it is sure.")
 
 
 class Intervention(Record):
@@ -139,6 +137,7 @@ class Grounding(Record):
     others: tuple[LocatedObject, ...] = Field(
         default=(), description="Other objects that the question names or that matter, if they were found."
     )
+    objects_complete: bool = Field(default=False, description="`others` are all: nothing else shown is a thing.")
     interventions: tuple[Intervention, ...] = Field(
         default=(), description="Objects taken away or put somewhere before the motion; not in `others`."
     )
@@ -150,6 +149,7 @@ class Grounding(Record):
         default=False, description="The question mentions a trail: similar balls in a row are one ball over time."
     )
     is_doubtful: bool = Field(default=False, description="As `LocatedObject.is_doubtful`, for the moving object.")
+    question_is_doubtful: bool = Field(default=False, description="Its words say otherwise than it was read.")
     language: Language | None = Field(default=None, description="Of the question, where a multimodal LLM says it.")
     source: Source
 
@@ -177,6 +177,7 @@ class AlsoMoving(Record):
     object: LocatedObject
     kind: MotionKind
     direction: Vector | None = Field(default=None, description="As `Motion.direction`.")
+    direction_deviation: float = Field(default=0.0, ge=0, le=90, description="As `Motion.direction_deviation`.")
     towards: LocatedObject | None = Field(default=None, description="As `Motion.towards`.")
     depth: float = Field(default=0.0, ge=-1, le=1, description="As `Motion.depth`.")
     speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
@@ -193,11 +194,10 @@ class Motion(Record):
         "velocity plus gravity, through everything.",
     )
     direction: Vector | None = Field(description="Unit vector in the image, px; null for a fall or a static object.")
+    direction_deviation: float = Field(default=0.0, ge=0, le=90, description="Degrees, one standard deviation.")
+    is_doubtful: bool = Field(default=False, description="Image, words and reader disagree about the direction.")
     depth: float = Field(
-        default=0.0,
-        ge=-1,
-        le=1,
-        description="Sine of the angle out of the image plane: positive away from the camera, negative towards it.",
+        default=0.0, ge=-1, le=1, description="Sine of the angle out of the image plane: positive away from the camera."
     )
     depth_deviation: float = Field(
         default=0.0, ge=0, le=90, description="Degrees, one standard deviation of that angle."
@@ -212,9 +212,7 @@ class Motion(Record):
         "moves along the floor, and away from the camera if the direction is up.",
     )
     cue: Cue
-    along_arrow: bool | None = Field(
-        default=None, description="Whether along the arrow, if the cue is one; else against it."
-    )
+    along_arrow: bool | None = Field(default=None, description="Along the arrow, if the cue is one; else against it.")
     speed: float = Field(ge=0, description="px/s at the depth of the first frame.")
     speed_deviation: float = Field(
         default=0.0, ge=0, le=3, description="One standard deviation of the speed's natural logarithm."
@@ -243,10 +241,12 @@ MEETINGS: dict[EncounterKind, str] = {  # what the mover does with the other obj
     "touches": "hits", "occludes": "passes in front of", "occluded-by": "passes behind",
 }  # fmt: skip
 BAND_PERCENTILES = (10, 90)  # of x and of y over the ensemble: the limits of `Path.band`
-Doubt = Literal["speed", "heading", "camera", "size", "place", "friction", "identity", "outline", "faint", "depth"]
-"""What a world is uncertain about. `place`: how far away and how high bodies are; `identity`: whether objects are the
-named ones; `outline`: where their outlines run; `faint`: whether a faint mark is an object; `depth`: whether the depth
-map fits the scene."""
+Doubt = Literal[
+    "speed", "heading", "camera", "size", "place", "friction", "reading", "identity", "outline", "faint", "depth"
+]  # fmt: skip
+"""What a world is uncertain about. `place`: how far away and how high bodies are; `reading`: whether question and image
+were read rightly; `identity`: whether objects are the named ones; `outline`: where their outlines run; `faint`: whether
+a faint mark is an object; `depth`: whether the depth map fits the scene."""
 CLEAR = 0.77  # confidence of a body below which no outcome that rests on it is sure
 CameraSource = Literal["request", "exif", "depth", "edges", "shadow", "side-view", "prior"]
 

@@ -422,6 +422,9 @@ class SimulateRequest(Record):
         max_length=MAX_OBJECTS,
         description="Other objects that matter, and their places, which take precedence over what the reader finds.",
     )
+    objects_complete: Flag = Field(
+        default=False, description="`objects` are all that could be hit or hide something: nothing else is looked for."
+    )
     interventions: tuple[InterventionRequest, ...] = Field(
         default=(),
         max_length=8,

@@ -16,6 +16,7 @@ from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObj
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
+from cow_service.stages.settling import settle_question
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object, mask_iou
 from cow_service.vision.segmentation import mask_from_bbox
 from cow_service.vision.types import Mask
@@ -57,6 +58,8 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         drawn = [("an arrow", each.tail) for each in scene.arrows if "arrow" not in question.drawings_named]
         drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in question.drawings_named]
     # The others, and what is changed of all of them.
+    asked = None if request.asked is None else Asked(**dict(request.asked))
+    asked, misread = settle_question(asked, reading, question) if source == "mllm" else (asked or reading.asked, ())
     mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
     beside = [each for each, mask in zip(given, masks, strict=True) if not _is_mover(each, mask, reading)]
     boxes = [each.bbox for each in beside]
@@ -70,16 +73,18 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         bbox=reading.bbox,
         mask=mask,
         others=tuple(other for other in others if not is_among(other.bbox, removed)),
+        objects_complete=request.objects_complete or reading.is_complete,
         interventions=interventions,
         prior=reading.prior,
-        asked=reading.asked if request.asked is None else Asked(**dict(request.asked)),
+        asked=asked,
+        question_is_doubtful=bool(misread),
         trail_named=question.trail_named,
         is_doubtful=reading.is_doubtful,
         language=reading.language,
         source=source,
     )
     grounding = understood(grounding, run.backends.words())
-    warnings = [*reading.warnings, *warnings]
+    warnings = [*reading.warnings, *warnings, *misread]
     warnings += [
         f"`objects.{index}` ('{each.object}') lies where the moving object is, and was taken for it."
         for index, each in enumerate(given)

@@ -9,18 +9,21 @@ from typing import Literal
 import numpy as np
 
 from cow_service import records
-from cow_service.errors import FieldError, InvalidRequest, field_of
+from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, field_of
 from cow_service.narration.words import bare_name, direction_words, place_words, same_name
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera
+from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.physics.trail_fit import fit_throw, straight_direction
 from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.prompts import load_prompt
+from cow_service.readers.remedies import GIVE_DIRECTION
 from cow_service.records import BBox, Grounding, Law, LocatedObject, Motion, MotionKind, Source, Vector
 from cow_service.requests import MotionRequest, SimulateRequest
 from cow_service.stages.grounding import placed_mover
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
+from cow_service.stages.settling import SeenWay, settle_way
 from cow_service.vision.scene import Scene
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.trails import trail_of
@@ -48,7 +51,14 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
     if reading is None:
         with run.cpu():
             given = run.reader_input("motion", run.scene_of(grounding, None if hints is None else hints.cue))
+            seen = _way_seen(run, given.scene, grounding)
         reading, source = run.reader.read_motion(given, grounding, hints), run.reader.source
+        reading = settle_way(reading, run.question.way, seen, grounding.bbox)
+        if reading.direction is None and reading.kind in records.DIRECTED_KINDS:
+            raise CannotReadDirection(
+                f"Neither the image nor the question tells which way the {grounding.object} moves.",
+                remedy=GIVE_DIRECTION,
+            )
     if request.motion is not None:
         reading = _with_request(reading, request.motion, grounding)
     placed = placed_mover(grounding)
@@ -87,6 +97,13 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
             "`motion.metres_per_pixel` sets it."
         )
     return StageResult(value=motion, warnings=tuple(warnings))
+
+
+def _way_seen(run: Run[SimulateRequest], scene: Scene, grounding: Grounding) -> SeenWay:
+    """What the image shows of the way of the mover. To be called with `cpu` held."""
+    arrow, towards = scene.arrow_at(grounding.bbox), run.question.way.towards
+    goals = [each for each in grounding.others if towards is not None and same_name(each.object, towards)]
+    return SeenWay(None if arrow is None else arrow.direction, goals[0] if len(goals) == 1 else None)
 
 
 # --- what the request says
@@ -136,7 +153,7 @@ def _with_request(reading: MotionReading, given: MotionRequest, grounding: Groun
                 errors=(FieldError(pointer, detail),),
             )
         speed = _quantity(each.speed, "px/s")
-        others.append(OtherMotionReading(found[0], each.stated_kind, each.direction, each.depth, speed))
+        others.append(OtherMotionReading(found[0], each.stated_kind, each.direction, None, each.depth, speed))
     scale = given.metres_per_pixel
     said = {
         "speed": _quantity(given.speed, "px/s"),
@@ -254,6 +271,7 @@ def _moving(
     scale: records.MetresPerPixel,
     law: Law,
     image_width: int,
+    usual_deviation: float,
 ) -> records.AlsoMoving:
     """What a thing does; kinds of motion that have no direction have no speed either."""
     moves, speed = said.kind in records.DIRECTED_KINDS, DEFAULT_SPEED * image_width
@@ -269,6 +287,7 @@ def _moving(
         object=thing,
         kind=said.kind,
         direction=_unit(said.direction) if moves and said.direction is not None else None,
+        direction_deviation=usual_deviation if said.direction_deviation is None else said.direction_deviation,
         depth=said.depth if moves else 0.0,
         towards=said.towards if moves else None,
         speed=speed if moves else 0.0,
@@ -285,7 +304,7 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
     )
     moves, falls = reading.kind in records.DIRECTED_KINDS, reading.kind in records.FALLING_KINDS
     thing = LocatedObject(object=grounding.object, bbox=grounding.bbox)
-    mover = _moving(thing, reading, scale, law, image_width)
+    mover = _moving(thing, reading, scale, law, image_width, DIRECTION_DEVIATIONS[reading.cue])
     depth_deviation = THROW_DEPTH_DEVIATION if reading.kind == "projectile" else 0.0
     speed_deviation = mover.speed_deviation if moves else 0.0
     if moves and reading.depth_deviation is not None:
@@ -311,6 +330,8 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         kind=reading.kind,
         law=law,
         direction=mover.direction,
+        direction_deviation=mover.direction_deviation,
+        is_doubtful=reading.is_doubtful,
         depth=mover.depth,
         depth_deviation=depth_deviation,
         towards=mover.towards,
@@ -324,7 +345,9 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         until=reading.until,
         steps=steps,
         trail=reading.trail,
-        others=tuple(_moving(other.object, other, scale, law, image_width) for other in reading.others),
+        others=tuple(
+            _moving(other.object, other, scale, law, image_width, mover.direction_deviation) for other in reading.others
+        ),
         gravity=(reading.down[0] * gravity, reading.down[1] * gravity) if falls else (0.0, 0.0),
         down=reading.down,
         metres_per_pixel=scale,
@@ -354,6 +377,7 @@ def along_trail(
     measured: dict[str, object] = {"trail": tuple(position.centre for position in trail.older)}
     if motion.kind == "linear":
         measured["direction"] = straight_direction(trail.positions)
+        measured["direction_deviation"] = DIRECTION_DEVIATIONS["trail"]
     throw = None
     if motion.kind == "projectile":
         shadow, size = find_shadow(scene, grounding.bbox), (scene.width, scene.height)
@@ -362,6 +386,7 @@ def along_trail(
         throw = fit_throw(trail.positions, fit, size)
     if throw is not None:
         measured["direction"] = throw.direction
+        measured["direction_deviation"] = DIRECTION_DEVIATIONS["trail"]
         measured["depth"] = math.sin(math.radians(throw.turn))
         measured["depth_deviation"] = min(throw.turn_deviation, 90.0)
     if throw is not None and not speed_given:

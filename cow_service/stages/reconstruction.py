@@ -93,7 +93,7 @@ class Situation:
 def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ...], tuple[Obstacle, ...]]:
     """What stands beside the mover, and what of it is removed before the motion."""
     removed, others = removed_of(grounding), others_of(grounding)
-    found = scene.obstacles(grounding.bbox, (*others, *removed))
+    found = scene.obstacles(grounding.bbox, (*others, *removed), grounding.objects_complete)
     gone, named = {each.bbox for each in removed}, {other.bbox for other in others}
     taken = tuple(each for each in found if each.bbox in gone)
     masks = [each.mask.full() for each in taken]
@@ -120,7 +120,8 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     if query is None and situation.grounding.asked is None and carried is not None:
         # Nothing is asked but whether it gets there: shown is what it does in most worlds.
         query = Query(Asked(relation="inside"), carried.targets[0])
-    faint = situation.scene.faint_beside([body.bbox for body in bodies])
+    is_complete = situation.grounding.objects_complete
+    faint = () if is_complete else situation.scene.faint_beside([body.bbox for body in bodies])
     depth = None if level is not None or situation.follows_path else situation.depth
     is_ball_in_air = bodies[0].shape == "sphere" and in_air[0]
     shadow = find_shadow(situation.scene, bodies[0].bbox) if depth is None and is_ball_in_air else None
@@ -141,7 +142,7 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
     # What else moves has a way and a speed of its own, and no end but what it meets.
-    fields = ("kind", "direction", "depth", "towards", "speed", "speed_deviation")
+    fields = ("kind", "direction", "direction_deviation", "depth", "towards", "speed", "speed_deviation")
     alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": (), "rises": False}
     others = {
         index: motion.model_copy(update=alone | {name: getattr(each, name) for name in fields})

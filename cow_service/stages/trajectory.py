@@ -94,7 +94,8 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
         return result, outcome
     first = None if result.decided.first is None else names[result.decided.first]
     decided = vars(result.decided) | {"first": first}
-    doubts: list[Doubt] = []
+    is_misread = situation.motion.is_doubtful or situation.grounding.question_is_doubtful
+    doubts: list[Doubt] = ["reading"] if is_misread else []
     if any(thing.is_doubtful for thing in (situation.grounding, *situation.located)):
         doubts.append("identity")
     if any(bodies[body].confidence < CLEAR for body in matter):

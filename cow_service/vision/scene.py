@@ -322,8 +322,11 @@ class Scene:
         other._found["mask", bbox] = mask
         return other
 
-    def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
-        """The objects besides the mover in a box: first those that the question names, then others, named by colour.
+    def obstacles(
+        self, mover: BBox, named: Sequence[LocatedObject] = (), is_complete: bool = False
+    ) -> tuple[Obstacle, ...]:
+        """The objects besides the mover in a box: first those that are named, then others, named by colour, unless the
+        named ones are all that there are.
 
         Found once for the same arguments. Of known regions their own mask is taken, which is cheaper than another
         silhouette, unless a mask was given.
@@ -341,7 +344,7 @@ class Scene:
                     confidence = region.confidence if region is not None and found else 1.0
                     obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
             outlined = [self.silhouette(other.bbox) for other in named if other.mask is not None]
-            for region in self.regions:
+            for region in () if is_complete else self.regions:
                 area = region.mask.area
                 if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
                     continue
@@ -358,7 +361,7 @@ class Scene:
                 obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
             return tuple(obstacles)
 
-        return self.once(("obstacles", mover, tuple(named)), find)
+        return self.once(("obstacles", mover, tuple(named), is_complete), find)
 
     def locate(self, point: tuple[float, float]) -> Cutout:
         """The object at a point [x, y]: the region there, else what can be cut out around it."""

@@ -94,6 +94,7 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "trajectory.tracks": ({"trajectory": PATH}, None, TWO),
     "trajectory.tracks_visible": ({"trajectory": PATH | {"tracks": TWO}}, None, [[True] * 3, [False] * 3]),
     "trajectory.anchors": ({"trajectory": PATH}, None, [[10, 10]]),
+    "objects_complete": ({"objects": [BLOCKS]}, False, True),
     "objects.bbox": ({"objects": [BLOCKS]}, BLOCK, (150, 75, 185, 111)),
     "objects.point": ({"objects": [{"object": "blue block"}]}, [167, 115], [230, 95]),
     "objects.mask": ({"objects": [{"object": "blue block"}]}, mask_of(BLOCK), mask_of(POST)),

@@ -249,6 +249,9 @@ SENTENCES: dict[str, Trajectory] = {
     "Not sure: something that the question names may be another thing, or only a part; the warnings say which.": world(
         unsure("touches", "cube", depends_on=("speed", "identity")), ensemble=50
     ),
+    "Not sure: what was read contradicts what the question says or the image shows; the warnings say where.": world(
+        unsure("touches", "cube", depends_on=("reading", "identity")), ensemble=50
+    ),
     "Not sure: something that matters was not seen clearly; the warnings say what.": world(
         unsure("touches", "cube", depends_on=("outline", "faint")), ensemble=50
     ),

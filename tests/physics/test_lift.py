@@ -56,7 +56,7 @@ def body(bbox, shape="box", name="thing", prior=None) -> SeenBody:
 def motion(kind="static", direction=None, speed=0.0, **other) -> Motion:
     return Motion(
         kind=kind, law="contact", direction=direction, cue="request", speed=speed, sentence="", source="request",
-        metres_per_pixel=MetresPerPixel(value=METRES, source="default"), **other,
+        direction_deviation=1.0,        metres_per_pixel=MetresPerPixel(value=METRES, source="default"), **other,
     )  # fmt: skip
 
 

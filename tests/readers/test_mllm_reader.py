@@ -36,6 +36,7 @@ from cow_service.records import Asked, Grounding, Usage
 from cow_service.settings import Settings
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import read_motion
+from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.scene import Scene
 
 if TYPE_CHECKING:
@@ -247,6 +248,7 @@ def test_priors_travel_to_both_stages(mllm, reader, scene) -> None:
     assert (motion.depth_deviation, motion.speed) == (estimates.HEADING_DEVIATION, "slow")
     assert motion.speed_deviation == estimates.SPEED_DEVIATION
     assert motion.direction == pytest.approx((0.37 * 640, 0))
+    assert motion.direction_deviation == estimates.HEADING_DEVIATION
     reading, motion = placed(mllm, reader, scene, {})
     assert (reading.prior, reading.others, reading.warnings) == (None, (), ())
     assert (motion.depth, motion.depth_deviation, motion.speed, motion.speed_deviation) == (0.0, None, None, None)
@@ -282,27 +284,33 @@ def test_each_object_has_one_box_and_obstacles_are_few(mllm, reader, scene) -> N
 
 
 @pytest.mark.parametrize(
-    ("direction", "along", "expected", "warned"),
+    ("ends", "along", "expected", "is_doubtful"),
     [
-        ([230, 500, 600, 520], True, (1, 0.03), False),
-        ([230, 500, 600, 900], True, (1, 0), True),
-        ([600, 500, 230, 500], True, (1, 0), True),
-        ([230, 500, 30, 500], False, (-1, 0), False),
-        ([230, 500, 600, 500], False, (-1, 0), True),
-        ([230, 500, 240, 900], None, (1, 0), True),
+        ([230, 500, 600, 600], True, (1, 0), False),
+        ([230, 500, 330, 900], True, (1, 0), True),
+        ([600, 500, 230, 500], False, (-1, 0), False),
+        (None, True, (1, 0), False),
     ],
 )
-def test_a_drawn_arrow_is_right_where_the_reader_is_not(
-    direction: list[int], along: bool | None, expected: Any, warned: bool, scene, mllm, reader
+def test_a_drawn_arrow_is_surer_than_the_reader(
+    ends: list[int] | None, along: bool, expected: Any, is_doubtful: bool, mllm, reader, scene
 ) -> None:
-    drawn = Scene(DrawnArrow((200, 200), 0.0, 110, 5, (30, 160, 30), "filled").on(scene.image.copy()))
-    mllm.say(json.dumps(BALL), json.dumps(PLACE | {"along_arrow": along, "direction": direction}))
-    motion = reader.read_motion(ReaderInput(drawn, QUESTION), grounding("mllm"), None)
+    drawn = DrawnArrow((200, 200), 0.0, 110, 5, (30, 160, 30), "filled").on(scene.image.copy())
+    wanted = {"relation": "touches", "target": "blue block", "form": "whether"}
+    asked = BALL | {"others": ["blue block"], "asked": wanted}
+    block = {"label": "blue block", "bbox_2d": [672, 375, 812, 625]}
+    mllm.say(json.dumps(asked), json.dumps(PLACE | {"along_arrow": along, "direction": ends, "others": [block]}))
+    run = run_of(drawn, reader=lambda: reader, question="Rollt die Kugel gegen den Block?")
+    found = run.stage("grounding", ground)
+    motion = run.stage("motion", read_motion, found, run.hints)
     assert motion.direction is not None
     assert angle_between(motion.direction, expected) < 2.5
-    assert motion.cue == "arrow"
-    assert bool(motion.warnings) is warned
-    assert (motion.sentence is None) is warned, "its sentence was worded for another direction"
+    assert (motion.cue, motion.is_doubtful) == ("arrow", is_doubtful)
+    assert motion.direction_deviation < 5, "it is as exact as the arrow"
+    outcome = run.stage("trajectory", compute_trajectory, found, motion).outcome
+    assert outcome is not None
+    assert outcome.sure is not is_doubtful
+    assert (outcome.depends_on[:1] == ("reading",)) is is_doubtful
 
 
 @pytest.mark.parametrize(("bbox", "named"), [([672, 375, 812, 625], "blue"), ([0, 0, 1000, 1000], "")])

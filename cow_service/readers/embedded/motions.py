@@ -108,7 +108,7 @@ def other_readings(scene: Scene, others: Sequence[OtherWords], grounding: Ground
                     direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
             way = _way(direction, motion.depth)
         speed = quantities(motion.quantities, None)["speed"]
-        readings.append(OtherMotionReading(found, kind, way[0], way[1], speed, goal))
+        readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
     return tuple(readings)
 
 

@@ -8,7 +8,7 @@ from functools import partial
 from cow_service import __version__, records
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.narration.words import phrases_of, same_name
-from cow_service.physics.camera import depth_motion
+from cow_service.physics.camera import depth_motion, way_to
 from cow_service.readers import base
 from cow_service.readers.base import MotionReading, ReaderInput
 from cow_service.readers.embedded import changes, matching, motions
@@ -21,7 +21,7 @@ from cow_service.readers.embedded.english.questions import Question, parse
 from cow_service.readers.embedded.facing import facing
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Source, Vector
+from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Source
 from cow_service.settings import Settings
 from cow_service.vision.masks import is_same_object
 from cow_service.vision.regions import Region
@@ -54,8 +54,14 @@ class EmbeddedReader:
             for change in read.interventions
         )
         drawings = frozenset(each for each in ("arrow", "box") if each in words)
-        trail_named, nouns = read.motion.trail is not None, matching.nouns_of(read)
-        return base.QuestionReading(read_asked(read), tuple(named), trail_named, nouns, drawings)
+        trail_named, nouns, said = read.motion.trail is not None, matching.nouns_of(read), read.motion
+        way = base.WayReading(
+            along_arrow=None if said.arrow is None else said.arrow == "along",
+            direction=None if said.depth else said.direction,
+            towards=None if said.towards is None else said.towards.text,
+        )
+        way = base.WayReading() if unread(read).turning or said.contradictory else way
+        return base.QuestionReading(read_asked(read), tuple(named), trail_named, nouns, drawings, way)
 
     def read_name(self, name: str) -> ObjectPrior:
         """By its noun."""
@@ -155,7 +161,7 @@ class EmbeddedReader:
             reading = on or _read_motion(scene, question, grounding)
             parted = any(each.share is not None for each in words.quantities)
             goal = _towards(scene, words.towards, grounding) if parted and words.towards is not None else None
-            way = None if goal is None else _way_to(goal, reading.kind, grounding)
+            way = None if goal is None else way_to(goal.bbox, grounding.bbox, reading.kind == "linear")
             return replace(
                 reading,
                 steps=motions.step_readings(words.steps, grounding.bbox),
@@ -292,7 +298,7 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
         return MotionReading(kind, direction, "text", depth=depth)
     if words.towards is not None:
         goal = _towards(scene, words.towards, grounding)
-        return MotionReading(kind, _way_to(goal, kind, grounding), "text", towards=goal)
+        return MotionReading(kind, way_to(goal.bbox, grounding.bbox, kind == "linear"), "text", towards=goal)
     return None
 
 
@@ -332,12 +338,3 @@ def _towards(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> Locate
         told = matching.unclear(phrase, matching.best_matches(besides, phrase), besides)
         raise CannotReadDirection(f"Where the {grounding.object} moves to is not clear: {told}.", remedy=GIVE_DIRECTION)
     return LocatedObject(object=phrase.text, bbox=bbox)
-
-
-def _way_to(goal: LocatedObject, kind: MotionKind, grounding: Grounding) -> Vector:
-    """From the mover to a thing in the image: from foot to foot on the floor, else between the middles."""
-    (x0, y0, x1, y1), (left, top, right, bottom) = goal.bbox, grounding.bbox
-    across = (x0 + x1 - left - right) / 2
-    if kind == "linear" and (across, y1) != (0.0, bottom):
-        return across, y1 - bottom
-    return across, (y0 + y1 - top - bottom) / 2

@@ -23,6 +23,7 @@ CUES = ("arrow", "trail", "text", "orientation", "none")
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
 POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")
 MAX_OBSTACLES = 8
+ALL = 2  # things from which a list is taken for all that matter, as it was asked for, where the reply does not say
 MAX_LABEL = 80  # characters
 STRAIGHT = 60.0  # degrees from the image's vertical, within which a line can also lead towards or away
 STEEP = 60.0  # degrees out of the image plane, from which a motion leads straight towards or away
@@ -89,6 +90,7 @@ class Surroundings(Reply):
     """What is around the object."""
 
     others: Annotated[tuple[SeenObject, ...], Field(max_length=MAX_OTHERS + MAX_OBSTACLES)]
+    complete: bool | None = None
 
 
 class Line(Reply):
@@ -131,6 +133,7 @@ class Located:
     point: Point | None = None
     label: str = ""
     others: tuple[LocatedObject, ...] = ()
+    is_complete: bool = False  # the others are all that could matter
     prior: ObjectPrior | None = None
     line: Line | None = None
     warnings: tuple[str, ...] = ()  # of optional fields and other boxes that were left out
@@ -225,11 +228,14 @@ def read_located(
             warnings.append(f"The reader's box of '{name}' was left out: it covers nearly the whole image.")
             continue
         objects.append(LocatedObject(object=name, bbox=found.bbox, role=role, prior=found.prior, source="mllm"))
+    told = (fields["complete"] for fields in map(replies.fields_of, values) if "complete" in fields)
+    complete = next(map(replies.truth_of, told), None)
     return Located(
         bbox=mover.bbox,
         point=frame.point(place.point) if mover.bbox is None else None,
         label=place.label,
         others=tuple(objects),
+        is_complete=len(objects) >= ALL if complete is None else complete,
         prior=mover.prior,
         line=line,
         warnings=tuple(warnings),

@@ -31,7 +31,6 @@ from cow_service.weights.manifests import PROMPTS
 
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_KIND: records.MotionKind = "linear"
-ARROW_TOLERANCE = 25.0  # degrees between an arrow and what was read of it; past that the arrow is right
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
 
 
@@ -127,6 +126,7 @@ class MllmReader:
             bbox=bbox,
             point=located.point,
             others=tuple(other for other in others if other.bbox not in removed),
+            is_complete=located.is_complete,
             interventions=interventions,
             warnings=(*warnings, *located.warnings, *doubles, *self._family_warnings),
             hints=hints if given.motion_wanted else None,
@@ -151,7 +151,7 @@ class MllmReader:
         for hint in hints.also:
             place = places.get(name_words(hint.object))
             if place is not None:
-                others.append(base.OtherMotionReading(place, hint.kind, hint.direction, hint.depth))
+                others.append(base.OtherMotionReading(place, hint.kind, hint.direction, HEADING_DEVIATION, hint.depth))
             elif others_sought:
                 raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
             else:
@@ -229,58 +229,32 @@ class MllmReader:
     def _directed(
         self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints
     ) -> MotionReading:
-        """The reading with its direction, checked against the drawn arrow where one is the cue."""
+        """The reading with its direction."""
         deviation = SPEED_DEVIATION if isinstance(hints.speed, str) else None
         ends = {"distance": hints.distance, "duration": hints.duration, "until": hints.until, "steps": hints.then}
-        reading = replace(reading, speed=hints.speed, speed_deviation=deviation, cue=hints.cue or "orientation", **ends)
+        reading = replace(
+            reading,
+            speed=hints.speed,
+            speed_deviation=deviation,
+            cue=hints.cue or "orientation",
+            direction_deviation=HEADING_DEVIATION,
+            **ends,
+        )
         if hints.camera is not None:
             direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
             return replace(reading, direction=direction, depth=depth, depth_deviation=HEADING_DEVIATION)
         if hints.ends is None:
-            raise CannotReadDirection(
-                f"{self._subject} found nothing in the image or the question that tells which way the "
-                f"{grounding.object} moves.",
-                remedy=GIVE_DIRECTION,
-            )
+            return reading
         if hints.depth_degrees is not None:
             depth = math.sin(math.radians(hints.depth_degrees))
             reading = replace(reading, depth=depth, depth_deviation=HEADING_DEVIATION)
         (x0, y0), (x1, y1) = hints.ends
-        reading = replace(reading, direction=(x1 - x0, y1 - y0))
-        if reading.cue != "arrow":
-            return reading
-        with given.cpu():
-            return follow_arrow(given.scene, grounding.bbox, replace(reading, along_arrow=hints.along_arrow))
+        return replace(reading, direction=(x1 - x0, y1 - y0), along_arrow=hints.along_arrow)
 
 
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable` if COW_MLLM cannot be used."""
     return MllmReader("mllm", MllmClient(configure(settings), settings), settings.mllm_base_url or "")
-
-
-def follow_arrow(scene: Scene, bbox: BBox, reading: MotionReading) -> MotionReading:
-    """The reading, with the direction of the arrow drawn at the object where the two are at odds.
-
-    `along_arrow` says whether the object moves with it; where the reader does not say, only the arrow's axis counts.
-    """
-    arrow = scene.arrow_at(bbox)
-    if arrow is None or reading.direction is None:
-        return reading
-    along = reading.along_arrow
-    if along is None:
-        along = _angle(reading.direction, arrow.direction) <= 90
-    sign = 1.0 if along else -1.0
-    drawn = sign * arrow.direction[0], sign * arrow.direction[1]
-    off = _angle(reading.direction, drawn)
-    if off <= ARROW_TOLERANCE:
-        return reading
-    warning = (
-        f"The reader's direction is {off:.0f} degrees off the arrow drawn at the object "
-        f"(followed {'along' if along else 'against'} it): the arrow was taken."
-    )
-    # Its sentence was worded for another direction.
-    warnings = (*reading.warnings, warning)
-    return replace(reading, direction=drawn, along_arrow=along, sentence=None, warnings=warnings)
 
 
 def box_warnings(scene: Scene, bbox: BBox, name: str) -> tuple[str, ...]:
@@ -298,8 +272,3 @@ def box_warnings(scene: Scene, bbox: BBox, name: str) -> tuple[str, ...]:
             f"({x:.0f}, {y:.0f}): the box may be wrong."
         )
     return tuple(found)
-
-
-def _angle(a: records.Vector, b: records.Vector) -> float:
-    """Degrees between two vectors, 0 to 180."""
-    return abs(math.degrees(math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])))

@@ -36,6 +36,7 @@ export const DOUBTS = {
   friction: "how much the floor slows things down",
   outline: "where the outlines of things run",
   identity: "whether the things are the ones that the question names",
+  reading: "whether the question and the image were read rightly",
   faint: "whether something too faint to make out stands in the way",
   depth: "whether the depth map shows what matters",
 };
