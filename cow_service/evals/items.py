@@ -12,7 +12,7 @@ from cow_service.media.artifacts import DiskArtifacts, media_type_of
 from cow_service.media.images import decode
 from cow_service.readers.options import split_options
 from cow_service.records import AnswerOption, Record
-from cow_service.records.world import BBox, Point, Sha256
+from cow_service.records.grounding import BBox, Point, Sha256
 
 Task = Literal["collision", "trajectory", "compatibility", "occlusion", "other"]
 TASKS: tuple[Task, ...] = ("collision", "trajectory", "compatibility", "occlusion", "other")

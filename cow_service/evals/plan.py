@@ -14,7 +14,7 @@ from cow_service.evals.design import GATE_VOTES, Arm, Order, primary
 from cow_service.evals.items import Ask
 from cow_service.evals.statistics import ALPHA, POWER, Cost, effect_shown, power_of, scenes_needed
 from cow_service.records import Record
-from cow_service.records.world import Sha256
+from cow_service.records.grounding import Sha256
 
 FORMAT: Literal[2] = 2
 DISCORDANT = 0.2  # share of pairs of replies with exactly one right, without a pilot

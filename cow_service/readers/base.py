@@ -84,6 +84,8 @@ class ReaderInput:
     language: Language = "en"  # of what is said of the simulation
     seed: int | None = None  # None: an MLLM is sent none, and draws as it likes
     motion_wanted: bool = True  # stage 2 is left to the reader, too
+    asked_wanted: bool = True  # what the question wants to know is; else the caller has said it
+    changes_wanted: bool = True  # so with what is taken away or put somewhere
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: not to be searched
     sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, besides the question's
     until: float | None = None  # Unix time, s, after which an MLLM that refuses is not asked again; None: its own limit

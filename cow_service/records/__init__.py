@@ -4,5 +4,6 @@ Coordinates are pixels of the upright input image, x right, y down, (0, 0) the i
 Times are seconds from the first frame. Records hold no pixels and do no I/O: bytes are named by their SHA-256.
 """
 
+from cow_service.records.grounding import *  # noqa: F403
 from cow_service.records.results import *  # noqa: F403
 from cow_service.records.world import *  # noqa: F403

@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-from cow_service.records.world import Artifact, BBox, Grounding, ImageInfo, Language, Motion, Record, Sha256, Trajectory
+from cow_service.records.grounding import Artifact, BBox, Grounding, ImageInfo, Language, Record, Sha256
+from cow_service.records.world import Motion, Trajectory
 
 FramePolicy = Literal["initial", "uniform", "events"]
 

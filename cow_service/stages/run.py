@@ -347,6 +347,8 @@ class Run(Generic[Request_co]):
             language=self.language,
             seed=self.request.seed,
             motion_wanted="motion" in self.request.left_to_reader,
+            asked_wanted=self.request.asked is None,
+            changes_wanted=not self.request.interventions,
             until=self.until,
             calls=self._calls[stage],
             check_canceled=self.check_canceled,

@@ -13,9 +13,9 @@ from drawn import angle_between, floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cow_service.perception.facing import DARK, OTHER, PAINT, VehicleModel, facing
 from cow_service.physics.camera import FloorCamera
 from cow_service.readers.base import ReaderInput
-from cow_service.readers.embedded.facing import DARK, OTHER, PAINT, VehicleModel, facing
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
 from cow_service.vision.masks import bbox_of, iou

@@ -8,6 +8,7 @@ from functools import partial
 from cow_service import __version__, records
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.narration.words import phrases_of, same_name
+from cow_service.perception.facing import facing
 from cow_service.physics.camera import depth_motion, way_to
 from cow_service.readers import base
 from cow_service.readers.base import MotionReading, ReaderInput
@@ -18,7 +19,6 @@ from cow_service.readers.embedded.english.asked import read_alternatives, read_a
 from cow_service.readers.embedded.english.lexicon import ARROWS, ObjectPhrase
 from cow_service.readers.embedded.english.motion import MotionWords
 from cow_service.readers.embedded.english.questions import Question, parse
-from cow_service.readers.embedded.facing import facing
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, MotionKind, ObjectPrior, Source
