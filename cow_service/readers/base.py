@@ -88,6 +88,7 @@ class ReaderInput:
     changes_wanted: bool = True  # so with what is taken away or put somewhere
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: not to be searched
     sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, besides the question's
+    objections: tuple[str, ...] = ()  # what speaks against its last reading, in sentences: to be asked again with these
     until: float | None = None  # Unix time, s, after which an MLLM that refuses is not asked again; None: its own limit
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = lambda: None  # to be called while waiting; raises `Canceled`
@@ -250,6 +251,9 @@ class Reader(Protocol):
 
     heeds_seed: bool
     """Whether the seed of a request changes anything. Of a reader without this attribute it is taken to."""
+
+    heeds_objections: bool
+    """Whether `ReaderInput.objections` may change what it reads."""
 
     def repeats_answers(self, votes: int) -> bool:
         """Whether `answer` gives the same votes every time for the same input.

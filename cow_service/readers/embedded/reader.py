@@ -36,6 +36,7 @@ class EmbeddedReader:
     fingerprint = f"embedded {__version__}"
 
     heeds_seed = False
+    heeds_objections = False
 
     def repeats_answers(self, votes: int) -> bool:
         """Always: rules draw no random numbers."""

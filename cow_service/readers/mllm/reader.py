@@ -64,6 +64,7 @@ class MllmReader:
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     heeds_seed = True
+    heeds_objections = True
 
     def repeats_answers(self, votes: int) -> bool:
         """True only for a model that is deterministic at temperature 0, if it is asked with that."""
