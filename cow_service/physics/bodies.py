@@ -41,6 +41,7 @@ class SeenBody:
     is_form_known: bool = True  # its shape was seen or said; else how deep it is, is not known
     stands_out: bool = True  # it is separate from its surroundings: nothing else is seen to carry it
     taper: float = 1.0  # its width at its lower end, of that at its upper end
+    bbox_deviation: float = 0.0  # of the edges of its box, in its sides
     point: Point | None = None  # px: of the mover, the one it was grounded at
 
     @property

@@ -231,7 +231,13 @@ class _Picture:
             support = above(cameras, self.bodies[on].core, self.bodies[on].shape, draws, plane)
             if support is not None:
                 plane = np.minimum(support.top, 0.95 * cameras.height)
-        return above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper)
+        seen = above(cameras, body.core, body.shape, draws, plane, depth_share, body.taper, body.bbox_deviation)
+        if seen is None or not body.bbox_deviation:
+            return seen
+        sides = draws[:, [COLUMN["let_go_ahead"], COLUMN["opening"]]]
+        aside = sides @ [math.cos(GOLDEN * index), math.sin(GOLDEN * index)]
+        shift = math.sqrt(2) * body.bbox_deviation * seen.half_width * aside  # two edges, each as exact as that
+        return replace(seen, centre=seen.centre + cameras.axes[:, :, 0] * shift[:, None])
 
     def depth_of(self, body: SeenBody, draws: Floats) -> Floats:
         """Depth of a body along the line of sight [K], relative to its width; for an unknown object it is a guess."""

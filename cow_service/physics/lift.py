@@ -127,24 +127,29 @@ def above(
     plane: Floats,
     depth_share: Floats | float = 1.0,
     taper: float = 1.0,
+    bbox_deviation: float = 0.0,
 ) -> LiftedBody | None:
     """A body that stands on a horizontal plane at a height [K] (m); None if its foot lies at or above the horizon.
 
     The foot is the middle of the box's lower edge; the body's middle lies half its depth there further away, which is
-    `taper` of that at its top. A sphere's depth follows from its radius and its middle.
+    `taper` of that at its top. A sphere's depth follows from its radius and its middle. `bbox_deviation` is that of
+    the lower edge, in heights of the box.
     """
     height = cameras.height - plane
-    stretch = np.exp(SIZE_SIGMA * draws[:, COLUMN["size"]])
+    stretch = np.exp(math.hypot(SIZE_SIGMA, math.sqrt(2) * bbox_deviation) * draws[:, COLUMN["size"]])
     x0, y0, x1, y1 = bbox
+    off = draws[:, COLUMN["foot"]]
     if shape == "sphere":
-        rays, radius = cameras.rays(((x0 + x1) / 2, (y0 + y1) / 2)), (x1 - x0 + y1 - y0) / 4
+        middle = (y0 + y1) / 2 + bbox_deviation * (y1 - y0) * off
+        rays = cameras.rays(np.column_stack([np.full(len(off), (x0 + x1) / 2), middle]))
+        radius = (x1 - x0 + y1 - y0) / 4
         sink = radius / cameras.focal - rays[:, 1]
         if not (sink[0] > HORIZON and height[0] > 0):
             return None
         z = height / np.maximum(sink, HORIZON)
         half = z * radius / cameras.focal
         return LiftedBody(shape, cameras.coordinates(rays * z[:, None]), half, half, True)
-    off, sigma = draws[:, COLUMN["foot"]], max(FOOT_SIGMA * (y1 - y0), LEAST_FOOT * cameras.width)
+    sigma = max(max(FOOT_SIGMA, bbox_deviation) * (y1 - y0), LEAST_FOOT * cameras.width)
     foot = y1 + (sigma * off if y1 <= cameras.height_px - 1 else CUT * (y1 - y0) * np.abs(off))
     rays = cameras.rays(np.stack([np.full(len(foot), (x0 + x1) / 2), foot], axis=1))
     if not (-rays[0, 1] > HORIZON and height[0] > 0):  # the likeliest ray meets the plane at no sane distance
@@ -200,7 +205,7 @@ def velocity_towards(
     turn = math.radians(motion.direction_deviation) * draws[:, COLUMN["turn"]]
     # Words such as "to the right" say how it goes over the floor: seen at a low angle, a little in the image is a lot.
     is_over_floor = motion.cue == "text" and mover.stands and motion.kind == "linear" and not motion.rises
-    direction = _turned(np.tile(motion.direction, (len(draws), 1)), np.zeros_like(turn) if is_over_floor else turn)
+    direction = _turned(_directions(motion, draws), np.zeros_like(turn) if is_over_floor else turn)
     if goal is not None and (mover.stands or motion.kind == "projectile"):
         way = _towards(mover, goal, motion, draws)
     elif motion.kind == "projectile":
@@ -215,6 +220,14 @@ def velocity_towards(
     return way * speed[:, None]
 
 
+def _directions(motion: Motion, draws: Floats) -> Floats:
+    """Unit vectors [K, 2] in the image: of two that speak against each other, each for half of the draws."""
+    x, y = motion.direction or (0.0, 0.0)
+    other = motion.other_direction or (x, y)
+    is_other = (draws[:, COLUMN["let_go_right"]] > 0)[:, None]
+    return np.where(is_other, np.array(other) / max(math.hypot(*other), 1e-9), np.array([x, y]))
+
+
 def _turned(vectors: Floats, angles: Floats) -> Floats:
     """Vectors [K, 2] turned by angles [K] (radians), from the first axis to the second."""
     cosine, sine, (x, y) = np.cos(angles), np.sin(angles), vectors.T
@@ -225,12 +238,15 @@ def velocity_in_side_view(
     mover: LiftedBody, motion: Motion, draws: Floats, goal: LiftedBody | None, speed_name: str
 ) -> Floats:
     """[K, 3] m/s of what moves in a drawing that has no depth: along the floor where it stands."""
-    dx, dy = motion.direction or (0.0, 0.0)
-    direction = np.array([dx, -dy, 0.0]) if goal is None else goal.centre[0] - mover.centre[0]
+    turn = math.radians(motion.direction_deviation) * draws[:, COLUMN["turn"]]
+    seen = _turned(_directions(motion, draws), turn)
+    direction = np.column_stack([seen[:, 0], -seen[:, 1], np.zeros(len(draws))])
+    if goal is not None:
+        direction = goal.centre - mover.centre
     if mover.stands and motion.kind == "linear" and not motion.rises:
         direction = direction * np.array([1.0, 0.0, 0.0])
     speed = motion.speed * motion.metres_per_pixel.value * speed_factors(motion, draws, speed_name)
-    return direction / max(float(np.linalg.norm(direction)), 1e-9) * speed[:, None]
+    return direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-9)[:, None] * speed[:, None]
 
 
 def speed_factors(motion: Motion, draws: Floats, name: str = "speed") -> Floats:

@@ -23,6 +23,7 @@ from cow_service.records import (
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
 
+Likeness = Literal["same", "other", "unknown"]
 SpeedWord = Literal["slow", "normal", "fast"]
 Unit = Literal["px", "m", "widths", "px/s", "m/s", "widths/s"]  # `widths`: of the image
 
@@ -142,7 +143,14 @@ class WayReading:
 
     along_arrow: bool | None = None  # else against it
     direction: Vector | None = None  # unit vector in the image
+    depth: float = 0.0  # see `Motion.depth`; 1 or -1 alone: straight away from the camera, or towards it
     towards: str | None = None  # name of the thing that it moves towards
+    forward: bool | None = None  # as it faces, else backward
+
+    @property
+    def speaks_of_arrow(self) -> bool:
+        """Whether a drawn arrow is to be followed."""
+        return self.along_arrow is not None
 
 
 @dataclass(frozen=True)
@@ -150,6 +158,7 @@ class QuestionReading:
     """What the words of a question say, without a look at the image and without a model."""
 
     asked: records.Asked | None = None  # null if the reader cannot tell from the words alone
+    mover: str | None = None  # what moves, in its words
     changes: tuple[NamedChange, ...] = ()  # what is taken away or put somewhere
     trail_named: bool = False  # the question speaks of a trail
     nouns: tuple[str, ...] = ()  # of the things that it names, each once
@@ -174,6 +183,8 @@ class GroundingReading:
     asked: records.Asked | None = None  # what the question wants to know; null if the reader cannot say
     changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
     is_doubtful: bool = False  # the object in the box may not be the named one
+    asked_is_doubtful: bool = False  # the words say otherwise than what is asked was read
+    bbox_deviation: float = 0.0  # see `LocatedObject.bbox_deviation`
     language: Language | None = None  # of the question, as far as the reader can say
 
 
@@ -186,7 +197,7 @@ class MotionReading:
     cue: records.Cue
     along_arrow: bool | None = None
     direction_deviation: float | None = None  # degrees; null: as is usual for the cue
-    is_doubtful: bool = False  # see `Motion.is_doubtful`
+    other_direction: Vector | None = None  # see `Motion.other_direction`
     depth: float = 0.0  # see `Motion.depth`
     depth_deviation: float | None = None  # degrees; null if the reader says nothing of the depth
     towards: LocatedObject | None = None  # see `Motion.towards`
@@ -233,6 +244,14 @@ class WordReader(Protocol):
 
     def read_name(self, name: str) -> ObjectPrior:
         """What the name of an object says of its shape."""
+        ...
+
+    def likeness(self, words: str, name: str) -> Likeness:
+        """Whether a phrase means the thing of that name.
+
+        It does where they share a colour, noun or number and differ in none; it means another one where they differ in
+        a colour, a number or a form.
+        """
         ...
 
     def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:

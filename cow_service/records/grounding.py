@@ -119,6 +119,9 @@ class LocatedObject(Record):
     mask: Artifact | None = Field(default=None, description="PNG of the image's size, white where the object is.")
     prior: ObjectPrior | None = None
     source: Source | None = Field(default=None, description="Who located it; null in results of older versions.")
+    bbox_deviation: float = Field(
+        default=0.0, ge=0, le=1, description="Of the edges of an estimated box, one standard deviation in its sides."
+    )
     is_doubtful: bool = Field(default=False, description="It may not be the named one: no answer about it is sure.")
 
 
@@ -154,6 +157,7 @@ class Grounding(Record):
     trail_named: bool = Field(
         default=False, description="The question mentions a trail: similar balls in a row are one ball over time."
     )
+    bbox_deviation: float = Field(default=0.0, ge=0, le=1, description="As `LocatedObject.bbox_deviation`.")
     is_doubtful: bool = Field(default=False, description="As `LocatedObject.is_doubtful`, for the moving object.")
     question_is_doubtful: bool = Field(default=False, description="Its words say otherwise than it was read.")
     language: Language | None = Field(default=None, description="Of the question, where a multimodal LLM says it.")

@@ -66,9 +66,16 @@ class Motion(Record):
     )
     direction: Vector | None = Field(description="Unit vector in the image, px; null for a fall or a static object.")
     direction_deviation: float = Field(default=0.0, ge=0, le=90, description="Degrees, one standard deviation.")
-    is_doubtful: bool = Field(default=False, description="Image, words and reader disagree about the direction.")
+    other_direction: Vector | None = Field(
+        default=None,
+        description="Another direction, px, that image, words or reader speak for: half of the simulated versions set "
+        "out that way, and nothing is sure.",
+    )
     depth: float = Field(
-        default=0.0, ge=-1, le=1, description="Sine of the angle out of the image plane: positive away from the camera."
+        default=0.0,
+        ge=-1,
+        le=1,
+        description="Sine of the angle out of the image plane: positive away from the camera, negative towards it.",
     )
     depth_deviation: float = Field(
         default=0.0, ge=0, le=90, description="Degrees, one standard deviation of that angle."

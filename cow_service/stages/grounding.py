@@ -9,14 +9,14 @@ from cow_service.media.images import decode, encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
 from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import GroundingReading, NamedChange, SeenThing, WordReader
+from cow_service.readers.base import GroundingReading, NamedChange, ReaderInput, SeenThing, WordReader
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, ObjectPrior
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
-from cow_service.stages.settling import settle_question
+from cow_service.stages.settling import SeenThings, settle_places, settle_question
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object, mask_iou
 from cow_service.vision.segmentation import mask_from_bbox
 from cow_service.vision.types import Mask
@@ -45,7 +45,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         empty, changed = run.reader_input("grounding"), request.changed_names
         sought = tuple(name for name in changed if not any(same_name(name, each.object) for each in given))
         find = partial(_find, run) if "detector" in run.backends.perception.names else None
-        reading = run.reader.ground(replace(empty, known=given, sought=sought, find=find))
+        reading = _read_and_settle(run, replace(empty, known=given, sought=sought, find=find))
         if run.can_segment:
             with run.cpu():
                 reading = _outlined(run, reading)
@@ -58,8 +58,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         drawn = [("an arrow", each.tail) for each in scene.arrows if "arrow" not in question.drawings_named]
         drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in question.drawings_named]
     # The others, and what is changed of all of them.
-    asked = None if request.asked is None else Asked(**dict(request.asked))
-    asked, misread = settle_question(asked, reading, question) if source == "mllm" else (asked or reading.asked, ())
+    asked = reading.asked if request.asked is None else Asked(**dict(request.asked))
     mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
     beside = [each for each, mask in zip(given, masks, strict=True) if not _is_mover(each, mask, reading)]
     boxes = [each.bbox for each in beside]
@@ -77,14 +76,15 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         interventions=interventions,
         prior=reading.prior,
         asked=asked,
-        question_is_doubtful=bool(misread),
+        question_is_doubtful=reading.asked_is_doubtful,
         trail_named=question.trail_named,
+        bbox_deviation=reading.bbox_deviation,
         is_doubtful=reading.is_doubtful,
         language=reading.language,
         source=source,
     )
     grounding = understood(grounding, run.backends.words())
-    warnings = [*reading.warnings, *warnings, *misread]
+    warnings = [*reading.warnings, *warnings]
     warnings += [
         f"`objects.{index}` ('{each.object}') lies where the moving object is, and was taken for it."
         for index, each in enumerate(given)
@@ -113,6 +113,37 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     things = (*others_of(grounding), *removed_of(grounding))
     artifacts = (mask.sha256, *(each.mask.sha256 for each in things if each.mask is not None))
     return StageResult(value=grounding, warnings=tuple(warnings), artifacts=artifacts, hints=reading.hints)
+
+
+def _read_and_settle(run: Run[SimulateRequest], given: ReaderInput) -> GroundingReading:
+    """What the reader says of places and of what is asked, settled with the words and with what is seen.
+
+    A reader that may be wrong is asked once more with what speaks against its reading. Raises what it raises.
+    """
+    reading, objections = run.reader.ground(given), ()
+    if not run.reader.heeds_objections:
+        return reading
+    settled, objections = _settled(run, reading)
+    if objections:
+        settled, objections = _settled(run, run.reader.ground(replace(given, objections=objections)))
+    return replace(settled, warnings=(*settled.warnings, *objections))
+
+
+def _settled(run: Run[SimulateRequest], reading: GroundingReading) -> tuple[GroundingReading, tuple[str, ...]]:
+    words, question, request = run.backends.words(), run.question, run.request
+    with run.cpu():
+        scene = run.scene
+        boxes = [reading.bbox, *(each.bbox for each in reading.others)]
+        bare = frozenset(bbox for bbox in boxes if not scene.shows_thing(bbox))
+        placed, objections = settle_places(reading, question, SeenThings(scene.regions, bare), words)
+    # What the request says of what is asked and changed is not the reader's to say.
+    if request.interventions:
+        question = replace(question, changes=())
+        placed = replace(placed, interventions=())
+    if request.asked is not None:
+        return placed, objections
+    asked, misread = settle_question(placed, question, words)
+    return asked, (*objections, *misread)
 
 
 def _is_mover(thing: LocatedObject, mask: Mask | None, mover: GroundingReading) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from cow_service import records
 from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, field_of
 from cow_service.narration.words import bare_name, direction_words, place_words, same_name
+from cow_service.perception.facing import facing
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
@@ -52,8 +53,12 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         with run.cpu():
             given = run.reader_input("motion", run.scene_of(grounding, None if hints is None else hints.cue))
             seen = _way_seen(run, given.scene, grounding)
-        reading, source = run.reader.read_motion(given, grounding, hints), run.reader.source
-        reading = settle_way(reading, run.question.way, seen, grounding.bbox)
+        way, source = run.question.way, run.reader.source
+        reading, objections = settle_way(run.reader.read_motion(given, grounding, hints), way, seen, grounding.bbox)
+        if objections:
+            again = run.reader.read_motion(replace(given, objections=objections), grounding, hints)
+            reading, objections = settle_way(again, way, seen, grounding.bbox)
+        reading = replace(reading, warnings=(*reading.warnings, *objections))
         if reading.direction is None and reading.kind in records.DIRECTED_KINDS:
             raise CannotReadDirection(
                 f"Neither the image nor the question tells which way the {grounding.object} moves.",
@@ -101,9 +106,12 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
 
 def _way_seen(run: Run[SimulateRequest], scene: Scene, grounding: Grounding) -> SeenWay:
     """What the image shows of the way of the mover. To be called with `cpu` held."""
-    arrow, towards = scene.arrow_at(grounding.bbox), run.question.way.towards
-    goals = [each for each in grounding.others if towards is not None and same_name(each.object, towards)]
-    return SeenWay(None if arrow is None else arrow.direction, goals[0] if len(goals) == 1 else None)
+    way, words = run.question.way, run.backends.words()
+    arrow, front = scene.arrow_at(grounding.bbox), None
+    if way.forward is not None and grounding.prior is not None and grounding.prior.elongated:
+        front = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
+    goals = [each for each in grounding.others if way.towards and words.likeness(way.towards, each.object) == "same"]
+    return SeenWay(None if arrow is None else arrow.direction, goals[0] if len(goals) == 1 else None, front)
 
 
 # --- what the request says
@@ -331,7 +339,7 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         law=law,
         direction=mover.direction,
         direction_deviation=mover.direction_deviation,
-        is_doubtful=reading.is_doubtful,
+        other_direction=None if reading.other_direction is None else _unit(reading.other_direction),
         depth=mover.depth,
         depth_deviation=depth_deviation,
         towards=mover.towards,

@@ -24,9 +24,9 @@ from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.stages.run import Run
 from cow_service.vision.edges import divide
 from cow_service.vision.forms import shape_seen
-from cow_service.vision.masks import CroppedMask, iou, is_same_object
+from cow_service.vision.masks import CroppedMask, iou, is_same_object, share_inside
 from cow_service.vision.openings import measure_opening
-from cow_service.vision.scene import Obstacle, Scene
+from cow_service.vision.scene import CLEAR_CUT, Obstacle, Scene
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.side_view import SideView
 
@@ -45,6 +45,7 @@ class Situation:
     request: SimulateRequest
     obstacles: Sequence[Obstacle]
     removed: Sequence[Obstacle] = ()
+    unlisted: tuple[BBox, ...] = ()  # of what is seen beside a list that says that it is complete
     depth: DepthMap | None = None
     focal: Estimate | None = None  # px, by what else than the request tells it
 
@@ -52,7 +53,8 @@ class Situation:
     def of(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: Motion) -> Situation:
         """With the obstacles that the scene shows."""
         obstacles, removed = obstacles_of(scene, grounding)
-        return Situation(scene, grounding, motion, run.request, obstacles, removed, run.depth, run.focal)
+        unlisted = () if not grounding.objects_complete else unlisted_of(scene, grounding)
+        return Situation(scene, grounding, motion, run.request, obstacles, removed, unlisted, run.depth, run.focal)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -91,16 +93,30 @@ class Situation:
 
 
 def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ...], tuple[Obstacle, ...]]:
-    """What stands beside the mover, and what of it is removed before the motion."""
+    """What stands beside the mover, and what of it is removed before the motion; no more than is listed where a list
+    says that it is complete."""
     removed, others = removed_of(grounding), others_of(grounding)
-    found = scene.obstacles(grounding.bbox, (*others, *removed), grounding.objects_complete)
+    found = scene.obstacles(grounding.bbox, (*others, *removed))
     gone, named = {each.bbox for each in removed}, {other.bbox for other in others}
+    if grounding.objects_complete:
+        found = tuple(each for each in found if each.bbox in gone | named)
     taken = tuple(each for each in found if each.bbox in gone)
     masks = [each.mask.full() for each in taken]
     # A part of what is removed, such as its lit top, may have been found as a region of its own.
     parts = {each.bbox for each in found if any(each.mask.shared_with(m) > PART * each.mask.area for m in masks)}
     kept = (each for each in found if each.bbox not in gone and (each.bbox in named or each.bbox not in parts))
     return tuple(kept), taken
+
+
+def unlisted_of(scene: Scene, grounding: Grounding) -> tuple[BBox, ...]:
+    """Boxes of what is clearly seen as one thing, and is no part of what a complete list has."""
+    listed = (*others_of(grounding), *removed_of(grounding))
+    boxes = [grounding.bbox, *(each.bbox for each in listed)]
+    return tuple(
+        each.bbox
+        for each in scene.obstacles(grounding.bbox, listed)
+        if each.confidence >= CLEAR_CUT and all(share_inside(each.bbox, box) < PART for box in boxes)
+    )
 
 
 def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePath | None]:
@@ -120,8 +136,9 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     if query is None and situation.grounding.asked is None and carried is not None:
         # Nothing is asked but whether it gets there: shown is what it does in most worlds.
         query = Query(Asked(relation="inside"), carried.targets[0])
-    is_complete = situation.grounding.objects_complete
-    faint = () if is_complete else situation.scene.faint_beside([body.bbox for body in bodies])
+    faint = situation.unlisted
+    if not situation.grounding.objects_complete:
+        faint = situation.scene.faint_beside([body.bbox for body in bodies])
     depth = None if level is not None or situation.follows_path else situation.depth
     is_ball_in_air = bodies[0].shape == "sphere" and in_air[0]
     shadow = find_shadow(situation.scene, bodies[0].bbox) if depth is None and is_ball_in_air else None
@@ -214,6 +231,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
             source=(None if thing is None else thing.source) or "embedded",
             confidence=seen.confidence,
             prior=said,
+            bbox_deviation=(thing if thing is not None and bodies else grounding).bbox_deviation,
             point=None if bodies else grounding.point,
             stands_out=region is not None or situation.side_view is not None,
         )

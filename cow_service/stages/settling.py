@@ -1,15 +1,24 @@
-"""What is said, seen and read of one thing, settled: the surer source decides, and what contradicts it is a doubt.
+"""What is said, seen and read of one thing, settled: the surer source decides.
 
-Pure functions, without a look at an image or a call of a model.
+Pure functions, without a look at an image or a call of a model. What speaks against a reading is told in sentences, for
+the reader to be asked again with, and to warn of where it stays.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from cow_service.physics.camera import way_to
+from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
-from cow_service.readers.base import GroundingReading, MotionReading, QuestionReading, WayReading
-from cow_service.records import Asked, BBox, Cue, LocatedObject, Vector
+from cow_service.readers.base import GroundingReading, MotionReading, QuestionReading, WayReading, WordReader
+from cow_service.records import BBox, Cue, Intervention, LocatedObject, Vector
+from cow_service.vision.masks import iou
+from cow_service.vision.regions import Region
+
+Objections = tuple[str, ...]
+"""What speaks against a reading, in whole sentences."""
+
+# --- which way
 
 APART = 2.0  # spreads between two sources from which they contradict each other
 WORDS_APART = 60.0  # degrees between a drawn arrow and a direction in words, which is a rough one: "to the right"
@@ -21,79 +30,235 @@ class SeenWay:
 
     arrow: Vector | None = None  # of the arrow that is drawn at it
     goal: LocatedObject | None = None  # where the thing is that the words have it move towards
+    front: Vector | None = None  # the way that it faces
 
 
-def settle_way(read: MotionReading, said: WayReading, seen: SeenWay, mover: BBox) -> MotionReading:
-    """The reading, with its direction by the surest source: a drawn arrow, then the words, then what was read.
+def settle_way(read: MotionReading, said: WayReading, seen: SeenWay, mover: BBox) -> tuple[MotionReading, Objections]:
+    """The reading, with its direction by the surest source: an arrow that is meant, words, its front, what was read.
 
-    An arrow gives an axis. Its sense is that of the words, else as read. What is more than two spreads away from that
-    makes the direction doubtful. A direction that was not estimated stays as it is.
+    An arrow gives an axis. Its sense is that of the words, else as read. Where another source is more than two spreads
+    away from what was taken, worlds are drawn from both. A direction that was not estimated stays as it is, and so does
+    one along a trail, which is measured.
     """
-    if read.direction_deviation is None:
-        return read
-    settled = _by_arrow(read, said, seen.arrow) or _by_words(read, said, seen.goal, mover)
-    if settled is None or settled.direction is None:
-        return read
-    warnings: list[str] = []
-    words = said.direction
-    if settled.cue == "arrow" and words is not None and angle(words, settled.direction) > WORDS_APART:
-        warnings.append(
-            "The question's words for the direction and the arrow drawn at the object contradict each other."
-        )
-    off = 0.0 if read.direction is None else angle(read.direction, settled.direction)
-    if off > APART * math.hypot(read.direction_deviation, DIRECTION_DEVIATIONS[settled.cue]):
-        taken = "the arrow drawn at the object" if settled.cue == "arrow" else "the question's words"
-        warnings.append(f"The reader's direction is {off:.0f} degrees off what was taken, {taken}.")
-    if not warnings:
-        return settled
+    if read.direction_deviation is None or (read.cue == "trail" and not said.speaks_of_arrow):
+        return read, ()
+    taken = _by_arrow(read, said, seen.arrow) or _by_words(read, said, seen.goal, mover) or _by_front(read, said, seen)
+    if taken is None or taken.direction is None:
+        return read, ()
+    objections, rival = list[str](), None
+    goal = None if seen.goal is None else way_to(seen.goal.bbox, mover, is_on_floor=read.kind == "linear")
+    words = said.direction or goal
+    if taken.cue == "arrow" and words is not None and angle(words, taken.direction) > WORDS_APART:
+        objections.append("The question's words for the direction contradict the arrow drawn at the object.")
+        rival = words
+    off = 0.0 if read.direction is None else angle(read.direction, taken.direction)
+    if off > APART * math.hypot(read.direction_deviation, DIRECTION_DEVIATIONS[taken.cue]):
+        source = {"arrow": "the arrow drawn at the object", "orientation": "its front"}.get(taken.cue, "the question")
+        if taken.cue == "arrow" and said.along_arrow is not None:
+            source += f", which the question has it move {'along' if said.along_arrow else 'against'},"
+        objections.append(f"The direction that was read is {off:.0f} degrees off what {source} says.")
+        rival = read.direction
+    if rival is None:
+        return taken, ()
     # Its sentence was worded for another direction.
-    return replace(settled, is_doubtful=True, sentence=None, warnings=(*read.warnings, *warnings))
+    return replace(taken, other_direction=rival, towards=None, sentence=None), tuple(objections)
 
 
 def _by_arrow(read: MotionReading, said: WayReading, arrow: Vector | None) -> MotionReading | None:
-    if arrow is None:
+    is_meant = said.speaks_of_arrow or read.cue == "arrow" or (read.direction is None and said == WayReading())
+    if arrow is None or not is_meant:
         return None
     along = read.along_arrow if said.along_arrow is None else said.along_arrow
     if along is None:
         rough = said.direction or read.direction
         along = rough is None or angle(rough, arrow) <= 90
     sign = 1.0 if along else -1.0
-    return _taken(read, (sign * arrow[0], sign * arrow[1]), "arrow", along)
+    return _taken(read, (sign * arrow[0], sign * arrow[1]), "arrow", along=along)
 
 
 def _by_words(read: MotionReading, said: WayReading, goal: LocatedObject | None, mover: BBox) -> MotionReading | None:
     if said.direction is not None:
-        return _taken(read, said.direction, "text")
+        return _taken(read, said.direction, "text", depth=said.depth)
+    if said.depth:
+        direction, depth = depth_motion(said.depth)
+        return _taken(read, direction, "text", depth=depth)
     if goal is None:
         return None
     return replace(_taken(read, way_to(goal.bbox, mover, is_on_floor=read.kind == "linear"), "text"), towards=goal)
 
 
-def _taken(read: MotionReading, direction: Vector, cue: Cue, along: bool | None = None) -> MotionReading:
-    return replace(read, direction=direction, cue=cue, along_arrow=along, direction_deviation=None)
+def _by_front(read: MotionReading, said: WayReading, seen: SeenWay) -> MotionReading | None:
+    if seen.front is None or said.forward is None:
+        return None
+    sign = 1.0 if said.forward else -1.0
+    return _taken(read, (sign * seen.front[0], sign * seen.front[1]), "orientation")
+
+
+def _taken(
+    read: MotionReading, direction: Vector, cue: Cue, along: bool | None = None, depth: float | None = None
+) -> MotionReading:
+    """The reading with a direction that was not estimated; a throw keeps the depth that was read, unless it is said."""
+    keeps = depth is None and read.kind == "projectile"
+    return replace(
+        read,
+        direction=direction,
+        cue=cue,
+        along_arrow=along,
+        direction_deviation=None,
+        depth=read.depth if keeps else depth or 0.0,
+        depth_deviation=read.depth_deviation if keeps else None,
+    )
+
+
+# --- what stands where
+
+EDGE_OFF = 0.25  # of the sides of a thing that is seen: an estimated edge this far off is still its own
+BBOX_DEVIATION = 0.1  # of its sides: how exact an estimated box is where nothing that is seen tells its edges
+
+
+@dataclass(frozen=True)
+class SeenThings:
+    """What the image shows of things."""
+
+    regions: Sequence[Region] = ()
+    bare: frozenset[BBox] = frozenset()  # those of the boxes that were read in which nothing stands
+
+
+def settle_places(
+    read: GroundingReading, said: QuestionReading, seen: SeenThings, words: WordReader
+) -> tuple[GroundingReading, Objections]:
+    """The reading, its boxes moved onto the things that are seen there, and what speaks against its names and places.
+
+    A box in which nothing stands, or something of another colour while the named one is elsewhere, is doubtful, and so
+    is a mover that is another one than the words say.
+    """
+    boxes = list(dict.fromkeys([read.bbox, *(each.bbox for each in _things_of(read))]))
+    moved, objections, doubtful = _onto_regions(boxes, seen.regions), list[str](), set[BBox]()
+    mover = LocatedObject(object=read.object, bbox=read.bbox)
+    for thing in dict.fromkeys((mover, *_things_of(read))):
+        fault = _fault_of(thing, moved[thing.bbox], seen)
+        if fault is not None and thing.bbox not in doubtful:
+            objections.append(fault)
+            doubtful.add(thing.bbox)
+    if said.mover is not None and _is_other(read, said.mover, words):
+        objections.append(f"The question has '{said.mover}' move, and '{read.object}' was read.")
+        doubtful.add(read.bbox)
+
+    def settled(thing: LocatedObject) -> LocatedObject:
+        region = moved[thing.bbox]
+        return thing.model_copy(update={
+            "bbox": thing.bbox if region is None else region.bbox,
+            "bbox_deviation": BBOX_DEVIATION if region is None else 0.0,
+            "is_doubtful": thing.is_doubtful or thing.bbox in doubtful,
+        })  # fmt: skip
+
+    changed = tuple(
+        each.model_copy(update={"object": settled(each.object), "targets": tuple(map(settled, each.targets))})
+        for each in read.interventions
+    )
+    own = settled(mover)
+    reading = replace(
+        read,
+        bbox=own.bbox,
+        bbox_deviation=own.bbox_deviation,
+        is_doubtful=read.is_doubtful or own.is_doubtful,
+        others=tuple(map(settled, read.others)),
+        interventions=changed,
+    )
+    return reading, tuple(objections)
+
+
+def _things_of(read: GroundingReading) -> list[LocatedObject]:
+    changed = (thing for each in read.interventions for thing in (each.object, *each.targets))
+    return [*read.others, *changed]
+
+
+def _onto_regions(boxes: Sequence[BBox], regions: Sequence[Region]) -> dict[BBox, Region | None]:
+    """For each box the region that it is about: none of its edges is far off, and no other box fits it better."""
+    pairs = [
+        (iou(box, region.bbox), at, box, region)
+        for box in boxes
+        for at, region in enumerate(regions)
+        if _is_about(box, region.bbox)
+    ]
+    found = dict[BBox, Region | None].fromkeys(boxes)
+    taken = set[int]()
+    for _, at, box, region in sorted(pairs, key=lambda pair: -pair[0]):
+        if found[box] is None and at not in taken:
+            found[box] = region
+            taken.add(at)
+    return found
+
+
+def _is_about(box: BBox, region: BBox) -> bool:
+    sides = (region[2] - region[0], region[3] - region[1]) * 2
+    return all(abs(a - b) <= EDGE_OFF * side for a, b, side in zip(box, region, sides, strict=True))
+
+
+def _fault_of(thing: LocatedObject, region: Region | None, seen: SeenThings) -> str | None:
+    if region is None and thing.bbox in seen.bare:
+        return f"In the box of '{thing.object}' nothing stands."
+    named = set(thing.object.lower().split())
+    if region is None or not named.isdisjoint((region.colour, *region.colours)):
+        return None
+    there = [each for each in seen.regions if each.colour in named]
+    if not there:
+        return None
+    x, y = there[0].centre
+    return (
+        f"In the box of '{thing.object}' is something {region.colour}, while something {there[0].colour} is at "
+        f"({x:.0f}, {y:.0f})."
+    )
+
+
+def _is_other(read: GroundingReading, mover: str, words: WordReader) -> bool:
+    """Whether what was read to move is another thing than the words say: one that they, or the reading, tell apart."""
+    likeness = words.likeness(mover, read.object)
+    return likeness == "other" or (
+        likeness == "unknown" and any(words.likeness(mover, each.object) == "same" for each in read.others)
+    )
+
+
+# --- what is asked
+
+COMPARED = ("form", "relation", "negated", "every", "partly", "within")
 
 
 def settle_question(
-    given: Asked | None, read: GroundingReading, said: QuestionReading
-) -> tuple[Asked | None, tuple[str, ...]]:
-    """What is asked, and what speaks against how the question was read: its words decide what they plainly say.
+    read: GroundingReading, said: QuestionReading, words: WordReader
+) -> tuple[GroundingReading, Objections]:
+    """The reading with what is asked, and what speaks against it: the words decide what they plainly say.
 
-    What is given needs no reading. Names stay as they were read: the things that were found have them. Words that were
-    not understood say nothing.
+    Names stay as they were read: the things that were found have them. Words that were not understood say nothing.
     """
-    asked, plain, doubts = read.asked or said.asked, said.asked, list[str]()
-    if given is not None:
-        asked = given
-    elif asked is not None and plain is not None:
-        words = {"form": plain.form, "relation": plain.relation, "negated": plain.negated}
-        followed = asked.model_copy(update=words)
-        if followed != asked:
-            doubts.append("The reader takes the question for another one than its words say: the words were followed.")
-            asked = followed
-    removed = [sum(each.kind == "remove" for each in changes) for changes in (said.changes, read.interventions)]
-    if removed[0] != removed[1]:
-        doubts.append("The question's words take {} things away beforehand, the reader {}.".format(*removed))
-    return asked, tuple(doubts)
+    asked, plain = read.asked, said.asked
+    if plain is None:
+        return read, ()
+    objections = list[str]()
+    if asked is not None:
+        followed = asked.model_copy(update={name: getattr(plain, name) for name in COMPARED})
+        differ = [name for name in COMPARED if getattr(asked, name) != getattr(plain, name)]
+        for name in ("subject", "target"):
+            wanted, taken = getattr(plain, name), getattr(asked, name)
+            if wanted is not None and taken is not None and words.likeness(wanted, taken) == "other":
+                differ.append(name)
+        if differ:
+            told = (f"`{name}` {_shown(getattr(plain, name))}, not {_shown(getattr(asked, name))}" for name in differ)
+            objections.append(f"By its words the question asks with {', '.join(told)}.")
+        asked = followed
+    names = [[each.object for each in said.changes if each.kind == "remove"], _removed(read.interventions)]
+    if len(names[0]) != len(names[1]):
+        told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in names]
+        objections.append(f"By its words the question takes {told[0]} away beforehand, and {told[1]} was read.")
+    return replace(read, asked=asked or plain, asked_is_doubtful=bool(objections)), tuple(objections)
+
+
+def _removed(changes: Sequence[Intervention]) -> list[str]:
+    return [each.object.object for each in changes if each.kind == "remove"]
+
+
+def _shown(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) or value is None else f"'{value}'"
 
 
 def angle(a: Vector, b: Vector) -> float:

@@ -94,7 +94,7 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
         return result, outcome
     first = None if result.decided.first is None else names[result.decided.first]
     decided = vars(result.decided) | {"first": first}
-    is_misread = situation.motion.is_doubtful or situation.grounding.question_is_doubtful
+    is_misread = situation.motion.other_direction is not None or situation.grounding.question_is_doubtful
     doubts: list[Doubt] = ["reading"] if is_misread else []
     if any(thing.is_doubtful for thing in (situation.grounding, *situation.located)):
         doubts.append("identity")

@@ -257,6 +257,12 @@ class Scene:
         """The region that a box [x0, y0, x1, y1] is about, if there is one."""
         return region_of(self.regions, bbox)
 
+    def shows_thing(self, bbox: BBox) -> bool:
+        """Whether something stands in a box: what was found there, or what can be cut out with a visible outline."""
+        if self.region_of(bbox) is not None:
+            return True
+        return self.once(("thing", bbox), lambda: fault_of(self.clean, self.silhouette(bbox)) is None)
+
     def confidence_of(self, bbox: BBox) -> float:
         """How sure it is (0..1) that what is in a box is one separate thing with its outline; 1 for what is given.
 
@@ -322,11 +328,8 @@ class Scene:
         other._found["mask", bbox] = mask
         return other
 
-    def obstacles(
-        self, mover: BBox, named: Sequence[LocatedObject] = (), is_complete: bool = False
-    ) -> tuple[Obstacle, ...]:
-        """The objects besides the mover in a box: first those that are named, then others, named by colour, unless the
-        named ones are all that there are.
+    def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
+        """The objects besides the mover in a box: first those that are named, then others, named by colour.
 
         Found once for the same arguments. Of known regions their own mask is taken, which is cheaper than another
         silhouette, unless a mask was given.
@@ -344,7 +347,7 @@ class Scene:
                     confidence = region.confidence if region is not None and found else 1.0
                     obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
             outlined = [self.silhouette(other.bbox) for other in named if other.mask is not None]
-            for region in () if is_complete else self.regions:
+            for region in self.regions:
                 area = region.mask.area
                 if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
                     continue
@@ -361,7 +364,7 @@ class Scene:
                 obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
             return tuple(obstacles)
 
-        return self.once(("obstacles", mover, tuple(named), is_complete), find)
+        return self.once(("obstacles", mover, tuple(named)), find)
 
     def locate(self, point: tuple[float, float]) -> Cutout:
         """The object at a point [x, y]: the region there, else what can be cut out around it."""

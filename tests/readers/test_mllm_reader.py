@@ -305,7 +305,7 @@ def test_a_drawn_arrow_is_surer_than_the_reader(
     motion = run.stage("motion", read_motion, found, run.hints)
     assert motion.direction is not None
     assert angle_between(motion.direction, expected) < 2.5
-    assert (motion.cue, motion.is_doubtful) == ("arrow", is_doubtful)
+    assert (motion.cue, motion.other_direction is not None) == ("arrow", is_doubtful)
     assert motion.direction_deviation < 5, "it is as exact as the arrow"
     outcome = run.stage("trajectory", compute_trajectory, found, motion).outcome
     assert outcome is not None

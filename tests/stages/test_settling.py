@@ -8,18 +8,32 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.readers.base import GroundingReading, MotionReading, NamedChange, QuestionReading, WayReading
-from cow_service.records import Asked, Cue, Intervention, LocatedObject, Vector
-from cow_service.stages.settling import APART, SeenWay, angle, settle_question, settle_way
+from cow_service.readers.embedded.reader import EmbeddedReader
+from cow_service.records import Asked, BBox, Cue, Intervention, LocatedObject, Vector
+from cow_service.stages.settling import (
+    APART,
+    BBOX_DEVIATION,
+    SeenThings,
+    SeenWay,
+    angle,
+    settle_places,
+    settle_question,
+    settle_way,
+)
+from cow_service.vision.masks import CroppedMask
+from cow_service.vision.regions import Region
 
 RIGHT, LEFT, DOWN = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)
 MOVER = (100.0, 100.0, 140.0, 140.0)
 VASE = LocatedObject(object="vase", bbox=(100.0, 300.0, 140.0, 380.0))
+WORDS = EmbeddedReader()
 READ = MotionReading("linear", RIGHT, "orientation", direction_deviation=20.0, sentence="The ball rolls on.")
 
 
@@ -28,33 +42,44 @@ def turned(degrees: float) -> tuple[float, float]:
 
 
 class Rule(NamedTuple):
-    """What is read instead of `READ`, said and seen; the direction it becomes, by what, and whether in doubt."""
+    """What is read instead of `READ`, said and seen; the direction it becomes, by what, and whether another stays."""
 
     direction: Vector | None
     cue: Cue
     read: Mapping[str, Any] = MappingProxyType({})
     said: WayReading = WayReading()
     seen: SeenWay = SeenWay()
-    is_doubtful: bool = False
+    rival: Vector | None = None
 
 
 ARROW, AGAINST, TO_THE_RIGHT = SeenWay(RIGHT), WayReading(along_arrow=False), WayReading(direction=RIGHT)
+BY_ARROW: dict[str, Any] = {"cue": "arrow"}
+FORWARD, BACKWARD, UP = WayReading(forward=True), WayReading(forward=False), (0.0, -1.0)
 TOWARDS, AT_VASE = WayReading(towards="vase"), SeenWay(goal=VASE)
 RULES = {
     "what is not estimated stays": Rule(RIGHT, "orientation", {"direction_deviation": None}, seen=SeenWay(DOWN)),
     "nothing else tells": Rule(RIGHT, "orientation"),
-    "an arrow is surer than what is read": Rule(RIGHT, "arrow", {"direction": turned(20)}, seen=ARROW),
-    "what is read tells the sense": Rule(LEFT, "arrow", {"direction": turned(160)}, seen=ARROW),
-    "the reader says it": Rule(LEFT, "arrow", {"direction": turned(170), "along_arrow": False}, seen=ARROW),
-    "the reader contradicts itself": Rule(LEFT, "arrow", {"along_arrow": False}, seen=ARROW, is_doubtful=True),
+    "an arrow is surer than what is read": Rule(RIGHT, "arrow", BY_ARROW | {"direction": turned(20)}, seen=ARROW),
+    "an arrow that nobody speaks of": Rule(RIGHT, "orientation", {}, seen=SeenWay(DOWN)),
+    "what is read tells the sense": Rule(LEFT, "arrow", BY_ARROW | {"direction": turned(160)}, seen=ARROW),
+    "the reader says it": Rule(LEFT, "arrow", BY_ARROW | {"direction": turned(170), "along_arrow": False}, seen=ARROW),
+    "the reader contradicts itself": Rule(LEFT, "arrow", BY_ARROW | {"along_arrow": False}, seen=ARROW, rival=RIGHT),
     "the words say it": Rule(LEFT, "arrow", {"direction": LEFT, "along_arrow": True}, AGAINST, ARROW),
-    "the reader passes over the words": Rule(LEFT, "arrow", {}, AGAINST, ARROW, is_doubtful=True),
-    "far from the arrow": Rule(RIGHT, "arrow", {"direction": turned(50)}, seen=ARROW, is_doubtful=True),
+    "the reader passes over the words": Rule(LEFT, "arrow", {}, AGAINST, ARROW, rival=RIGHT),
+    "far from the arrow": Rule(RIGHT, "arrow", BY_ARROW | {"direction": turned(50)}, seen=ARROW, rival=turned(50)),
     "words tell the direction": Rule(RIGHT, "text", {"direction": turned(30)}, TO_THE_RIGHT),
-    "far from the words": Rule(RIGHT, "text", {"direction": turned(50)}, TO_THE_RIGHT, is_doubtful=True),
-    "an arrow that the words contradict": Rule(DOWN, "arrow", {}, TO_THE_RIGHT, SeenWay(DOWN), is_doubtful=True),
+    "far from the words": Rule(RIGHT, "text", {"direction": turned(50)}, TO_THE_RIGHT, rival=turned(50)),
+    "an arrow that the words contradict": Rule(DOWN, "arrow", BY_ARROW, TO_THE_RIGHT, SeenWay(DOWN), rival=RIGHT),
+    "an arrow that leads elsewhere than to the thing": Rule(
+        RIGHT, "arrow", BY_ARROW, TOWARDS, SeenWay(RIGHT, VASE), rival=DOWN
+    ),
     "towards a thing": Rule(DOWN, "text", {"direction": DOWN}, TOWARDS, AT_VASE),
-    "towards a thing elsewhere": Rule(DOWN, "text", {}, TOWARDS, AT_VASE, is_doubtful=True),
+    "towards a thing elsewhere": Rule(DOWN, "text", {}, TOWARDS, AT_VASE, rival=RIGHT),
+    "as it faces": Rule(DOWN, "orientation", {"direction": turned(60)}, FORWARD, SeenWay(front=DOWN)),
+    "backward from its front": Rule(UP, "orientation", {"direction": UP}, BACKWARD, SeenWay(front=DOWN)),
+    "its front elsewhere": Rule(DOWN, "orientation", {}, FORWARD, SeenWay(front=DOWN), rival=RIGHT),
+    "along a trail": Rule(RIGHT, "trail", {"cue": "trail"}, TO_THE_RIGHT, ARROW),
+    "straight away from the camera": Rule(UP, "text", {"direction": UP, "depth": -0.3}, WayReading(depth=1.0)),
     "only the arrow tells": Rule(DOWN, "arrow", {"direction": None}, seen=SeenWay(DOWN)),
     "only the words tell": Rule(RIGHT, "text", {"direction": None}, TO_THE_RIGHT),
     "nobody says anything": Rule(None, "orientation", {"direction": None}),
@@ -64,12 +89,16 @@ RULES = {
 @pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
 def test_the_surest_source_decides(rule: Rule) -> None:
     read = replace(READ, **rule.read)
-    settled = settle_way(read, rule.said, rule.seen, MOVER)
+    settled, objections = settle_way(read, rule.said, rule.seen, MOVER)
     assert settled.direction == rule.direction or angle(settled.direction or RIGHT, rule.direction or LEFT) < 1e-6
-    assert (settled.cue, settled.is_doubtful, bool(settled.warnings)) == (rule.cue, rule.is_doubtful, rule.is_doubtful)
-    assert (settled.sentence is None) is rule.is_doubtful, "its sentence was worded for another direction"
-    assert settled.direction_deviation == (None if rule.cue != read.cue else read.direction_deviation)
-    assert settled.towards == (VASE if rule.said.towards else None)
+    assert (settled.cue, bool(objections)) == (rule.cue, rule.rival is not None)
+    assert (settled.other_direction is None) is (rule.rival is None)
+    assert rule.rival is None or angle(settled.other_direction or RIGHT, rule.rival) < 1e-6
+    assert (settled.sentence is None) is (rule.rival is not None), "its sentence was worded for another direction"
+    is_estimate = settled is read
+    assert settled.direction_deviation == (read.direction_deviation if is_estimate else None)
+    assert (settled.towards == VASE) is (rule.said is TOWARDS and rule.rival is None)
+    assert is_estimate or settled.depth == pytest.approx(0.0 if not rule.said.depth else 0.87, abs=0.01)
 
 
 @given(
@@ -78,42 +107,112 @@ def test_the_surest_source_decides(rule: Rule) -> None:
 def test_along_a_drawn_arrow_or_against_it_and_never_between(
     off: float, arrow: float, along: bool | None, said: bool | None
 ) -> None:
-    read = replace(READ, direction=turned(arrow + off), along_arrow=along)
-    settled = settle_way(read, WayReading(along_arrow=said), SeenWay(turned(arrow)), MOVER)
+    read = replace(READ, direction=turned(arrow + off), along_arrow=along, cue="arrow")
+    settled, objections = settle_way(read, WayReading(along_arrow=said), SeenWay(turned(arrow)), MOVER)
     assert settled.direction is not None
     gap = angle(settled.direction, turned(arrow))
     assert gap < 1e-6 or gap > 180 - 1e-6
     assert said is None or (gap < 90) is said
     apart = APART * math.hypot(20.0, DIRECTION_DEVIATIONS["arrow"])
-    assert settled.is_doubtful is (angle(turned(arrow + off), settled.direction) > apart)
+    assert bool(objections) is (angle(turned(arrow + off), settled.direction) > apart)
 
 
 ASKED = Asked(relation="touches", target="vase")
+WITHIN = ASKED.model_copy(update={"within": 2.0})
 TAKEN = NamedChange("remove", "box")
 REMOVED = Intervention(kind="remove", object=VASE)
 
 
-# What is given, read and said; what becomes of it, and whether a doubt is left.
-QUESTIONS: dict[str, tuple[Asked | None, dict[str, Any], dict[str, Any], Asked | None, bool]] = {
-    "as read, where the words were not understood": (None, {"asked": ASKED}, {}, ASKED, False),
-    "as the words say, where the reader says nothing": (None, {}, {"asked": ASKED}, ASKED, False),
-    "both say the same": (None, {"asked": ASKED}, {"asked": ASKED.model_copy(update={"target": "it"})}, ASKED, False),
-    "the reader turns it round": (
-        None, {"asked": ASKED.model_copy(update={"negated": True})}, {"asked": ASKED}, ASKED, True
+# What is read and said; what is asked by that, and whether a doubt is left.
+QUESTIONS: dict[str, tuple[dict[str, Any], dict[str, Any], Asked | None, bool]] = {
+    "as read, where the words were not understood": ({"asked": ASKED}, {"changes": (TAKEN,)}, ASKED, False),
+    "as the words say, where the reader says nothing": ({}, {"asked": ASKED}, ASKED, False),
+    "both say the same": (
+        {"asked": ASKED}, {"asked": ASKED.model_copy(update={"target": "the thing"})}, ASKED, False
     ),
+    "the reader turns it round": ({"asked": ASKED.model_copy(update={"negated": True})}, {"asked": ASKED}, ASKED, True),
     "the reader asks something else": (
-        None, {"asked": ASKED.model_copy(update={"relation": "covers"})}, {"asked": ASKED}, ASKED, True
+        {"asked": ASKED.model_copy(update={"relation": "covers"})}, {"asked": ASKED}, ASKED, True
     ),
-    "what is given": (ASKED, {"asked": Asked(relation="covers")}, {"asked": Asked(relation="tips")}, ASKED, False),
-    "both take one thing away": (None, {"interventions": (REMOVED,)}, {"changes": (TAKEN,)}, None, False),
-    "the reader forgets what is taken away": (None, {}, {"changes": (TAKEN,)}, None, True),
-    "the reader takes something away": (None, {"interventions": (REMOVED,)}, {}, None, True),
+    "the reader asks about another thing": (
+        {"asked": ASKED}, {"asked": ASKED.model_copy(update={"target": "the red ball"})}, ASKED, True
+    ),
+    "the reader passes over a time": (
+        {"asked": ASKED}, {"asked": WITHIN}, WITHIN, True
+    ),
+    "both take one thing away": (
+        {"interventions": (REMOVED,)}, {"asked": ASKED, "changes": (TAKEN,)}, ASKED, False
+    ),
+    "the reader forgets what is taken away": ({}, {"asked": ASKED, "changes": (TAKEN,)}, ASKED, True),
+    "the reader takes something away": ({"interventions": (REMOVED,)}, {"asked": ASKED}, ASKED, True),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("given_asked", "read", "said", "asked", "is_doubtful"), QUESTIONS.values(), ids=QUESTIONS)
+@pytest.mark.parametrize(("read", "said", "asked", "is_doubtful"), QUESTIONS.values(), ids=QUESTIONS)
 def test_the_words_decide_what_they_say(
-    given_asked: Asked | None, read: dict[str, Any], said: dict[str, Any], asked: Asked | None, is_doubtful: bool
+    read: dict[str, Any], said: dict[str, Any], asked: Asked | None, is_doubtful: bool
 ) -> None:
-    settled, doubts = settle_question(given_asked, GroundingReading("ball", MOVER, **read), QuestionReading(**said))
-    assert (settled, bool(doubts)) == (asked, is_doubtful)
+    settled, objections = settle_question(GroundingReading("ball", MOVER, **read), QuestionReading(**said), WORDS)
+    assert (settled.asked, settled.asked_is_doubtful, bool(objections)) == (asked, is_doubtful, is_doubtful)
+
+
+def seen(bbox: BBox, colour: str) -> Region:
+    """A block of one colour."""
+    x0, y0, x1, y1 = map(int, bbox)
+    mask = np.zeros((400, 600), bool)
+    mask[y0:y1, x0:x1] = True
+    return Region(CroppedMask.of(mask), colour, frozenset((colour,)), 0.8, 1.0, is_disc=False)
+
+
+RED, BLUE = (100.0, 100.0, 140.0, 140.0), (300.0, 100.0, 380.0, 180.0)
+REGIONS = (seen(RED, "red"), seen(BLUE, "blue"))
+
+
+def named(name: str, bbox: BBox) -> LocatedObject:
+    return LocatedObject(object=name, bbox=bbox)
+
+
+@given(st.tuples(*[st.floats(-0.2, 0.2)] * 4), st.tuples(*[st.floats(-0.2, 0.2)] * 4))
+def test_estimated_boxes_are_moved_onto_the_things_that_are_seen(
+    first: tuple[float, ...], second: tuple[float, ...]
+) -> None:
+    def estimated(bbox: BBox, off: tuple[float, ...]) -> BBox:
+        sides = (bbox[2] - bbox[0], bbox[3] - bbox[1]) * 2
+        x0, y0, x1, y1 = (edge + side * share for edge, side, share in zip(bbox, sides, off, strict=True))
+        return x0, y0, x1, y1
+
+    read = GroundingReading("red ball", estimated(RED, first), others=(named("blue box", estimated(BLUE, second)),))
+    settled, objections = settle_places(read, QuestionReading(), SeenThings(REGIONS), WORDS)
+    assert (settled.bbox, settled.others[0].bbox, settled.bbox_deviation) == (RED, BLUE, 0.0)
+    assert not objections
+
+
+def test_a_box_that_no_edges_tell_has_a_spread() -> None:
+    half = (RED[0], RED[1], RED[0] + 20, RED[3])  # a part of what is seen, or what is seen a part of it
+    settled, objections = settle_places(GroundingReading("duck", half), QuestionReading(), SeenThings(REGIONS), WORDS)
+    assert (settled.bbox, settled.bbox_deviation, settled.is_doubtful, objections) == (half, BBOX_DEVIATION, False, ())
+
+
+ELSEWHERE = (450.0, 300.0, 500.0, 350.0)
+# What is read and said of it; whether the mover, and the other thing, are in doubt.
+PLACES: dict[str, tuple[GroundingReading, str | None, bool, bool]] = {
+    "as the words say": (GroundingReading("red ball", RED), "the ball", False, False),
+    "under another word": (GroundingReading("red toy", RED), "the vehicle", False, False),
+    "another thing than they say": (GroundingReading("blue box", BLUE), "the red ball", True, False),
+    "a thing that they tell apart": (
+        GroundingReading("toy", BLUE, others=(named("duck", RED),)), "the duck", True, False
+    ),
+    "on something of another colour": (GroundingReading("red ball", BLUE), None, True, False),
+    "on bare floor": (GroundingReading("red ball", RED, others=(named("vase", ELSEWHERE),)), None, False, True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("read", "mover", "is_doubtful", "is_other_doubtful"), PLACES.values(), ids=PLACES)
+def test_what_speaks_against_a_name_or_a_place_is_a_doubt(
+    read: GroundingReading, mover: str | None, is_doubtful: bool, is_other_doubtful: bool
+) -> None:
+    things = SeenThings(REGIONS, frozenset({ELSEWHERE}))
+    settled, objections = settle_places(read, QuestionReading(mover=mover), things, WORDS)
+    assert settled.is_doubtful is is_doubtful
+    assert any(each.is_doubtful for each in settled.others) is is_other_doubtful
+    assert bool(objections) is (is_doubtful or is_other_doubtful)

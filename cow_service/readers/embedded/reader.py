@@ -58,11 +58,15 @@ class EmbeddedReader:
         trail_named, nouns, said = read.motion.trail is not None, matching.nouns_of(read), read.motion
         way = base.WayReading(
             along_arrow=None if said.arrow is None else said.arrow == "along",
-            direction=None if said.depth else said.direction,
+            direction=said.direction,
+            depth=said.depth,
             towards=None if said.towards is None else said.towards.text,
+            forward=said.forward,
         )
         way = base.WayReading() if unread(read).turning or said.contradictory else way
-        return base.QuestionReading(read_asked(read), tuple(named), trail_named, nouns, drawings, way)
+        asked = read_asked(read)
+        mover = None if asked is None or read.mover is None else read.mover.text
+        return base.QuestionReading(asked, mover, tuple(named), trail_named, nouns, drawings, way)
 
     def read_name(self, name: str) -> ObjectPrior:
         """By its noun."""
@@ -73,6 +77,10 @@ class EmbeddedReader:
             equal_sided=noun_phrases.is_cube(name),
             opening=None if opening == "unknown" else opening,
         )
+
+    def likeness(self, words: str, name: str) -> base.Likeness:
+        """By their colours, nouns and numbers, and the forms of their nouns."""
+        return noun_phrases.likeness(words, name)
 
     def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
         """Those of a kind such as "both mugs", where there are as many as is said; else the words themselves."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Literal
 
-from cow_service.readers.base import Quantity, SpeedWord, Unit
+from cow_service.readers.base import Likeness, Quantity, SpeedWord, Unit
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.grammar import Node, read_from, terminals
 from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, QuantityWords, key_at
@@ -414,3 +414,15 @@ def may_name(phrase: ObjectPhrase, name: str) -> bool:
     pairs = ((phrase.colour, other.colour), tuple(nouns), (phrase.number, other.number))
     said = [(one, two) for one, two in pairs if one is not None and two is not None]
     return bool(said) and all(one == two for one, two in said)
+
+
+def likeness(words: str, name: str) -> Likeness:
+    """Whether a phrase means the thing of a name; see `WordReader.likeness`."""
+    phrase, other = parse_noun_phrase(words), parse_noun_phrase(name)
+    if phrase is None or other is None:
+        return "same" if plain(words) == plain(name) else "unknown"
+    shapes = (shape_of(words), shape_of(name))
+    differ = [(phrase.colour, other.colour), (phrase.number, other.number), shapes]
+    if any(one is not None and two is not None and one != two for one, two in differ):
+        return "other"
+    return "same" if may_name(phrase, name) else "unknown"
