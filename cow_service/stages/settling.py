@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.readers.base import GroundingReading, MotionReading, QuestionReading, WayReading, WordReader
-from cow_service.records import BBox, Cue, Intervention, LocatedObject, Vector
+from cow_service.records import Asked, BBox, Cue, Intervention, LocatedObject, Vector
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import Region
 
@@ -221,7 +221,7 @@ def _is_other(read: GroundingReading, mover: str, words: WordReader) -> bool:
 
 # --- what is asked
 
-COMPARED = ("form", "relation", "negated", "every", "partly", "within")
+PLAIN, DETAILS = ("form", "relation", "negated"), ("every", "partly", "within")
 
 
 def settle_question(
@@ -236,8 +236,11 @@ def settle_question(
         return read, ()
     objections = list[str]()
     if asked is not None:
-        followed = asked.model_copy(update={name: getattr(plain, name) for name in COMPARED})
-        differ = [name for name in COMPARED if getattr(asked, name) != getattr(plain, name)]
+        # What is left at its default was not said: the words complete it.
+        usual = Asked(relation=asked.relation)
+        differ = [name for name in PLAIN if getattr(asked, name) != getattr(plain, name)]
+        differ += [name for name in DETAILS if getattr(asked, name) not in (getattr(usual, name), getattr(plain, name))]
+        followed = asked.model_copy(update={name: getattr(plain, name) for name in (*PLAIN, *DETAILS)})
         for name in ("subject", "target"):
             wanted, taken = getattr(plain, name), getattr(asked, name)
             if wanted is not None and taken is not None and words.likeness(wanted, taken) == "other":
