@@ -138,6 +138,7 @@ def test_a_reply_is_looked_through_once() -> None:
             {"relation": "touches", "form": "which to remove", "among": ["vase", "cup"]},
             Asked(relation="touches", form="which-to-remove", among=("vase", "cup")),
         ),
+        ([{"relation": "touches", "target": "vase"}], Asked(relation="touches", target="vase")),
         ("Will it hit the vase?", Asked(relation="touches", target="vase")),
         ("Does it knock over anything?", Asked(relation="tips")),
         ("Will it not hit the vase?", None),

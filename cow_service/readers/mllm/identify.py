@@ -1,7 +1,7 @@
 """First prompt: what the question asks, which object it sets in motion, and how that moves, in words."""
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from functools import partial
 from typing import Annotated, Any, ClassVar, Self, get_args
 
@@ -58,13 +58,9 @@ _CHANGES = {
     "removed": "remove", "removal": "remove", "take away": "remove", "put": "place", "placed": "place", "add": "place",
 }  # fmt: skip
 _KINDS = {
-    **dict.fromkeys(("roll", "rolls", "rolling", "slide", "slides", "sliding", "move", "moves", "moving"), "linear"),
-    **dict.fromkeys(("drive", "drives", "driving", "straight", "translation"), "linear"),
-    **dict.fromkeys(("throw", "thrown", "throwing", "kick", "kicked", "shot", "parabolic"), "projectile"),
-    **dict.fromkeys(("falls", "falling", "free fall", "free-fall", "drop", "dropped", "drops"), "fall"),
-    **dict.fromkeys(("still", "stationary", "none"), "static"),
-    **dict.fromkeys(("placed", "placement", "put"), "place"),
-}
+    "rolling": "linear", "sliding": "linear", "moving": "linear", "driving": "linear", "thrown": "projectile",
+    "throw": "projectile", "falling": "fall", "drop": "fall", "dropped": "fall",
+}  # fmt: skip
 # What a reply may call a relation in words of its own. What "hidden" says depends on which of the two is meant.
 _RELATIONS: tuple[tuple[records.AskedRelation, bool, str], ...] = (  # with whether it is denied
     ("touches", False, r"hits?|hitting|collides?|colliding|collision|touch(?:es|ing)?|contacts?|bumps?|strikes?"),
@@ -77,7 +73,6 @@ _RELATIONS: tuple[tuple[records.AskedRelation, bool, str], ...] = (  # with whet
 _NOT = re.compile(r"\b(?:not|never|no|without|first|when|where|how|which|what)\b|n['\u2019]t\b", re.IGNORECASE)
 _ANY = re.compile(r"\b(?:anything|something|any object)\b", re.IGNORECASE)
 _FORMS = {"yes-no": "whether", "yes/no": "whether", "if": "whether"}
-_NAME_SCHEMA = replies.words(replies.MAX_NAME)
 _DIAGONAL = 0.5**0.5
 WAYS: dict[str, tuple[records.Vector, float]] = {  # direction in the image, and the depth's sense
     "left": ((-1, 0), 0), "right": ((1, 0), 0), "up": ((0, -1), 0), "down": ((0, 1), 0),
@@ -186,7 +181,7 @@ class Identified(Reply):
     """What is asked and what moves, in words; nothing about where it is. Null is what the reply does not say."""
 
     other_names: ClassVar = {"object": _NAMES}
-    object: Annotated[str, BeforeValidator(replies.text_of), WithJsonSchema(replies.nullable(_NAME_SCHEMA))]
+    object: Annotated[str, WithJsonSchema(replies.nullable(replies.words(replies.MAX_NAME)))]
     others: Annotated[tuple[str, ...], *_names(MAX_NAMED)]
     asked: records.Asked | None
     kind: Annotated[records.MotionKind | None, _known(records.MotionKind, _KINDS)]
@@ -201,18 +196,46 @@ class Identified(Reply):
     language: Annotated[records.Language | None, _LANGUAGE] = None
     warnings: Annotated[SkipJsonSchema[tuple[str, ...]], BeforeValidator(lambda _: ())] = ()  # of what was left out
 
+    @field_validator("object", mode="before")
+    @classmethod
+    def _check_name(cls, written: Any) -> str:
+        name = replies.text_of(written)
+        if len(name) > replies.MAX_NAME:
+            raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
+        if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
+            raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
+        if _DENIAL.search(name) or name.lower().strip(" .") in _POINTING:
+            raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
+        if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
+            raise ReplyError(f"'{name}' names no object; say in words what moves")
+        return name
+
     @field_validator("asked", mode="before")
     @classmethod
     def _read_asked(cls, written: Any, info: ValidationInfo) -> records.Asked | None:
         """What is asked; null where any of it cannot be read: no verdict is better than one on another question."""
         if replies.is_none(written):
             return None
-        given = replies.fields_of(written) or _asked_in_words(replies.text_of(written), info.data.get("others", ()))
+        if len(parts := replies.listed(written)) == 1:
+            (written,) = parts
+        given = replies.fields_of(written)
+        if not given:  # a question such as "Will it hit the mug?"
+            sentence, others = replies.text_of(written), info.data.get("others", ())
+            words = set(replies.name_words(sentence))
+            named = [name for name in others if set(replies.name_words(name)) <= words]
+            if len(named) == 1 or (not named and _ANY.search(sentence)):
+                given = {"relation": sentence, "target": "".join(named)}
         fields = {name: given[name] for name in records.Asked.model_fields if not replies.is_none(given.get(name))}
         if "form" in fields:
             form = replies.text_of(fields["form"]).lower().replace("_", "-").replace(" ", "-")
             fields["form"] = _FORMS.get(form, form)
-        fields |= _relation_in(replies.text_of(fields.get("relation")))
+        relation = replies.text_of(fields.get("relation")).lower().strip(" .").replace("_", " ")
+        told = {(name, denied) for name, denied, words in _RELATIONS if re.search(rf"\b(?:{words})\b", relation)}
+        if relation in get_args(records.AskedRelation):
+            fields["relation"] = relation
+        elif len(told) == 1 and not _NOT.search(relation):
+            ((fields["relation"], denied),) = told
+            fields |= {"negated": True} if denied else {}
         if "within" in fields:
             fields["within"] = seconds_of(fields["within"]) or fields["within"]
         try:
@@ -250,7 +273,11 @@ class Identified(Reply):
 def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
     """The call that asks which object moves, in words, and of the rest what the caller has not said."""
     schema = replies.schema_of(Identified, reasoning_length=reasoning_length)
-    said = _given_fields(given)
+    said = frozenset((
+        *(() if given.asked_wanted else ("asked",)),
+        *(() if given.changes_wanted else ("changes",)),
+        *(() if given.motion_wanted else ("kind", "sentence", *_SAID_ALIKE, "then", "also_moving")),
+    ))  # fmt: skip
     schema["properties"] = {name: each for name, each in schema["properties"].items() if name not in said}
     schema["required"] = [name for name in schema["required"] if name not in said]
     inputs: dict[str, object] = {
@@ -261,15 +288,6 @@ def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int
         "objections": tuple(" ".join(each.split()) for each in given.objections),
     }
     return PromptCall("identify", inputs, (image.jpeg,), schema, partial(read_identified, said=said))
-
-
-def _given_fields(given: ReaderInput) -> frozenset[str]:
-    """The fields of `Identified` that the caller has said."""
-    return frozenset((
-        *(() if given.asked_wanted else ("asked",)),
-        *(() if given.changes_wanted else ("changes",)),
-        *(() if given.motion_wanted else ("kind", "sentence", *_SAID_ALIKE, "then", "also_moving")),
-    ))  # fmt: skip
 
 
 def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None:
@@ -296,7 +314,8 @@ def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None
         return None
     else:
         raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
-    _check_names(names)
+    if len(set(map(replies.name_words, names))) > 1:
+        raise ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
 
     # What contradicts the rest of the same reply is left out, and things have one name each.
     context = ReadingContext(faults=[] if objects else ["it is no JSON object, so that fields are missing"])
@@ -305,15 +324,15 @@ def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None
     mover, asked = replies.name_words(found.object), found.asked
     others = tuple(name for name in found.others if replies.name_words(name) != mover)
     if asked is not None:
-        one = partial(_one_name, known=(found.object, *others))
-        subject = asked.subject and one(asked.subject)
-        asked = asked.model_copy(
-            update={
-                "subject": None if subject == found.object else subject,  # null is the mover
-                "target": asked.target and one(asked.target),
-                "among": tuple(map(one, asked.among)),
-            }
-        )
+        one = partial(replies.named_among, known=(found.object, *others))
+        names = {name: one(name) or name for name in (asked.subject, asked.target, *asked.among) if name is not None}
+        subject = names.get(asked.subject or "")
+        update: dict[str, Any] = {
+            "subject": None if subject == found.object else subject,  # null is the mover
+            "target": names.get(asked.target or ""),
+            "among": tuple(names[name] for name in asked.among),
+        }
+        asked = asked.model_copy(update=update)
     placed = any(each.kind == "place" and replies.name_words(each.object) == mover for each in found.changes)
     kind = None if found.kind == "place" and not placed else found.kind
     update = {"others": others, "asked": asked, "kind": kind, "warnings": context.left_out}
@@ -321,51 +340,6 @@ def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None
     if context.faults:
         raise ReplyError("; ".join(context.faults), found)
     return found
-
-
-def _check_names(names: Sequence[str]) -> None:
-    """Raises `ReplyError` if these are not all names of one object."""
-    for name in names:
-        if len(name) > replies.MAX_NAME:
-            raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
-        if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
-            raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
-        if _DENIAL.search(name) or name.lower().strip(" .") in _POINTING:
-            raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
-        if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
-            raise ReplyError(f"'{name}' names no object; say in words what moves")
-    if len(set(map(replies.name_words, names))) > 1:
-        raise ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
-
-
-def _one_name(name: str, known: Sequence[str]) -> str:
-    """The known name that a name means: the one whose words it has, or the only one that it is part of or extends."""
-    words = set(replies.name_words(name))
-    held = [(set(replies.name_words(each)), each) for each in known]
-    same = [each for other, each in held if other == words]
-    alike = [each for other, each in held if words and other and (other < words or words < other)]
-    return same[0] if same else alike[0] if len(alike) == 1 else name
-
-
-def _relation_in(said: str) -> dict[str, Any]:
-    """The fields of the one relation that some words say; as they are where they say none or several."""
-    word = said.lower().strip(" .").replace("_", " ")
-    if word in get_args(records.AskedRelation):
-        return {"relation": word}
-    told = {(name, denied) for name, denied, words in _RELATIONS if re.search(rf"\b(?:{words})\b", word)}
-    if len(told) != 1 or _NOT.search(word):
-        return {"relation": word}
-    ((relation, denied),) = told
-    return {"relation": relation, "negated": True} if denied else {"relation": relation}
-
-
-def _asked_in_words(sentence: str, others: Sequence[str]) -> dict[str, Any]:
-    """The fields of a question such as "Will it hit the mug?"; none where it does not say which thing it is about."""
-    words = set(replies.name_words(sentence))
-    named = [name for name in others if set(replies.name_words(name)) <= words]
-    if len(named) == 1:
-        return {"relation": sentence, "target": named[0]}
-    return {"relation": sentence} if not named and _ANY.search(sentence) else {}
 
 
 def _replies(value: object) -> Iterator[dict[str, Any]]:

@@ -423,14 +423,12 @@ def _named(
     """Each place with its name and role: the targets, each once, then all the rest but the floor."""
     left = list(places)
     for target in targets:
-        wanted = set(replies.name_words(target))
-        labels = [(set(replies.name_words(place.label)), place) for place in left]
-        same = [place for held, place in labels if held == wanted]
-        alike = [place for held, place in labels if held and (held < wanted or wanted < held)]
-        if len({repr(place.box) for place in same}) > 1:
-            context.faults.append(f"{len(same)} things are labelled '{target}'; label only the one that is meant so")
+        label = replies.named_among(target, [place.label for place in left])
+        meant = [place for place in left if label and replies.name_words(place.label) == replies.name_words(label)]
+        if len({repr(place.box) for place in meant}) > 1:
+            context.faults.append(f"{len(meant)} things are labelled '{target}'; label only the one that is meant so")
             continue
-        for place in same[:1] or (alike if len(alike) == 1 else []):
+        for place in meant[:1]:
             left = [other for other in left if other is not place]
             yield target, "target", place
     for place in left:

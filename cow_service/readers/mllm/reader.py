@@ -156,7 +156,7 @@ class MllmReader:
             call = locate_call(given, image, grounding.object, grounding.bbox, (), True, self._reasoning)
             if (located := self._client.complete(call, given)) is not None:
                 warnings += located.warnings
-                hints = hints.model_copy(update=located.line_hints)
+                hints = hints.model_copy(update=located.line_hints | {"speed": hints.speed})
         places = {name_words(each.object): each for each in grounding.others}
         others: list[base.OtherMotionReading] = []
         for hint in hints.also:

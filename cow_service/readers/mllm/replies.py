@@ -6,7 +6,7 @@ repaired by a library, but only where its brackets close: a reply that was cut s
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar, TypeGuard, TypeVar, cast
 
@@ -243,6 +243,15 @@ def name_of(value: object) -> str:
 def name_words(name: str) -> tuple[str, ...]:
     """The words of an object's name without determiners, lower case: names with the same words are the same."""
     return tuple(word for word in re.findall(r"\w+", name.lower()) if word not in _DETERMINERS)
+
+
+def named_among(name: str, known: Sequence[str]) -> str | None:
+    """The one of the known names that has the words of a name, or the only one that is part of it or extends it."""
+    words = set(name_words(name))
+    held = [(set(name_words(each)), each) for each in known]
+    same = [each for other, each in held if other == words]
+    alike = [each for other, each in held if words and other and (other < words or words < other)]
+    return same[0] if same else alike[0] if len(alike) == 1 else None
 
 
 def shown(written: object) -> str:
