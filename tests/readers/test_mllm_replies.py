@@ -410,7 +410,6 @@ def test_a_list_is_complete_if_it_says_so_or_is_one_and_nothing_of_it_is_left_ou
         ({"others": [{"bbox_2d": VASE["bbox_2d"]}]}, "without a label"),
         ({"others": [VASE, VASE | {"bbox_2d": MUG["bbox_2d"]}]}, "2 things are labelled 'vase'"),
         ({"others": [VASE | {"bbox_2d": BALL["bbox_2d"]}]}, "the same box"),
-        ({"others": [VASE], "bbox_2d": [0, 0, 1000, 1000]}, "whole image"),
         ({"others": [VASE], "sense": "sideways"}, "`sense`"),
         ({"others": [VASE], "direction": "right"}, "in words"),
     ],
@@ -422,6 +421,17 @@ def test_what_contradicts_itself_is_asked_for_again(reply: dict[str, Any], fault
     with pytest.raises(ReplyError, match=fault) as caught:
         read_located(json.dumps(BALL | LINE | reply), frame_of("qwen3-vl"), "red ball", ("vase",), True, True)
     assert caught.value.usable is not None
+
+
+@pytest.mark.parametrize(
+    ("mover", "fault"), [({"bbox_2d": [0, 0, 1000, 1000]}, "whole image"), (VASE, "that of 'vase'")]
+)
+def test_nothing_is_read_with_the_wrong_box_of_what_moves(mover: dict[str, Any], fault: str) -> None:
+    from cow_service.readers.mllm.replies import ReplyError
+
+    with pytest.raises(ReplyError, match=fault) as caught:
+        read(BALL | mover, [VASE])
+    assert caught.value.usable is None
 
 
 @pytest.mark.parametrize("family", ["qwen3-vl", "gemini", "gpt"])

@@ -298,7 +298,7 @@ def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None
     text = replies.without_thinking(reply)
     values = replies.values_in(text)
     # Words in brackets may be part of the prose around the object.
-    objects = [value for value in values if isinstance(value, dict)]
+    objects = [value for value in values if any(replies.objects_in(value))]
     written = [fields for value in objects for fields in _replies(value)]
     written = written or [fields for value in values for fields in _replies(value)]
     if not written and not any(isinstance(value, dict | list) or value is None for value in values):

@@ -278,6 +278,8 @@ def _read_objects(
         return SeenObject.model_validate({**found.fields, "label": found.label, "bbox": found.box}, context=own)
 
     mover = seen(wanted, place)
+    if mover.bbox is not None and coordinates.covers_image(frame.width, frame.height, mover.bbox):
+        raise ReplyError(f"the box of '{wanted}' covers nearly the whole image; give that of the object alone")
     objects: list[LocatedObject] = []
     for name, role, other in named:
         try:
@@ -293,8 +295,6 @@ def _read_objects(
             context.faults.append(f"'{wanted}' and '{name}' have the same box")
         else:
             objects.append(LocatedObject(object=name, bbox=bbox, role=role, prior=found.prior, source="mllm"))
-    if mover.bbox is not None and coordinates.covers_image(frame.width, frame.height, mover.bbox):
-        context.faults.append(f"the box of '{wanted}' covers nearly the whole image")
     told = [replies.truth_of(fields["complete"]) for fields in reply if "complete" in fields]
     is_complete = told[-1] is True if told else len(objects) >= MIN_COMPLETE_LIST
     return Located(
