@@ -190,6 +190,7 @@ def test_without_hints_the_motion_is_asked_for_with_the_box_that_is_known(source
     assert asked.calls.usage == Usage(calls=2, input_tokens=200, output_tokens=20)
     schema = mllm.asked[-1]["response_format"]["json_schema"]["schema"]
     assert "bbox_2d" not in schema["properties"]
+    assert "`changes`" not in mllm.text(0), "the question's changes are known with the places"
     assert "in the box [" in mllm.text(-1)
     mllm.say(json.dumps(BALL | {"also_moving": [{"object": "cup", "kind": "fall"}]}), json.dumps(PLACE))
     motion = reader.read_motion(asked, grounding(source), None)

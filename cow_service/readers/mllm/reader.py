@@ -146,7 +146,7 @@ class MllmReader:
         warnings: list[str] = []
         others_sought = hints is not None  # with the mover
         if hints is None:
-            image, identified = self._identify(given)
+            image, identified = self._identify(replace(given, asked_wanted=False, changes_wanted=False))
             located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
             warnings += () if identified is None else identified.warnings
             warnings += () if located is None else located.warnings
