@@ -174,7 +174,7 @@ class GroundingReading:
     bbox: BBox  # px of the upright image
     point: Point | None = None  # where the reader pointed, if it gave no box; by default the centre of the box
     others: tuple[LocatedObject, ...] = ()
-    is_complete: bool = False  # the others are all that could matter
+    objects_complete: bool = False  # the others are all that could be hit or hide something
     warnings: tuple[str, ...] = ()
     interventions: tuple[records.Intervention, ...] = ()
     hints: MotionHints | None = None

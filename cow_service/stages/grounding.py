@@ -72,7 +72,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         bbox=reading.bbox,
         mask=mask,
         others=tuple(other for other in others if not is_among(other.bbox, removed)),
-        objects_complete=request.objects_complete or reading.is_complete,
+        objects_complete=request.objects_complete or reading.objects_complete,
         interventions=interventions,
         prior=reading.prior,
         asked=asked,

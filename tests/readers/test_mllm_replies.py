@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -36,6 +37,18 @@ def frame_of(family: str, image: tuple[int, int] = (640, 400), sent: tuple[int, 
     return CoordinateFrame(*image, sent, load_families()[family].coordinates)
 
 
+def usable(read: Callable[[], Any]) -> Any:
+    """What is read of a reply, or what can be used of one that is asked for again."""
+    from cow_service.readers.mllm.replies import ReplyError
+
+    try:
+        return read()
+    except ReplyError as error:
+        if error.usable is None:
+            raise
+        return error.usable
+
+
 def told(case: dict[str, Any]) -> dict[str, Any]:
     """What the reading of a case's stage makes of it, in the terms of `expect`."""
     from cow_service.readers.mllm.answer import read_answer
@@ -47,7 +60,7 @@ def told(case: dict[str, Any]) -> dict[str, Any]:
     stage, raw = case["stage"], case["raw"]
     try:
         if stage == "identify":
-            named = read_identified(raw)
+            named = usable(lambda: read_identified(raw))
             return {"error": "object-not-found"} if named is None else {"object": named.object}
         if stage == "answer":
             reading = read_answer(raw, CHOICES)
@@ -116,34 +129,71 @@ def test_a_reply_is_looked_through_once() -> None:
             Asked(relation="covers", target="coin", within=2),
         ),
         ({"relation": "touches", "subject": "red ball", "target": "vase"}, Asked(relation="touches", target="vase")),
+        ({"relation": "collides with", "target": "the vase on the left"}, Asked(relation="touches", target="vase")),
+        (
+            {"relation": "misses", "target": "vase", "form": "yes/no"},
+            Asked(relation="touches", target="vase", negated=True),
+        ),
+        (
+            {"relation": "touches", "form": "which to remove", "among": ["vase", "cup"]},
+            Asked(relation="touches", form="which-to-remove", among=("vase", "cup")),
+        ),
+        ([{"relation": "touches", "target": "vase"}], Asked(relation="touches", target="vase")),
+        ("Will it hit the vase?", Asked(relation="touches", target="vase")),
+        ("Does it knock over anything?", Asked(relation="tips")),
+        ("Will it not hit the vase?", None),
+        ("Will it hit the target?", None),
+        ("Will it hit and hide the vase?", None),
         ({"relation": "explodes", "target": "vase"}, None),
         ({"target": "vase"}, None),
         ({"relation": "touches", "among": "all of them", "negated": "perhaps"}, None),
-        ("does it hit the vase?", None),
     ],
 )
-def test_what_is_asked_is_read_whole_or_not_at_all(written: Any, asked: Asked | None) -> None:
+def test_what_is_asked_is_read_whole_or_asked_again_and_left_out(written: Any, asked: Asked | None) -> None:
     from cow_service.readers.mllm.identify import read_identified
+    from cow_service.readers.mllm.replies import ReplyError
 
-    found = read_identified(json.dumps(NAMED | {"asked": written}))
-    assert found is not None
+    reply = json.dumps(NAMED | {"others": ["vase"], "asked": written})
+    if asked is None:
+        with pytest.raises(ReplyError, match="`asked`"):
+            read_identified(reply)
+    found = usable(lambda: read_identified(reply))
     assert found.asked == asked
+    assert bool(found.warnings) is (asked is None)
 
 
 def test_changes_as_replies_write_them() -> None:
     from cow_service.readers.mllm.identify import read_identified
+    from cow_service.readers.mllm.replies import ReplyError
 
     between = [{"kind": "put", "object": "cube", "relation": "between", "targets": ["mug", "vase"]}]
     for written, read in (
         ({"kind": "place", "object": "apple", "relation": "inside", "targets": "bowl"}, [("into", ("bowl",))]),
         (between, [("between", ("mug", "vase"))]),
-        ([{"kind": "place", "object": "apple", "relation": "over there", "targets": ["bowl"]}], []),
-        ([{"kind": "place", "object": "apple", "relation": "into"}], []),
-        (["remove the vase"], []),
+        ([{"kind": "remove", "object": None}, "none", {"kind": "...", "object": "..."}], []),
     ):
         named = read_identified(json.dumps(NAMED | {"changes": written}))
         assert named is not None
         assert [(each.relation, each.targets) for each in named.changes] == read, written
+    # Without one that cannot be read, another world would be simulated.
+    for unread in (
+        {"kind": "place", "object": "apple", "relation": "over there", "targets": ["bowl"]},
+        {"kind": "place", "object": "apple", "relation": "into"},
+        "remove the vase",
+        [{"kind": "remove", "object": f"cup {number}"} for number in range(9)],
+    ):
+        with pytest.raises(ReplyError, match="`changes`") as caught:
+            read_identified(json.dumps(NAMED | {"changes": unread}))
+        assert caught.value.usable is None
+
+
+def test_what_the_caller_has_said_is_not_read() -> None:
+    from cow_service.readers.mllm.identify import read_identified
+
+    unread = {"asked": "?", "changes": ["?"], "then": ["?"], "kind": "?"}
+    found = read_identified(json.dumps(NAMED | unread), unread.keys())
+    assert found is not None
+    assert (found.asked, found.changes, found.then, found.kind, found.warnings) == (None, (), (), None, ())
 
 
 # What an object is like
@@ -154,9 +204,7 @@ def read(mover: dict[str, Any], others: object = (), targets: tuple[str, ...] = 
     from cow_service.readers.mllm.locate import read_located
 
     reply = {"reasoning": "r", **mover, "others": others, **LINE, **motion}
-    found = read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", targets, True, True)
-    assert found is not None
-    return found
+    return usable(lambda: read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", targets, True, True))
 
 
 def test_priors_have_widths() -> None:
@@ -302,7 +350,101 @@ def test_what_is_no_object_is_left_out() -> None:
     bad = {"label": "lamp", "bbox_2d": [500, 400, 500, 400]}
     wall = {"label": "wall", "bbox_2d": [0, 0, 1000, 1000]}
     ground = {"label": "the floor", "bbox_2d": [0, 500, 1000, 1000]}
-    found = read(BALL | {"stands_on": "lamp"}, [bad, wall, ground, VASE, {"label": "cat", "bbox_2d": None}, 3, "x"])
+    found = read(BALL | {"stands_on": "lamp"}, [bad, wall, ground, VASE, {"label": "cat", "bbox_2d": None}, 3, "cup"])
     assert [other.object for other in found.others] == ["vase"]
-    assert ["'lamp'" in warning or "'wall'" in warning for warning in found.warnings] == [True, True]
+    assert all(sum(name in warning for warning in found.warnings) == 1 for name in ("'3'", "'cup'", "'lamp'", "'wall'"))
+    assert len(found.warnings) == 4
     assert found.prior == ObjectPrior(stands_on="lamp")  # in words: it was not located
+
+
+MUG = {"label": "mug", "bbox_2d": [400, 300, 450, 400]}
+IN_THE_WAY = [("vase", "target"), ("mug", "obstacle")]
+
+
+@pytest.mark.parametrize("wrap", ["result", "arguments", "a list", "a plain list", "others by name", "others with key"])
+def test_others_are_found_in_whatever_the_reply_is_wrapped(wrap: str) -> None:
+    from cow_service.readers.mllm.locate import read_located
+
+    reply: Any = BALL | LINE | {"others": [MUG, VASE]}
+    if wrap == "a list":
+        reply = [reply]
+    elif wrap == "a plain list":
+        reply = [BALL, MUG, VASE, LINE]
+    elif wrap == "others by name":
+        reply["others"] = {each["label"]: each["bbox_2d"] for each in (MUG, VASE)}
+    elif wrap == "others with key":
+        reply["others"] = [{each["label"]: each["bbox_2d"]} for each in (MUG, VASE)]
+    else:
+        reply = {"name": "reply", wrap: reply}
+    found = read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", ("vase",), True, True)
+    assert found is not None
+    assert [(other.object, other.role) for other in found.others] == IN_THE_WAY
+    assert found.objects_complete
+    assert found.line is not None
+
+
+@pytest.mark.parametrize(
+    ("others", "complete"),
+    [
+        ({"others": [MUG, VASE]}, True),  # all that could be hit was asked for
+        ({"others": [VASE]}, False),
+        ({"others": [VASE], "complete": True}, True),
+        ({"others": [MUG, VASE], "complete": False}, False),
+        ({"others": [MUG, VASE], "complete": "perhaps"}, False),
+        ({"others": [MUG, VASE], "complete": None}, False),
+        *(
+            ({"others": [MUG, VASE, each], "complete": True}, False)
+            for each in ("cup", {"label": "cup", "bbox_2d": None})
+        ),
+    ],
+)
+def test_a_list_is_complete_if_it_says_so_or_is_one_and_nothing_of_it_is_left_out(
+    others: dict[str, Any], complete: bool
+) -> None:
+    assert read(BALL, **others).objects_complete is complete
+
+
+@pytest.mark.parametrize(
+    ("reply", "fault"),
+    [
+        ({"others": [{"bbox_2d": VASE["bbox_2d"]}]}, "without a label"),
+        ({"others": [VASE, VASE | {"bbox_2d": MUG["bbox_2d"]}]}, "2 things are labelled 'vase'"),
+        ({"others": [VASE | {"bbox_2d": BALL["bbox_2d"]}]}, "the same box"),
+        ({"others": [VASE], "sense": "sideways"}, "`sense`"),
+        ({"others": [VASE], "direction": "right"}, "in words"),
+    ],
+)
+def test_what_contradicts_itself_is_asked_for_again(reply: dict[str, Any], fault: str) -> None:
+    from cow_service.readers.mllm.locate import read_located
+    from cow_service.readers.mllm.replies import ReplyError
+
+    with pytest.raises(ReplyError, match=fault) as caught:
+        read_located(json.dumps(BALL | LINE | reply), frame_of("qwen3-vl"), "red ball", ("vase",), True, True)
+    assert caught.value.usable is not None
+
+
+@pytest.mark.parametrize(
+    ("mover", "fault"), [({"bbox_2d": [0, 0, 1000, 1000]}, "whole image"), (VASE, "that of 'vase'")]
+)
+def test_nothing_is_read_with_the_wrong_box_of_what_moves(mover: dict[str, Any], fault: str) -> None:
+    from cow_service.readers.mllm.replies import ReplyError
+
+    with pytest.raises(ReplyError, match=fault) as caught:
+        read(BALL | mover, [VASE])
+    assert caught.value.usable is None
+
+
+@pytest.mark.parametrize("family", ["qwen3-vl", "gemini", "gpt"])
+def test_a_direction_is_two_named_points_and_its_sense_a_word(family: str) -> None:
+    from cow_service.readers.mllm.locate import read_located
+
+    frame = frame_of(family, sent=(320, 200))
+    for word, sense in (("with", True), ("against the arrow", False), (None, None)):
+        line = {"cue": "arrow", "sense": word, "start": frame.write((100, 300)), "end": frame.write((400, 100))}
+        found = read_located(json.dumps(line), frame, "red ball", (), False, True)
+        assert found is not None
+        assert found.line is not None
+        assert found.line.sense is sense
+        assert found.line.direction is not None
+        for point, wanted in zip(found.line.direction, ((100, 300), (400, 100)), strict=True):
+            assert point == pytest.approx(wanted, abs=2)

@@ -18,7 +18,7 @@ SAMPLES: dict[str, object] = {  # of inputs that are no words
     "box_key": "bbox_2d",
     "question": "If the ball moves,\nwill it hit the vase?",
     "options": read_choices("", ["Yes", "No"]),
-    **dict.fromkeys(("further", "also", "others", "facts", "encounters"), ("one thing", "another")),
+    **dict.fromkeys(("further", "also", "others", "facts", "encounters", "objections"), ("one thing", "another")),
 }
 
 

@@ -11,7 +11,7 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from threading import Thread
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import anyio
 from pydantic_ai import Agent, BinaryContent, ModelRetry, TextOutput
@@ -71,6 +71,7 @@ class _ReplyParser(Generic[T]):
     parse: Callable[[str], T]
     fault: str = "it was empty"
     reply: str = ""
+    usable: T | None = None  # of a reply that was asked for again for the rest
 
     def read(self, reply: str) -> T:
         """The value of a reply. Raises `ModelRetry`, which has the model asked again with the reason."""
@@ -78,7 +79,9 @@ class _ReplyParser(Generic[T]):
         try:
             return self.parse(reply)
         except ReplyError as error:
-            self.fault = str(error)
+            if self.usable is not None:
+                return self.usable if error.usable is None else cast("T", error.usable)
+            self.fault, self.usable = str(error), cast("T | None", error.usable)
             raise ModelRetry(f"That cannot be used: {error}.") from error
         except _PARSER_BUGS as error:  # on an unforeseen reply; the other votes must not be lost
             log.warning("a reply could not be parsed", exc_info=error)

@@ -96,6 +96,11 @@ class CoordinateFrame:
         return "[x0, y0, x1, y1]" if self.coordinates.axes == "xy" else "[ymin, xmin, ymax, xmax]"
 
     @property
+    def point_order(self) -> str:
+        """The order of a point's numbers, in words for a prompt."""
+        return "[x, y]" if self.coordinates.axes == "xy" else "[y, x]"
+
+    @property
     def line_order(self) -> str:
         """The order of the numbers of a line from one point to another, in words for a prompt."""
         return "[x0, y0, x1, y1]" if self.coordinates.axes == "xy" else "[y0, x0, y1, x1]"
@@ -120,7 +125,7 @@ class CoordinateFrame:
 
     def ends(self, written: object) -> tuple[Point, Point]:
         """Where a line begins and ends, in pixels. Raises `ReplyError` for one outside or without length."""
-        start, end = (self._inside(*pair) for pair in self._pairs(written, 2, "a direction is 4 numbers"))
+        start, end = (self._inside(*pair) for pair in self._pairs(written, 2, "a line is two points"))
         if math.dist(start, end) < LEAST_LENGTH:
             raise ReplyError(f"the direction {_shown(written)} has no length; give two different points")
         return start, end

@@ -78,17 +78,35 @@ _PARTS = frozenset({"top", "surface", "upper", "edge"})  # of an object that oth
 
 @dataclass
 class ReadingContext:
-    """What validators need besides the reply: the image, whose fields these are, and where warnings go."""
+    """What validators need besides the reply: whose fields these are, and where warnings and faults go."""
 
-    frame: CoordinateFrame
     owner: str = ""  # the object that the fields are of; empty for the motion
     others: Sequence[str] = ()  # names of all other objects
     warnings: list[str] = field(default_factory=list[str])
+    faults: list[str] = field(default_factory=list[str])  # parts that are asked for again once, then left out
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Warnings of all that is left out."""
+        again = "The reader was asked again for a part of its reply, which then was left out"
+        return (*self.warnings, *(f"{again}: {fault}." for fault in self.faults))
+
+
+@dataclass
+class PlacesContext(ReadingContext):
+    """With the image whose coordinates are read."""
+
+    frame: CoordinateFrame = field(kw_only=True)
 
 
 def context_of(info: ValidationInfo) -> ReadingContext:
     """The context with which a reply is read."""
     return cast("ReadingContext", info.context)
+
+
+def frame_of(info: ValidationInfo) -> CoordinateFrame:
+    """The image whose coordinates are read."""
+    return cast("PlacesContext", info.context).frame
 
 
 def estimate(expected: str, schema: Schema, read: Callable[[object, ValidationInfo], object]) -> tuple[Any, Any]:
@@ -187,13 +205,13 @@ def metres_of(written: object) -> float | None:
 
 
 def _quantity(*units: Unit) -> tuple[Any, Any]:
-    def read(written: object) -> Quantity | None:
+    def read(written: object, _: ValidationInfo) -> Quantity | None:
         found = measured(written)
         if found is None or found[1] not in units or not found[0] > 0:
             return None
         return Quantity(found[0], found[1])
 
-    return PlainValidator(read), WithJsonSchema(words(MAX_QUANTITY))
+    return estimate(f"a number with {' or '.join(units)}", words(MAX_QUANTITY), read)
 
 
 def seconds_of(written: object) -> float | None:
@@ -204,7 +222,9 @@ def seconds_of(written: object) -> float | None:
 
 Distance = Annotated[Quantity | None, *_quantity("px", "m")]
 Speed = Annotated[Quantity | None, *_quantity("px/s", "m/s")]
-Seconds = Annotated[float | None, PlainValidator(seconds_of), WithJsonSchema(words(MAX_QUANTITY))]
+Seconds = Annotated[
+    float | None, *estimate("a time in seconds", words(MAX_QUANTITY), lambda written, _: seconds_of(written))
+]
 
 
 def support_named(said: str, own: str, others: Sequence[str]) -> str | None:

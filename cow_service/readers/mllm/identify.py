@@ -1,23 +1,33 @@
 """First prompt: what the question asks, which object it sets in motion, and how that moves, in words."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from functools import partial
 from typing import Annotated, Any, ClassVar, Self, get_args
 
-from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
+from pydantic.json_schema import SkipJsonSchema
 
 from cow_service import records
 from cow_service.narration.words import RELATION_WORDS
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import OtherMotionHint, StepReading
+from cow_service.readers.base import OtherMotionHint, ReaderInput, StepReading
 from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage
-from cow_service.readers.mllm.estimates import Distance, Seconds, Speed, seconds_of
+from cow_service.readers.mllm.estimates import Distance, ReadingContext, Seconds, Speed, context_of, seconds_of
 from cow_service.readers.mllm.replies import Reply, ReplyError
 from cow_service.readers.options import plain
 
-MAX_OTHERS = 4
+MAX_NAMED = 12  # other objects that the question names
 MIN_SENTENCE, MAX_SENTENCE = 8, 240  # characters
 _SAID_ALIKE = ("sentence", "speed", "distance", "duration", "until")  # fields of a reply and of `MotionHints`
 _NAMES = ("object", "moving_object", "mover", "object_name", "final_result", "result")
@@ -26,7 +36,8 @@ _ANSWERS = frozenset({"yes", "no", "not sure", "unsure", "true", "false", "unkno
 _SENTENCE = re.compile(r"\b(?:I|am|is|are|was|were|will|would|has|have|does|do)\b")
 _LETTERED = re.compile(r"\W*[(\[]?[A-Za-z][)\].:](\s|$)|\W*[A-Za-z]\W*$")
 _SAID = re.compile(
-    r"(?:final result|(?:moving )?object|mover|(?:object|thing) that moves)[*\"'`]*\s*(?:is|:|=)\s*(?P<name>[^\n]+)",
+    r"(?:final result|(?:moving )?object|mover|(?:object|thing) that moves)[*\"'`]*\s*(?:is|:|=)\s*"
+    r"(?P<name>[^\n]+?)(?=[.!;](?:\s|$)|\n|$)",
     re.IGNORECASE,
 )
 _DENIAL = re.compile(
@@ -46,7 +57,22 @@ _POINTING = frozenset({"it", "this", "that", "them", "they", "object", "the obje
 _CHANGES = {
     "removed": "remove", "removal": "remove", "take away": "remove", "put": "place", "placed": "place", "add": "place",
 }  # fmt: skip
-_NAME_SCHEMA = replies.words(replies.MAX_NAME)
+_KINDS = {
+    "rolling": "linear", "sliding": "linear", "moving": "linear", "driving": "linear", "thrown": "projectile",
+    "throw": "projectile", "falling": "fall", "drop": "fall", "dropped": "fall",
+}  # fmt: skip
+# What a reply may call a relation in words of its own. What "hidden" says depends on which of the two is meant.
+_RELATIONS: tuple[tuple[records.AskedRelation, bool, str], ...] = (  # with whether it is denied
+    ("touches", False, r"hits?|hitting|collides?|colliding|collision|touch(?:es|ing)?|contacts?|bumps?|strikes?"),
+    ("touches", True, r"miss|misses|avoids?"),
+    ("covers", False, r"occludes?|occluding|hides?|hiding|covers?|covering|obscures?"),
+    ("inside", False, r"fits?|enters?"),
+    ("tips", False, r"tips?|tipping|topples?|knock(?:s|ed)? over|tipped over"),
+    ("leaves", False, r"leaves?|leaving|exits?"),
+)
+_NOT = re.compile(r"\b(?:not|never|no|without|first|when|where|how|which|what)\b|n['\u2019]t\b", re.IGNORECASE)
+_ANY = re.compile(r"\b(?:anything|something|any object)\b", re.IGNORECASE)
+_FORMS = {"yes-no": "whether", "yes/no": "whether", "if": "whether"}
 _DIAGONAL = 0.5**0.5
 WAYS: dict[str, tuple[records.Vector, float]] = {  # direction in the image, and the depth's sense
     "left": ((-1, 0), 0), "right": ((1, 0), 0), "up": ((0, -1), 0), "down": ((0, 1), 0),
@@ -57,21 +83,33 @@ WAYS: dict[str, tuple[records.Vector, float]] = {  # direction in the image, and
 
 
 def _known(kind: Any, synonyms: dict[str, str] | None = None, default: str | None = None) -> BeforeValidator:
-    """Reads one of the words of a `Literal`, or a synonym of one."""
+    """Reads one of the words of a `Literal`, or a synonym of one; any other word is a fault."""
     known = {word: word for word in get_args(kind)} | (synonyms or {})
-    return BeforeValidator(lambda written: known.get(replies.text_of(written).lower(), default))
+
+    def read(written: object, info: ValidationInfo) -> str | None:
+        said = replies.text_of(written).lower().strip(" .")
+        if said not in known and not replies.is_none(written) and default is None:
+            words = ", ".join(get_args(kind))
+            context_of(info).faults.append(f"`{info.field_name}` is {replies.shown(written)}, not one of {words}")
+        return known.get(said, default)
+
+    return BeforeValidator(read)
 
 
 def _names(most: int) -> tuple[Any, Any]:
     """The annotations of a list of names. An object with a name is taken for it."""
 
-    def read(written: object) -> tuple[str, ...]:
-        listed = replies.listed(written)
-        parts = [
-            replies.first_of(replies.fields_of(part), *_INNER) if isinstance(part, dict) else part for part in listed
-        ]
-        names = [replies.name_of(part) for part in parts if not replies.is_none(part) and replies.text_of(part)]
-        return tuple(dict.fromkeys(names))[:most]
+    def read(written: object, info: ValidationInfo) -> tuple[str, ...]:
+        names = dict[str, None]()
+        for part in replies.listed(written):
+            name = replies.first_of(replies.fields_of(part), *_INNER) if isinstance(part, dict) else part
+            if replies.text_of(name) and not replies.is_none(name):
+                names[replies.name_of(name)] = None
+            elif not replies.is_none(name):
+                context_of(info).faults.append(f"`{info.field_name}` has {replies.shown(part)}, which is no name")
+        if len(names) > most:
+            context_of(info).faults.append(f"`{info.field_name}` has {len(names)} names; give at most {most}")
+        return tuple(names)[:most]
 
     return Field(max_length=most), BeforeValidator(read)
 
@@ -87,7 +125,7 @@ def _way(written: object) -> tuple[records.Vector, float] | None:
 
 
 Name = Annotated[str, Field(min_length=1), BeforeValidator(replies.name_of)]
-_RELATION = BeforeValidator(lambda said: RELATION_WORDS.get(replies.text_of(said).lower().replace("_", "-")))
+_PLACE_RELATION = BeforeValidator(lambda said: RELATION_WORDS.get(replies.text_of(said).lower().replace("_", "-")))
 _LANGUAGES = get_args(records.Language)
 _LANGUAGE = BeforeValidator(lambda said: code if (code := replies.text_of(said)[:2].lower()) in _LANGUAGES else None)
 _WAY = BeforeValidator(_way), WithJsonSchema(replies.one_of(*WAYS))
@@ -99,7 +137,7 @@ class Change(Reply):
     other_names: ClassVar = {"object": ("name", "label"), "targets": ("target",)}
     kind: Annotated[records.InterventionKind, _known(records.InterventionKind, _CHANGES)]
     object: Name
-    relation: Annotated[records.PlaceRelation | None, _RELATION] = None
+    relation: Annotated[records.PlaceRelation | None, _PLACE_RELATION] = None
     targets: Annotated[tuple[str, ...], *_names(2)] = ()
 
     @model_validator(mode="after")
@@ -123,7 +161,7 @@ class AlsoMoving(Reply):
 
     other_names: ClassVar = {"object": ("name", "label"), "way": ("direction",)}
     object: Name
-    kind: Annotated[records.MotionKind, _known(records.MotionKind, default="linear")]
+    kind: Annotated[records.MotionKind, _known(records.MotionKind, _KINDS, default="linear")]
     way: Annotated[tuple[records.Vector, float] | None, *_WAY] = None
 
     @property
@@ -143,33 +181,68 @@ class Identified(Reply):
     """What is asked and what moves, in words; nothing about where it is. Null is what the reply does not say."""
 
     other_names: ClassVar = {"object": _NAMES}
-    object: Annotated[str, BeforeValidator(replies.text_of), WithJsonSchema(replies.nullable(_NAME_SCHEMA))]
-    others: Annotated[tuple[str, ...], *_names(MAX_OTHERS)]
+    object: Annotated[str, WithJsonSchema(replies.nullable(replies.words(replies.MAX_NAME)))]
+    others: Annotated[tuple[str, ...], *_names(MAX_NAMED)]
     asked: records.Asked | None
-    kind: Annotated[records.MotionKind | None, _known(records.MotionKind)]
+    kind: Annotated[records.MotionKind | None, _known(records.MotionKind, _KINDS)]
     sentence: Annotated[str | None, WithJsonSchema(replies.words(MAX_SENTENCE))]
-    changes: Annotated[tuple[Change, ...], replies.usable(Change)] = ()
+    changes: Annotated[tuple[Change, ...], replies.all_of(Change)] = ()
     speed: Speed = None
     distance: Distance = None
     duration: Seconds = None
     until: Annotated[records.Until | None, _known(records.Until)] = None
-    then: Annotated[tuple[Leg, ...], replies.usable(Leg)] = ()
-    also_moving: Annotated[tuple[AlsoMoving, ...], replies.usable(AlsoMoving)] = ()
+    then: Annotated[tuple[Leg, ...], replies.all_of(Leg)] = ()
+    also_moving: Annotated[tuple[AlsoMoving, ...], replies.all_of(AlsoMoving)] = ()
     language: Annotated[records.Language | None, _LANGUAGE] = None
+    warnings: Annotated[SkipJsonSchema[tuple[str, ...]], BeforeValidator(lambda _: ())] = ()  # of what was left out
+
+    @field_validator("object", mode="before")
+    @classmethod
+    def _check_name(cls, written: Any) -> str:
+        name = replies.text_of(written)
+        if len(name) > replies.MAX_NAME:
+            raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
+        if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
+            raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
+        if _DENIAL.search(name) or name.lower().strip(" .") in _POINTING:
+            raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
+        if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
+            raise ReplyError(f"'{name}' names no object; say in words what moves")
+        return name
 
     @field_validator("asked", mode="before")
     @classmethod
-    def _read_asked(cls, written: Any) -> records.Asked | None:
+    def _read_asked(cls, written: Any, info: ValidationInfo) -> records.Asked | None:
         """What is asked; null where any of it cannot be read: no verdict is better than one on another question."""
+        if replies.is_none(written):
+            return None
+        if len(parts := replies.listed(written)) == 1:
+            (written,) = parts
         given = replies.fields_of(written)
+        if not given:  # a question such as "Will it hit the mug?"
+            sentence, others = replies.text_of(written), info.data.get("others", ())
+            words = set(replies.name_words(sentence))
+            named = [name for name in others if set(replies.name_words(name)) <= words]
+            if len(named) == 1 or (not named and _ANY.search(sentence)):
+                given = {"relation": sentence, "target": "".join(named)}
         fields = {name: given[name] for name in records.Asked.model_fields if not replies.is_none(given.get(name))}
-        for name in fields.keys() & {"form", "relation"}:
-            fields[name] = replies.text_of(fields[name]).lower()
+        if "form" in fields:
+            form = replies.text_of(fields["form"]).lower().replace("_", "-").replace(" ", "-")
+            fields["form"] = _FORMS.get(form, form)
+        relation = replies.text_of(fields.get("relation")).lower().strip(" .").replace("_", " ")
+        told = {(name, denied) for name, denied, words in _RELATIONS if re.search(rf"\b(?:{words})\b", relation)}
+        if relation in get_args(records.AskedRelation):
+            fields["relation"] = relation
+        elif len(told) == 1 and not _NOT.search(relation):
+            ((fields["relation"], denied),) = told
+            fields |= {"negated": True} if denied else {}
         if "within" in fields:
             fields["within"] = seconds_of(fields["within"]) or fields["within"]
         try:
             return records.Asked.model_validate(fields)
-        except ValidationError:
+        except ValidationError as error:
+            fault = ".".join(map(str, error.errors()[0]["loc"]))
+            context_of(info).faults.append(f"`asked` is {replies.shown(written)}, of which `{fault}` cannot be read")
             return None
 
     @field_validator("sentence", mode="before")
@@ -197,67 +270,88 @@ class Identified(Reply):
         }
 
 
-def identify_call(question: str, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
-    """The call that asks what is asked, which object moves, in words, and how."""
+def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
+    """The call that asks which object moves, in words, and of the rest what the caller has not said."""
     schema = replies.schema_of(Identified, reasoning_length=reasoning_length)
-    return PromptCall("identify", {"question": question}, (image.jpeg,), schema, read_identified)
+    said = frozenset((
+        *(() if given.asked_wanted else ("asked",)),
+        *(() if given.changes_wanted else ("changes",)),
+        *(() if given.motion_wanted else ("kind", "sentence", *_SAID_ALIKE, "then", "also_moving")),
+    ))  # fmt: skip
+    schema["properties"] = {name: each for name, each in schema["properties"].items() if name not in said}
+    schema["required"] = [name for name in schema["required"] if name not in said]
+    inputs: dict[str, object] = {
+        "question": given.question,
+        "wants_asked": given.asked_wanted,
+        "wants_changes": given.changes_wanted,
+        "wants_motion": given.motion_wanted,
+        "objections": tuple(" ".join(each.split()) for each in given.objections),
+    }
+    return PromptCall("identify", inputs, (image.jpeg,), schema, partial(read_identified, said=said))
 
 
-def read_identified(reply: str) -> Identified | None:
-    """The object that a reply names; None where it says that there is none. Raises `ReplyError`."""
-    said = replies.without_thinking(reply)
-    values = replies.values_in(said)
-    written = [fields for value in values for fields in _replies(value)]
+def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None:
+    """The object that a reply names; None where it says that there is none. Raises `ReplyError`.
+
+    Fields that the caller has `said` are not read.
+    """
+    text = replies.without_thinking(reply)
+    values = replies.values_in(text)
+    # Words in brackets may be part of the prose around the object.
+    objects = [value for value in values if any(replies.objects_in(value))]
+    written = [fields for value in objects for fields in _replies(value)]
+    written = written or [fields for value in values for fields in _replies(value)]
     if not written and not any(isinstance(value, dict | list) or value is None for value in values):
-        written = [{"object": name} for name in _names_in_prose(said)]
+        written = [{"object": name} for name in _names_in_prose(text)]
     names = [replies.text_of(fields["object"]) for fields in written]
     if names:
         if all(map(_ABSENT.fullmatch, names)):
             return None
     # A value that has the field says so there, any other as a whole.
-    elif _ABSENT.fullmatch(said) or any(
+    elif _ABSENT.fullmatch(text) or any(
         replies.is_none(replies.first_of({"": value} | replies.fields_of(value), *_NAMES, "")) for value in values
     ):
         return None
     else:
         raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
-    for name in names:
-        if len(name) > replies.MAX_NAME:
-            raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
-        if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
-            raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
-        if _DENIAL.search(name) or name.lower().strip(" .") in _POINTING:
-            raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
-        if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
-            raise ReplyError(f"'{name}' names no object; say in words what moves")
     if len(set(map(replies.name_words, names))) > 1:
         raise ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
 
-    # What contradicts the rest of the same reply is left out.
-    found = Identified.model_validate(written[-1])
+    # What contradicts the rest of the same reply is left out, and things have one name each.
+    context = ReadingContext(faults=[] if objects else ["it is no JSON object, so that fields are missing"])
+    fields = {name: held for name, held in written[-1].items() if name not in said}
+    found = Identified.model_validate(fields, context=context)
     mover, asked = replies.name_words(found.object), found.asked
-    if asked is not None and asked.subject is not None and replies.name_words(asked.subject) == mover:
-        asked = asked.model_copy(update={"subject": None})  # null is the mover
     others = tuple(name for name in found.others if replies.name_words(name) != mover)
+    if asked is not None:
+        one = partial(replies.named_among, known=(found.object, *others))
+        names = {name: one(name) or name for name in (asked.subject, asked.target, *asked.among) if name is not None}
+        subject = names.get(asked.subject or "")
+        update: dict[str, Any] = {
+            "subject": None if subject == found.object else subject,  # null is the mover
+            "target": names.get(asked.target or ""),
+            "among": tuple(names[name] for name in asked.among),
+        }
+        asked = asked.model_copy(update=update)
     placed = any(each.kind == "place" and replies.name_words(each.object) == mover for each in found.changes)
     kind = None if found.kind == "place" and not placed else found.kind
-    return found.model_copy(update={"others": others, "asked": asked, "kind": kind})
+    update = {"others": others, "asked": asked, "kind": kind, "warnings": context.left_out}
+    found = found.model_copy(update=update)
+    if context.faults:
+        raise ReplyError("; ".join(context.faults), found)
+    return found
 
 
 def _replies(value: object) -> Iterator[dict[str, Any]]:
-    """The fields of each reply in a value that names an object, without headings and lists around it."""
-    if isinstance(value, list):
-        for part in replies.listed(value):
-            yield from _replies(part if isinstance(part, dict) else {"object": part})
-    fields = replies.fields_of(value)
-    for each in replies.listed(replies.first_of(fields, *_NAMES)):
-        inner = replies.fields_of(each)
-        if "kind" in inner and not inner.keys().isdisjoint(_NAMES):  # the whole reply, under a heading
-            yield from _replies(each)
-            continue
-        for named in replies.listed(replies.first_of(inner, *_INNER) if inner else each):
-            if not replies.is_none(named) and replies.text_of(named):
-                yield fields | {"object": named}
+    """The fields of each object in a value that names what moves, whatever it is wrapped in; words of a list alone."""
+    words = [part for part in replies.listed(value) if isinstance(part, str)] if isinstance(value, list) else []
+    yield from ({"object": word} for word in words)
+    for fields in replies.objects_in(value, "changes", "also_moving"):
+        for each in replies.listed(replies.first_of(fields, *_NAMES)):
+            inner = replies.fields_of(each)
+            for named in replies.listed(replies.first_of(inner, *_INNER) if inner else each):
+                if not replies.is_none(named) and replies.text_of(named):
+                    yield fields | {"object": named}
 
 
 def _names_in_prose(said: str) -> list[str]:

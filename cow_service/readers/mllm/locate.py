@@ -4,26 +4,29 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from cow_service import records
+from cow_service.narration.words import same_name
+from cow_service.readers.base import ReaderInput
 from cow_service.readers.mllm import coordinates, estimates, replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, EncodedImage
-from cow_service.readers.mllm.identify import MAX_OTHERS
+from cow_service.readers.mllm.estimates import PlacesContext
+from cow_service.readers.mllm.identify import MAX_NAMED
 from cow_service.readers.mllm.replies import Reply, ReplyError
 from cow_service.records import BBox, LocatedObject, ObjectPrior, Point, Vector
-from cow_service.vision.masks import is_among
+from cow_service.vision.masks import is_among, is_same_object
 
 CUES = ("arrow", "trail", "text", "orientation", "none")
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
 POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")
-MAX_OBSTACLES = 8
-ALL = 2  # things from which a list is taken for all that matter, as it was asked for, where the reply does not say
+MAX_OBSTACLES = 12
+MIN_COMPLETE_LIST = 2  # things in a list that is taken for complete, as it was asked for, where the reply does not say
 MAX_LABEL = 80  # characters
 STRAIGHT = 60.0  # degrees from the image's vertical, within which a line can also lead towards or away
 STEEP = 60.0  # degrees out of the image plane, from which a motion leads straight towards or away
@@ -54,6 +57,11 @@ _CORNER_PAIRS = re.compile(rf"{_PAIR}\s*(?:,|-|–|→|to|and|through)?\s*{_PAIR
 _FOUR = re.compile(r"[(\[]?\s*" + r"\s*,\s*".join([f"({NUMBER})"] * 4) + r"\s*[)\]]?")
 _CAMERA = BeforeValidator(lambda said: estimates.CAMERA.get(replies.text_of(said).lower().strip(" .")))
 _COORDINATES = WithJsonSchema({replies.COORDINATES: 4})  # nullable
+_WITH, _AGAINST = "with", "against"  # the arrow
+_SENSES = {
+    **dict.fromkeys((_WITH, "along", "same", "forward", "true", "yes"), True),
+    **dict.fromkeys((_AGAINST, "opposite", "reverse", "reversed", "backward", "false", "no"), False),
+}
 Ends = tuple[Point, Point]  # of a line, px of the upright image
 
 
@@ -70,7 +78,7 @@ class SeenObject(Reply):
     @field_validator("bbox", mode="before")
     @classmethod
     def _read_bbox(cls, written: object, info: ValidationInfo) -> BBox | None:
-        return None if replies.is_none(written) else estimates.context_of(info).frame.bbox(written)
+        return None if replies.is_none(written) else estimates.frame_of(info).bbox(written)
 
     @property
     def prior(self) -> ObjectPrior | None:
@@ -89,18 +97,18 @@ class SeenObject(Reply):
 class Surroundings(Reply):
     """What is around the object."""
 
-    others: Annotated[tuple[SeenObject, ...], Field(max_length=MAX_OTHERS + MAX_OBSTACLES)]
+    others: Annotated[tuple[SeenObject, ...], Field(max_length=MAX_NAMED + MAX_OBSTACLES)]
     complete: bool | None = None
 
 
 class Line(Reply):
-    """The object's direction of motion in the reply: `direction` in px of the upright image."""
+    """The direction of motion in the reply: `direction`, asked for as two points, in px of the upright image."""
 
-    other_names: ClassVar = {"direction": _DIRECTION_KEYS[1:]}
+    other_names: ClassVar = {"direction": _DIRECTION_KEYS[1:], "sense": ("along_arrow",)}
     cue: Annotated[records.Cue | None, WithJsonSchema(replies.one_of(*CUES))]
-    along_arrow: Annotated[bool | None, BeforeValidator(replies.truth_of)]
+    sense: Annotated[bool | None, WithJsonSchema(replies.nullable(replies.one_of(_WITH, _AGAINST)))]
     camera: Annotated[estimates.CameraSense | None, _CAMERA]
-    direction: Annotated[Ends | None, _COORDINATES]
+    direction: Annotated[Ends | None, WithJsonSchema({replies.POINTS: ["start", "end"]})]
     depth_degrees: estimates.DepthDegrees = None  # out of the image plane, positive away from the camera
     speed: estimates.KnownSpeed = None
 
@@ -110,6 +118,17 @@ class Line(Reply):
         said = replies.text_of(written).lower()
         return next((cue for word, cue in _CUE_WORDS.items() if word in said), None)
 
+    @field_validator("sense", mode="before")
+    @classmethod
+    def _read_sense(cls, written: object, info: ValidationInfo) -> bool | None:
+        """Whether the motion follows the arrow; null where the reply says nothing of it."""
+        if isinstance(written, bool):
+            return written
+        said = {_SENSES[word] for word in replies.text_of(written).lower().split() if word in _SENSES}
+        if len(said) != 1 and not replies.is_none(written):
+            estimates.context_of(info).faults.append(f"`sense` is {replies.shown(written)}, not 'with' or 'against'")
+        return said.pop() if len(said) == 1 else None
+
     @field_validator("direction", mode="before")
     @classmethod
     def _read_direction(cls, written: object, info: ValidationInfo) -> Ends | None:
@@ -118,8 +137,8 @@ class Line(Reply):
         if info.data.get("cue", "") is None and not any(replies.listed(written)):
             return None  # zeros: how some models that see no direction fill the field
         if isinstance(written, str) and not re.search(r"\d", written):
-            raise ReplyError(f"`direction` is given in words ('{written[:40]}'); give two points as four numbers")
-        return estimates.context_of(info).frame.ends(written)
+            raise ReplyError(f"the direction is given in words ('{written[:40]}'); give the points `start` and `end`")
+        return estimates.frame_of(info).ends(written)
 
 
 @dataclass(frozen=True)
@@ -133,10 +152,19 @@ class Located:
     point: Point | None = None
     label: str = ""
     others: tuple[LocatedObject, ...] = ()
-    is_complete: bool = False  # the others are all that could matter
+    objects_complete: bool = False  # the others are all that could be hit or hide something
     prior: ObjectPrior | None = None
     line: Line | None = None
-    warnings: tuple[str, ...] = ()  # of optional fields and other boxes that were left out
+    warnings: tuple[str, ...] = ()  # of what was left out
+
+    @property
+    def line_hints(self) -> dict[str, Any]:
+        """Fields of `MotionHints` that the line says; none without one."""
+        line = self.line
+        if line is None:
+            return {}
+        fields = ("cue", "camera", "depth_degrees", "speed")
+        return {"ends": line.direction, "along_arrow": line.sense} | {name: getattr(line, name) for name in fields}
 
 
 @dataclass(frozen=True)
@@ -148,9 +176,14 @@ class WrittenPlace:
     point: Any = None
     fields: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
+    @property
+    def is_unseen(self) -> bool:
+        """Whether the reply says that it does not see the object."""
+        return replies.is_none(self.box) and replies.is_none(self.point)
+
 
 def locate_call(
-    question: str,
+    given: ReaderInput,
     image: EncodedImage,
     name: str,
     bbox: BBox | None,
@@ -161,17 +194,18 @@ def locate_call(
     """The call that asks where the object `name` is, unless its box is known, and which way it moves."""
     frame, wants_box = image.coordinate_frame, bbox is None
     inputs: dict[str, object] = {
-        "question": question,
+        "question": given.question,
         "object": " ".join(name.split()),
         "others": tuple(others),
         "bbox": "" if bbox is None else str(frame.write((bbox[0], bbox[1]), (bbox[2], bbox[3]))),
         "units": frame.units,
         "box_key": frame.coordinates.box,
         "box_order": frame.box_order,
-        "line_order": frame.line_order,
+        "point_order": frame.point_order,
         "wants_box": wants_box,
         "wants_direction": wants_direction,
         "max_obstacles": MAX_OBSTACLES,
+        "objections": tuple(" ".join(each.split()) for each in given.objections),
     }
     schema = locate_schema(frame, wants_box, wants_direction, reasoning_length)
     read = partial(
@@ -198,70 +232,127 @@ def read_located(
     """
     said = replies.without_thinking(reply)
     values = replies.values_in(said)
-    place = _find_place(values, said, frame, wanted) if wants_box else None
+    places = [place for value in values for place in _places(value, frame)] or list(_places_in_prose(said))
+    place = _choose_place(places, values, frame, wanted, others) if wants_box else None
     if wants_box and place is None:
         return None
-    warnings: list[str] = []
-    line = _read_line(values, said, estimates.ReadingContext(frame, warnings=warnings)) if wants_direction else None
-    if place is None:
-        return Located(line=line, warnings=tuple(warnings))
+    context, line = PlacesContext(frame=frame), None
+    if wants_direction:
+        try:
+            line = _read_line(values, said, context)
+        except ReplyError as error:  # what is drawn or said may tell the direction as well
+            context.faults.append(str(error))
+    located = Located(line=line)
+    if place is not None:
+        located = replace(_read_objects(values, place, places, wanted, others, context), line=line)
+    located = replace(located, warnings=context.left_out)
+    if context.faults:
+        raise ReplyError("; ".join(context.faults), located)
+    return located
 
-    around = [found for value in values for found in _places(replies.fields_of(value).get("others"), frame)]
-    named = list(_named([found for found in around if not replies.is_none(found.box)], others))
+
+def _read_objects(
+    values: Sequence[object],
+    place: WrittenPlace,
+    places: Sequence[WrittenPlace],
+    wanted: str,
+    others: Sequence[str],
+    context: PlacesContext,
+) -> Located:
+    """The object at its `place` and the others: those of the reply's list, else the rest of its `places`.
+
+    What cannot be read of the others is a fault, and the list is not complete then.
+    """
+    frame = context.frame
+    reply = list(replies.objects_in(list(values), "others"))
+    lists = [fields["others"] for fields in reply if "others" in fields]
+    rest = [each for each in places if each != place and not replies.is_none(each.box)]
+    around, is_whole = _read_others(lists[-1], context) if lists else (rest, True)
+    if others and not lists and not around:
+        context.faults.append(f"`others` is missing, with the boxes of {', '.join(others)}")
+    named = list(_named(around, others, context))
     names = [wanted, *(name for name, _, _ in named)]
 
     def seen(name: str, found: WrittenPlace) -> SeenObject:
-        context = estimates.ReadingContext(frame, name, names, warnings)
-        return SeenObject.model_validate({**found.fields, "label": found.label, "bbox": found.box}, context=context)
+        own = replace(context, owner=name, others=names)  # with the same lists of warnings and faults
+        return SeenObject.model_validate({**found.fields, "label": found.label, "bbox": found.box}, context=own)
 
     mover = seen(wanted, place)
+    if mover.bbox is not None and coordinates.covers_image(frame.width, frame.height, mover.bbox):
+        raise ReplyError(f"the box of '{wanted}' covers nearly the whole image; give that of the object alone")
     objects: list[LocatedObject] = []
     for name, role, other in named:
         try:
-            found = seen(name, other)
-        except ReplyError as error:  # the mover matters more than asking for this again
-            warnings.append(f"The reader's box of '{name}' was left out: {error}.")
+            bbox = (found := seen(name, other)).bbox
+        except ReplyError as error:
+            context.faults.append(f"the box of '{name}': {error}")
             continue
-        if found.bbox is None:
+        if bbox is None:  # words such as "none" in a list
             continue
-        if role == "obstacle" and coordinates.covers_image(frame.width, frame.height, found.bbox):
-            warnings.append(f"The reader's box of '{name}' was left out: it covers nearly the whole image.")
-            continue
-        objects.append(LocatedObject(object=name, bbox=found.bbox, role=role, prior=found.prior, source="mllm"))
-    told = (fields["complete"] for fields in map(replies.fields_of, values) if "complete" in fields)
-    complete = next(map(replies.truth_of, told), None)
+        if role == "obstacle" and coordinates.covers_image(frame.width, frame.height, bbox):
+            context.faults.append(f"the box of '{name}' covers nearly the whole image")
+        elif role == "target" and mover.bbox is not None and is_same_object(bbox, mover.bbox):
+            context.faults.append(f"'{wanted}' and '{name}' have the same box")
+        else:
+            objects.append(LocatedObject(object=name, bbox=bbox, role=role, prior=found.prior, source="mllm"))
+    told = [replies.truth_of(fields["complete"]) for fields in reply if "complete" in fields]
+    is_complete = told[-1] is True if told else len(objects) >= MIN_COMPLETE_LIST
     return Located(
         bbox=mover.bbox,
         point=frame.point(place.point) if mover.bbox is None else None,
         label=place.label,
         others=tuple(objects),
-        is_complete=len(objects) >= ALL if complete is None else complete,
+        objects_complete=is_complete and is_whole and len(objects) == len(named),
         prior=mover.prior,
-        line=line,
-        warnings=tuple(warnings),
     )
 
 
-def separate_objects(mover: BBox, others: Sequence[LocatedObject]) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
+def _read_others(written: object, context: PlacesContext) -> tuple[list[WrittenPlace], bool]:
+    """The places of a list, or of an object with boxes by name; and whether every entry has one."""
+    fields, is_whole = replies.fields_of(written), True
+    entries = [("", each) for each in replies.listed(written)]
+    if fields and fields.keys().isdisjoint((context.frame.coordinates.box, *BOX_KEYS, *_LABEL_KEYS)):
+        entries = [(str(name), box) for name, box in cast("dict[object, object]", written).items()]
+    found: list[WrittenPlace] = []
+    for name, entry in entries:
+        places = list(_places(entry, context.frame, name))
+        usable = [place for place in places if place.label and not replies.is_none(place.box)]
+        found += usable
+        is_whole = is_whole and bool(usable)
+        if not usable and not replies.is_none(entry) and not any(place.is_unseen for place in places):
+            context.faults.append(f"`others` has {replies.shown(entry)}, without a label and a box")
+    return found, is_whole
+
+
+def separate_objects(
+    mover: LocatedObject, others: Sequence[LocatedObject]
+) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
     """The others without those that have the box of the mover or of one before them, and with few obstacles.
 
-    A warning reports a target that is dropped.
+    A warning reports each that is dropped, unless it is the mover under its own name.
     """
     kept: list[LocatedObject] = []
     warnings: list[str] = []
     for other in others:
-        boxes = [mover, *(each.bbox for each in kept)]
-        if is_among(other.bbox, boxes):
-            if other.role == "target":
-                warnings.append(f"The reader's box of '{other.object}' was left out: it is that of another object.")
-        elif other.role == "target" or sum(each.role == "obstacle" for each in kept) < MAX_OBSTACLES:
+        if is_same_object(other.bbox, mover.bbox) and same_name(other.object, mover.object):
+            continue
+        if is_among(other.bbox, [mover.bbox, *(each.bbox for each in kept)]):
+            warnings.append(f"The reader's box of '{other.object}' was left out: it is that of another object.")
+        elif other.role == "obstacle" and sum(each.role == "obstacle" for each in kept) >= MAX_OBSTACLES:
+            warnings.append(f"The reader's box of '{other.object}' was left out: at most {MAX_OBSTACLES} are taken.")
+        else:
             kept.append(other)
     return tuple(kept), tuple(warnings)
 
 
-def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wanted: str) -> WrittenPlace | None:
+def _choose_place(
+    places: Sequence[WrittenPlace],
+    values: Sequence[object],
+    frame: CoordinateFrame,
+    wanted: str,
+    others: Sequence[str],
+) -> WrittenPlace | None:
     """The place that the reply gives for the object; None if it says that it does not see it."""
-    places = [place for value in values for place in _places(value, frame)] or list(_places_in_prose(said))
     if not places:
         if any(map(replies.is_none, values)):
             return None
@@ -280,7 +371,11 @@ def _find_place(values: Sequence[object], said: str, frame: CoordinateFrame, wan
             raise ReplyError(f"{len(distinct)} places are given ({labels}); give one box, that of '{wanted}'")
         distinct = named
     (place,) = distinct
-    return None if replies.is_none(place.box) and replies.is_none(place.point) else place
+    if place.is_unseen:
+        return None
+    if replies.name_words(place.label) in map(replies.name_words, others):
+        raise ReplyError(f"the box is that of '{place.label}'; give that of '{wanted}'")
+    return place
 
 
 def _places(value: object, frame: CoordinateFrame, name: str = "") -> Iterator[WrittenPlace]:
@@ -323,16 +418,17 @@ def _places_in_prose(said: str) -> Iterator[WrittenPlace]:
 
 
 def _named(
-    places: Sequence[WrittenPlace], targets: Sequence[str]
+    places: Sequence[WrittenPlace], targets: Sequence[str], context: PlacesContext
 ) -> Iterator[tuple[str, records.ObjectRole, WrittenPlace]]:
     """Each place with its name and role: the targets, each once, then all the rest but the floor."""
     left = list(places)
     for target in targets:
-        wanted = set(replies.name_words(target))
-        labels = [(set(replies.name_words(place.label)), place) for place in left]
-        same = [place for held, place in labels if held == wanted]
-        alike = [place for held, place in labels if held and (held < wanted or wanted < held)]
-        for place in same[:1] or (alike if len(alike) == 1 else []):
+        label = replies.named_among(target, [place.label for place in left])
+        meant = [place for place in left if label and replies.name_words(place.label) == replies.name_words(label)]
+        if len({repr(place.box) for place in meant}) > 1:
+            context.faults.append(f"{len(meant)} things are labelled '{target}'; label only the one that is meant so")
+            continue
+        for place in meant[:1]:
             left = [other for other in left if other is not place]
             yield target, "target", place
     for place in left:
@@ -341,14 +437,14 @@ def _named(
             yield label, "obstacle", place
 
 
-def _read_line(values: Sequence[object], said: str, context: estimates.ReadingContext) -> Line:
+def _read_line(values: Sequence[object], said: str, context: PlacesContext) -> Line:
     """The one line that a reply gives. Raises `ReplyError` if it gives none, several, or one that cannot be."""
     written = [fields for value in values for fields in _line_fields(value)]
     if not written and not values and "<" not in said and (corners := _CORNER_PAIRS.search(said)):
         written = [{"direction": list(corners.groups())}]
     lines = [Line.model_validate(fields, context=context) for fields in written]
     if not lines:
-        raise ReplyError("`direction` is missing; give two points on the line of the motion, or null")
+        raise ReplyError("the direction is missing; give `start` and `end`, or null for both")
     for one, other in itertools.pairwise(lines):
         if one.direction is None or other.direction is None:
             same = one.direction == other.direction and one.camera == other.camera
@@ -370,7 +466,7 @@ def _read_line(values: Sequence[object], said: str, context: estimates.ReadingCo
             line = line.model_copy(update={"camera": sense, "depth_degrees": None})
     if line.direction is not None and line.camera is not None and not _leads(line.direction, line.camera):
         raise ReplyError(
-            "`direction` and `camera` disagree; `camera` is for what moves straight towards or away from it, else null"
+            "the points and `camera` disagree; `camera` is for what moves straight towards or away from it, else null"
         )
     return line
 
@@ -388,7 +484,8 @@ def _line_fields(value: object) -> Iterator[dict[str, Any]]:
     if not fields.keys().isdisjoint(_DIRECTION_KEYS):
         yield fields
     elif {"start", "end"} <= fields.keys():
-        yield fields | {"direction": value}
+        points = fields["start"], fields["end"]
+        yield fields | {"direction": None if all(map(replies.is_none, points)) else list(points)}
     else:
         for key, held in fields.items():
             if isinstance(held, dict) and key not in {"others", *BOX_KEYS, *POINT_KEYS}:
@@ -416,7 +513,7 @@ class Scale(Reply):
     def _read_ends(cls, written: object, info: ValidationInfo) -> Ends | None:
         if replies.is_none(written) or info.data.get("metres") is None:
             return None
-        ends = estimates.context_of(info).frame.ends(written)
+        ends = estimates.frame_of(info).ends(written)
         if math.dist(*ends) < LEAST_SPAN:
             raise ReplyError("`ends` are too close to measure by; take a longer thing")
         return ends
@@ -447,7 +544,7 @@ def read_scale(reply: str, frame: CoordinateFrame) -> Scale:
         raise ReplyError("`ends` and `metres` are missing; give both, or null for both")
     if len(objects) > 1:
         raise ReplyError("several references are given; give one")
-    context = estimates.ReadingContext(frame)
+    context = PlacesContext(frame=frame)
     scale = Scale.model_validate(objects[0], context=context)
     if context.warnings:
         raise ReplyError(" ".join(context.warnings).rstrip("."))

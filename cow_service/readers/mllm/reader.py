@@ -15,7 +15,7 @@ from cow_service.readers.base import GroundingReading, MotionHints, MotionReadin
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.client import MllmClient, PromptCall
-from cow_service.readers.mllm.coordinates import EncodedImage, covers_image, encode
+from cow_service.readers.mllm.coordinates import EncodedImage, encode
 from cow_service.readers.mllm.estimates import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import Identified, identify_call
@@ -46,7 +46,9 @@ class MllmReader:
         self.upstream = self._model.upstream
         self._origin = origin
         self._subject = f"The multimodal LLM '{self._model.name}'"
-        self._reasoning = int(self._model.manifest.defaults.get("max_reasoning", DEFAULT_REASONING_LENGTH))
+        defaults = self._model.manifest.defaults
+        self._reasoning = int(defaults.get("max_reasoning", DEFAULT_REASONING_LENGTH))
+        self._direction_deviation = float(defaults.get("direction_deviation", HEADING_DEVIATION))
         self.info = records.ReaderInfo(name=name, model=self._model.name)
         taken = f"by its name it was taken for one of the family '{self._model.family.name}'"
         if self._model.family.name == UNKNOWN:
@@ -90,14 +92,14 @@ class MllmReader:
                 f"{self._subject} sees nothing in the image that the question could move.",
                 remedy=GIVE_PLACE,
             )
-        located, hints = self._locate(given, image, identified, identified.object, None)
+        located, hints = self._locate(given, image, identified, identified.object)
         if located is None:
             raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image.", remedy=GIVE_PLACE)
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
             warnings = box_warnings(given.scene, bbox, identified.object)
-        others, doubles = separate_objects(bbox, located.others)
         mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
+        others, doubles = separate_objects(mover, located.others)
         known = {name_words(each.object): each for each in (mover, *others)}
 
         def changed(name: str) -> LocatedObject:
@@ -127,9 +129,9 @@ class MllmReader:
             bbox=bbox,
             point=located.point,
             others=tuple(other for other in others if other.bbox not in removed),
-            is_complete=located.is_complete,
+            objects_complete=located.objects_complete and not doubles,
             interventions=interventions,
-            warnings=(*warnings, *located.warnings, *doubles, *self._family_warnings),
+            warnings=(*warnings, *identified.warnings, *located.warnings, *doubles, *self._family_warnings),
             hints=hints if given.motion_wanted else None,
             prior=located.prior,
             asked=identified.asked,
@@ -137,22 +139,31 @@ class MllmReader:
         )
 
     def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
-        """No call with hints, else two.
+        """No call with hints, one where something speaks against them, else two.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
         """
         warnings: list[str] = []
         others_sought = hints is not None  # with the mover
         if hints is None:
-            image, identified = self._identify(given)
+            image, identified = self._identify(replace(given, asked_wanted=False, changes_wanted=False))
             located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
+            warnings += () if identified is None else identified.warnings
             warnings += () if located is None else located.warnings
+        elif given.objections and hints.kind in records.DIRECTED_KINDS:
+            with given.cpu():
+                image = encode(given.scene.image, self._model.family)
+            call = locate_call(given, image, grounding.object, grounding.bbox, (), True, self._reasoning)
+            if (located := self._client.complete(call, given)) is not None:
+                warnings += located.warnings
+                hints = hints.model_copy(update=located.line_hints | {"speed": hints.speed})
         places = {name_words(each.object): each for each in grounding.others}
         others: list[base.OtherMotionReading] = []
         for hint in hints.also:
             place = places.get(name_words(hint.object))
             if place is not None:
-                others.append(base.OtherMotionReading(place, hint.kind, hint.direction, HEADING_DEVIATION, hint.depth))
+                width = self._direction_deviation
+                others.append(base.OtherMotionReading(place, hint.kind, hint.direction, width, hint.depth))
             elif others_sought:
                 raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
             else:
@@ -190,10 +201,15 @@ class MllmReader:
         """The image as it is sent, and the question about it."""
         with given.cpu():
             image = encode(given.scene.image, self._model.family)
-        return image, self._client.complete(identify_call(given.question, image, self._reasoning), given)
+        return image, self._client.complete(identify_call(given, image, self._reasoning), given)
 
     def _locate(
-        self, given: ReaderInput, image: EncodedImage, identified: Identified | None, name: str, bbox: BBox | None
+        self,
+        given: ReaderInput,
+        image: EncodedImage,
+        identified: Identified | None,
+        name: str,
+        bbox: BBox | None = None,
     ) -> tuple[Located | None, MotionHints]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
@@ -207,8 +223,7 @@ class MllmReader:
         wants_direction = given.motion_wanted and kind in records.DIRECTED_KINDS
         calls: dict[str, PromptCall[Any]] = {}
         if bbox is None or wants_direction:
-            place = locate_call(given.question, image, name, bbox, others, wants_direction, self._reasoning)
-            calls["place"] = place
+            calls["place"] = locate_call(given, image, name, bbox, others, wants_direction, self._reasoning)
         if given.motion_wanted and kind in records.FALLING_KINDS:
             calls["scale"] = scale_call(image, name, self._reasoning)
         results = dict(zip(calls, self._client.complete_all(list(calls.values()), given), strict=True))
@@ -217,8 +232,8 @@ class MllmReader:
         if isinstance(located, CowError):
             raise located
         hints: dict[str, Any] = {"kind": kind}
-        if located is not None and (line := located.line) is not None:
-            hints |= {"ends": line.direction} | line.model_dump(exclude={"direction"})
+        if located is not None:
+            hints |= located.line_hints
         if identified is not None:
             hints |= identified.hints
         if isinstance(scaled, Scale):
@@ -238,7 +253,7 @@ class MllmReader:
             speed=hints.speed,
             speed_deviation=deviation,
             cue=hints.cue or "orientation",
-            direction_deviation=HEADING_DEVIATION,
+            direction_deviation=self._direction_deviation,
             **ends,
         )
         if hints.camera is not None:
@@ -260,16 +275,13 @@ def create(settings: Settings) -> MllmReader:
 
 def box_warnings(scene: Scene, bbox: BBox, name: str) -> tuple[str, ...]:
     """What speaks against a box that was given for an object of this name; empty if nothing does."""
-    found: list[str] = []
-    if covers_image(scene.width, scene.height, bbox):
-        found.append("The reader's box covers nearly the whole image: it may not be that of one object.")
     colours = set(name_words(name))
     there = [each for each in scene.regions if each.colour in colours and not is_same_object(each.bbox, bbox)]
     here = scene.region_of(bbox) if there else None
-    if here is not None and colours.isdisjoint((here.colour, *here.colours)):
-        x, y = there[0].centre
-        found.append(
-            f"The reader's box is around something {here.colour}, while something {there[0].colour} is at "
-            f"({x:.0f}, {y:.0f}): the box may be wrong."
-        )
-    return tuple(found)
+    if here is None or not colours.isdisjoint((here.colour, *here.colours)):
+        return ()
+    x, y = there[0].centre
+    return (
+        f"The reader's box is around something {here.colour}, while something {there[0].colour} is at "
+        f"({x:.0f}, {y:.0f}): the box may be wrong.",
+    )

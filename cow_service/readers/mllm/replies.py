@@ -6,23 +6,24 @@ repaired by a library, but only where its brackets close: a reply that was cut s
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar, TypeGuard, TypeVar, cast
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo, model_validator
 
 Schema = dict[str, Any]
 
 MAX_LENGTH = 20_000  # characters behind the thinking; a longer reply is not looked through
 MAX_NAME = 120  # characters of an object's name, and of any text without another limit
-MAX_LISTED = 4  # entries of a list without another limit
+MAX_LISTED = 8  # entries of a list without another limit
 COORDINATES = "coordinates"  # key of a schema that stands for so many numbers as the model's family writes them
+POINTS = "points"  # key of a schema that stands for points under these names instead of the field
 _FENCE = re.compile(r"```[\w+-]*[ \t]*\n?(.*?)```", re.DOTALL)
 _THOUGHT = re.compile(r"</(?:think|thinking|thought|reasoning|seed:think)>|◁/think▷|<\|channel\|>final<\|message\|>")
 _THINKING = re.compile(r"<(?:think|thinking|thought|seed:think)>|◁think▷|<\|channel\|>analysis")
 _OPENING = {"{": "}", "[": "]"}
-_NOTHING = frozenset({"", "none", "null", "n/a", "not found", "nothing"})
+_NOTHING = frozenset({"", "none", "null", "n/a", "not found", "nothing", "...", "\u2026"})
 _NO_JSON = object()
 _DETERMINERS = frozenset({"the", "a", "an", "this", "that"})
 _BEFORE_STRING, _AFTER_STRING = frozenset("{[,:("), frozenset("}],:)")
@@ -32,8 +33,13 @@ _SCHEMA_KEYS = ("type", "enum", "minimum", "maximum", "minItems", "maxItems", "m
 class ReplyError(Exception):
     """A reply cannot be used. The message says why, in words that the model can act on.
 
-    Not a `ValueError`: raised in a validator, it passes through pydantic as it is.
+    `usable` is what can be used of it: such a reply is asked for again once, then taken without the rest. Not a
+    `ValueError`: raised in a validator, it passes through pydantic as it is.
     """
+
+    def __init__(self, message: str, usable: object = None) -> None:
+        super().__init__(message)
+        self.usable = usable
 
 
 class Reply(BaseModel):
@@ -55,16 +61,30 @@ class Reply(BaseModel):
 R = TypeVar("R", bound=Reply)
 
 
-def usable(kind: type[R]) -> BeforeValidator:
-    """Reads a list of objects, or one alone. Other entries are left out."""
+def all_of(kind: type[R]) -> BeforeValidator:
+    """Reads a list of objects, or one alone; entries that name nothing count as none.
 
-    def read(written: object) -> tuple[R, ...]:
+    Raises `ReplyError` for any other one that cannot be used: without it, another world would be simulated.
+    """
+    own = next(name for name in ("object", *kind.model_fields) if name in kind.model_fields)
+
+    def read(written: object, info: ValidationInfo) -> tuple[R, ...]:
         found: list[R] = []
-        for part in listed(written)[:MAX_LISTED]:
-            with suppress(ValidationError):  # a word instead of an object is its first field
-                found.append(
-                    kind.model_validate(part if isinstance(part, dict) else {next(iter(kind.model_fields)): part})
-                )
+        for part in listed(written):
+            fields = fields_of(part) or {own: part}
+            if is_none(first_of(fields, own, *kind.other_names.get(own, ()))):
+                continue
+            try:
+                found.append(kind.model_validate(fields, context=info.context))
+            except ValidationError as error:
+                fault = error.errors()[0]
+                where = ".".join(map(str, fault["loc"])) or "it"
+                raise ReplyError(
+                    f"`{info.field_name}` has {shown(part)}, of which {where} cannot be read; give it in the form that "
+                    "is asked for, or [] if the question does not say it"
+                ) from error
+        if len(found) > MAX_LISTED:
+            raise ReplyError(f"`{info.field_name}` has {len(found)} entries; give at most {MAX_LISTED}")
         return tuple(found)
 
     return BeforeValidator(read)
@@ -90,11 +110,16 @@ def schema_of(*kinds: type[Reply], reasoning_length: int, numbers: Schema | None
         if kept.get("type") == "array":
             kept |= {"items": adapted(schema["items"], definitions), "maxItems": kept.get("maxItems", MAX_LISTED)}
         if "properties" in schema:
-            names = {name: box_key if name == "bbox" else name for name in schema["properties"]}
-            kept["properties"] = {
-                names[name]: adapted(each, definitions) for name, each in schema["properties"].items()
+            names = {
+                name: each.get(POINTS, [box_key if name == "bbox" else name])
+                for name, each in schema["properties"].items()
             }
-            kept["required"] = [names[name] for name in schema.get("required", ())]
+            kept["properties"] = {
+                key: adapted({COORDINATES: 2} if POINTS in each else each, definitions)
+                for name, each in schema["properties"].items()
+                for key in names[name]
+            }
+            kept["required"] = [key for name in schema.get("required", ()) for key in names[name]]
             kept["additionalProperties"] = False
         return kept
 
@@ -171,6 +196,19 @@ def first_of(fields: dict[str, Any], *names: str) -> Any:
     return next((fields[name] for name in names if name in fields), None)
 
 
+def objects_in(value: object, *closed: str) -> Iterator[dict[str, Any]]:
+    """The fields of a value's objects, the outer ones first; what the fields `closed` hold is not looked into."""
+    for part in listed(value):
+        if isinstance(part, list):
+            yield from objects_in(part, *closed)
+        fields = fields_of(part)
+        if fields:
+            yield fields
+        for key, held in fields.items():
+            if key not in closed and isinstance(held, dict | list):
+                yield from objects_in(held, *closed)
+
+
 def listed(written: object) -> list[Any]:
     """A field that should hold a list; anything else is a list of one, and nothing an empty one."""
     return cast("list[Any]", written) if isinstance(written, list) else [] if written is None else [written]
@@ -205,6 +243,20 @@ def name_of(value: object) -> str:
 def name_words(name: str) -> tuple[str, ...]:
     """The words of an object's name without determiners, lower case: names with the same words are the same."""
     return tuple(word for word in re.findall(r"\w+", name.lower()) if word not in _DETERMINERS)
+
+
+def named_among(name: str, known: Sequence[str]) -> str | None:
+    """The one of the known names that has the words of a name, or the only one that is part of it or extends it."""
+    words = set(name_words(name))
+    held = [(set(name_words(each)), each) for each in known]
+    same = [each for other, each in held if other == words]
+    alike = [each for other, each in held if words and other and (other < words or words < other)]
+    return same[0] if same else alike[0] if len(alike) == 1 else None
+
+
+def shown(written: object) -> str:
+    """What was written, in quotation marks and short enough for a message."""
+    return f"'{' '.join(str(written).split())[:80]}'"
 
 
 def _parsed(text: str) -> Any:
