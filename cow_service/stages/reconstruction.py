@@ -24,7 +24,7 @@ from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.stages.run import Run
 from cow_service.vision.edges import divide
 from cow_service.vision.forms import shape_seen
-from cow_service.vision.masks import CroppedMask, iou, is_same_object, share_inside
+from cow_service.vision.masks import CroppedMask, iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import CLEAR_CUT, Obstacle, Scene
 from cow_service.vision.shadows import find_shadow
@@ -111,12 +111,12 @@ def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ..
 def unlisted_of(scene: Scene, grounding: Grounding) -> tuple[BBox, ...]:
     """Boxes of what is clearly seen as one thing, and is no part of what a complete list has."""
     listed = (*others_of(grounding), *removed_of(grounding))
-    boxes = [grounding.bbox, *(each.bbox for each in listed)]
-    return tuple(
-        each.bbox
-        for each in scene.obstacles(grounding.bbox, listed)
-        if each.confidence >= CLEAR_CUT and all(share_inside(each.bbox, box) < PART for box in boxes)
-    )
+    known = np.zeros((scene.height, scene.width), bool)
+    for x0, y0, x1, y1 in (grounding.bbox, *(each.bbox for each in listed)):
+        known[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1] = True
+    seen = scene.obstacles(grounding.bbox, listed)
+    clear = (each for each in seen if each.confidence >= CLEAR_CUT)
+    return tuple(each.bbox for each in clear if each.mask.shared_with(known) < PART * each.mask.area)
 
 
 def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePath | None]:

@@ -72,12 +72,6 @@ def iou(a: BBox, b: BBox) -> float:
     return width * height / both
 
 
-def share_inside(a: BBox, b: BBox) -> float:
-    """Share of the area of a box that lies inside another."""
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    return max(0.0, width) * max(0.0, height) / max((a[2] - a[0]) * (a[3] - a[1]), 1e-9)
-
-
 def mask_iou(a: Mask, b: Mask) -> float:
     """Intersection over union of two masks [h, w]; 0 of two that are empty."""
     return float(np.count_nonzero(a & b) / max(1, np.count_nonzero(a | b)))
