@@ -58,14 +58,13 @@ def direct(outcome: Outcome, say: Phrases) -> str:
         case "which-first":
             return outcome.first or say("nothing")
         case "when":
-            if outcome.time is None or not outcome.happens:
-                return say("never")
-            return say("after", time=say.seconds(outcome.time))
+            is_known = outcome.time is not None and outcome.happens
+            return say("after", time=say.seconds(outcome.time or 0.0)) if is_known else say("never")
         case "which" | "which-to-remove":
             meant = [] if outcome.is_needless else [each.object for each in outcome.candidates if each.is_meant]
-            if meant:
-                return say.joined(meant, "names-and" if outcome.asked.form == "which" else "names-or")
-            return say("nothing" if outcome.is_needless or not outcome.asked.among else "none-of-them")
+            none = "nothing" if outcome.is_needless or not outcome.asked.among else "none-of-them"
+            last = "names-and" if outcome.asked.form == "which" else "names-or"
+            return say.joined(meant, last) if meant else say(none)
         case "how-many":
             return str(outcome.count or 0)
         case "where" | "what-happens":

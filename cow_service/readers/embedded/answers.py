@@ -209,7 +209,8 @@ def choose_option(
         return _unsure(options, say, narration.summary)
     if not options:
         return AnswerReading(narration.answer, False, reasoning=narration.summary)
-    fitting = _fitting([option for option in options if not says_not_sure(option.text)], outcome)
+    fits = _fitting_set if outcome.asked.form in ("which", "which-to-remove") else _fitting
+    fitting = fits([option for option in options if not says_not_sure(option.text)], outcome)
     # Options in another language than English are told by the words of the answer in it, such as "Ja".
     only = fitting[0] if len(fitting) == 1 else None if fitting else option_saying(options, narration.answer)
     if only is not None:
@@ -225,8 +226,6 @@ def _unsure(options: Sequence[AnswerOption], say: Phrases, why: str) -> AnswerRe
 def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
     """The options that say what the world says."""
     form, first = outcome.asked.form, outcome.first
-    if form in ("which", "which-to-remove"):
-        return _fitting_set(options, outcome)
     if form in ("whether", "changes"):
         is_yes = outcome.happens
         return [option for option in options if says_it_happens(option.text, outcome.asked) is is_yes]
@@ -253,12 +252,12 @@ def _fitting_set(options: Sequence[AnswerOption], outcome: Outcome) -> list[Answ
     """The options that name just the candidates that are meant: of all, if the question names them, else of those that
     any option names."""
     names = [each.object for each in outcome.candidates]
-    meant = {each.object for each in outcome.candidates if each.is_meant and not outcome.is_needless}
+    meant = frozenset(each.object for each in outcome.candidates if each.is_meant and not outcome.is_needless)
     if not outcome.asked.among:
         chosen = [_named_in(option.text, names) or frozenset[str]() for option in options if not _says_all(option.text)]
         named = frozenset[str]().union(*chosen)
         names = [name for name in names if name in named] or names
-    return [option for option in options if _named_in(option.text, names) == meant & set(names)]
+    return [option for option in options if _named_in(option.text, names) == meant & frozenset(names)]
 
 
 def _says_all(text: str) -> re.Match[str] | None:
