@@ -46,6 +46,7 @@ FEW_WORLDS = 0.2  # share of the worlds: what is touched in no more of them turn
 # worlds in which all are there, and what is met in fewer worlds than these hardly keeps anything from happening.
 MOST_TAKEN = 8
 
+OF_COVERING: tuple[AskedRelation, ...] = ("covers", "covered")
 KIND_OF: dict[AskedRelation, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
 BY_EVENTS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that what happens in a world decides
 FIRST_MET: tuple[AskedForm, ...] = ("which-first", "where", "what-happens")  # told apart by what is met first
@@ -221,7 +222,8 @@ def _run_until_settled(
 
 def _with_met(query: Query, there: ObservedWorlds) -> Query:
     """With the things that the acting object meets, those first that it meets in most worlds."""
-    shares = np.isfinite(there.events.of[query.subject].times["touches"]).mean(axis=0)
+    touches = there.events.of[query.subject].times["touches"]
+    shares = np.isfinite(np.minimum(touches, _per_body(query.of(None), there.events))).mean(axis=0)
     met = [int(body) for body in np.argsort(-shares, kind="stable") if body and shares[body] > FEW_WORLDS]
     among = dict.fromkeys((*query.among, *met[:MOST_TAKEN]))
     return replace(query, among=tuple(among), meets_more=False)
@@ -229,20 +231,22 @@ def _with_met(query: Query, there: ObservedWorlds) -> Query:
 
 def _told_of(query: Query, candidate: int, drawn: DrawnWorlds, there: ObservedWorlds, part: slice) -> Told:
     """What worlds of its own, with the same draws, tell of a candidate; `there` are some in which all is there."""
-    asked, events = query.of(candidate), there.events
+    asked, events, count = query.of(candidate), there.events, len(there.worlds.runs)
     if not query.is_of_removal:
         goal = query.goals[query.among.index(candidate)]
         own = replace(drawn, given=replace(drawn.given, placement=goal))
     elif candidate in (0, query.subject, query.target):  # without it there is nothing that could happen
-        return replace(Told.by(asked, events), happens=np.zeros(len(there.worlds.runs), bool))
+        return replace(Told.by(asked, events), happens=np.zeros(count, bool), misread=np.zeros(count, bool))
     else:
         meetings = (each for run in there.worlds.runs for each in run.meetings if each.b is not None)
-        if candidate not in {*there.worlds.layout.supports, *(body for each in meetings for body in (each.a, each.b))}:
+        matter = {*there.worlds.layout.supports, *(body for each in meetings for body in (each.a, each.b))}
+        if candidate not in matter and (query.target is not None or query.asked.relation not in OF_COVERING):
             return Told.by(asked, events)  # what touches nothing changes nothing
         own = drawn.without(candidate)
     found = _observed(own.given, own.run(part), drawn.draws[part])
     path = seen_paths(found.worlds.within_horizon, 0)
-    return Told.by(asked, found.events, path.points[0] - path.seen[0])
+    told = Told.by(asked, found.events, path.points[0] - path.seen[0])
+    return replace(told, misread=told.misread | _misread(events))
 
 
 def _run(world: WorldInput, draws: Floats) -> ObservedWorlds:
@@ -379,9 +383,10 @@ def decide_each(query: Query, events: WorldEvents, told: Sequence[Told], draws: 
     """
     negated, bodies = query.asked.negated, query.among
     turned = negated != query.is_of_removal  # what is told is that it does not happen
-    misread = _misread(events)
-    happens = np.array([each.happens for each in told], bool).reshape(len(told), len(draws))
-    unclear = np.array([each.misread for each in told], bool).reshape(happens.shape) | misread
+    misread, shape = _misread(events), (len(told), len(draws))
+    happens, unclear = (
+        np.array([getattr(each, n) for each in told], bool).reshape(shape) for n in ("happens", "misread")
+    )
     shares = np.where(unclear, 0.5, happens != turned).mean(axis=1)
     is_so = shares >= 0.5
     enough = np.where(is_so != turned, query.sure, query.sure_of_miss)
