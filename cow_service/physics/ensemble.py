@@ -245,8 +245,7 @@ def _told_of(query: Query, candidate: int, drawn: DrawnWorlds, there: ObservedWo
         own = drawn.without(candidate)
     found = _observed(own.given, own.run(part), drawn.draws[part])
     path = seen_paths(found.worlds.within_horizon, 0)
-    told = Told.by(asked, found.events, path.points[0] - path.seen[0])
-    return replace(told, misread=told.misread | _misread(events))
+    return Told.by(asked, found.events, path.points[0] - path.seen[0])
 
 
 def _run(world: WorldInput, draws: Floats) -> ObservedWorlds:

@@ -77,8 +77,9 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
     touches = None if result.ensemble is None else result.ensemble.events.of[0].times["touches"]
     candidates = () if result.decided is None or query is None else result.decided.candidates
     bodies = list(world.bodies)
+    are_named = query is not None and bool(query.asked.among)
     of_each = [
-        bodies_that_matter(query and query.of(each.body), each.told.touches, len(bodies), each.body)
+        bodies_that_matter(query and query.of(each.body), each.told.touches, len(bodies), each.body if are_named else 0)
         for each in candidates
     ]
     matter = bodies_that_matter(query, touches, len(bodies)).union(*of_each)

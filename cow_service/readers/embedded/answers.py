@@ -271,16 +271,16 @@ def _named_in(text: str, names: Sequence[str]) -> frozenset[str] | None:
         return frozenset()
     if said := _says_all(text):
         return frozenset(names) if said[1] != "both" or len(names) == 2 else None
+
+    def named(part: str) -> str | None:
+        """The only object that a text may name."""
+        phrase = parse_noun_phrase(part)
+        found = [name for name in names if same_name(part, name)]
+        found = found or [name for name in names if phrase is not None and may_name(phrase, name)]
+        return found[0] if len(found) == 1 else None
+
     bare = _ONLY.fullmatch(" ".join(text.lower().split()).rstrip(".!"))
     whole = "" if bare is None else bare[1]
     is_name = any(same_name(whole, name) for name in names)
-    found = [_named(part, names) for part in ([whole] if is_name else re.split(r",? and |, |/| & ", whole))]
+    found = [named(part) for part in ([whole] if is_name else re.split(r",? and |, |/| & ", whole))]
     return None if None in found else frozenset(name for name in found if name is not None)
-
-
-def _named(text: str, names: Sequence[str]) -> str | None:
-    """The only one of some objects that a text may name."""
-    phrase = parse_noun_phrase(text)
-    found = [name for name in names if same_name(text, name)]
-    found = found or [name for name in names if phrase is not None and may_name(phrase, name)]
-    return found[0] if len(found) == 1 else None
