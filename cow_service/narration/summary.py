@@ -77,10 +77,10 @@ def why_unsure(outcome: Outcome, in_worlds: bool, say: Phrases) -> str:
         return say("unsure-not-found")
     if "depth" in outcome.depends_on:
         return say("unsure-depth")
-    if outcome.asked.form in _OF_EACH and outcome.asked.among and not outcome.candidates and in_worlds:
-        return say("unsure-no-outcome")
     if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
-        return say("unsure-unseen" if in_worlds else "unsure-uncounted")
+        may_tell = not outcome.asked.among and outcome.asked.relation in (*KINDS, *OF_TARGET)
+        unseen = "unsure-no-outcome" if outcome.asked.form in _OF_EACH and not may_tell else "unsure-unseen"
+        return say(unseen if in_worlds else "unsure-uncounted")
     doubt = None if outcome.sure else next((doubt for doubt in _UNSEEN if doubt in outcome.depends_on), None)
     return "" if doubt is None else say(f"unsure-{doubt}")
 

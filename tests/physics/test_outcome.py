@@ -105,6 +105,8 @@ def test_of_several_things_one_will_do_or_each_is_meant() -> None:
         several = asked(target=None).model_copy(update={"every": every})
         answer = decide(Query(several, among=(1, 2)), found, DRAWS)
         assert (answer.probability, answer.time) == (pytest.approx(probability), time)
+        with_taken = decide(Query(several, among=(2, 4)), found, DRAWS)  # numbered behind the bodies that are there
+        assert with_taken.probability == (0.0 if every else 1.0)
 
 
 def test_which_is_met_first() -> None:
