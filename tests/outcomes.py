@@ -7,7 +7,7 @@ from typing import Any
 from sdk import SIMULATION
 
 from cow_service.narration.summary import narrate
-from cow_service.records import Asked, Outcome, Simulation, Trajectory
+from cow_service.records import Asked, AskedForm, CandidateOutcome, Outcome, Simulation, Trajectory
 
 HIT = Asked(relation="touches", target="vase")
 MISS = Asked(relation="touches", target="vase", negated=True)
@@ -20,6 +20,18 @@ def outcome(asked: Asked, probability: float | None = 0.95, **values: Any) -> Ou
     return Outcome(asked=asked, probability=probability, **(found | values))
 
 
+def of_each(form: AskedForm, among: bool = True, as_it_is: float | None = None, **meant: bool) -> Outcome:
+    """What is so of candidates, named with underscores."""
+    names = {name.replace("_", " "): 0.9 if is_meant else 0.1 for name, is_meant in meant.items()}
+    candidates = tuple(CandidateOutcome(object=name, probability=share, sure=True) for name, share in names.items())
+    asked = Asked(form=form, relation="touches", among=tuple(names) if among else ())
+    return outcome(asked, candidates=candidates, as_it_is=as_it_is)
+
+
+ONE = of_each("which", cardboard_box=True, basketball=False)
+BOTH, NEITHER = of_each("which", red_box=True, blue_box=True), of_each("which", red_box=False, blue_box=False)
+WITHOUT = of_each("which-to-remove", False, 0.95, vase=True, red_box=True, duck=False)
+NEEDLESS = of_each("which-to-remove", True, 0.04, red_box=True, duck=True)
 YES, NO = outcome(HIT), outcome(HIT, 0.03)
 AT = outcome(WHEN, time=1.1, time_band=(1.0, 1.3))
 CHOICES: list[tuple[Outcome, list[str], str | None]] = [
@@ -68,6 +80,21 @@ CHOICES: list[tuple[Outcome, list[str], str | None]] = [
     (outcome(COUNT, count=2), ["1", "2-3"], "B"),
     (outcome(COUNT, count=3), ["1-2", "3"], "B"),
     (outcome(HIT, 0.7, sure=False), ["Yes", "No"], None),
+    (ONE, ["only the cardboard box", "only the basketball", "both", "neither", "Not sure"], "A"),
+    (ONE, ["The basketball", "The cardboard box"], "B"),
+    (ONE, ["Just the ball", "Both of them", "The box alone", "None of them"], "C"),
+    (ONE, ["the mug", "the basketball"], None),
+    (BOTH, ["only the red box", "only the blue box", "both", "neither", "Not sure"], "C"),
+    (BOTH, ["the red box", "the blue box", "the red box and the blue box"], "C"),
+    (BOTH, ["the red box", "the blue box"], None),
+    (BOTH, ["the box", "all of them", "none"], "B"),
+    (NEITHER, ["only the red box", "only the blue box", "both", "neither the red box nor the blue box"], "D"),
+    (WITHOUT, ["Removing the red box", "Removing the duck", "both", "neither"], "A"),
+    (WITHOUT, ["The duck", "None of them"], "B"),
+    (WITHOUT, ["Remove the vase", "Remove the red box", "Both", "Not sure"], "C"),
+    (WITHOUT, ["both", "neither"], None),
+    (NEEDLESS, ["the red box", "the duck", "both", "neither"], "D"),
+    (of_each("which", red_box=True, duck=False).model_copy(update={"sure": False}), ["the red box", "the duck"], None),
 ]  # fmt: skip
 
 

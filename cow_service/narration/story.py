@@ -74,7 +74,7 @@ class Story:
 
     def __init__(self, mover: str, trajectory: Trajectory, say: Phrases, *, only_what_happens: bool = False) -> None:
         self._trajectory, self._say, self._only_what_happens = trajectory, say, only_what_happens
-        self._outcome = trajectory.outcome
+        self._outcome = None if trajectory.outcome is None else trajectory.outcome.of_shown
         self._names = [mover, *(body.object for body in trajectory.bodies[1:])]
         self._supports = [body.support for body in trajectory.bodies] or ["floor"]
         self._paths = {path.body: path for path in reversed(trajectory.paths)}

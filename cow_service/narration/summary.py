@@ -17,6 +17,7 @@ ROUNDING = 1e-6  # of a count of versions, which is rounded down: one that was m
 LEANING = 2 / 3  # share of the simulated versions from which an answer that is not sure is called probable
 _UNSEEN: tuple[Doubt, ...] = ("reading", "identity", "outline", "faint")  # doubts that no simulation weighs
 _FITTING = ("inside", "on-top", "beside")  # results of a thing that ends as it was meant to
+_OF_EACH = ("which", "which-to-remove")  # forms whose answer is what is so of each candidate
 _TOLD_BY_STORY = ("where", "what-happens")  # forms whose answer is the story
 
 
@@ -57,9 +58,13 @@ def direct(outcome: Outcome, say: Phrases) -> str:
         case "which-first":
             return outcome.first or say("nothing")
         case "when":
-            if outcome.time is None or not outcome.happens:
-                return say("never")
-            return say("after", time=say.seconds(outcome.time))
+            is_known = outcome.time is not None and outcome.happens
+            return say("after", time=say.seconds(outcome.time or 0.0)) if is_known else say("never")
+        case "which" | "which-to-remove":
+            meant = [] if outcome.is_needless else [each.object for each in outcome.candidates if each.is_meant]
+            none = "nothing" if outcome.is_needless or not outcome.asked.among else "none-of-them"
+            last = "names-and" if outcome.asked.form == "which" else "names-or"
+            return say.joined(meant, last) if meant else say(none)
         case "how-many":
             return str(outcome.count or 0)
         case "where" | "what-happens":
@@ -73,7 +78,9 @@ def why_unsure(outcome: Outcome, in_worlds: bool, say: Phrases) -> str:
     if "depth" in outcome.depends_on:
         return say("unsure-depth")
     if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
-        return say("unsure-unseen" if in_worlds else "unsure-uncounted")
+        may_tell = not outcome.asked.among and outcome.asked.relation in (*KINDS, *OF_TARGET)
+        unseen = "unsure-no-outcome" if outcome.asked.form in _OF_EACH and not may_tell else "unsure-unseen"
+        return say(unseen if in_worlds else "unsure-uncounted")
     doubt = None if outcome.sure else next((doubt for doubt in _UNSEEN if doubt in outcome.depends_on), None)
     return "" if doubt is None else say(f"unsure-{doubt}")
 
@@ -179,12 +186,38 @@ class _Summary:
         outcome, say, form = self._given, self._say, self._given.asked.form
         if form == "changes":
             return say("differs" if outcome.happens else "differs-not")
+        if form in _OF_EACH:
+            return self._of_each()
         if outcome.first is not None:
             return say("first-is", thing=say.name(outcome.first))
         if form == "how-many" and outcome.count:
             return say("it-is", thing=self._count(outcome.count))
         does = form in ("whether", "when") and outcome.happens != outcome.asked.negated
         return self._event(does, outcome.time if does and with_time else None)
+
+    def _of_each(self) -> str:
+        """Of which candidates it is so, and of which of those that the question names it is not."""
+        outcome, say, asked = self._given, self._say, self._given.asked
+        meant = [each.object for each in outcome.candidates if each.is_meant]
+        others = [each.object for each in outcome.candidates if not each.is_meant and (asked.among or not meant)]
+        if asked.form == "which-to-remove":
+            shown = self._trajectory.model_copy(update={"outcome": outcome.of_shown})
+            there = _Summary(self._mover, shown, say)._statement(with_time=False)
+            if outcome.is_needless:
+                return say("nothing-to-remove", statement=there)
+            told = (("prevents", meant), ("prevents-not", others))
+            removals = [say(key, object=say.names(names, "names-or")) for key, names in told if names]
+            return say.joined([there, *removals], "every-and")
+        if not meant and not asked.among and not asked.negated:
+            return self._event(False, None)
+        key = "fit" if asked.relation == "inside" else EVENTS[asked.relation]
+        told = [(does, names) for does, names in ((not asked.negated, meant), (asked.negated, others)) if names]
+        if asked.relation in OF_TARGET:
+            each = [(say.name(name), self._clause(key, does, None, [name])) for does, names in told for name in names]
+            return say.joined([say("statement", subject=name, clause=clause) for name, clause in each], "every-and")
+        subject = say("subject", name=say.name(self._mover)) if outcome.subject is None else say.name(outcome.subject)
+        clauses = [self._clause(key, does, None, names) for does, names in told]
+        return say("statement", subject=subject, clause=say.joined(clauses, "clauses-and"))
 
     def _event(self, does: bool, time: float | None) -> str:
         """That what is asked about happens, or does not, with its time where one is given."""
@@ -209,7 +242,7 @@ class _Summary:
         """What its subject does, or does not."""
         say, asked = self._say, self._given.asked
         placement = None if self._given.subject else self._trajectory.placement  # that of the mover
-        if asked.relation == "inside" and placement is not None and (placement.result in _FITTING) == does:
+        if key == EVENTS["inside"] and placement is not None and (placement.result in _FITTING) == does:
             return self._within(self.story.placed())
         if asked.relation == "lands" and self.story.support():
             key, meant = key.replace("land", "fall-off"), self.story.support()
@@ -218,7 +251,8 @@ class _Summary:
         if not does:
             key = f"{key}-not" if meant or asked.relation not in KINDS else f"{key}-none"
             key = "on-from-start" if asked.relation == "touches" and meant and meant == self.story.support() else key
-        last = "names-nor" if not does else "names-and" if asked.every else "names-or"
+        last = "names-nor" if not does else "names-and" if asked.every or asked.form == "which" else "names-or"
+        last = "names-or" if key == "fit-not" else last
         name = say.names(meant, last) if meant else say("something")
         if time is None or not key.endswith("-at"):
             return self._within(say(key.removesuffix("-at"), object=name))

@@ -85,7 +85,7 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
     ]
     if trajectory.outcome is not None and "outline" in trajectory.outcome.depends_on:
         outcome, met = trajectory.outcome, {each.object for each in trajectory.encounters}
-        matter = {trajectory.bodies[0].object, outcome.subject, outcome.object} | met
+        matter = {trajectory.bodies[0].object, outcome.subject, outcome.object, *outcome.asked.among} | met
         found += [
             f"'{body.object}' was not seen clearly: give its box in `objects` to get an answer that may rely on it."
             for body in trajectory.bodies

@@ -63,6 +63,7 @@ class RigidShape:
     base: float = 1.0  # width on which a cylinder stands, of its width
     waist: float = 0.0  # height up to which it is that narrow, of its height
     fixed: bool = False  # nothing moves it
+    absent: bool = False  # it was taken away: nothing meets it
     pieces: tuple[Floats, ...] = ()  # corners [N, 2] of its convex parts, m right of its centre and above it
     follows: Floats | None = field(default=None, compare=False)  # [F, 3] m: it is led along these positions
 
@@ -258,7 +259,7 @@ class _Engine:
             angle = 2 * math.atan2(length, w) / max(length, 1e-12)
             rotation = (a * angle, b * angle, c * angle)
         builder = builder.translation((x, y + lift, z)).rotation(rotation)
-        builder = builder.gravity_scale(1.0 if body.falls else 0.0)
+        builder = builder.gravity_scale(1.0 if body.falls else 0.0).enabled(not body.absent)
         if body.is_active:
             x, y, z = (v * self.scale for v in body.velocity)
             builder = builder.linvel((x, y, z)).ccd_enabled(not body.ghost).soft_ccd_prediction(FORESEEN)

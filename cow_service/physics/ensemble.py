@@ -8,16 +8,20 @@ Worlds are run in batches, until those that are left are not likely to change th
 of the first batch agree on is settled.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import ceil, comb, floor, sqrt
+from typing import Any
 
 import numpy as np
 
 from cow_service.physics.draws import NAMES, PARAMETERS, ensemble, likeliest
-from cow_service.physics.events import NEVER, WorldEvents, find_world_events
+from cow_service.physics.events import NEVER, WorldEvents, find_world_events, seen_paths
+from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import DrawnWorlds, WorldInput, Worlds, run_world
 from cow_service.records import Asked, AskedForm, AskedRelation, Doubt, EncounterKind
 from cow_service.vision.types import Floats, Mask
@@ -37,9 +41,16 @@ MAY_CHANGE, MAY_CHANGE_ROBUST = 0.01, 0.12
 MATTERS, MATTERS_OF = 0.2, 50  # least correlation with the outcome to name a parameter, for that many worlds
 MOST_NAMED = 3
 
+FEW_WORLDS = 0.2  # share of the worlds: what is touched in no more of them turns no answer that is clear
+# Things that are met, at most, which are taken away in turn where the question names none: each takes as long as the
+# worlds in which all are there, and what is met in fewer worlds than these hardly keeps anything from happening.
+MOST_TAKEN = 8
+
+OF_COVERING: tuple[AskedRelation, ...] = ("covers", "covered")
 KIND_OF: dict[AskedRelation, EncounterKind] = {"touches": "touches", "covers": "occludes", "covered": "occluded-by"}
 BY_EVENTS = (*KIND_OF, "tips", "moves", "leaves", "lands")  # relations that what happens in a world decides
 FIRST_MET: tuple[AskedForm, ...] = ("which-first", "where", "what-happens")  # told apart by what is met first
+OF_EACH: tuple[AskedForm, ...] = ("which", "which-to-remove")  # told of each candidate, which `among` are
 
 
 @dataclass(frozen=True)
@@ -50,9 +61,63 @@ class Query:
     target: int | None = None  # None: any
     subject: int = 0  # the acting body
     among: tuple[int, ...] = ()  # the things that are meant; empty: any
+    goals: tuple[PlacementGoal, ...] = ()  # of `which`, if the mover is put into each of `among` in turn
+    meets_more: bool = False  # what the acting object meets is one of `among`, too
     is_decidable: bool = True  # by worlds
     sure: float = SURE  # share of the worlds from which an answer is given
     sure_of_miss: float = SURE  # share of the worlds from which it is answered that nothing happens
+
+    @property
+    def is_of_removal(self) -> bool:
+        """Whether it asks what happens without each candidate."""
+        return self.asked.form == "which-to-remove"
+
+    @property
+    def has_own_worlds(self) -> bool:
+        """Whether it is worlds of their own that say what is so of each candidate."""
+        return self.is_of_removal or bool(self.goals)
+
+    def of(self, candidate: int | None) -> Query:
+        """Whether it happens: with one candidate or, where that is taken away, in the world without it."""
+        asked = self.asked.model_copy(update={"form": "whether", "among": (), "every": False})
+        return replace(self, asked=asked, target=self.target if self.is_of_removal else candidate, among=(), goals=())
+
+    def of_shown(self, world: WorldInput) -> Query:
+        """What the world itself can be asked, without those of the candidates."""
+        if not self.has_own_worlds:
+            return self
+        return self.of(None if world.placement is None else world.placement.targets[0])
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the worlds of one candidate tell, per draw [K]."""
+
+    happens: Mask
+    misread: Mask
+    touches: Floats  # [K, B] s: when the mover first touches each body
+    way: Floats | None = None  # [F, 2] px: how far the mover gets in the first draw; None: as in the world shown
+
+    @staticmethod
+    def by(query: Query, events: WorldEvents, way: Floats | None = None) -> Told:
+        """As worlds answer whether it happens."""
+        happens = np.isfinite(_happens(query, events))
+        return Told(happens, _misread(events), events.of[0].times["touches"], way)
+
+    def joined(self, other: Told) -> Told:
+        """With those of more draws."""
+        names = "happens", "misread", "touches"
+        return replace(self, **{n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in names})
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What is decided of one candidate: that it happens with it or, where it is taken away, that it does not."""
+
+    body: int
+    probability: float
+    sure: bool
+    told: Told
 
 
 @dataclass(frozen=True)
@@ -67,6 +132,8 @@ class Decided:
     count: int | None = None
     time: float | None = None
     time_band: tuple[float, float] | None = None
+    candidates: tuple[Candidate, ...] = ()
+    as_it_is: float | None = None  # probability that it happens while all candidates are there
 
 
 @dataclass(frozen=True)
@@ -95,9 +162,9 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     What is shown must not contradict what is answered: where an answer is sure and the likeliest world differs from
     it, the likeliest world of those that agree is shown.
     """
-    given, queries = (world,), [query]
+    given, queries, of_shown = (world,), [query], None if query is None else query.of_shown(world)
     if world.removed or world.placed_before:
-        as_it_is = query
+        as_it_is = of_shown
         if query is not None and query.asked.form == "changes":  # of the unchanged world: what would change
             form = "what-happens" if query.target is None else "whether"
             as_it_is = replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
@@ -108,14 +175,14 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     rows = ensemble(size)
     with ThreadPoolExecutor(1) as beside:  # half of the time is the engine's, which does not hold the interpreter up
         likely = beside.submit(lambda: [_run(each, likeliest()) for each in given])
-        worlds, decided = _run_until_settled(given, queries, rows)
+        worlds, decided, queries[0] = _run_until_settled(given, queries, rows)
         shown = likely.result()
     rows = rows[: len(worlds[0].worlds.runs)]
-    if query is not None and any(each is not None and each.sure for each in decided):
-        shown = _agreeing(given, query, decided, rows, worlds, shown)
+    if of_shown is not None and any(each is not None and each.sure for each in decided):
+        shown = _agreeing(given, of_shown, decided, rows, worlds, shown)
     for place, (each, world_shown) in enumerate(zip(decided, shown, strict=True)):
-        if query is not None and each is not None and each.time_band is not None:
-            time, (early, late) = float(_happens(query, world_shown.events)[0]), each.time_band
+        if of_shown is not None and each is not None and each.time_band is not None:
+            time, (early, late) = float(_happens(of_shown, world_shown.events)[0]), each.time_band
             # One time for one event: that of what is shown, unless most others have it much earlier, or later.
             decided[place] = replace(each, time=time) if early <= time <= late else each
     return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
@@ -128,22 +195,57 @@ def batches(size: int) -> tuple[int, ...]:
 
 def _run_until_settled(
     given: Sequence[WorldInput], queries: Sequence[Query | None], rows: Floats
-) -> tuple[list[ObservedWorlds], list[Decided | None]]:
-    """The first of some draws [K, P] in each world, as many as it takes, and what they say."""
+) -> tuple[list[ObservedWorlds], list[Decided | None], Query | None]:
+    """The first of some draws [K, P] in each world, as many as it takes, what they say, and the first one's query."""
     drawn = [DrawnWorlds.of(each, rows, EVERY) for each in given]
-    worlds, decided, count = list[ObservedWorlds](), list[Decided | None](), 0
+    worlds, decided, told, count = list[ObservedWorlds](), list[Decided | None](), list[Told](), 0
+    query = queries[0]
     for most in batches(len(rows)):
-        run = [each.run(slice(count, most)) for each in drawn]
+        part = slice(count, most)
+        run = [each.run(part) for each in drawn]
+        if query is not None and query.is_decidable and query.has_own_worlds:
+            there = _observed(given[0], run[0], rows[part])
+            query = _with_met(query, there) if query.meets_more else query
+            more = [_told_of(query, each, drawn[0], there, part) for each in query.among]
+            told = [one.joined(other) for one, other in zip(told, more, strict=True)] if count else more
         if count:
             layouts = [each.layout.of(slice(0, most)) for each in drawn]
             run = [each.worlds.joined(*more) for each, more in zip(worlds, zip(run, layouts, strict=True), strict=True)]
         count = most
         worlds = [_observed(*each, rows[:count]) for each in zip(given, run, strict=True)]
-        decided = _decide(queries, worlds, rows[:count])
+        decided = _decide((query, *queries[1:]), worlds, rows[:count], told)
         verdicts = [each for each in decided if each is not None]
-        if len(verdicts) == len(decided) and all(is_settled(each, queries[0], count, len(rows)) for each in verdicts):
+        if len(verdicts) == len(decided) and all(is_settled(each, query, count, len(rows)) for each in verdicts):
             break
-    return worlds, decided
+    return worlds, decided, query
+
+
+def _with_met(query: Query, there: ObservedWorlds) -> Query:
+    """With the things that the acting object meets, those first that it meets in most worlds."""
+    touches = there.events.of[query.subject].times["touches"]
+    shares = np.isfinite(np.minimum(touches, _per_body(query.of(None), there.events))).mean(axis=0)
+    met = [int(body) for body in np.argsort(-shares, kind="stable") if body and shares[body] > FEW_WORLDS]
+    among = dict.fromkeys((*query.among, *met[:MOST_TAKEN]))
+    return replace(query, among=tuple(among), meets_more=False)
+
+
+def _told_of(query: Query, candidate: int, drawn: DrawnWorlds, there: ObservedWorlds, part: slice) -> Told:
+    """What worlds of its own, with the same draws, tell of a candidate; `there` are some in which all is there."""
+    asked, events, count = query.of(candidate), there.events, len(there.worlds.runs)
+    if not query.is_of_removal:
+        goal = query.goals[query.among.index(candidate)]
+        own = replace(drawn, given=replace(drawn.given, placement=goal))
+    elif candidate in (0, query.subject, query.target):  # without it there is nothing that could happen
+        return replace(Told.by(asked, events), happens=np.zeros(count, bool), misread=np.zeros(count, bool))
+    else:
+        meetings = (each for run in there.worlds.runs for each in run.meetings if each.b is not None)
+        matter = {*there.worlds.layout.supports, *(body for each in meetings for body in (each.a, each.b))}
+        if candidate not in matter and (query.target is not None or query.asked.relation not in OF_COVERING):
+            return Told.by(asked, events)  # what touches nothing changes nothing
+        own = drawn.without(candidate)
+    found = _observed(own.given, own.run(part), drawn.draws[part])
+    path = seen_paths(found.worlds.within_horizon, 0)
+    return Told.by(asked, found.events, path.points[0] - path.seen[0])
 
 
 def _run(world: WorldInput, draws: Floats) -> ObservedWorlds:
@@ -154,14 +256,19 @@ def _observed(world: WorldInput, worlds: Worlds, draws: Floats) -> ObservedWorld
     return ObservedWorlds(worlds, find_world_events(worlds.within_horizon, world.bodies, draws, world.size))
 
 
-def _decide(queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], draws: Floats) -> list[Decided | None]:
-    """What is decided of each world; None if worlds decide nothing."""
+def _decide(
+    queries: Sequence[Query | None], worlds: Sequence[ObservedWorlds], draws: Floats, told: Sequence[Told]
+) -> list[Decided | None]:
+    """What is decided of each world; None if worlds decide nothing. `told` is of the first one's candidates."""
     decided: list[Decided | None] = []
     for asked, each in zip(queries, worlds, strict=True):
         if asked is None or not asked.is_decidable or (asked.asked.form == "changes" and len(worlds) == 1):
             decided.append(None)
         elif asked.asked.form == "changes":
             decided.append(decide_change(asked, each.events, worlds[1].events, draws))
+        elif asked.asked.form in OF_EACH:
+            own = told if asked.has_own_worlds else [Told.by(asked.of(body), each.events) for body in asked.among]
+            decided.append(decide_each(asked, each.events, own, draws))
         else:
             decided.append(decide(asked, each.events, draws))
     return decided
@@ -173,12 +280,14 @@ def is_settled(decided: Decided, query: Query | None, count: int, size: int) -> 
     The worlds that agree are hypergeometrically distributed; what all of them would say differs where they cross a
     share, and is likeliest to do so just beyond it.
     """
-    share = decided.probability
+    shares = [decided.probability]
     if query is not None and query.asked.form in ("whether", "when", "changes"):
-        share = max(share, 1 - share)
+        shares = [max(decided.probability, 1 - decided.probability)]
+    shares += [max(each.probability, 1 - each.probability) for each in decided.candidates]
     sure = {SURE} if query is None else {query.sure, query.sure_of_miss}
     return all(
         _chance_beyond(share * count, count, size, least) < may_change
+        for share in shares
         for least, may_change in (*((each, MAY_CHANGE) for each in sure), (ROBUST, MAY_CHANGE_ROBUST))
     )
 
@@ -233,10 +342,7 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
     asked, answers = query.asked, answers_of(query, events)
     answer, _ = max(Counter(answers).items(), key=lambda item: (item[1], item[0]))
     agrees = np.array([found == answer for found in answers])
-    misread = np.zeros(len(agrees), bool) if events.misread is None else events.misread
-    depends: list[Doubt] = list(_depends_on(agrees, draws))
-    if misread.mean() > MATTERS:
-        depends = ["place", *(doubt for doubt in depends if doubt != "place")]
+    misread = _misread(events)
     probability = shown = float(np.where(misread, 0.5, agrees).mean())  # what was misread tells neither way
     times = _happens(query, events)
     times = times[np.isfinite(times)]
@@ -247,11 +353,61 @@ def decide(query: Query, events: WorldEvents, draws: Floats) -> Decided:
         probability=shown,
         sure=probability >= (query.sure_of_miss if answer <= 0 else query.sure),
         robust=probability >= ROBUST,
-        depends_on=tuple(depends[:MOST_NAMED]),
+        depends_on=_depends_on(agrees, draws, misread),
         first=answer if asked.form in FIRST_MET and answer >= 0 else None,
         count=answer if asked.form == "how-many" else None,
-        time=float(np.median(times)) if len(times) else None,
-        time_band=(float(np.quantile(times, 0.1)), float(np.quantile(times, 0.9))) if len(times) else None,
+        **_timed(_happens(query, events)),
+    )
+
+
+def _misread(events: WorldEvents) -> Mask:
+    """[K]: which worlds tell neither way."""
+    return np.zeros(len(events.moved), bool) if events.misread is None else events.misread
+
+
+def _timed(times: Floats) -> dict[str, Any]:
+    """When it happens, by times [K] s, as fields of what is decided."""
+    times = times[np.isfinite(times)]
+    if not len(times):
+        return {}
+    band = float(np.quantile(times, 0.1)), float(np.quantile(times, 0.9))
+    return {"time": float(np.median(times)), "time_band": band}
+
+
+def decide_each(query: Query, events: WorldEvents, told: Sequence[Told], draws: Floats) -> Decided:
+    """What is so of each candidate, and how many worlds say that of all of them.
+
+    Where each is taken away in turn, that changes nothing in worlds in which it does not happen anyway: if most are
+    such worlds, the answer is that nothing has to be taken away.
+    """
+    negated, bodies = query.asked.negated, query.among
+    turned = negated != query.is_of_removal  # what is told is that it does not happen
+    misread, shape = _misread(events), (len(told), len(draws))
+    happens, unclear = (
+        np.array([getattr(each, n) for each in told], bool).reshape(shape) for n in ("happens", "misread")
+    )
+    shares = np.where(unclear, 0.5, happens != turned).mean(axis=1)
+    is_so = shares >= 0.5
+    enough = np.where(is_so != turned, query.sure, query.sure_of_miss)
+    sure = np.maximum(shares, 1 - shares) >= enough
+    agrees, as_it_is = ((happens != turned) == is_so[:, None]).all(axis=0), None
+    if query.is_of_removal:
+        there = np.isfinite(_happens(query.of(None), events)) != negated
+        as_it_is = float(np.where(misread, 0.5, there).mean())
+        agrees = agrees & there if as_it_is >= 0.5 else ~there
+    misread = misread | unclear.any(axis=0)
+    probability = float(np.where(misread, 0.5, agrees).mean())
+    return Decided(
+        probability=probability,
+        sure=bool(sure.all()) and probability >= query.sure_of_miss,
+        robust=probability >= ROBUST,
+        depends_on=_depends_on(agrees, draws, misread),
+        candidates=tuple(
+            Candidate(body, float(share), bool(is_sure), each)
+            for body, share, is_sure, each in zip(bodies, shares, sure, told, strict=True)
+        ),
+        as_it_is=as_it_is,
+        **_timed(_happens(query.of(None) if query.is_of_removal else query, events)),
     )
 
 
@@ -270,7 +426,7 @@ def decide_change(query: Query, changed: WorldEvents, factual: WorldEvents, draw
 
 
 def answers_of(query: Query, events: WorldEvents) -> list[int]:
-    """Per draw: 1 or 0 for whether and when, the body that is met first or -1, or how many are met.
+    """Per draw: 1 or 0 for whether and when, the body that is met first or -1, how many are met, or which, as a number.
 
     Of `changes` it is the answer whose change is asked about: whether the target is met, or what is met first.
     """
@@ -280,13 +436,18 @@ def answers_of(query: Query, events: WorldEvents) -> list[int]:
         return np.where(np.isfinite(times.min(axis=1)), first, -1).tolist()
     if asked.form == "how-many":
         return np.isfinite(times).sum(axis=1).tolist()
+    if asked.form == "which":
+        return [int.from_bytes(row.tobytes()) for row in np.packbits(np.isfinite(times), axis=1)]
     return np.isfinite(_happens(query, events)).astype(int).tolist()
 
 
 def _happens(query: Query, events: WorldEvents) -> Floats:
     """[K]: when it has happened with any of the bodies that are meant or, where that is asked, with each of them."""
     times = _per_body(query, events)
-    return times[:, list(query.among)].max(axis=1) if query.asked.every and query.among else times.min(axis=1)
+    if not query.asked.every or not query.among:
+        return times.min(axis=1)
+    is_there = max(query.among) < times.shape[1]  # what was taken away is numbered behind the others
+    return times[:, list(query.among)].max(axis=1) if is_there else np.full(len(times), NEVER)
 
 
 def _per_body(query: Query, events: WorldEvents) -> Floats:
@@ -313,8 +474,8 @@ def _per_body(query: Query, events: WorldEvents) -> Floats:
     return times if limit is None else np.where(times <= limit, times, NEVER)
 
 
-def _depends_on(same: Mask, draws: Floats) -> tuple[Doubt, ...]:
-    """Doubts whose parameters go with the answer, the closest first."""
+def _depends_on(same: Mask, draws: Floats, misread: Mask | None = None) -> tuple[Doubt, ...]:
+    """Doubts whose parameters go with the answer, the closest first; where many worlds were misread, places."""
     weights: dict[Doubt, float] = {}
     least = MATTERS * max(1.0, sqrt(MATTERS_OF / len(draws)))  # of fewer worlds chance makes larger ones
     for place, name in enumerate(NAMES):
@@ -325,4 +486,6 @@ def _depends_on(same: Mask, draws: Floats) -> tuple[Doubt, ...]:
             doubt = PARAMETERS[name]
             weights[doubt] = max(weights.get(doubt, 0.0), related)
     ranked: Sequence[Doubt] = sorted(weights, key=lambda doubt: -weights[doubt])
+    if misread is not None and misread.mean() > MATTERS:
+        ranked = ["place", *(doubt for doubt in ranked if doubt != "place")]
     return tuple(ranked[:MOST_NAMED])

@@ -151,7 +151,7 @@ class Events:
 
     times: PerKind
     shares: PerKind  # 0 for touches
-    eligible: Mask  # [B]: neither the subject, nor the mover, nor what the subject stands on
+    eligible: Mask  # [B]: neither the subject, nor the mover, nor what the subject stands on, nor taken away
     partly: PerKind  # as times, where any part is covered
     subject: int = 0  # the body that meets the others
 
@@ -171,7 +171,7 @@ class _EventsOf(dict[int, Events]):
         enough = COVERED * np.exp(COVERED_SIGMA * self.draws[:, COLUMN["outline"]])[:, None]
         eligible, count = np.ones(len(self.bodies), bool), len(self.bodies)
         on, loads = self.worlds.layout.supports[subject], self.worlds.layout.loads_of(subject)
-        eligible[[0, subject, *([] if on is None else [on])]] = False
+        eligible[[0, subject, *([] if on is None else [on]), *self.worlds.layout.absent]] = False
         times: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
         partly: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
         most: PerKind = {kind: np.zeros((len(self.draws), count)) for kind in KINDS}
@@ -187,7 +187,7 @@ class _EventsOf(dict[int, Events]):
         path, step = self.paths[subject], self.worlds.every / self.worlds.fps
         clock = np.arange(path.depth.shape[1]) * step
         for other in range(count):
-            if other in (subject, on) or other in loads:
+            if other in (subject, on, *self.worlds.layout.absent) or other in loads:
                 continue
             found = shares(self.bodies[subject].mask, path, self.bodies[other].mask, self.paths[other])
             before = clock[None] <= times["touches"][:, other : other + 1] + step

@@ -6,7 +6,7 @@ Coordinates are metres right, above the floor and ahead, the camera above their 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -58,6 +58,7 @@ class Layout:
     light: Floats  # [K, 2]: metres that a shadow lies to the right and ahead, per metre of height
     unsupported: frozenset[int] = frozenset()  # bodies whose support was taken away, or put elsewhere
     put: frozenset[int] = frozenset()  # bodies that were put where they are
+    absent: frozenset[int] = frozenset()  # bodies that were taken away, and keep their places in the lists
 
     def of(self, draws: slice) -> Layout:
         """That of some draws."""
@@ -72,12 +73,18 @@ class Layout:
         )
 
     def first(self, count: int) -> Layout:
-        """Without the bodies behind the first ones, which are taken away: what stood on them has no support."""
+        """The first bodies, without those behind them, which are taken away."""
+        kept = self.without(range(count, len(self.bodies)))
+        return replace(kept, bodies=kept.bodies[:count], supports=kept.supports[:count], absent=self.absent)
+
+    def without(self, taken: Collection[int]) -> Layout:
+        """With some bodies taken away: what stood on them has no support."""
         loose: set[int] = set()
-        for _ in range(count):  # what stands on something that falls falls, too
-            loose |= {i for i in range(count) if (on := self.supports[i]) is not None and (on >= count or on in loose)}
-        supports = tuple(None if on is None or on >= count else on for on in self.supports[:count])
-        return replace(self, bodies=self.bodies[:count], supports=supports, unsupported=frozenset(loose))
+        for _ in self.supports:  # what stands on something that falls falls, too
+            loose |= {i for i, on in enumerate(self.supports) if i not in taken and (on in taken or on in loose)}
+        supports = tuple(None if on in taken else on for on in self.supports)
+        unsupported = (self.unsupported | loose).difference(taken)
+        return replace(self, supports=supports, unsupported=unsupported, absent=self.absent.union(taken))
 
     def loads_of(self, body: int) -> frozenset[int]:
         """What was put into or onto a body: that it is there is no encounter of the body that carries it."""

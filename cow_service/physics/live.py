@@ -16,7 +16,7 @@ from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import COLUMN, ensemble, likeliest, quantiles
 from cow_service.physics.engine import RigidShape
-from cow_service.physics.ensemble import EVERY, SURE, SURE_OF_MISS, Query
+from cow_service.physics.ensemble import EVERY, OF_EACH, SURE, SURE_OF_MISS, Query
 from cow_service.physics.layout import FARTHEST
 from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
 from cow_service.vision.types import Floats
@@ -106,7 +106,7 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
             "heading": _column(quantiles(draws[:, COLUMN["depth"]])),
         },
         "course": _course([course for course in courses if course is not None]),
-        "asked": None if query is None or not query.is_decidable else _asked(query),
+        "asked": None if query is None or not query.is_decidable or query.asked.form in OF_EACH else _asked(query),
     }
 
 

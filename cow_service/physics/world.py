@@ -168,6 +168,10 @@ class DrawnWorlds:
             given, layout.rearranged(new_supports(goals, layout.supports)) if goals else layout, draws, every
         )
 
+    def without(self, body: int) -> DrawnWorlds:
+        """The same worlds with one body taken away."""
+        return replace(self, layout=self.layout.without((body,)))
+
     def shapes(self, part: slice) -> tuple[tuple[RigidShape, ...], ...]:
         """The bodies of some draws at the start."""
         layout, draws = self.layout.of(part), self.draws[part]
@@ -261,8 +265,10 @@ class _Draw:
         for loose in layout.unsupported:
             bodies[loose] = replace(bodies[loose], starts=True)
         for i, motion in given.others.items():
-            if i < len(bodies):  # else it is taken away
+            if i < len(bodies) and i not in layout.absent:  # else it is taken away
                 bodies[i] = self.set_going(i, bodies[i], motion, [layout.others[i][k]], "other_speed")
+        for taken in layout.absent:
+            bodies[taken] = replace(bodies[taken], absent=True)
         return tuple(bodies)
 
     def pieces(self, seen: SeenBody) -> tuple[Floats, ...]:

@@ -321,6 +321,24 @@ class Encounter(Record):
     )
 
 
+class CandidateOutcome(Record):
+    """One of the objects that a question chooses from."""
+
+    object: str
+    probability: float = Field(
+        ge=0,
+        le=1,
+        description="Of `which`: that what is asked happens with it. Of `which-to-remove`: that what is asked does not "
+        "happen without it, all others being there.",
+    )
+    sure: bool = Field(description="As `Outcome.sure`, for this object alone.")
+
+    @property
+    def is_meant(self) -> bool:
+        """Whether the object is one of those that the question asks for, as most simulated versions have it."""
+        return self.probability >= 0.5
+
+
 class Outcome(Record):
     """What the question asks, as the world answers it."""
 
@@ -334,10 +352,23 @@ class Outcome(Record):
         ge=0,
         le=1,
         description="That what is asked happens, negation included; of `which-first`, `when` and `how-many`: of the "
-        "value below. Null where nothing tells.",
+        "value below; of `which` and `which-to-remove`: of what is said of all `candidates` together. Null where "
+        "nothing tells.",
     )
     first: str | None = Field(default=None, description="Of `which-first`: the object, null for none.")
     count: int | None = Field(default=None, description="Of `how-many`: the number.")
+    candidates: tuple[CandidateOutcome, ...] = Field(
+        default=(),
+        description="Of `which` and `which-to-remove`: the objects to choose from. If the question names none, of "
+        "`which` all, of `which-to-remove` those that are met, at most 8, and the object in question.",
+    )
+    as_it_is: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Of `which-to-remove`: the probability that what is asked happens with all objects there; below "
+        "0.5 nothing has to be removed.",
+    )
     time: float | None = Field(
         default=None, description="Seconds until it first happens: in the version that is shown, else the median."
     )
@@ -350,6 +381,21 @@ class Outcome(Record):
     def happens(self) -> bool:
         """Whether what is asked happens, negation included, as most simulated versions have it."""
         return (self.probability or 0.0) >= 0.5
+
+    @property
+    def is_needless(self) -> bool:
+        """Whether what a removal is to prevent does not happen anyway."""
+        return self.as_it_is is not None and self.as_it_is < 0.5
+
+    @property
+    def of_shown(self) -> Outcome:
+        """Whether it happens while all objects are there, which is what is shown, where it is asked which to remove."""
+        if self.asked.form != "which-to-remove":
+            return self
+        asked = self.asked.model_copy(update={"form": "whether", "among": ()})
+        return self.model_copy(
+            update={"asked": asked, "probability": self.as_it_is, "candidates": (), "as_it_is": None}
+        )
 
 
 PlacementResult = Literal["inside", "sticks-out", "on-the-rim", "on-top", "beside", "overlaps", "falls-off", "tips"]

@@ -9,7 +9,14 @@ from cow_service.media.images import decode, encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
 from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import GroundingReading, NamedChange, ReaderInput, SeenThing, WordReader
+from cow_service.readers.base import (
+    GroundingReading,
+    MotionHints,
+    NamedChange,
+    ReaderInput,
+    SeenThing,
+    WordReader,
+)
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, ObjectPrior
@@ -52,7 +59,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     # What the image shows, now that it is known what moves.
     shows_trail = question.trail_named or (reading.hints is not None and reading.hints.cue == "trail")
     with run.cpu():
-        scene = run.scene_with(reading.bbox, shows_trail)
+        scene = run.scene_with(reading.bbox, [each.bbox for each in (*given, *reading.others)], shows_trail)
         silhouette = scene.silhouette(reading.bbox) if reading.mask is None else reading.mask
         mask = run.backends.artifacts.put(encode_png(silhouette), "image/png")
         drawn = [("an arrow", each.tail) for each in scene.arrows if "arrow" not in question.drawings_named]
@@ -83,7 +90,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         language=reading.language,
         source=source,
     )
-    grounding = understood(grounding, run.backends.words())
+    grounding = put_into_first(understood(grounding, run.backends.words()), request, reading.hints)
     warnings = [*reading.warnings, *warnings]
     warnings += [
         f"`objects.{index}` ('{each.object}') lies where the moving object is, and was taken for it."
@@ -462,6 +469,22 @@ def placed_mover(grounding: Grounding) -> Intervention | None:
     """The intervention that puts the grounded object somewhere; None where it stays or moves by itself."""
     placed = (each for each in grounding.interventions if each.kind == "place")
     return next((each for each in placed if is_same_object(each.object.bbox, grounding.bbox)), None)
+
+
+def put_into_first(grounding: Grounding, request: SimulateRequest, hints: MotionHints | None) -> Grounding:
+    """With the mover put into the first of several things, if it is asked into which of them it fits and nothing says
+    how it moves."""
+    asked, mover = grounding.asked, LocatedObject(object=grounding.object, bbox=grounding.bbox, source=grounding.source)
+    if asked is None or (asked.form, asked.relation, asked.subject) != ("which", "inside", None):
+        return grounding
+    given, kind = request.stated_motion, None if hints is None else hints.kind
+    if grounding.source == "request" and request.trajectory is None:
+        kind = "place" if given is None else given.stated_kind
+    first = [each for each in others_of(grounding) if asked.among and same_name(each.object, asked.among[0])]
+    if kind != "place" or not first or placed_mover(grounding) is not None:
+        return grounding
+    put = Intervention(kind="place", object=mover, relation="into", targets=tuple(first[:1]))
+    return grounding.model_copy(update={"interventions": (*grounding.interventions, put)})
 
 
 def asked_of_itself(grounding: Grounding) -> str | None:

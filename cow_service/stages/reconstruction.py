@@ -14,7 +14,7 @@ from cow_service.narration.words import place_words, same_name
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera, no_segments
-from cow_service.physics.ensemble import BY_EVENTS, SURE, SURE_OF_FIT, SURE_OF_MISS, Query
+from cow_service.physics.ensemble import BY_EVENTS, OF_EACH, SURE, SURE_OF_FIT, SURE_OF_MISS, Query
 from cow_service.physics.geometry import DepthMap, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
@@ -136,6 +136,8 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     if query is None and situation.grounding.asked is None and carried is not None:
         # Nothing is asked but whether it gets there: shown is what it does in most worlds.
         query = Query(Asked(relation="inside"), carried.targets[0])
+    if query is not None and query.is_decidable and query.asked.form == "which" and query.asked.relation == "inside":
+        query = replace(query, goals=_goals_of_each(situation, query, present))
     faint = situation.unlisted
     if not situation.grounding.objects_complete:
         faint = situation.scene.faint_beside([body.bbox for body in bodies])
@@ -156,7 +158,8 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
         fit, measured = measure_scene(depth, fit, bodies, supports, in_air)
         faint = faint if measured is None else rise_above(depth, measured, faint)
     # What something is put into is as wide at its lower end as its opening was measured.
-    openings = ((each.targets[0], each.opening) for each in (*before, *([] if carried is None else [carried])))
+    goals = (*before, *([] if carried is None else [carried]), *(() if query is None else query.goals))
+    openings = ((each.targets[0], each.opening) for each in goals)
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
     # What else moves has a way and a speed of its own, and no end but what it meets.
     fields = ("kind", "direction", "direction_deviation", "depth", "towards", "speed", "speed_deviation")
@@ -261,16 +264,24 @@ def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequenc
     is_of_itself = targets[:1] == subjects[:1] and asked.relation not in (*OF_TARGET, *OF_ITSELF)
     if not subjects or not targets or not all(among) or is_of_itself:
         return None
-    known = tuple(dict.fromkeys(body for meant in among for body in meant))
+    known, present = tuple(dict.fromkeys(body for meant in among for body in meant)), 1 + len(situation.obstacles)
     asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
     is_guess = motion.kind == "projectile" and motion.cue != "trail" and motion.towards is None
     sure_of_miss = SURE_OF_MISS if is_guess and motion.depth_deviation > 0 else SURE
     query = Query(asked, targets[0], subjects[0], known, sure_of_miss=sure_of_miss)
+    is_of_each = asked.form in OF_EACH
+    if is_of_each and not known:  # to be taken away: what the question names, and what is met
+        others = [i for i in range(1, present) if i != query.subject]
+        said = {each.bbox for each in situation.located if each.role == "target"}
+        chosen = [i for i in others if bodies[i].bbox in said] if query.is_of_removal else others
+        query = replace(query, among=tuple(chosen), meets_more=query.is_of_removal)
     if situation.carried is not None and asked.relation == "inside":
-        return replace(query, sure=SURE_OF_FIT, sure_of_miss=SURE_OF_FIT)
+        can_tell = not is_of_each or (bool(known) and not query.is_of_removal and not query.subject)
+        return replace(query, sure=SURE_OF_FIT, sure_of_miss=SURE_OF_FIT, is_decidable=can_tell)
     # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.
-    is_present = situation.is_separated and query.subject <= len(situation.obstacles)
+    is_present = situation.is_separated and query.subject < present
     is_seen = asked.relation in BY_EVENTS and not (on_floor[query.subject] and asked.relation == "lands")
+    is_seen &= asked.form != "which" or asked.relation not in OF_ITSELF
     return replace(query, is_decidable=is_present and is_seen)
 
 
@@ -343,6 +354,14 @@ def _goal(scene: Scene, placed: Intervention, bodies: Sequence[SeenBody]) -> Pla
             raise CannotGround(f"'{target.name}' shows no opening: call it what it is, such as a bowl, a cup or a box.")
         opening = replace(opening, foot_hidden=is_hidden)
     return PlacementGoal(placed.relation, tuple(targets), opening, side, body)
+
+
+def _goals_of_each(situation: Situation, query: Query, bodies: Sequence[SeenBody]) -> tuple[PlacementGoal, ...]:
+    """Those of the mover, if it is put to each of several things instead. Raises `CannotGround` as `_goal`."""
+    carried = situation.carried
+    assert carried is not None  # else it is not asked what the mover fits into
+    targets = (LocatedObject(object=body.name, bbox=body.bbox) for body in (bodies[each] for each in query.among))
+    return tuple(_goal(situation.scene, carried.model_copy(update={"targets": (each,)}), bodies) for each in targets)
 
 
 def _says_no_place(name: str) -> CannotGround:

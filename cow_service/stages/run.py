@@ -3,7 +3,7 @@
 import time
 import uuid
 from collections import abc
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -158,22 +158,25 @@ class Run(Generic[Request_co]):
             self.seen.recall(self._image_key, scene)
         return scene
 
-    def scene_with(self, mover: BBox, trail_named: bool) -> Scene:
+    def scene_with(self, mover: BBox, others: Sequence[BBox], trail_named: bool) -> Scene:
         """The image in which a trail ends at what moves: its earlier positions are taken out.
 
-        Where a trail is named, balls that look alike, one after another, are one.
+        Where a trail is named, balls that look alike, one after another, are one. Neither the mover nor the others are
+        annotations.
         """
-        scene = self.scene.with_trail_named() if trail_named else self.scene
-        return scene.with_mover(mover)
+        scene = self.scene.keeping((mover, *others))
+        return (scene.with_trail_named() if trail_named else scene).with_mover(mover)
 
     def scene_of(self, grounding: Grounding, cue: Cue | None = None) -> Scene:
         """The image as a grounding, and the cue of its motion, have it; its masks are those that were stored.
 
         A mask cut again from its box may differ from one that was cut around a point, or given.
         """
-        scene = self.scene_with(grounding.bbox, grounding.trail_named or cue == "trail")
         changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
-        for placed in (grounding, *grounding.others, *changed):
+        others = (*grounding.others, *changed)
+        boxes = [each.bbox for each in others]
+        scene = self.scene_with(grounding.bbox, boxes, grounding.trail_named or cue == "trail")
+        for placed in (grounding, *others):
             if placed.mask is not None:
                 scene.preset_mask(placed.bbox, partial(_stored_mask, self.backends.artifacts, placed.mask))
         return scene

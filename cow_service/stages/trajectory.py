@@ -12,20 +12,20 @@ from cow_service.media.images import encode_png, fit_within
 from cow_service.narration.warnings import warnings_of
 from cow_service.physics.ballistic import FreePath
 from cow_service.physics.bodies import SeenBody
-from cow_service.physics.ensemble import EnsembleResult, Query, run_ensemble
+from cow_service.physics.ensemble import FEW_WORLDS, EnsembleResult, Query, run_ensemble
 from cow_service.physics.events import seen_paths
 from cow_service.physics.live import live_worlds
 from cow_service.physics.recording import record_trajectory
 from cow_service.physics.world import WorldInput
-from cow_service.records import CLEAR, BBox, Doubt, Grounding, Motion, Outcome, Trajectory
+from cow_service.records import CLEAR, BBox, CandidateOutcome, Doubt, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
 from cow_service.vision.scene import Scene
+from cow_service.vision.types import Floats
 
 SPRITE_SIDE = 256  # px, at most: sprites are seen while somebody drags
-FEW_WORLDS = 0.2  # share of the worlds: what is touched in no more of them turns no answer that is clear
 
 
 def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
@@ -73,14 +73,22 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
     However the worlds agree, nothing is sure of a thing that may be another one than the question means, nor where a
     thing that matters was not seen clearly: doubtful outlines of those are cut out a second time.
     """
-    asked, world, bodies = situation.grounding.asked, result.world, list(result.world.bodies)
-    matter = bodies_that_matter(result)
+    asked, world, query = situation.grounding.asked, result.world, result.query
+    touches = None if result.ensemble is None else result.ensemble.events.of[0].times["touches"]
+    candidates = () if result.decided is None or query is None else result.decided.candidates
+    bodies = list(world.bodies)
+    are_named = query is not None and bool(query.asked.among)
+    of_each = [
+        bodies_that_matter(query and query.of(each.body), each.told.touches, len(bodies), each.body if are_named else 0)
+        for each in candidates
+    ]
+    matter = bodies_that_matter(query, touches, len(bodies)).union(*of_each)
     for body in matter:
         bodies[body] = replace(bodies[body], confidence=situation.scene.confidence_of(bodies[body].bbox))
     result = replace(result, world=replace(world, bodies=tuple(bodies)))
     if asked is None:
         return result, None
-    query, names = result.query, [body.name for body in (*bodies, *world.removed)]
+    names = [body.name for body in (*bodies, *world.removed)]
     outcome = Outcome(
         asked=asked if query is None else query.asked,
         subject=None if query is None or not query.subject else names[query.subject],
@@ -92,40 +100,52 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
         return result, outcome.model_copy(update={"depends_on": ("depth",)})
     if result.decided is None:
         return result, outcome
-    first = None if result.decided.first is None else names[result.decided.first]
-    decided = vars(result.decided) | {"first": first}
     is_misread = situation.motion.other_direction is not None or situation.grounding.question_is_doubtful
-    doubts: list[Doubt] = ["reading"] if is_misread else []
+    of_reading: list[Doubt] = ["reading"] if is_misread else []
     if any(thing.is_doubtful for thing in (situation.grounding, *situation.located)):
-        doubts.append("identity")
-    if any(bodies[body].confidence < CLEAR for body in matter):
-        doubts.append("outline")
-    if world.measured is not None and not all(world.measured.footprints[body] for body in matter):
-        doubts.append("depth")
-    if moves_over(result, world.faint):
-        doubts.append("faint")
-    if doubts:
+        of_reading.append("identity")
+    path = seen_paths(result.shown.worlds.within_horizon, 0)
+    way = path.points[0] - path.seen[0]
+
+    def doubts_of(matter: set[int], ways: Sequence[Floats]) -> list[Doubt]:
+        doubts = list(of_reading)
+        if any(bodies[body].confidence < CLEAR for body in matter):
+            doubts.append("outline")
+        if world.measured is not None and not all(world.measured.footprints[body] for body in matter):
+            doubts.append("depth")
+        if any(moves_over(bodies[0].bbox, each, world.faint) for each in ways):
+            doubts.append("faint")
+        return doubts
+
+    ways = [way if each.told.way is None else each.told.way for each in candidates]
+    chosen = [
+        CandidateOutcome(
+            object=names[each.body],
+            probability=each.probability,
+            sure=each.sure and not doubts_of(own, [its_way]),
+        )
+        for each, own, its_way in zip(candidates, of_each, ways, strict=True)
+    ]
+    first = None if result.decided.first is None else names[result.decided.first]
+    decided = vars(result.decided) | {"first": first, "candidates": tuple(chosen)}
+    if doubts := doubts_of(matter, [way, *ways]):
         decided |= {"sure": False, "robust": False, "depends_on": (*doubts, *result.decided.depends_on)}
     return result, outcome.model_copy(update=decided)
 
 
-def moves_over(result: EnsembleResult, boxes: Sequence[BBox]) -> bool:
-    """Whether the mover's box meets one of some boxes (px) on its way."""
-    mover, path = result.world.bodies[0].bbox, seen_paths(result.shown.worlds.within_horizon, 0)
-    away = path.points[0] - path.seen[0]
-    swept = np.array(mover) + np.hstack([away, away])
+def moves_over(mover: BBox, way: Floats, boxes: Sequence[BBox]) -> bool:
+    """Whether a box meets one of some boxes (px) on its way [F, 2]."""
+    swept = np.array(mover) + np.hstack([way, way])
     return any(bool(((swept[:, :2] < box[2:]) & (swept[:, 2:] > box[:2])).all(axis=1).any()) for box in boxes)
 
 
-def bodies_that_matter(result: EnsembleResult) -> list[int]:
-    """The mover, what is asked about, and what the mover touches before that in more than a few worlds."""
-    query, count = result.query, len(result.world.bodies)
-    meant = {0} if query is None else {0, query.subject, query.target}
-    if result.ensemble is None:
-        return [i for i in range(count) if i in meant]
-    touches = result.ensemble.events.of[0].times["touches"]
+def bodies_that_matter(query: Query | None, touches: Floats | None, count: int, candidate: int = 0) -> set[int]:
+    """Of so many bodies the mover, what is asked about, and what the mover touches [K, B] before that in more than a
+    few worlds. What was removed, numbered after the bodies, is never met."""
+    meant = {0, candidate} if query is None else {0, candidate, query.subject, query.target}
+    if touches is None:
+        return {i for i in range(count) if i in meant}
     # Of what is struck by something else in turn, what comes first is not told here.
     target = None if query is None or query.subject or query.asked.relation != "touches" else query.target
-    # What was removed, numbered after the bodies, is never met.
     before = touches[:, target] if target is not None and target < count else np.full(len(touches), np.inf)
-    return [i for i in range(count) if i in meant or float(np.mean(touches[:, i] < before)) > FEW_WORLDS]
+    return {i for i in range(count) if i in meant or float(np.mean(touches[:, i] < before)) > FEW_WORLDS}

@@ -211,6 +211,28 @@ class Scene:
             return self
         return self.once("trail named", lambda: self._with_trails(trail_named=True, _preset=dict(self._preset)))
 
+    def keeping(self, things: Sequence[BBox]) -> Scene:
+        """The scene in which none of some things, by their boxes, is taken for an annotation that is drawn over it."""
+
+        def is_thing(drawing: Arrow | DrawnBox) -> bool:
+            # What frames a thing, or lies over a part of it, is drawn.
+            own = [bbox for bbox in things if is_same_object(bbox_of(drawing.mask), bbox)]
+            return any((drawing.mask & self.silhouette(bbox)).sum() > PART_OF * drawing.mask.sum() for bbox in own)
+
+        false = [drawing for drawing in (*self.arrows, *self.boxes) if is_thing(drawing)]
+        if not false:
+            return self
+
+        def without() -> Scene:
+            other = replace(self, _found={}, _preset=dict(self._preset))
+            drawn = {
+                name: tuple(each for each in getattr(self, name) if each not in false) for name in ("arrows", "boxes")
+            }
+            other.__dict__.update(drawn)
+            return other
+
+        return self.once(("keeping", *(bbox_of(each.mask) for each in false)), without)
+
     def _with_trails(self, **changes: Any) -> Scene:
         """The same image with other trails in it."""
         other = replace(self, **{"_found": {}, "_preset": {}, **changes})

@@ -43,6 +43,54 @@ def test_multipart_is_the_same_request(http: httpx.Client) -> None:
     assert [f["sha256"] for f in again.json()["frames"]] == [f.sha256 for f in simulation.frames]
 
 
+def test_what_has_to_be_removed_is_asked_of_each_thing_or_of_one(http: httpx.Client) -> None:
+    """A ball, a block and a cube in a row; nothing but `asked` says what is asked."""
+    boxes = {"cube": (480, 196, 550, 274), "green block": (280, 200, 350, 272), "post": (300, 40, 350, 90)}
+    image = floor()
+    for box, colour in zip(boxes.values(), ((40, 60, 200), (40, 160, 60), (210, 190, 40)), strict=True):
+        image = block(image, box, colour)
+    asked = {"relation": "touches", "target": "green block"}
+    body = {
+        "image": data_url(png_bytes(ball(image, (105, 235), 25, (200, 30, 30)))),
+        "grounding": {"object": "red ball", "bbox": (80, 210, 130, 260)},
+        "objects": [{"object": name, "bbox": box, "shape": "box"} for name, box in boxes.items()],
+        "motion": {"direction": (1, 0)},
+        "camera": {"pitch": 28, "focal": 640},
+        "objects_complete": True,
+        "num_frames": 17,
+    }
+    which = {
+        "question": "Which has to go, that there is no collision?",
+        "asked": asked | {"form": "which-to-remove", "among": ["green block", "post"]},
+        "options": ["only the post", "only the green block", "both", "neither", "Not sure"],
+    }
+    answer = http.post("/answer", json=body | which).json()
+    outcome = answer["simulation"]["trajectory"]["outcome"]
+    assert (answer["answer"], outcome["as_it_is"], outcome["object"]) == ("B", 1, "green block")
+    assert outcome["candidates"] == [
+        {"object": "green block", "probability": 1, "sure": True}, {"object": "post", "probability": 0, "sure": True},
+    ]  # fmt: skip
+    assert answer["reasoning"].startswith(
+        "It hits the green block, removing the green block prevents that and removing the post does not prevent that. "
+    )
+    for target, removed, said in (
+        ("cube", "post", "Yes"),
+        ("green block", "post", "No"),
+        ("cube", "green block", "No"),
+    ):
+        whether = {
+            "question": f"Would there be no collision without the {removed}?",
+            "interventions": [{"kind": "remove", "object": removed}],
+            "asked": asked | {"target": target, "negated": True},
+            "options": ["Yes", "No", "Not sure"],
+        }
+        answer = http.post("/answer", json=body | whether).json()
+        does = "misses" if said == "Yes" else "hits"
+        assert answer["option"] == said
+        assert answer["reasoning"].startswith(f"{said}, it {does} the {target}")
+        assert answer["simulation"]["narration"]["story"].startswith(f"Without the {removed}: The red ball rolls ")
+
+
 def test_methods_that_an_address_does_not_have(http: httpx.Client) -> None:
     addresses = {"/simulate": "POST", "/jobs/x": "DELETE, GET", "/jobs": "GET", "/artifacts/x": "GET, HEAD"}
     for path, methods in addresses.items():

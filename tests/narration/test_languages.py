@@ -22,6 +22,7 @@ from cow_service.records import (
     Asked,
     AskedForm,
     AskedRelation,
+    CandidateOutcome,
     Doubt,
     Language,
     Outcome,
@@ -61,6 +62,9 @@ def test_every_word_of_the_records_has_a_template(language: Language) -> None:
     assert wanted <= templates.keys()
 
 
+CANDIDATES = tuple(
+    CandidateOutcome(object=name, probability=share, sure=True) for name, share in (("cube", 0.9), ("mug", 0.1))
+)
 OUTCOMES = st.builds(
     lambda question, rest: Outcome(asked=question, subject=question.subject, robust=False, **rest),
     st.builds(
@@ -80,6 +84,8 @@ OUTCOMES = st.builds(
         "probability": st.sampled_from([None, 0.0, 0.3, 0.5, 1.0]),
         "sure": st.booleans(),
         "first": st.sampled_from([None, "mug"]),
+        "candidates": st.sampled_from([(), CANDIDATES[:1], CANDIDATES[1:], CANDIDATES]),
+        "as_it_is": st.sampled_from([None, 0.1, 0.9]),
         "count": st.sampled_from([None, 0, 1, 3]),
         "time": st.sampled_from([None, 0.8, 4.0]),
         "time_band": st.sampled_from([None, (0.5, 1.0)]),

@@ -62,6 +62,14 @@ CASES: dict[str, tuple[dict[str, Any], Trajectory, list[str]]] = {
     "outlines in doubt": ({}, world(OUTLINE, encounters=(touch(),), bodies=tuple(
         body(name, confidence=value) for name, value in (("ball", 0.76), ("cube", 0.5), ("vase", 0.77), ("mug", 0))
     )), [f"'ball' {CLEARER}", f"'cube' {CLEARER}"]),
+    "outlines in doubt of one that is chosen from": (
+        {},
+        world(
+            unsure("touches", None, form="which", among=("cube", "mug"), depends_on=("outline",)),
+            bodies=(*BODIES[:2], body("mug", confidence=0.4), body("vase", confidence=0.4)),
+        ),
+        [f"'mug' {CLEARER}"],
+    ),
     "outlines in doubt that nothing hangs on": (
         {}, world(unsure("touches", "vase", depends_on=("speed",)), bodies=(body("ball", confidence=0.5),)), []
     ),

@@ -16,10 +16,12 @@ from cow_service.physics.ensemble import (
     SURE,
     Decided,
     Query,
+    Told,
     answers_of,
     batches,
     decide,
     decide_change,
+    decide_each,
     is_settled,
 )
 from cow_service.physics.events import KINDS, NEVER, Events, WorldEvents
@@ -103,6 +105,8 @@ def test_of_several_things_one_will_do_or_each_is_meant() -> None:
         several = asked(target=None).model_copy(update={"every": every})
         answer = decide(Query(several, among=(1, 2)), found, DRAWS)
         assert (answer.probability, answer.time) == (pytest.approx(probability), time)
+        with_taken = decide(Query(several, among=(2, 4)), found, DRAWS)  # numbered behind the bodies that are there
+        assert with_taken.probability == (0.0 if every else 1.0)
 
 
 def test_which_is_met_first() -> None:
@@ -113,6 +117,57 @@ def test_which_is_met_first() -> None:
     assert (none.first, none.probability, none.sure) == (None, 1.0, True)
     open_ = decided(asked("which-first", target=None), None, events(touches={2: share(0.5, 0.5), 1: late}))
     assert not open_.sure
+
+
+def test_which_are_met_is_told_of_each_and_sure_where_all_are() -> None:
+    which, halves = Query(asked("which", target=None), among=(1, 2, 3)), share(0.5)
+
+    def told(found: WorldEvents, query: Query = which) -> Decided:
+        return decide_each(query, found, [Told.by(query.of(body), found) for body in query.among], DRAWS)
+
+    found = told(events(touches={1: 1.0, 2: share(0.9)}))
+    assert [(each.body, each.probability, each.sure) for each in found.candidates] == [
+        (1, 1.0, True), (2, pytest.approx(0.9), True), (3, 0.0, True),
+    ]  # fmt: skip
+    assert (found.probability, found.sure, found.robust) == (pytest.approx(0.9), True, True)
+    found = told(events(touches={1: 1.0, 2: halves}))
+    assert [each.sure for each in found.candidates] == [True, False, True]
+    assert (found.probability, found.sure) == (0.5, False)
+    assert not is_settled(found, which, 15, 50), "what of each is said may change"
+    # Each is likely, and hardly ever both: then nothing is sure of the two.
+    apart = np.roll(share(0.25), 1)
+    apart[np.isfinite(share(0.25))] = NEVER
+    found = told(events(touches={1: share(0.25), 2: apart}), replace(which, among=(1, 2)))
+    assert [each.sure for each in found.candidates] == [True, True]
+    assert (found.probability, found.sure) == (pytest.approx(0.5, abs=0.05), False)
+    missed = told(events(touches={1: 1.0}), Query(asked("which", target=None, negated=True), among=(1, 2)))
+    assert [each.probability for each in missed.candidates] == [0.0, 1.0]
+    throw = replace(which, among=(1,), sure_of_miss=0.85)
+    assert [told(events(touches={1: share(value)}), throw).candidates[0].sure for value in (0.2, 0.1, 0.8)] == [
+        False, True, True,
+    ]  # fmt: skip
+    misread = replace(events(touches={1: 1.0}), misread=np.arange(COUNT) < 0.4 * COUNT)
+    assert told(misread, throw).candidates[0].probability == pytest.approx(0.8)
+
+
+def test_to_take_something_away_helps_only_where_it_would_happen() -> None:
+    query = Query(asked("which-to-remove"), 2, among=(1, 2))
+
+    def told(as_it_is: float, without: float, query: Query = query) -> Decided:
+        own = [Told.by(query.of(1), events(touches={2: share(without)})), Told.by(query.of(2), events())]
+        return decide_each(query, events(touches={2: share(as_it_is)}), own, DRAWS)
+
+    found = told(0.9, 0.0)
+    assert [each.probability for each in found.candidates] == [1.0, 1.0]
+    assert (found.as_it_is, found.probability, found.sure, found.time) == (pytest.approx(0.9), found.as_it_is, True, 1)
+    found = told(0.9, 0.9)
+    assert [(each.probability, each.sure) for each in found.candidates] == [(pytest.approx(0.1), True), (1.0, True)]
+    assert not told(0.6, 0.0).sure, "it may happen or not"
+    needless = told(0.05, 0.05)
+    assert (needless.as_it_is, needless.probability, needless.sure) == (pytest.approx(0.05), pytest.approx(0.95), True)
+    turned = told(0.05, 0.95, replace(query, asked=asked("which-to-remove", negated=True)))
+    assert [each.probability for each in turned.candidates] == [pytest.approx(0.95), 0.0], "so that it is met"
+    assert (turned.as_it_is, turned.sure) == (pytest.approx(0.95), True)
 
 
 def test_when_it_happens() -> None:

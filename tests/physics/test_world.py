@@ -190,6 +190,53 @@ class TestRemoval:
             assert factual.query.asked.form == "whether"
 
 
+class TestEachTakenAway:
+    """A ball rolls towards a vase, behind which there is a post; another post stands aside."""
+
+    ROW = (ball(-1.2), post(0.9), post(0.0, 4.2, name="far"), post(-0.2, name="vase"))
+
+    def told(
+        self, *among: int, target: int | None = 1, bodies=ROW, motion=None, **asked: Any
+    ) -> tuple[dict[int, float], Any]:
+        question = Asked(form="which-to-remove", **({"relation": "touches"} | asked))
+        world = WorldInput(bodies, motion or rolling(), known(CAMERA), CAMERA.size, FRAMES, FPS)
+        (result,) = run_ensemble(world, Query(question, target, among=among, meets_more=not among), 9)
+        return {each.body: each.probability for each in result.decided.candidates}, result
+
+    def test_each_has_the_worlds_that_are_left_without_it(self) -> None:
+        so_that_it_is_met, result = self.told(2, 3, negated=True)
+        assert so_that_it_is_met == {2: 0.0, 3: 1.0}
+        assert (result.decided.as_it_is, result.decided.sure) == (1.0, True)
+        assert len(result.shown.worlds.runs[0].positions) == 4, "what is shown has all of them"
+        # The same worlds as where it is taken away beforehand.
+        taken = WorldInput(self.ROW[:3], rolling(), known(CAMERA), CAMERA.size, FRAMES, FPS, removed=self.ROW[3:])
+        changed, _ = run_ensemble(taken, Query(Asked(relation="touches"), 1), 9)
+        own = result.decided.candidates[1].told
+        np.testing.assert_array_equal(own.touches[:, 1], changed.ensemble.events.of[0].times["touches"][:, 1])
+        assert not np.isfinite(own.touches[:, 3]).any()
+
+    def test_what_is_hit_is_not_when_it_is_gone_and_something_else_may_be(self) -> None:
+        assert self.told(3, 2, target=3)[0] == {3: 1.0, 2: 0.0}
+        told, result = self.told(target=None)
+        assert told == {3: 0.0}, "those that are met, and behind it stands the next"
+        assert result.decided.as_it_is == 1.0
+        assert self.told(target=None, bodies=(self.ROW[0], *self.ROW[2:]))[0] == {2: 1.0}
+
+    def test_it_hides_nothing_without_what_it_hides(self) -> None:
+        bodies = (ball(-1.2), post(0.2, 3.4, half=0.1, height=0.12), post(-2.0, name="behind"))
+        told, result = self.told(1, 2, target=None, bodies=bodies, relation="covers")
+        assert {body: round(share) for body, share in told.items()} == {1: 1, 2: 0}, "although it touches nothing"
+        assert result.decided.as_it_is > 0.8
+
+    def test_what_stood_on_it_falls(self) -> None:
+        raised = outline("cylinder", (0.6, 3.2), 0.08, 0.16) + np.array([0.0, 0.4, 0.0])
+        table = post(0.6, 3.2, half=0.4, height=0.4, name="table", shape="box")
+        bodies = (ball(-1.2), seen("cup", "cylinder", CAMERA.box(raised)), table, self.ROW[2])
+        still = rolling(0.0, kind="static", direction=None)
+        told, _ = self.told(2, 3, target=1, bodies=bodies, motion=still, relation="moves", negated=True)
+        assert told == {2: 1.0, 3: 0.0}
+
+
 # Radius and height of the rims from the floor up, m.
 VASE = [(0.07, 0.0), (0.13, 0.08), (0.15, 0.2), (0.12, 0.3), (0.07, 0.4), (0.11, 0.5)]
 BOTTLE = [(0.1, 0.0), (0.1, 0.3), (0.04, 0.4), (0.04, 0.55)]

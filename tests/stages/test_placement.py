@@ -9,7 +9,7 @@ import pytest
 from drawn import Image, ball, block, bowl, floor
 from refusals import refused
 from runs import run_of
-from staged import BLUE, GREEN, RED, is_red
+from staged import BLUE, GREEN, RED, computed, is_red
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
@@ -94,6 +94,22 @@ class TestInto:
         assert not is_red(last[290, 150]), "it is gone from its place"
         over_x, over_y = trajectory.path.points[8]
         assert is_red(carried[int(over_y), int(over_x)])
+
+    def test_into_which_of_two_it_fits_is_told_of_each_and_seen_of_the_first(self) -> None:
+        image = bowl(with_bowl(SMALL), (570, 290), 18, 30, GREEN)
+        cup, things = (551.0, 280.0, 589.0, 326.0), ("blue bowl", "green cup")
+        objects = [{"object": name, "bbox": box} for name, box in zip(things, (BOWL, cup), strict=True)]
+        asked = {"form": "which", "relation": "inside", "among": things}
+        given = {"grounding": {"object": "red ball", "bbox": SMALL}, "objects": objects, "num_frames": FRAMES}
+        into_cup = ({"kind": "place", "object": "red ball", "relation": "into", "targets": ("green cup",)},)
+        for put_there, result in (((), "inside"), (into_cup, "on-the-rim")):
+            told = computed(run_of(image, **given, interventions=put_there, asked=asked)).value
+            assert [(each.object, each.probability, each.sure) for each in told.outcome.candidates] == [
+                ("blue bowl", 1.0, True), ("green cup", 0.0, True),
+            ]  # fmt: skip
+            assert (told.outcome.sure, told.outcome.object, told.placement.result) == (True, None, result)
+        open_to_all = computed(run_of(image, **given, interventions=into_cup, asked=asked | {"among": ()})).value
+        assert (open_to_all.outcome.probability, open_to_all.outcome.sure) == (None, False)
 
     def test_a_large_one_does_not(self) -> None:
         _, placement = result(with_bowl(BIG), "into", BLUE_BOWL, mover=BIG)

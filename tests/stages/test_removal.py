@@ -9,24 +9,31 @@ import pytest
 from drawn import ball, block, floor
 from refusals import refused
 from runs import run_of
-from staged import BLUE, GREEN, RED, VideoModel, clip_of, computed, pixels
+from staged import BLUE, GREEN, RED, YELLOW, VideoModel, clip_of, computed, pixels
 
 from cow_service.generators.cutout import create
+from cow_service.physics.ensemble import run_ensemble
 from cow_service.settings import Settings
 from cow_service.stages.grounding import ground
+from cow_service.stages.motion import read_motion
+from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
+from cow_service.stages.trajectory import judge
+from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image
 
 MOVER, GOAL, BETWEEN = (80, 210, 130, 260), (480, 196, 550, 274), (280, 200, 350, 272)
 THERE = slice(BETWEEN[1] - 8, BETWEEN[3] + 8), slice(BETWEEN[0] - 8, BETWEEN[2] + 8)
 QUESTION = "Will the ball hit the cube?"
 ALL = ({"object": "cube", "bbox": GOAL, "shape": "box"}, {"object": "Green  block", "bbox": BETWEEN, "shape": "box"})
+ASIDE = {"object": "yellow block", "bbox": (300, 40, 350, 90), "shape": "box"}
 REMOVE = ({"kind": "remove", "object": "the green block"},)
 
 
 def picture(*, with_block: bool = True) -> Image:
     image = block(floor(640, 400), GOAL, BLUE)
     image = block(image, BETWEEN, GREEN) if with_block else image
+    image = block(image, ASIDE["bbox"], YELLOW)
     return ball(image, (105, 235), 25, RED)
 
 
@@ -56,6 +63,39 @@ def test_without_it_the_mover_gets_to_what_is_behind_it() -> None:
     assert next(each.object for each in factual.encounters if each.kind == "touches") == "Green  block"
     assert told.bodies[0].position == factual.bodies[0].position, "both worlds have the same draws"
     assert computed(run(interventions=(), ensemble=0)).value.factual is None, "nothing is taken away"
+
+
+def test_which_one_to_take_away_is_told_of_each_in_the_scene_with_all() -> None:
+    asked = {"form": "which-to-remove", "relation": "touches", "target": "cube", "negated": True}
+    known = {"interventions": (), "camera": {"pitch": 28, "focal": 640}, "objects_complete": True}
+    for among in ((), ("cube", "green block", "yellow block")):
+        told = computed(run(objects=(*ALL, ASIDE), asked=asked | {"among": among}, **known)).value
+        assert told.outcome.asked.among == tuple({"green block": "Green  block"}.get(name, name) for name in among)
+        found = {each.object: (each.probability, each.sure) for each in told.outcome.candidates}
+        assert found == {"cube": (0, True), "Green  block": (1, True), "yellow block": (0, True)}
+        assert (told.outcome.as_it_is, told.outcome.sure, told.outcome.object) == (1, True, "cube")
+        assert next(each.object for each in told.encounters if each.kind == "touches") == "Green  block"
+        assert (len(told.bodies), told.factual) == (4, None), "what is shown has all of them"
+    # Taken away for good, it is no reason any more; what would be hit without it is the cube.
+    told = computed(
+        run(objects=(*ALL, ASIDE), asked=asked | {"negated": False}, **known | {"interventions": REMOVE})
+    ).value
+    assert {each.object: each.probability for each in told.outcome.candidates} == {"cube": 1, "yellow block": 0}
+    assert (told.factual.outcome.asked.form, told.factual.outcome.probability) == ("whether", 0)
+
+
+def test_what_is_not_seen_clearly_makes_that_candidate_unsure_and_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = {"form": "which", "relation": "touches", "among": ("cube", "green block")}
+    wanted = run(interventions=(), asked=asked, camera={"pitch": 28, "focal": 640}, objects_complete=True)
+    grounding = ground(wanted).value
+    situation = Situation.of(wanted, wanted.scene_of(grounding), grounding, read_motion(wanted, grounding, None).value)
+    world, query, _ = reconstruct(situation)
+    (result,) = run_ensemble(world, query, 15)
+    for blurred, sure in ((None, [True, True]), (GOAL, [False, True]), (MOVER, [False, False])):
+        monkeypatch.setattr(Scene, "confidence_of", lambda _, box, blurred=blurred: 0.5 if box == blurred else 0.9)
+        _, outcome = judge(situation, result)
+        assert [each.sure for each in outcome.candidates] == sure
+        assert (outcome.sure, outcome.depends_on[:1]) == (blurred is None, () if blurred is None else ("outline",))
 
 
 CUBE_ONTO = {"kind": "place", "object": "cube", "relation": "onto"}

@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
-from cow_service.narration.words import Phrases
+from cow_service.narration.words import Phrases, same_name
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.asked import Unread
@@ -40,6 +40,11 @@ _NONE = re.compile(
     r"|(?:it |the \w+(?: \w+)? )?never (?:hits|touches|reaches)(?: (?:it|anything|any of them))?"
     r"|(?:it |the \w+(?: \w+)? )?(?:does|will) not(?: (?:hit|touch|reach|collide with))?"
     r"(?: (?:it|anything|any object|any of them|happen))?"
+)
+_ALL = re.compile(r"(both|all|each)(?: of (?:them|these|the \w+))?(?: (?:objects|things))?")
+_ONLY = re.compile(
+    r"(?:(?:it is )?(?:only|just|both) )?(?:(?:by )?(?:removing|remove|taking away|take away) )?(?:only |just |both )?"
+    r"(.+?)(?:,? (?:only|alone))?"
 )
 _SEVERAL = re.compile(r"\b(?:both|all|several|more than one|at the same time|simultaneously|each)\b", re.IGNORECASE)
 
@@ -204,7 +209,8 @@ def choose_option(
         return _unsure(options, say, narration.summary)
     if not options:
         return AnswerReading(narration.answer, False, reasoning=narration.summary)
-    fitting = _fitting([option for option in options if not says_not_sure(option.text)], outcome)
+    fits = _fitting_set if outcome.asked.form in ("which", "which-to-remove") else _fitting
+    fitting = fits([option for option in options if not says_not_sure(option.text)], outcome)
     # Options in another language than English are told by the words of the answer in it, such as "Ja".
     only = fitting[0] if len(fitting) == 1 else None if fitting else option_saying(options, narration.answer)
     if only is not None:
@@ -240,3 +246,41 @@ def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOp
         met = [(option, span) for option, span in placed if span[0] <= high and span[1] >= low]
         return [option for option, (start, end) in met if len(met) == 1 and start <= outcome.time <= end]
     return []
+
+
+def _fitting_set(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
+    """The options that name just the candidates that are meant: of all, if the question names them, else of those that
+    any option names."""
+    names = [each.object for each in outcome.candidates]
+    meant = frozenset(each.object for each in outcome.candidates if each.is_meant and not outcome.is_needless)
+    if not outcome.asked.among:
+        chosen = [_named_in(option.text, names) or frozenset[str]() for option in options if not _says_all(option.text)]
+        named = frozenset[str]().union(*chosen)
+        names = [name for name in names if name in named] or names
+    return [option for option in options if _named_in(option.text, names) == meant & frozenset(names)]
+
+
+def _says_all(text: str) -> re.Match[str] | None:
+    return _ALL.fullmatch(_unfolded(text))
+
+
+def _named_in(text: str, names: Sequence[str]) -> frozenset[str] | None:
+    """Which of some objects an option names, as in: only the mug; the mug and the box; both; neither. None where it
+    names something else, or does not single one out."""
+    if names_none(text) or re.fullmatch(r"neither .+ nor .+", _unfolded(text)):
+        return frozenset()
+    if said := _says_all(text):
+        return frozenset(names) if said[1] != "both" or len(names) == 2 else None
+
+    def named(part: str) -> str | None:
+        """The only object that a text may name."""
+        phrase = parse_noun_phrase(part)
+        found = [name for name in names if same_name(part, name)]
+        found = found or [name for name in names if phrase is not None and may_name(phrase, name)]
+        return found[0] if len(found) == 1 else None
+
+    bare = _ONLY.fullmatch(" ".join(text.lower().split()).rstrip(".!"))
+    whole = "" if bare is None else bare[1]
+    is_name = any(same_name(whole, name) for name in names)
+    found = [named(part) for part in ([whole] if is_name else re.split(r",? and |, |/| & ", whole))]
+    return None if None in found else frozenset(name for name in found if name is not None)
