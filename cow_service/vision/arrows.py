@@ -17,13 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox, Point
+from cow_service.vision.masks import lab_of
 from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask
-from cow_service.vision.types import Floats, Mask
+from cow_service.vision.types import Floats, Image, Mask
 
 MIN_FIT = 0.73  # intersection over union with the ideal arrow
 HEAD, HOLLOW_HEAD = 1.8, 1.3  # of the shaft's width: the least width of a head, and of a hollow drawing's
 MIN_HOLLOW_FIT = 0.88  # the same for a hollow drawing, whose head may be small
 SLENDER = 5.0  # of its shaft's width: an arrow without a rim is longer; the side of a can behind a ball is not
+FRINGE, BETWEEN = 2, 12.0  # px of what resampling blurs; Lab units within which a colour is a mixture of two others
 CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
 
 
@@ -240,8 +242,30 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox
         rim = [patch[:line].any(0), patch[-line:].any(0), patch[:, :line].any(1), patch[:, -line:].any(1)]
         if patch[frame].sum() < ON_OUTLINE * patch.sum() or np.concatenate(rim).mean() < COVERED:
             continue
+        if line <= FRINGE and _is_fringe(image.pixels, stroke):
+            continue
         inner = (stroke.x + line, stroke.y + line, stroke.x + w - line, stroke.y + h - line)
         x0, y0, x1, y1 = (value / image.scale for value in inner)
         if all(np.abs(np.array(box.bbox) - (x0, y0, x1, y1)).max() >= 8 / image.scale for box in boxes):
             boxes.append(DrawnBox((x0, y0, x1, y1), image.full(drawing_mask(image.pixels, stroke))))
     return tuple(sorted(boxes, key=lambda box: -(box.bbox[2] - box.bbox[0]) * (box.bbox[3] - box.bbox[1])))
+
+
+def _is_fringe(pixels: Image, stroke: Stroke) -> bool:
+    """Whether a thin frame is the fringe of a block: of a colour between that of the block and that around it."""
+    (h, w), far = stroke.patch.shape, 2 * FRINGE
+    window, patch = stroke.surroundings(pixels, far)
+    lab = lab_of(np.ascontiguousarray(pixels[window])).astype(np.float64)
+    inner, outer = np.zeros(patch.shape, bool), np.ones(patch.shape, bool)
+    top, left = min(far, stroke.y), min(far, stroke.x)
+    outer[max(0, top - FRINGE) : top + h + FRINGE, max(0, left - FRINGE) : left + w + FRINGE] = False
+    inner[top + far : top + h - far, left + far : left + w - far] = True
+    if not (inner.any() and outer.any()):
+        return False
+    inside, outside, own = (np.median(lab[where], axis=0) for where in (inner, outer, patch > 0))
+    across = inside - outside
+    length = float(np.linalg.norm(across))
+    if length < BETWEEN:
+        return False
+    share = float((own - outside) @ across) / length**2
+    return 0 < share < 1 and float(np.linalg.norm(own - outside - share * across)) < BETWEEN

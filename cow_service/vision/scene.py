@@ -219,19 +219,17 @@ class Scene:
             own = [bbox for bbox in things if is_same_object(bbox_of(drawing.mask), bbox)]
             return any((drawing.mask & self.silhouette(bbox)).sum() > PART_OF * drawing.mask.sum() for bbox in own)
 
-        false = [drawing for drawing in (*self.arrows, *self.boxes) if is_thing(drawing)]
-        if not false:
+        arrows = tuple(each for each in self.arrows if not is_thing(each))
+        boxes = tuple(each for each in self.boxes if not is_thing(each))
+        if len(arrows) + len(boxes) == len(self.arrows) + len(self.boxes):
             return self
 
         def without() -> Scene:
             other = replace(self, _found={}, _preset=dict(self._preset))
-            drawn = {
-                name: tuple(each for each in getattr(self, name) if each not in false) for name in ("arrows", "boxes")
-            }
-            other.__dict__.update(drawn)
+            other.__dict__.update(arrows=arrows, boxes=boxes)
             return other
 
-        return self.once(("keeping", *(bbox_of(each.mask) for each in false)), without)
+        return self.once(("keeping", *(each.tail for each in arrows), *(each.bbox for each in boxes)), without)
 
     def _with_trails(self, **changes: Any) -> Scene:
         """The same image with other trails in it."""

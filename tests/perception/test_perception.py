@@ -222,6 +222,7 @@ def test_boxes_of_a_reader_are_outlined() -> None:
 
     class Reader:
         source = "mllm"
+        heeds_objections = False
 
         def ground(self, given: Any) -> GroundingReading:
             others = (LocatedObject(object="cyan cone", bbox=loose(cone)),)

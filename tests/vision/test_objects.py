@@ -29,6 +29,7 @@ def pixels() -> np.ndarray:
 
 class OneReader:
     source = "embedded"
+    heeds_objections = False
 
     def ground(self, given):
         others = (LocatedObject(object="blue cube", bbox=CUBE), LocatedObject(object="vase", bbox=(20, 300, 60, 390)))
