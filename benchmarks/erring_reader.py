@@ -173,10 +173,10 @@ def verdict(meta: dict[str, Any], simulation: Simulation) -> str:
     if outcome is None or not outcome.sure:
         return "not sure"
     if outcome.asked.form == "which-first":
-        said = outcome.first or ""
+        said = outcome.first or "floor"
         return "right" if said.removeprefix("the ") == truth.removeprefix("the ") else "wrong"
     if outcome.asked.form == "which":
-        among = [each.object for each in outcome.candidates if each.happens]
+        among = [each.object for each in outcome.candidates if each.is_meant]
         said = {0: "neither", 2: "both"}.get(len(among), f"only the {among[0].removeprefix('the ') if among else ''}")
         return "right" if said == truth else "wrong"
     return "right" if outcome.happens == (truth == "Yes") else "wrong"

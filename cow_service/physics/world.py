@@ -77,7 +77,7 @@ class WorldInput:
     level: float | None = None  # px: height in the image of the floor of a drawing that is seen from the side
     measured: Measurement | None = None  # by a depth map, of `bodies` and then of `removed`
     depth: DepthEstimate | None = None  # of the map that was given
-    faint: tuple[BBox, ...] = ()  # px: where the image may show things, too faint to tell
+    faint: tuple[BBox, ...] = ()  # px: where the image may show things, but not for certain
 
     @property
     def horizon(self) -> float:

@@ -475,7 +475,7 @@ class Trajectory(Record):
     encounters: tuple[Encounter, ...] = ()
     faint: tuple[BBox, ...] = Field(
         default=(),
-        description="Boxes [x0, y0, x1, y1] (px) of marks too faint to be objects for certain. They are not simulated; "
+        description="Boxes [x0, y0, x1, y1] (px) of what may be objects, but not for certain. They are not simulated; "
         "if the path crosses one, the outcome is not sure.",
     )
     encounters_known: bool = Field(

@@ -33,6 +33,7 @@ SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 SAME_MASK = 0.5  # IoU from which two outlines are of one thing
 MOST_FOUND = 24  # detections that are outlined, best first
 WHITE = 128  # grey level from which a pixel of a mask is the object's
+FLOOR = frozenset({"floor", "the floor", "ground", "the ground"})
 MAX_SHARE = 0.95  # of the image that a box or a mask covers: more is no object
 
 
@@ -526,7 +527,9 @@ def understood(grounding: Grounding, words: WordReader) -> Grounding:
     if asked is not None and asked.among:
         apart = {plain(grounding.object), plain(asked.subject or "")}
         names = [other.object for other in others_of(grounding) if plain(other.object) not in apart]
-        among = dict.fromkeys(name for said in asked.among for name in words.names_meant(said, names))
+        # Of what is met first the floor is what is left, where no thing is met.
+        things = [said for said in asked.among if asked.form != "which-first" or plain(said) not in FLOOR]
+        among = dict.fromkeys(name for said in things for name in words.names_meant(said, names))
         asked = asked.model_copy(update={"among": tuple(among)})
     interventions = (
         each.model_copy(update={"object": described(each.object), "targets": tuple(map(described, each.targets))})

@@ -134,9 +134,10 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
 
 
 def moves_over(mover: BBox, way: Floats, boxes: Sequence[BBox]) -> bool:
-    """Whether a box meets one of some boxes (px) on its way [F, 2]."""
-    swept = np.array(mover) + np.hstack([way, way])
-    return any(bool(((swept[:, :2] < box[2:]) & (swept[:, 2:] > box[:2])).all(axis=1).any()) for box in boxes)
+    """Whether what is in a box meets what is in one of some boxes (px) on its way [F, 2]: their lower halves do."""
+    (x0, y0, x1, y1), lower = mover, [(left, (top + bottom) / 2, right, bottom) for left, top, right, bottom in boxes]
+    swept = np.array([x0, (y0 + y1) / 2, x1, y1]) + np.hstack([way, way])
+    return any(bool(((swept[:, :2] < box[2:]) & (swept[:, 2:] > box[:2])).all(axis=1).any()) for box in lower)
 
 
 def bodies_that_matter(query: Query | None, touches: Floats | None, count: int, candidate: int = 0) -> set[int]:

@@ -29,7 +29,7 @@ from cow_service.vision.regions import (
     measure,
     region_of,
 )
-from cow_service.vision.segmentation import fault_of, mask_from_bbox, mask_from_point
+from cow_service.vision.segmentation import fault_of, is_bare, mask_from_bbox, mask_from_point
 from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
 from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
@@ -278,10 +278,15 @@ class Scene:
         return region_of(self.regions, bbox)
 
     def shows_thing(self, bbox: BBox) -> bool:
-        """Whether something stands in a box: what was found there, or what can be cut out with a visible outline."""
+        """Whether something stands in a box: what was found there, what can be cut out with a visible outline, or what
+        has colours that its surroundings lack."""
         if self.region_of(bbox) is not None:
             return True
-        return self.once(("thing", bbox), lambda: fault_of(self.clean, self.silhouette(bbox)) is None)
+
+        def shown() -> bool:
+            return fault_of(self.clean, self.silhouette(bbox)) is None or not is_bare(self.clean, bbox)
+
+        return self.once(("thing", bbox), shown)
 
     def confidence_of(self, bbox: BBox) -> float:
         """How sure it is (0..1) that what is in a box is one separate thing with its outline; 1 for what is given.

@@ -308,7 +308,7 @@ SENTENCES: dict[str, Trajectory] = {
     "Not sure: something that matters was not seen clearly; the warnings say what.": world(
         unsure("touches", "cube", depends_on=("outline", "faint")), ensemble=50
     ),
-    "Not sure: something too faint to make out may stand in the way; the warnings say where.": world(
+    "Not sure: something that could not be made out for certain may stand in the way; the warnings say where.": world(
         unsure("touches", "cube", depends_on=("faint",)), ensemble=50
     ),
 }

@@ -140,7 +140,9 @@ QUESTIONS: dict[str, tuple[dict[str, Any], dict[str, Any], Asked | None, bool]] 
     "the reader passes over a time": (
         {"asked": ASKED}, {"asked": WITHIN}, WITHIN, False
     ),
-    "the reader has another time": ({"asked": Asked(relation="touches", target="vase", within=5.0)}, {"asked": WITHIN}, WITHIN, True),
+    "the reader has another time": (
+        {"asked": ASKED.model_copy(update={"within": 5.0})}, {"asked": WITHIN}, WITHIN, True
+    ),
     "both take one thing away": (
         {"interventions": (REMOVED,)}, {"asked": ASKED, "changes": (TAKEN,)}, ASKED, False
     ),

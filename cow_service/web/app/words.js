@@ -37,7 +37,7 @@ export const DOUBTS = {
   outline: "where the outlines of things run",
   identity: "whether the things are the ones that the question names",
   reading: "whether the question and the image were read rightly",
-  faint: "whether something too faint to make out stands in the way",
+  faint: "whether something that could not be made out for certain stands in the way",
   depth: "whether the depth map shows what matters",
 };
 
