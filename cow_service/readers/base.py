@@ -176,6 +176,7 @@ class GroundingReading:
     others: tuple[LocatedObject, ...] = ()
     objects_complete: bool = False  # the others are all that could be hit or hide something
     warnings: tuple[str, ...] = ()
+    place_doubts: tuple[str, ...] = ()  # why its boxes may be wrong, unless the image shows the mover there
     interventions: tuple[records.Intervention, ...] = ()
     hints: MotionHints | None = None
     prior: ObjectPrior | None = None  # of the mover

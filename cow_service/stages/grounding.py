@@ -145,11 +145,10 @@ def _settled(run: Run[SimulateRequest], reading: GroundingReading) -> tuple[Grou
         bare = frozenset(bbox for bbox in boxes if not scene.shows_thing(bbox))
         placed, objections = settle_places(reading, question, SeenThings(scene.regions, bare), words)
     # What the request says of what is asked and changed is not the reader's to say.
-    if request.interventions:
-        question = replace(question, changes=())
-        placed = replace(placed, interventions=())
     if request.asked is not None:
         return placed, objections
+    if request.interventions:
+        question, placed = replace(question, changes=()), replace(placed, interventions=())
     asked, misread = settle_question(placed, question, words)
     return asked, (*objections, *misread)
 
@@ -393,25 +392,17 @@ def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
 def _find_interventions(
     request: SimulateRequest, reading: GroundingReading, things: Sequence[LocatedObject]
 ) -> tuple[Intervention, ...]:
-    """Those of the request, then those of the question that are not among them; the last of `things` is the mover.
+    """Those of the request, else those of the question; the last of `things` is the mover.
 
     Raises `InvalidRequest` for an object that is not there, for what is done twice, for a thing that is put to itself,
     and for the mover taken away; `CannotGround` where the question says so.
     """
     mover, found = things[-1], list[Intervention]()
-    wanted = [(f"/interventions/{index}", change) for index, change in enumerate(request.interventions)]
-    told = [(None, change) for change in (*reading.interventions, *reading.changes)]
-    for pointer, change in (*wanted, *told):
+    given = [(f"/interventions/{index}", change) for index, change in enumerate(request.interventions)]
+    read = [(None, change) for change in (*reading.interventions, *reading.changes)]
+    for pointer, change in given or read:
         each = change if isinstance(change, Intervention) else _located(change, things, pointer)
-        name, (box, *targets) = each.object.object, [thing.bbox for thing in (each.object, *each.targets)]
-        # The question may say again what the request says.
-        alike = [
-            [thing.bbox for thing in (other.object, *other.targets)]
-            for other in found
-            if (other.kind, other.relation, len(other.targets)) == (each.kind, each.relation, len(targets))
-        ]
-        if pointer is None and any(all(map(is_same_object, (box, *targets), boxes)) for boxes in alike):
-            continue
+        name, box, targets = each.object.object, each.object.bbox, [thing.bbox for thing in each.targets]
         taken = [other.object.bbox for other in found if other.kind == "remove"]
         put = [other for other in found if other.kind == "place"]
         if each.kind == "remove":

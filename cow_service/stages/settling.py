@@ -157,11 +157,13 @@ def settle_places(
         for each in read.interventions
     )
     own = settled(mover)
+    unproved = read.place_doubts if moved[read.bbox] is None else ()
     reading = replace(
         read,
         bbox=own.bbox,
         bbox_deviation=own.bbox_deviation,
-        is_doubtful=read.is_doubtful or own.is_doubtful,
+        is_doubtful=read.is_doubtful or own.is_doubtful or bool(unproved),
+        warnings=(*read.warnings, *unproved),
         others=tuple(map(settled, read.others)),
         interventions=changed,
     )

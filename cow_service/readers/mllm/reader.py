@@ -120,10 +120,10 @@ class MllmReader:
             )
             for each in identified.changes
         )
-        removed = {each.object.bbox for each in interventions if each.kind == "remove"}
+        removed, is_other = {each.object.bbox for each in interventions if each.kind == "remove"}, False
         if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
             mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
-            warnings = (*warnings, mismatch)
+            warnings, is_other = (*warnings, mismatch), True
         return GroundingReading(
             object=identified.object,
             bbox=bbox,
@@ -131,7 +131,9 @@ class MllmReader:
             others=tuple(other for other in others if other.bbox not in removed),
             objects_complete=located.objects_complete and not doubles,
             interventions=interventions,
-            warnings=(*warnings, *identified.warnings, *located.warnings, *doubles, *self._family_warnings),
+            warnings=(*warnings, *identified.warnings, *located.warnings, *doubles),
+            place_doubts=self._family_warnings,
+            is_doubtful=is_other,
             hints=hints if given.motion_wanted else None,
             prior=located.prior,
             asked=identified.asked,
