@@ -9,16 +9,8 @@ import numpy as np
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.base import SeenThing
-from cow_service.readers.embedded.english.asked import read_alternatives, read_asked
-from cow_service.readers.embedded.english.lexicon import ObjectPhrase, like_a_colour, words
-from cow_service.readers.embedded.english.noun_phrases import (
-    TABLES,
-    Kind,
-    kind_of,
-    may_name,
-    parse_noun_phrase,
-    shape_of,
-)
+from cow_service.readers.embedded.english.lexicon import SOLID_NOUNS, TABLES, ObjectPhrase, like_a_colour, words
+from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, shape_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, LocatedObject
@@ -119,7 +111,6 @@ CALLED, NOT_CALLED = 3.0, -2.0  # log ratios if a detector found the noun: for i
 IMPOSSIBLE = -math.inf
 NOWHERE = -1  # place of the region of a name that has none
 
-_SOLID = words("glass chair book lamp robot pencil pen")  # no balls; of their outlines nothing is known
 _ANYTHING = words("object thing item shape one")
 
 Row = list[float]  # the log ratio of each region
@@ -127,7 +118,7 @@ Row = list[float]  # the log ratio of each region
 
 def is_known(phrase: ObjectPhrase) -> bool:
     """Whether the noun says something of a shape, or claims nothing."""
-    return phrase.noun is None or form_of(phrase.head) is not None or phrase.head in _SOLID | _ANYTHING | TABLES
+    return phrase.noun is None or form_of(phrase.head) is not None or phrase.head in SOLID_NOUNS | _ANYTHING | TABLES
 
 
 def log_ratios(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[ObjectPhrase]) -> Row:
@@ -181,7 +172,7 @@ def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
     """By outline; one that the border cuts says less."""
     form = form_of(phrase.head)
     # A region is round where the noun names something round, and not where it does not.
-    can_be = not region.is_disc or (form is None and phrase.head not in _SOLID)
+    can_be = not region.is_disc or (form is None and phrase.head not in SOLID_NOUNS)
     if form == "ball":
         can_be = region.is_hidden or region.roundness >= (ROUND if phrase.colour is None else NOT_ROUND)
     if form is None or not can_be:
@@ -227,9 +218,9 @@ def _foremost(
     ranked = sorted((ratio for ratio in ratios if ratio > IMPOSSIBLE), reverse=True)
     least = ranked[min(count, len(ranked)) - 1] - CLEARLY_WORSE if ranked else 0.0
     fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(IMPOSSIBLE, least)]
-    # Where no colour says for certain that one is meant, and the outlines speak against it, none is; nor is what is
-    # clearly another kind of thing, such as a candle where a cone of its colour was not seen.
-    is_sure = any(
+    # A thing is meant by positive evidence alone: a detector called it so, its outline is that of the noun, or it has
+    # the colour and is not clearly another kind of thing. What is merely left is not meant.
+    is_sure = not says_nothing(phrase, fitting) and any(
         phrase.noun in each.called
         or _shape_ratio(each, phrase) >= POOR
         or (each.colour == phrase.colour and not is_other_kind(each, phrase.head))
@@ -246,7 +237,7 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase, others: Sequence[
 
 def unclear(phrase: ObjectPhrase, fitting: Sequence[Region], regions: Sequence[Region]) -> str:
     """Why not one region is what a phrase names, for a message."""
-    if fitting and says_nothing(phrase, fitting):
+    if phrase.colour is None and not is_known(phrase) and not phrase.is_other:
         return f"'{phrase.text}' names no colour and no shape that is known here. Seen: {describe(regions)}"
     if len(fitting) > 1:
         what = "its place" if phrase.colour else "its colour or its place"
@@ -256,7 +247,8 @@ def unclear(phrase: ObjectPhrase, fitting: Sequence[Region], regions: Sequence[R
 
 def says_nothing(phrase: ObjectPhrase, fitting: Sequence[Region]) -> bool:
     """Whether a phrase fits regions because nothing is known of its noun, and it names no colour."""
-    return phrase.colour is None and not is_known(phrase) and phrase.noun not in fitting[0].called
+    called = any(phrase.noun in each.called for each in fitting)
+    return phrase.colour is None and not is_known(phrase) and not called
 
 
 def match_several(
@@ -311,7 +303,7 @@ def things_of_kinds(
 
     Raises `CannotGround`.
     """
-    asked, found = read_asked(question), list[LocatedObject]()
+    asked, found = question.asked, list[LocatedObject]()
     among = () if asked is None else asked.among
     left = [region for region in regions if not is_same_object(region.bbox, mover)]
     for name in among:
@@ -328,7 +320,7 @@ def things_of_kinds(
             )
         found += _named(fitting, kind)
     # Those of the kind in "which mug does it hit first"; none where the image does not tell which those are.
-    for phrase in read_alternatives(question):
+    for phrase in question.alternatives:
         kind = kind_of(phrase.text) or Kind(phrase, None)
         listed = asked is None or phrase.text in among or phrase.colour is not None or kind.phrase.head is None
         if not listed and not any(may_name(kind.phrase, each.object) for each in given):
@@ -343,20 +335,20 @@ def _named(regions: Sequence[Region], kind: Kind) -> list[LocatedObject]:
 
 def is_kind_asked(phrase: ObjectPhrase, question: Question) -> bool:
     """Whether a phrase is that of a kind asked about, and of no one thing."""
-    asked = read_asked(question)
+    asked = question.asked
     return asked is not None and any(kind_of(name) and name.endswith(phrase.text.lower()) for name in asked.among)
 
 
 def nouns_of(question: Question, sought: Sequence[str] = ()) -> tuple[str, ...]:
     """The nouns of the things that a question names, and of further words, each once."""
-    changed = (each for change in question.interventions for each in (change.object, *change.targets))
-    asked = read_asked(question)
+    changed = (each for change in question.changes for each in (change.object, *change.targets))
+    asked = question.asked
     kinds = (kind_of(name) for name in (() if asked is None else asked.among))
     named = (question.mover, *question.others, *changed, *map(parse_noun_phrase, sought))
     phrases = [each for each in named if each is not None]
     phrases += [each.place.of for each in phrases if each.place is not None and each.place.of is not None]
     phrases += [kind.phrase for kind in kinds if kind is not None]
-    return tuple(dict.fromkeys(each.noun for each in phrases if each.noun and each.is_thing))
+    return tuple(dict.fromkeys(each.noun for each in phrases if each.noun))
 
 
 def with_found(scene: Scene, found: Sequence[SeenThing]) -> Scene:

@@ -5,20 +5,24 @@ from collections.abc import Sequence
 from typing import TypedDict, TypeVar
 
 from cow_service.errors import CannotGround, CannotReadDirection
-from cow_service.physics.camera import depth_motion
+from cow_service.perception.facing import facing
+from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
-from cow_service.readers.embedded.english.lexicon import QuantityWords
-from cow_service.readers.embedded.english.motion import MotionWords, OtherWords, StepWords
-from cow_service.readers.embedded.english.noun_phrases import shape_of
-from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.matching import best_matches, describe, match_one
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
+from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
+from cow_service.readers.embedded.english.questions import MotionWords, Question, StepWords
+from cow_service.readers.embedded.matching import best_matches, describe, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, Until, Vector
-from cow_service.vision.scene import Scene
+from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, MotionKind, Until, Vector
+from cow_service.vision.masks import is_same_object
+from cow_service.vision.scene import Scene, arrow_of
 from cow_service.vision.trails import trail_of
 
 NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
+AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
+_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
+_RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
 
 _T = TypeVar("_T")
 
@@ -88,11 +92,11 @@ def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | Loc
     raise CannotReadDirection(fault, remedy=GIVE_DIRECTION)
 
 
-def other_readings(scene: Scene, others: Sequence[OtherWords], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
+def other_readings(scene: Scene, others: Sequence[tuple[ObjectPhrase, MotionWords]], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
     """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
     readings: list[OtherMotionReading] = []
-    for other in others:
-        name, motion, kind = other.object.text, other.motion, other.motion.kind or "linear"
+    for phrase, motion in others:
+        name, kind = phrase.text, motion.kind or "linear"
         found = next((each for each in grounding.others if each.object == name), None)
         if found is None:
             raise CannotReadDirection(f"'{name}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
@@ -178,3 +182,110 @@ def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> Motio
         f"found in the image.",
         remedy=GIVE_DIRECTION,
     )
+
+
+def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionReading:
+    """Kind and direction by the words, else by the only arrow or trail. Raises `CannotReadDirection`."""
+    words, name = question.motion, grounding.object
+    kind = words.kind or "linear"
+    if question.unread_motion:
+        unread = "', '".join(question.unread_motion)
+        raise CannotReadDirection(f"How the {name} moves was not understood: '{unread}'.", remedy=GIVE_DIRECTION)
+    if kind == "static" and question.names_direction:
+        raise CannotReadDirection(
+            f"The question says that the {name} does not move, and speaks of a direction all the same: "
+            f"which is meant was not understood.",
+            remedy=GIVE_DIRECTION,
+        )
+    if words.is_contradictory:
+        raise CannotReadDirection(
+            f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict "
+            f"each other: which is meant was not understood.",
+            remedy=GIVE_DIRECTION,
+        )
+    refuse_unclear_fall(scene, words, grounding)
+    if kind not in DIRECTED_KINDS:
+        return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
+    if scene.side_view is not None and words.direction == (0.0, 1.0) and kind == "linear":
+        return MotionReading("fall", None, "gravity")  # down a slope, or over an edge, by its weight
+    if scene.side_view is not None and words.depth:
+        raise CannotReadDirection(
+            "The image is a drawing seen from the side: nothing in it moves towards the viewer, or away.",
+            remedy=GIVE_DIRECTION,
+        )
+    said = _as_said(scene, words, kind, grounding)
+    if said is not None:
+        return said
+    if words.forward is None:
+        return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
+    # Forward or backward, by the way that a vehicle is seen to face.
+    told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
+    if not is_vehicle(name):
+        raise CannotReadDirection(
+            f"{told} The embedded reader sees only of vehicles with wheels which way they face.",
+            remedy=GIVE_DIRECTION,
+        )
+    way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
+    if way is None:
+        raise CannotReadDirection(f"{told} Which way it faces could not be seen for certain.", remedy=GIVE_DIRECTION)
+    return MotionReading(kind, way if words.forward else (-way[0], -way[1]), "orientation")
+
+
+def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grounding) -> MotionReading | None:
+    """The motion whose direction the words give; None if they give none."""
+    if words.along_arrow is not None:
+        x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
+        along = words.along_arrow
+        x, y = (x, y) if along else (-x, -y)
+        said = words.direction or (x, y)
+        if x * said[0] + y * said[1] < AGREES * math.hypot(x, y) * math.hypot(*said):
+            raise CannotReadDirection(
+                "The question names the arrow and another direction, and the arrow does not point there.",
+                remedy=GIVE_DIRECTION,
+            )
+        return MotionReading(kind, (x, y), "arrow", along_arrow=along)
+    if words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth:
+        direction, depth = depth_motion(-math.copysign(1.0, words.direction[1]))  # up the image is away on the floor
+        return MotionReading(kind, direction, "text", depth=depth)
+    if words.direction is not None:
+        rises = words.verb in _RISES and words.direction[1] < 0
+        return MotionReading(kind, words.direction, "text", depth=words.depth, rises=rises)
+    if words.depth:
+        direction, depth = depth_motion(words.depth)
+        return MotionReading(kind, direction, "text", depth=depth)
+    if words.towards is not None:
+        goal = goal_of(scene, words.towards, grounding)
+        return MotionReading(kind, way_to(goal.bbox, grounding.bbox, kind == "linear"), "text", towards=goal)
+    return None
+
+
+def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
+    """Along the only arrow drawn at the mover, where the question names no direction at all."""
+    near = scene.arrows_near(grounding.bbox)
+    if near and question.names_direction:
+        raise CannotReadDirection(
+            "The question has words of direction that could not be read as the motion's, so the drawn arrow was "
+            "not followed either.",
+            remedy=GIVE_DIRECTION,
+        )
+    if len(near) != 1:
+        raise CannotReadDirection(
+            "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
+            f"image shows {len(near) or 'no'} arrow{'s' if len(near) > 1 else ''} at the {grounding.object}.",
+            remedy=GIVE_DIRECTION,
+        )
+    note = "The question names no direction; the arrow drawn at the object was followed."
+    return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
+
+
+def goal_of(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> LocatedObject:
+    """The thing that the mover moves towards. Raises `CannotReadDirection`."""
+    goal = next((other for other in grounding.others if other.object == phrase.text), None)
+    if goal is not None:
+        return goal
+    besides = [each for each in scene.regions if not is_same_object(each.bbox, grounding.bbox)]
+    region = match_one(besides, phrase)
+    if region is None:
+        told = unclear(phrase, best_matches(besides, phrase), besides)
+        raise CannotReadDirection(f"Where the {grounding.object} moves to is not clear: {told}.", remedy=GIVE_DIRECTION)
+    return LocatedObject(object=phrase.text, bbox=region.bbox)

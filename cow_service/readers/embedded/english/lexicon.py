@@ -1,17 +1,11 @@
-"""The closed word lists of `lexicon.toml`, and what a text is made of: items, noun phrases and words."""
+"""The closed word lists. Nouns are an open set and have none: a noun is what no list claims."""
 
-from __future__ import annotations
-
-import re
-import tomllib
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from importlib.resources import files
 from typing import Literal, NamedTuple
 
 from cow_service.readers.base import Quantity, SpeedWord
-from cow_service.records import MotionKind, Until, Vector
+from cow_service.records import MotionKind, Until
 
 
 def words(*lists: str) -> frozenset[str]:
@@ -19,97 +13,157 @@ def words(*lists: str) -> frozenset[str]:
     return frozenset(word for text in lists for word in text.split())
 
 
-TABLES: dict[str, dict[str, str]] = tomllib.loads(
-    files("cow_service.readers.embedded.english").joinpath("lexicon.toml").read_text(encoding="utf-8")
-)
-SETS = {name: words(text) for table in ("sets", "verbs", "of_verbs") for name, text in TABLES[table].items()}
-
-COLOURS: dict[str, str] = {word: name for name, text in TABLES["colours"].items() for word in text.split()}
-_VECTORS: dict[str, Vector] = {"left": (-1.0, 0.0), "right": (1.0, 0.0), "up": (0.0, -1.0), "down": (0.0, 1.0)}
-DIRECTIONS = {word: _VECTORS[way] for way, text in TABLES["directions"].items() for word in text.split()}
-NUMBER_WORDS = {word: value for value, word in enumerate(TABLES["sets"]["numerals"].split(), 1)}
-NUMERALS = NUMBER_WORDS | {"twenty": 20, "thirty": 30, "forty": 40, "fifty": 50, "sixty": 60, "hundred": 100}
-NOUNS = words(*TABLES["shapes"].values())
-METRES = {  # of a unit of length
-    word: float(text.split()[0])
-    for unit, text in TABLES["metres"].items()
-    for word in (unit, *text.split()[1:])
+COLOURS = {
+    word: text.split()[0]
+    for text in (
+        "red crimson scarlet maroon burgundy reddish", "orange amber", "yellow gold golden yellowish",
+        "green emerald greenish", "cyan teal turquoise aqua aquamarine", "blue navy azure cobalt bluish",
+        "purple violet lavender lilac indigo", "pink magenta fuchsia", "brown tan beige khaki bronze", "black",
+        "white ivory", "grey gray silver greyish",
+    )
+    for word in text.split()
 }  # fmt: skip
 NEARLY = 0.8  # difflib's ratio from which a word is nearly a colour's name
-PLACES = DIRECTIONS.keys() | SETS["places"]
-DETERMINERS, VAGUE_DETERMINERS = SETS["determiners"], SETS["vague_determiners"]
-CONDITIONALS, AUXILIARIES, BE, NEGATIONS = (SETS[n] for n in ("conditionals", "auxiliaries", "be", "negations"))
-CAUSATIVES, MOVER_PRONOUNS = SETS["causatives"], SETS["mover_pronouns"]
-FUNCTION_WORDS = AUXILIARIES | BE | NEGATIONS | CONDITIONALS | CAUSATIVES | MOVER_PRONOUNS | SETS["function_words"]
-CLOSED = FUNCTION_WORDS | DETERMINERS
-AGENTS, GENERIC, SCENERY = SETS["agents"], SETS["generic"], SETS["scenery"]
-ABSTRACT = PLACES | SETS["viewers"] | SETS["abstract"]
-NO_THINGS = ABSTRACT | SCENERY
-TOUCH, OCCLUDE, LAND = SETS["touch"], SETS["occlude"], SETS["land"]
-ARROWS = frozenset(["arrow", "arrowhead"])
-PUNCTUATION = frozenset(".,;:?!()—–")
-ENDS = frozenset(".?!;")  # of a sentence
+ADJECTIVES = words("""
+big large huge giant small little tiny mini tall short long wide narrow thick thin high low deep heavy light round
+square flat hollow empty full open closed shiny glossy dark pale bright transparent clear wooden metal metallic plastic
+glass rubber paper ceramic stone leather steel cardboard soft hard smooth rough old new other same different nearest
+closest farthest furthest nearby leftmost rightmost topmost second third last single main larger smaller bigger taller
+shorter largest smallest biggest tallest shortest far slow fast central front rear back middle center centre left right
+top bottom upper lower toy model billiard pool snooker tennis striped two three four five pointy fuzzy latest oldest""")
+PLACES = words("left right top bottom upper lower front back middle center centre")
+DETERMINERS = words("""
+the a an this that these those its his her their my your our another each every any some which what both either neither all
+no""")
+PRONOUNS = words("it they them itself he she that this these those one ones itself others")
+FLOORS = "floor|ground|surface|carpet|grass|pavement|street|road|tabletop|counter|sky"
+IMAGES = "image|picture|photo|photograph|scene|frame|view"
+TABLES = words("table desk tabletop")
+AGENTS = words("""
+person man woman boy girl child kid player human user people robot arm hand wind gust finger foot driver toddler
+friend somebody someone anyone anybody nobody i you we he she cat dog""")
+GENERIC = words("object objects thing things item items one ones body bodies obstacle obstacles")
+FUNCTION = words("""
+will be get have let make cause allow to of in inside within on onto upon into at toward towards from off over under
+below above beneath beside near by with along against across through around past behind before between among via per
+about as like than during until till for out outside and or but then so because whether since though how where why if
+when while once suppose supposing imagine assume assuming given after unless not never there here who whom whose that
+which what safe still first next together away up down close closer also ever just already always only even perhaps
+maybe else opposite due parallel backward too much more most than yes ok now freely able free true false same twice
+halfway alone throughout again later soon long instead except rather anywhere nowhere everywhere somewhere without
+straight directly well possible visible unobstructed unoccluded uncovered untouched upright motionless stationary
+nothing anything something everything i you we us me him them they it its itself itself's due such upside""")
+MOTIONS: dict[MotionKind, frozenset[str]] = {
+    "linear": words("""
+move roll slide go drive travel push pull drag blow shove kick nudge flick tap glide skid drift advance proceed head
+run speed dash sail crawl shift steer reverse accelerate cruise float carry transport lift raise rise climb ascend
+descend lower continue scoot creep coast retreat send march trundle shunt aim translate start set keep come"""),
+    "projectile": words("throw toss launch hurl shoot fly fire chuck bounce"),
+    "fall": words("fall drop release tumble topple plummet plunge collapse tip detach"),
+    "static": words("stay remain rest stand"),
+}
+_OTHER = words("""
+hit touch collide bump strike reach knock crash contact smash meet impact ram graze whack smack bang slam occlude hide
+block cover obscure conceal overlap eclipse obstruct disappear vanish land settle happen occur end stop halt fit miss avoid prevent
+remove delete erase eliminate exclude take put place insert position pass leave overturn displace budge change
+differ clear pick want finish change mean go smash eclipse""")
+CAUSES = words("""
+move roll slide push pull drag blow shove kick nudge flick tap shift carry lift raise lower throw toss launch hurl
+shoot fire chuck bounce drop release topple tip drive steer send shunt aim""")  # "push the ball to the left"
+_DOUBLED = words("travel drag skid drop tap hop run tip ram hit fit stop get let put set")
+_IRREGULAR = {
+    "go": "went gone", "drive": "drove driven", "run": "ran", "rise": "rose risen", "keep": "kept", "creep": "crept",
+    "come": "came", "send": "sent", "speed": "sped", "throw": "threw thrown", "blow": "blew blown", "shoot": "shot",
+    "fly": "flew flown", "fall": "fell fallen", "stand": "stood", "hit": "", "strike": "struck", "meet": "met",
+    "hide": "hid hidden", "slide": "slid", "take": "took taken", "put": "", "set": "", "leave": "",
+    "get": "got gotten", "make": "made", "let": "", "mean": "meant", "begin": "began begun",
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Verb:
-    """One inflected form of a verb. `kind` is None for a verb that is not a way to move."""
+class Verb(NamedTuple):
+    """An inflected form of a verb."""
 
     lemma: str
     form: Literal["base", "s", "past", "ing"]
-    kind: MotionKind | None
 
 
-def _inflect(lemma: str, kind: MotionKind | None) -> dict[str, Verb]:
-    """The forms of a verb."""
-    stem = lemma + lemma[-1] if lemma in SETS["doubled"] else lemma.removesuffix("e")
+def _inflected(lemma: str) -> dict[str, Verb]:
+    stem = lemma + lemma[-1] if lemma in _DOUBLED else lemma.removesuffix("e")
     third, past = f"{lemma}s", f"{stem}ed"
     if lemma.endswith("y") and lemma[-2] not in "aeo":
         third, past = f"{lemma[:-1]}ies", f"{lemma[:-1]}ied"
     elif lemma.endswith(("s", "x", "ch", "sh", "o")):
         third = f"{lemma}es"
-    forms = {third: Verb(lemma, "s", kind), f"{stem}ing": Verb(lemma, "ing", kind)}
-    forms |= dict.fromkeys(TABLES["irregular_verbs"].get(lemma, past).split(), Verb(lemma, "past", kind))
-    return forms | {lemma: Verb(lemma, "base", kind)}
+    pasts = dict.fromkeys(_IRREGULAR.get(lemma, past).split(), Verb(lemma, "past"))
+    return {third: Verb(lemma, "s"), f"{stem}ing": Verb(lemma, "ing"), **pasts, lemma: Verb(lemma, "base")}
 
 
-_KINDS: dict[str, MotionKind | None] = dict.fromkeys(TOUCH | OCCLUDE | LAND | SETS["other"])
-_MOTIONS: tuple[MotionKind, ...] = ("linear", "projectile", "fall", "static")
-_KINDS.update((lemma, kind) for kind in _MOTIONS for lemma in SETS[kind])
-VERBS = {word: Verb(word, "past", None) for word in SETS["participles"]}
-VERBS.update(form for lemma, kind in _KINDS.items() for form in _inflect(lemma, kind).items())
+VERBS = {
+    word: verb
+    for lemma in sorted(_OTHER.union(*MOTIONS.values(), words("get make let begin have")))
+    for word, verb in _inflected(lemma).items()
+}
+VERBS |= dict.fromkeys(words("is are was were be been being am"), Verb("be", "base"))
+VERBS |= dict.fromkeys(words("has had"), Verb("have", "base"))
+VERBS |= dict.fromkeys(words("would does do did can could may might shall should must"), Verb("will", "base"))
+KINDS = {lemma: kind for kind, lemmas in MOTIONS.items() for lemma in lemmas}
+
+# What a noun says of a body's shape. A vehicle is longer along its heading than across, a cube as wide as high.
+_SHAPES = {
+    "sphere": "ball sphere egg orb marble basketball football baseball balloon globe orange apple pea bead pearl bubble",
+    "box": "cube box block brick cuboid die dice book chair table desk carton parcel package crate drawer cabinet",
+    "vehicle": "car truck bus train van lorry jeep taxi tram tractor wagon locomotive boat",
+    "cube": "cube die dice",
+    "cone": "cone pyramid",
+    "cylinder": "cylinder bottle vase mug cup glass jar can candle tin tube pencil pen lamp pot bowl bucket barrel pawn "
+    "person man woman tree plant post pole",
+    "square": "box crate drawer carton case chest tray suitcase bag cart sink crib bathtub package parcel",
+    "round": "bowl cup mug glass jar pot pan bucket barrel bin basket vase tin can dish goblet teacup pitcher jug tub "
+    "flowerpot saucepan container pail beaker tumbler cauldron urn hat",
+}
+NOUNS = {shape: words(text) for shape, text in _SHAPES.items()}
+HOLLOW = words("bowl basket hole pocket goal bin bucket pit hoop net drawer gap garage tunnel tray pan pot")  # to roll into
+CONTAINERS = HOLLOW | (NOUNS["round"] | NOUNS["square"]) - {"vase", "can"}  # to fall into
+SOLID_NOUNS = words("glass chair book lamp robot pencil pen")  # no balls; of their outlines nothing is known
+NUMBER_WORDS = {
+    word: value
+    for value, word in enumerate(
+        "one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen".split(), 1
+    )
+}
+METRES = {
+    word: size
+    for size, text in (
+        (1.0, "m meter meters metre metres"), (0.01, "cm centimeter centimeters centimetre centimetres"),
+        (0.001, "mm millimeters millimetres"), (0.0254, "inch inches"), (0.3048, "ft foot feet"),
+    )
+    for word in text.split()
+}  # fmt: skip
+# Of options: words that carry no answer, and words of contact.
+FILLERS = words("""
+it they the a an will would does do is are be gets get with into on onto against makes make comes come there in by
+remains stays stay remain still to from view sight of passes pass out""")
+TOUCHING = words("""
+hit hits hitting touch touches touching collide collides collision contact impact strike strikes bump bumps land lands
+reach reaches touched struck""")
 
 
 def lemma(word: str) -> str:
-    """The base form of a lower case verb; empty for a word that is none."""
-    return VERBS[word].lemma if word in VERBS else ""
-
-
-def is_form(word: str, *forms: str) -> bool:
-    """Whether a lower case word is one of some forms of a verb."""
-    return word in VERBS and VERBS[word].form in forms
-
-
-def moves(verb: Verb | None) -> bool:
-    """Whether what does so changes its place."""
-    return verb is not None and verb.kind not in {None, "static"}
+    """The base form of a lower case verb; any other word as it is."""
+    return VERBS[word].lemma if word in VERBS else word
 
 
 def is_modifier(word: str) -> bool:
     """Whether a lower case word describes a noun and is none: a colour, an adjective, a participle, a place."""
-    if word in SETS["not_adjectives"]:
-        return False
-    known = any(word in listed for listed in (COLOURS, SETS["adjectives"], PLACES, NUMBER_WORDS, SETS["marked"]))
-    ending = len(word) > 4 and word.endswith(("ed", "ing", "ish", "ful", "less", "ous"))
-    return is_form(word, "past", "ing") or known or word.isdecimal() or ending
+    ing = word in VERBS and VERBS[word].form in {"past", "ing"}
+    return ing or word in COLOURS or word in ADJECTIVES or word in PLACES or word in {"marked", "highlighted", "circled"}
 
 
 def singular(noun: str) -> str:
     """A plural noun made singular, by its ending."""
-    if noun in TABLES["irregular_plurals"]:
-        return TABLES["irregular_plurals"][noun]
-    unchanged = noun in SETS["unchanged_plurals"] or noun.endswith(("ss", "us", "is"))
-    if unchanged or len(noun) < 4 or not noun.endswith("s"):
+    if noun in words("glasses scissors pants dice bus lens chess series shoes trousers jeans") or len(noun) < 4:
+        return noun
+    if not noun.endswith("s") or noun.endswith(("ss", "us", "is")):
         return noun
     if noun.endswith(("sses", "xes", "ches", "shes", "toes")):
         return noun[:-2]
@@ -121,23 +175,24 @@ class PlaceWords:
     """Where a thing is in the image: behind, in front of or nearest to another one, or to the camera (`of` is None)."""
 
     relation: str
-    of: ObjectPhrase | None
+    of: "ObjectPhrase | None"
 
 
 @dataclass(frozen=True)
 class ObjectPhrase:
     """An object as the question words it: `text` has no determiner, `noun` is the head noun, or a compound, singular.
 
-    `place` is where the image shows it, as far as the question says so by another thing.
+    `place` is where the image shows it, as far as the question says so. `is_given`: the text is the name under which
+    the caller gave it.
     """
 
     text: str
     colour: str | None
     noun: str | None
-    inside_box: bool = False
-    number: int | None = None
+    inside_box: bool = False  # drawn around it
+    path_end: str | None = None  # it stands at the "start" or the "end" of a drawn path
     place: PlaceWords | None = None
-    as_thing: bool = False  # a table, where it is more than the place of what happens
+    is_given: bool = False
 
     @property
     def head(self) -> str | None:
@@ -145,9 +200,9 @@ class ObjectPhrase:
         return self.noun.rsplit(" ", 1)[-1] if self.noun else None
 
     @property
-    def is_thing(self) -> bool:
-        """Whether it names a thing: not a place, the arrow or the image, and not the floor."""
-        return self.head is not None and (self.as_thing or self.head not in NO_THINGS)
+    def is_other(self) -> bool:
+        """Whether it is "the other one": whatever else there is."""
+        return self.text in {"other one", "other"}
 
     @property
     def words(self) -> set[str]:
@@ -157,7 +212,7 @@ class ObjectPhrase:
 
 def like_a_colour(text: str) -> str | None:
     """A word of a noun phrase that is nearly a colour's name, and no other word that is known: "grean"; or None."""
-    unknown = (word for word in text.lower().split()[:-1] if word not in SETS["adjectives"] and word not in PLACES)
+    unknown = (word for word in text.lower().split()[:-1] if word not in ADJECTIVES and word not in PLACES)
     return next((word for word in unknown if get_close_matches(word, COLOURS, 1, NEARLY)), None)
 
 
@@ -172,123 +227,3 @@ class QuantityWords:
     duration: float | None = None  # s
     until: Until | None = None
     within: float | None = None  # s: a limit for the event, not for the motion
-
-
-@dataclass(frozen=True)
-class Item:
-    """A word (`key`, lower case), a noun phrase (`phrase`) or a quantity, which has the key "~".
-
-    `words` are those of a noun phrase, determiner first, or of a quantity.
-    """
-
-    key: str
-    start: int
-    end: int
-    phrase: ObjectPhrase | None = None
-    words: tuple[str, ...] = ()
-    quantity: QuantityWords | None = None
-
-    @property
-    def thing(self) -> ObjectPhrase | None:
-        """The noun phrase, where it names a thing."""
-        return self.phrase if self.phrase is not None and self.phrase.is_thing else None
-
-
-_TOKEN = re.compile(r"\d+\.\d+|no\.(?=\s{0,3}\d)|n't\b|'s\b|#\d+|\w+?(?=n't\b)|\w+|[.,;:?!()—–]", re.IGNORECASE)
-
-
-def tokens(text: str) -> list[Item]:
-    """The words and punctuation marks of a text; a typographic apostrophe counts as a plain one."""
-    # One character for one, so that positions stay those of the text.
-    plain = text.replace("’", "'").replace(" - ", " – ")
-    return [Item(found.group().lower(), found.start(), found.end()) for found in _TOKEN.finditer(plain)]
-
-
-def key_at(found: Sequence[Item], at: int) -> str:
-    """The word at a place; a full stop outside the text, nothing for a noun phrase."""
-    return found[at].key if 0 <= at < len(found) else "."
-
-
-def phrase_at(found: Sequence[Item], at: int) -> ObjectPhrase | None:
-    """The noun phrase at a place, if there is one."""
-    return found[at].phrase if 0 <= at < len(found) else None
-
-
-def is_count(key: str) -> bool:
-    """Whether a word numbers an object, or says that a number follows."""
-    numeral = key.lstrip("#").isdecimal() or (key in NUMBER_WORDS and key != "one")
-    return numeral or key in {"number", "no", "no.", "numbered"}
-
-
-def object_phrase(text: str, keys: tuple[str, ...]) -> ObjectPhrase:
-    """The phrase with these lower case words, behind its determiners."""
-    content = [key for key in keys if not is_count(key) and key != "and"]
-    content = [key for key in content if len(key) > 1] or content  # "ball A" is a ball
-    nouns = [key for key in content[:-1] if not is_modifier(key)]
-    head = content[-1] if content else ""
-    numbered = nouns[-1] if head.isdecimal() and nouns else head
-    plural = numbered.endswith("s") and not numbered.endswith("ss") and numbered not in SETS["unchanged_plurals"]
-    number = None
-    for at, key in enumerate(keys):
-        digits, named = key.lstrip("#"), at > 0 and keys[at - 1] in {"number", "no", "no."}
-        if plural and at < len(keys) - 1 and not named and not key.startswith("#"):
-            continue  # it counts them
-        if digits.isdecimal() and len(digits) <= 6:
-            number = int(digits)
-        elif key in NUMBER_WORDS and (named or key != "one"):
-            number = NUMBER_WORDS[key]
-        if number is not None:
-            break
-    return ObjectPhrase(
-        text=" ".join(text.split()),
-        colour=next((COLOURS[key] for key in content[:-1] or content if key in COLOURS), None),
-        noun=" ".join([*nouns, singular(head)]) if content and head not in {"one", "ones"} else None,
-        inside_box=any(key in SETS["marked"] for key in content[:-1]),
-        number=number,
-    )
-
-
-class Word(NamedTuple):
-    """What rules are made of. `kind` is the terminal of a noun phrase or a pronoun; `at`, its place in the items."""
-
-    kind: str
-    text: str
-    at: int
-    phrase: ObjectPhrase | None = None
-
-
-_SAME: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(["be", "is", "are", "was", "were", "been", "am", "'s"], ("be",)),
-    **dict.fromkeys(["get", "gets", "got", "gotten"], ("get",)),
-    **dict.fromkeys(["has", "had"], ("have",)),
-    "being": ("be", "-ing"), "getting": ("get", "-ing"), "having": ("have", "-ing"), "making": ("make", "-ing"),
-    "makes": ("make",), "made": ("make",), "elapses": ("elapse",), "longer": ("long", "-er"),
-    "n't": ("not",), "cannot": ("can", "not"), "wo": ("will",), "ca": ("can",),
-}  # fmt: skip
-_BASE = {word: (verb.lemma, "-ing") if verb.form == "ing" else (verb.lemma,) for word, verb in VERBS.items()} | _SAME
-_PRONOUNS = words("it itself they them he she")
-_WITH_UNIT = re.compile(r"([0-9]+(?:\.[0-9]+)?)([a-z]+)")
-
-
-def plain_words(keys: Sequence[str], at: int) -> Iterator[Word]:
-    """Lower case words at a place for the rules: verbs in their base form, an ending "-ing" and a unit apart."""
-    for key in keys:
-        with_unit = _WITH_UNIT.fullmatch(key) if key[0].isdigit() else None
-        for text in with_unit.groups() if with_unit else _BASE.get(key, (key,)):
-            yield Word("PRONOUN" if key in _PRONOUNS else "", text, at)
-
-
-def words_of(found: Sequence[Item], start: int = 0) -> Iterator[Word]:
-    """The items from a place on as words: noun phrases that name no object, such as "the left", in their words."""
-    for at in range(start, len(found)):
-        item, phrase = found[at], found[at].phrase
-        if phrase is None:
-            yield from plain_words([item.key], at)
-            continue
-        singled_out = phrase.as_thing or phrase.colour or phrase.number is not None or phrase.inside_box
-        content = (word for word in item.words if word not in DETERMINERS)
-        nameless = phrase.head in NO_THINGS or all(word == "one" or is_modifier(word) for word in content)
-        if phrase.head in ARROWS or (nameless and not singled_out):
-            yield from plain_words(item.words, at)
-        else:
-            yield Word("AGENT" if phrase.head in AGENTS else "NP", phrase.text, at, phrase)

@@ -1,344 +1,417 @@
-"""Cuts a sentence into noun phrases, quantities and the words between them; and what a noun says of a shape.
+"""Puts a question into plain tokens: things as `X0`, idioms as one word in capitals, verbs in their base form.
 
-Nouns have no list. A phrase runs from its determiner up to a word that cannot be inside one: a function word, a verb
-form, a direction behind the noun. Positions are those of the question's own characters.
+"If the red ball rolls in the direction of the arrow, will it bump into the mug?" becomes
+"if X0 roll ALONG , will it bump into X1 ?". The sentence forms are written over these tokens.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import takewhile
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from cow_service.readers.base import Quantity, SpeedWord, Unit
+from cow_service.readers.base import Quantity, Unit
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import Node, read_from, terminals
-from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, QuantityWords, key_at
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.options import plain
 from cow_service.records import Shape
 
-_QUANTITY_WINDOW, _PLACE_WINDOW = 14, 9  # words
-_MEASURES = frozenset({"_SLOWLY", "_QUICKLY", "_SECOND", "_TEMPO", "LENGTH"})  # terminals
-_BARE = lex.words("width widths diameter diameters halfway midway until till push shove")  # measures, too
-_ADJECTIVE_BEHIND = lex.DETERMINERS | lex.COLOURS.keys() | lex.SETS["adjectives"] | lex.words("how as so is are be")
-_PARTS = {"half": 0.5, "halfway": 0.5, "twice": 2.0}
+_COLOUR = "|".join(lex.COLOURS)
+_ARROW = rf"(?:(?:the|this|that|its) )?(?:(?:{_COLOUR}|drawn|shown) )*arrow(?:head)?"
+_SAYS = r"(?:show|indicat|point|mark|draw|giv|suggest|depict|say|tell)\w*"
+_TOLD = rf"(?:(?:that |which )?(?:is |are )?(?:shown|indicated|marked|drawn|given|depicted)(?: by {_ARROW}| in IMAGE)?)"
+_WAY = r"(?:direction|way|path)"
+_TO = r"(?:(?:straight|directly|further|over|across|off|back|away|diagonally|all the way|closer|nearer) )*"
+_NUMBER = r"(\d+(?:\.\d+)?|half an?|an?|" + "|".join((*lex.NUMBER_WORDS, "ten", "twenty", "thirty", "fifty")) + ")"
+_ABOUT = r"(?:(?:about|only|just|roughly|approximately|exactly) )?"
+_LENGTH = "(" + "|".join(("px", "pixels?", *lex.METRES)) + r")\b"
+_SECOND = r"(?:seconds?|secs?|s)\b"
+_HALT = r"(?:,? (?:but |and )?(?:then )?(?:it )?(?:stops|halts|pauses)(?: dead| there)?\b)?"
+_THINGS = r"(?:objects?|things?|items?|obstacles?|bod(?:y|ies))"
+
+# Idioms, each with what stands in its place; in this order.
+IDIOMS = tuple((re.compile(rf"(?<![\w'-])(?:{idiom})(?![\w'-])"), token) for idiom, token in (
+    # Words around the question that change nothing.
+    (r"[\"“”'‘’]\w+(?: \w+)*[\"“”'‘’] means [^.?!]*[.?!]?", ""),  # "Fit into" means that ...
+    (r"(?:^|(?<=[.?!] ))(?:question ?\d* ?:|quick question:?|excuse me,|(?:ok|okay|so|now|well|right|hi|hello|hey|and)(?: so)?,?)(?= )", ""),
+    (r", (?:right|okay|ok)(?= ?[?.])|(?:, )?(?:yes or no|or not)(?= ?[?.])|\(yes ?/ ?no\)|if any(?= ?[?.,])", ""),
+    (r"(?:please )?(?:can|could|would) you (?:please |kindly )?(?:tell me|say|predict|let me know),? (?:whether|if)", "ASK"),
+    (r"i wonder (?:whether|if)|(?:please )?(?:tell|let) me (?:know )?(?:whether|if)|what i(?:'d| would) like to know is whether", "ASK"),
+    (r"(?:do you think|would you say|is it true)(?: that)?|(?:is|are) there (?:any|a) (?:chance|risk|danger|way) (?:of|that|for)|any (?:chance|risk|danger) (?:of|that)", "ASK"),
+    (r"true or false ?[:?,]?", "CLAIM"),
+    (r"let's (?:say|assume|suppose|imagine)(?: that)?|(?:^|(?<=[.?!] ))say(?: that)?|provided(?: that)?", "if"),
+    (rf"(?:forget|ignore) {_ARROW}(?: and|,)?", ""),
+    (r"giv(?:es?|ing|en) (?:to )?((?:the |a )?[^,.?]+?|it) an? (?:\w+ )*?(push|shove|kick|nudge|flick)", r"push \1"),
+    (r"(?:the )?(?:very )?(?:tip|top) of|(?:the|its) edge of(?= the| [XN])", ""), (r"backs? up|backed up", "move BACKWARD"),
+    (r"please|kindly|pretty|what if", lambda found: "if" * (found[0] == "what if")),
+    (r"(?:on|along|in|during) (?:its|the|this) (?:way|flight|course|fall|journey|path|motion|movement)(?: (?:there|down|over|up|along))?(?! (?:of|by|that|which|where|shown)| (?:the |that |this )?arrow)", ""),
+    (r"along the way|in the (?:process|end)|at the end(?! of)|as a result|at all|in total|altogether|eventually|actually|thereby|afterwards|simply|just|also|ever|suddenly|anyway", ""),
+    (r"gonna|going to", ""), (r"carr(?:y|ies) on|keeps? on|keeps?(?= \w+ing)", "continue"), (r"sets? off", "go"), (r"at the (?:very )?same (?:time|moment|instant)|simultaneously|at once", "while"),
+    (r"before (?:it|that ball|the \w+ ball) (?:hits|reaches|touches|gets to) (?:a|the|any|one) (?:cushion|rail|wall|edge)s?", ""),
+    (r"(?:get in the way of|block\w*|obstruct\w*) (?:(?:the|our|my|your) )?(?:view|sight) of|(?:(?:be|is) )?(?:pass\w*|mov\w+|goes|go|come|stand\w*) in front of|(?:be|is|get) in front of", "hide"),
+    (r"(?:from|out of) (?:the |our |my )?(?:view|sight)|from us", ""),
+    # What is looked at, and where that stands.
+    (r"there (?:is|are|was)(?= an? | the | N)", "THERE"),
+    (rf"(?:the|this|that) (?:{'|'.join(lex.IMAGES.split('|'))})", "IMAGE"),
+    (rf"(?:the|its) (?:{lex.FLOORS})", "FLOOR"),
+    (rf"(?:the )?(?:first|last|next) (?:{_THINGS}|one)(?: that)?", lambda found: "FIRST" if "first" in found[0] else found[0]),
+    (rf"(?:any|another|some|an?|a single|one of the|any of the)(?: other)? {_THINGS}(?: else)?|(?:any|some)thing(?: else)?|any of (?:them|these|those)", "ANY"),
+    (rf"nothing(?: else)?|no(?: other)? {_THINGS}|none of (?:them|the {_THINGS})", "NONE"),
+    (rf"(?:which|what) (?:of (?:the|these|those) )?(?:other )?(?:{_THINGS}|ones?)(?: of (?:them|these|those|the {_THINGS}))?|which of (?:(?:the )?(?:two|three|four)|them|these|those)(?= (?:will|would|does|is|gets|it|do))", "WHICH"),
+    (rf"how many (?:of )?(?:the )?(?:other )?{_THINGS}", "HOWMANY"),
+    (r"at what (?:time|moment|point|instant)", "when"), (r"each other|one another", "EACH"), (r"(?:these|those|the) two(?= (?:ever |then )?(?:collide|meet|touch|hit|crash|run|bump|running))|both of them", "they"),
+    # Which way.
+    (rf"(?:in |into |along )?(?:exactly )?(?:the )?(?:opposite|reverse|contrary) (?:{_WAY} )?(?:to |of |from )?(?:the {_WAY} )?(?:of |to |in which |that |shown by |indicated by |where )?(?:{_ARROW}|(?:this|that) {_WAY})(?: (?:is )?{_SAYS})?", "AGAINST"),
+    (rf"against (?:the {_WAY} of )?{_ARROW}|(?:in |exactly )*the (?:opposite|reverse|other) {_WAY}|away from where {_ARROW} {_SAYS}|in {_ARROW}'s opposite {_WAY}|opposite to (?:the )?(?:shown|indicated) {_WAY}|opposite to (?:this|that|the) {_WAY}", "AGAINST"),
+    (rf"(?:exactly )?(?:(?:in|into|towards?|along|to|following|given|by) )?(?:exactly )?the (?:same )?{_WAY} (?:(?:of|in which|that|which|where|to which|towards which) )?(?:the )?(?:{_TOLD}|{_ARROW}(?: (?:is )?{_SAYS})?)", "ALONG"),
+    (rf"(?:in|into|along|towards?|to|following|follows?) (?:this|that|the (?:shown|indicated|marked|drawn|given|depicted|specified)|{_ARROW}(?:'s)?) {_WAY}", "ALONG"),
+    (rf"follow(?:s|ing|ed)? {_ARROW}", "move ALONG"),
+    (rf"(?:along|with|by) {_ARROW}|(?:where|as|like|how|the way) {_ARROW}(?: is)? {_SAYS}|(?:as|like) (?:it is )?(?:shown|drawn|indicated|marked|depicted)(?: by {_ARROW}| in IMAGE)?|(?:this|that) way", "ALONG"),
+    (r"(?:in|along) the (?:direction|way) (?:that )?(?:it|its \w+)(?:'s| is| are)? (?:fac|point|head)\w+|the way (?:that )?(?:it|its \w+)(?:'s| is| are)? (?:fac|point)\w+|(?:straight |nose )?(?:forwards?|ahead|first)(?<!straight first)(?<! first)|straight on", "FORWARD"),
+    (r"(?:straight )?backwards?|in reverse|tail first", "BACKWARD"),
+    (rf"{_TO}(?:towards?|to|at) (?:the |our )?(?:camera|viewer|observer|us|me)|(?:closer|nearer) to (?:the )?(?:camera|viewer)", "NEAR"),
+    (rf"{_TO}(?:away from|deeper into) (?:the )?(?:camera|viewer|observer|us|me|IMAGE)|into the (?:background|distance)|away(?= ?[,.?]|$| for | by )", "AWAY"),
+    *((rf"{_TO}(?:(?:to|towards?|into) (?:the|its) (?:far )?{word}(?:[ -]hand)?(?: side| edge| end| corner)?(?: of IMAGE)?(?! (?:of|edge|side) )|{word}wards?)", token)
+      for word, token in (("left", "LEFT"), ("right", "RIGHT"), ("top", "UP"), ("up", "UP"), ("bottom", "DOWN"), ("down", "DOWN"))),
+    (r"freely|straight down|vertically", "FREELY"), (r"from (?:its|the) (?:current|present|original|starting) (?:position|place)|from (?:where it is(?: now)?|there|rest)", ""),
+    (r"(?:on |further )?(?:along|following|follows?|continu\w+(?: on| along)?|as|on) (?:its|the|this|that) (?:\w+ )?(?:trail|trajectory|path|row)(?: of (?:its |the )?(?:earlier |past |previous )?(?:positions|places))?(?: (?:(?:that|which) (?:is|are) )?shown)?(?: suggests)?", "TRAIL"),
+    # How it is put that something is hit or hidden.
+    (r"(?:mak\w+|made) (?:\w+ )?contact with|(?:com\w+|came|gets?|got|is|be) in(?:to)? (?:\w+ )?contact with|com\w+ across", "hit"),
+    (r"(?:mak\w+|made) (?:\w+ )?contact", "collide"),
+    (r"(?:(?:the|a|any|this|that|physical|further) )*collisions?|(?:(?:the|a|any|this|that|physical) )+(?:contact|crash|impact)s?", "CRASH"),
+    (r"(?:at|in|for) (?:some|any|one|a) (?:brief |short )?(?:point|moment|time|stage|instant|while)(?: in time)?(?: (?:of|during) (?:its|the) \w+)?", "SOMETIME"),
+    (r"(?:at least )?(?:partly|partially|in part)|even if just a (?:bit|part) of it|(?:at least )?(?:a |any |some )?part of", "PARTLY"),
+    (r"get\w* rid of|got rid of", "remove"), (r"(?:is|are|was|were|be|had been|has been) (?:already )?(?:gone|absent|missing)|(?:is|are|was|were|had|has) (?:not|never) (?:been )?(?:there|here|present)", "VANISHED"),
+))  # fmt: skip
+_CONTRACTED = ((r"\bcan ?not\b", "can not"), (r"\bwo ?n't\b", "will not"), (r"\bca n't\b|\bcan't\b", "can not"), (r"n't\b", " not"),
+    (r"\b(what|where|it|there|that|here|who|which)'s\b", r"\1 is"), (r"\bwhat's\b", "what is"), (r"\bit'd\b", "it would"), (r"\bi'd\b", "i would"))  # fmt: skip
+_TOKEN = re.compile(r"N\d+N|[A-Z]+\d*|\d+(?:\.\d+)?|[a-z]+(?:['-][a-z]+)*|\w+|[.,;:?!()-]")
+_BEHIND_NOUN = lex.words("safe both last earlier hard each together neither either nearest closest farthest able")
 
 
-def _joined(found: Sequence[Item], join: Callable[[int], tuple[Item, int] | None]) -> list[Item]:
-    """The items, some runs as one: `join` gives the one for a run that begins at a place, and the place behind it."""
-    kept: list[Item] = []
+@dataclass(frozen=True)
+class Tokens:
+    """A question in plain tokens; `said` are its words in their place, `things` those of `X0`, `X1`, ..."""
+
+    plain: tuple[str, ...]
+    said: tuple[str, ...]
+    things: tuple[ObjectPhrase, ...]
+    quantities: tuple[QuantityWords, ...]
+
+
+@dataclass
+class _Reader:
+    """What is made of the words from first to last."""
+
+    names: Sequence[str]
+    things: list[ObjectPhrase] = field(default_factory=list[ObjectPhrase])
+    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
+    plain: list[str] = field(default_factory=list[str])
+    said: list[str] = field(default_factory=list[str])
+    going: list[str] = field(default_factory=list[str])
+
+    def add(self, token: str, said: str) -> None:
+        self.plain.append(token)
+        self.said.append(said)
+
+    def thing(self, phrase: ObjectPhrase) -> str:
+        """The token of a thing: one that was named before keeps its own."""
+        known = next((at for at, each in enumerate(self.things) if plain(each.text) == plain(phrase.text)), None)
+        if known is None:
+            self.things.append(phrase)
+        return f"X{len(self.things) - 1 if known is None else known}"
+
+
+def tokens_of(text: str, names: Sequence[str] = ()) -> Tokens:
+    """The question in plain tokens. A given name that stands in it is a name there, whatever its words."""
+    text = " ".join(text.replace("’", "'").lower().split())
+    for idiom, said in _CONTRACTED:
+        text = re.sub(idiom, said, text)
+    text = re.sub(r" [–—-] |[:—–]", " , ", text)
+    reader = _Reader(names)
+    for at, name in sorted(enumerate(names), key=lambda each: -len(each[1])):
+        words = r"\s+".join(map(re.escape, name.lower().split()))
+        text = re.sub(rf"(?<![\w'-]){words}(?![\w'-])", f"N{at}N", text)
+    text = _with_quantities(text, reader.quantities)
+    for idiom, token in IDIOMS:
+        text = " ".join(idiom.sub(token, text).split())
+    words = _TOKEN.findall(text)
     at = 0
-    while at < len(found):
-        item, at = join(at) or (found[at], at + 1)
-        kept.append(item)
-    return kept
+    while at < len(words):
+        at = _read_phrase(reader, words, at)
+    return Tokens((*reader.plain, *reader.going), (*reader.said, *reader.going), tuple(reader.things), tuple(reader.quantities))
 
 
-def _with_quantities(found: Sequence[Item]) -> list[Item]:
-    """The words of a question, each quantity in them joined to one item."""
-    measures = [item.key[0].isdigit() or item.key in _BARE or bool(_MEASURES & terminals(item.key)) for item in found]
-
-    def join(at: int) -> tuple[Item, int] | None:
-        key, before = found[at].key, key_at(found, at - 1)
-        adjective = key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND
-        place = key in _PARTS and key_at(found, at + 1) == "between"
-        if adjective or place or before == "number" or not any(measures[at : at + 8]):
-            return None
-        parsed = read_from("quantity", found, at, _QUANTITY_WINDOW)
-        if parsed is None:
-            return None
-        tree, end = parsed
-        words = tuple(item.key for item in found[at:end])
-        return Item("~", found[at].start, found[end - 1].end, None, words, _read_quantity(tree)), end
-
-    return _joined(found, join)
+def _value(word: str) -> float:
+    if word[0].isdigit():
+        return float(word)
+    numbers = lex.NUMBER_WORDS | {"twenty": 20, "thirty": 30, "fifty": 50, "a": 1, "an": 1}
+    return 0.5 if word.startswith("half") else float(numbers[word])
 
 
-def _read_quantity(tree: Node) -> QuantityWords:
-    names = tree.names
-    part = next((_PARTS[name] for name in names if name in _PARTS), None)
-    numeral = next((word.text for word in tree.words if word.text in lex.NUMERALS or word.text[0].isdigit()), None)
-    number = part or (1.0 if numeral is None else float(lex.NUMERALS.get(numeral, numeral)))  # 1 for "a second"
-    length = next((node.words[0].text for node in tree.find("length")), None)
-    units: tuple[float, Unit, Unit] = (1.0, "px", "px/s")
-    size, unit, per_second = (lex.METRES[length], "m", "m/s") if length in lex.METRES else units
-    match names[1]:
-        case "speed":
-            pace: SpeedWord = "fast" if {"slow", "slowly"}.isdisjoint(names) else "slow"
-            said = QuantityWords(speed=pace if length is None else Quantity(number * size, per_second))
-        case "distance" if "own_width" in names:
-            said = QuantityWords(own_widths=number)
-        case "distance":
-            said = QuantityWords(distance=Quantity(number * size, unit))
-        case "until":
-            said = QuantityWords(until="contact")
-        case "limit":
-            said = QuantityWords(within=number)
-        case "duration":
-            said = QuantityWords(duration=number)
-        case _:
-            said = QuantityWords(share=number)
-    return said
+_QUANTITIES: tuple[tuple[str, str], ...] = (
+    (rf"(?:(?:at|with) )?(?:(?:a|an) )?(?:(?:constant|steady|initial) )?(?:(?:speed|velocity|pace) (?:of |is )?)?{_ABOUT}{_NUMBER} ?{_LENGTH} ?(?:per|/|an?) ?(?:second|sec|s)\b", "speed"),
+    (r"(?:(?:very|quite|rather) )?(slowly|gently|softly|lightly|slow)|(?:at|with) (?:a )?(low|slow|small) speed|at (?:a )?(constant|steady) (?:speed|velocity)", "slow"),
+    (r"(?:(?:very|quite|rather) )?(quickly|rapidly|swiftly|fast|hard|forcefully)|(?:at|with) (?:a )?(?:high|full|great) speed", "fast"),
+    (rf"(?:within|in less than|in under) {_ABOUT}{_NUMBER} {_SECOND}|(?:within|in|for|during) the first (?:{_NUMBER} )?{_SECOND}(?: of (?:its|the) \w+)?", "within"),
+    (rf"(?:for|during) {_ABOUT}{_NUMBER} {_SECOND}{_HALT}", "duration"),
+    (rf"(?:(?:though )?(?:by|for) )?{_ABOUT}(?:a distance of )?{_NUMBER} ?{_LENGTH}{_HALT}", "distance"),
+    (rf"(?:by |though )*{_ABOUT}(twice|{_NUMBER[1:-1]}) (?:times |of )?its own (?:width|diameter)s?{_HALT}", "own_widths"),
+    (rf"(?:,? (?:but|and|then) )?(?:(?:it )?(?:stops?|only goes|goes) )?(?:halfway|midway)(?! between){_HALT}", "share"),
+    (r"(?:until|till) it (?:hits|meets|touches|reaches|runs into|bumps into) (?:some|any)thing(?: else)?", "until"),
+)  # fmt: skip
+_COMPILED = tuple((re.compile(rf"(?<![\w'-]){idiom}(?![\w'-])"), what) for idiom, what in _QUANTITIES)
 
 
-MAX_WORDS = 12  # of one phrase; what is longer is no phrase
-# Behind a noun they are no part of it: "the ball and the mug both move".
-_BEHIND = lex.words(
-    "safe both twice earlier later last hard all each together neither either nearest closest able farthest"
-)
-_NUMBERED = lex.words("with labeled labelled marked numbered bearing carrying saying called")
-_FINITE_BE = lex.words("be is are was were 's")
+def _with_quantities(text: str, found: list[QuantityWords]) -> str:
+    """The text, each quantity as `Q0`, `Q1`, ...; what a name says ("the slow ball") is none."""
+
+    def read(match: re.Match[str], what: str) -> str:
+        groups = [group for group in match.groups() if group is not None]
+        value = _value(groups[0]) if groups and what not in {"slow", "fast"} and groups[0] != "twice" else 2.0
+        size, unit = lex.METRES.get(groups[-1], 1.0) if groups else 1.0, "m" if groups and groups[-1] in lex.METRES else "px"
+        units: tuple[Unit, Unit] = ("m", "m/s") if unit == "m" else ("px", "px/s")
+        match what:
+            case "speed":
+                said = QuantityWords(speed=Quantity(value * size, units[1]))
+            case "slow":
+                if groups[0] in {"constant", "steady"}:
+                    return ""
+                said = QuantityWords(speed="slow")
+            case "fast":
+                said = QuantityWords(speed="fast")
+            case "within":
+                said = QuantityWords(within=value if groups else 1.0)
+            case "duration":
+                said = QuantityWords(duration=value)
+            case "distance":
+                said = QuantityWords(distance=Quantity(value * size, units[0]))
+            case "own_widths":
+                said = QuantityWords(own_widths=value)
+            case "share":
+                said = QuantityWords(share=0.5)
+            case _:
+                said = QuantityWords(until="contact")
+        found.append(said)
+        return f"Q{len(found) - 1}"
+
+    for idiom, what in _COMPILED:
+        kept = rf"(?<!\bthe )(?<!\ban )(?<!\bhow )(?<!\bas )(?:{idiom.pattern})" if what in {"slow", "fast"} else idiom
+        text = re.sub(kept, lambda match, what=what: read(match, what), text)
+    return text
 
 
-def items(text: str) -> list[Item]:
-    """Noun phrases and the words between them, in order."""
-    found = list(_chunked(text, _with_quantities(lex.tokens(text))))
-
-    def join(at: int) -> tuple[Item, int] | None:
-        """Joins an object with the mark that singles it out: "the object inside the red box", "the ball labeled 3"."""
-        end = at + 1
-        while found[at].phrase and end < len(found) and end - at < 6 and found[end].key in lex.SETS["links"]:
-            end += 1
-        if not found[at].phrase or not at + 1 < end < len(found) or not found[end].phrase:
-            return None
-        marked = _with_mark(text, found[at], [link.key for link in found[at + 1 : end]], found[end])
-        return None if marked is None else (marked, end + 1)
-
-    return _joined(found, join)
+def _is_determiner(words: Sequence[str], at: int) -> bool:
+    word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
+    if word not in lex.DETERMINERS:
+        return False
+    if word in {"that", "this"} and after in lex.DETERMINERS:
+        return False
+    closed = not after[0].islower() and not after.startswith("N") or after in lex.FUNCTION and after not in lex.PLACES
+    return not (closed or (after in lex.VERBS and (word in {"that", "which", "what", "this"} or lex.VERBS[after].form == "s")))
 
 
-def _chunked(text: str, found: Sequence[Item]) -> Iterator[Item]:
-    """The items, noun phrases joined.
-
-    `asked`: an auxiliary still waits for its verb, and only then can a verb behind a noun be in its base form.
-    """
-    at, verb, asked = 0, -1, False
-    while at < len(found):
-        first = at
-        while first - at < 3 and _is_determiner(found, first):
-            first += 1
-        has_noun, end = False, first
-        while end - first < MAX_WORDS and _belongs(found, end, at, first, has_noun, asked):
-            key = key_at(found, end)
-            has_noun = has_noun or not (lex.is_modifier(key) or key in lex.SETS["noun_modifiers"])
-            end += 1
-        if end == first or at == verb:
-            yield found[at]
-            key = found[at].key
-            # "Is the mug hit?": a form of "be" that opens a clause waits for a participle.
-            opens = key in {"is", "are", "was", "were"} and (at == 0 or found[at - 1].key in lex.PUNCTUATION)
-            waits = key in lex.AUXILIARIES or key in lex.CAUSATIVES or opens
-            asked = at != verb and (waits or (asked and key not in lex.ENDS and not lex.is_form(key, "base")))
-            at += 1
-            continue
-        if _ends_in_unknown_verb(found, at, first, end, asked):
-            end = verb = end - 1
-        keys = tuple(item.key for item in found[at:end])
-        start, stop = found[first].start, found[end - 1].end
-        yield Item("", start, stop, lex.object_phrase(text[start:stop], keys[first - at :]), keys)
-        at = end
-
-
-def _is_determiner(found: Sequence[Item], at: int) -> bool:
-    """A relative "that" or a bare "which" is no determiner: what follows it is no part of a noun phrase."""
-    key, after = key_at(found, at), key_at(found, at + 1)
-    closed = after in lex.CLOSED or after in lex.PUNCTUATION
-    if key == "a":  # or the letter: "ball A moves"
-        return not closed and not lex.is_form(after, "s")
-    ambiguous = key in {"that", "this", "which", "what", "any", "some"}
-    return key in lex.DETERMINERS and not (ambiguous and (closed or after in lex.VERBS))
-
-
-def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: bool, asked: bool) -> bool:
+def _belongs(words: Sequence[str], at: int, first: int, start: int, has_noun: bool) -> bool:
     """Whether a word belongs to the phrase that begins at `start`, with determiners up to `first`."""
-    key, before, after = (key_at(found, place) for place in (at, at - 1, at + 1))
-    determined, inside = first > start, at > first
-    if key == "and":
-        return inside and not has_noun and before in lex.COLOURS and after in lex.COLOURS
-    adverb = key == "first" or (len(key) > 4 and key.endswith("ly") and key not in lex.SETS["not_adverbs"])
-    if key in lex.PLACES or key in {"one", "far", "can"}:
+    word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
+    begun, determined = at > start, first > start
+    if word == "and":
+        return begun and not has_noun and words[at - 1] in lex.COLOURS and after in lex.COLOURS
+    if word == "can" and not has_noun and begun:
+        return True
+    if word.isdigit():
+        return has_noun and len(word) < 3
+    if has_noun and (word in _BEHIND_NOUN or word in lex.PLACES or (word in lex.COLOURS and words[at - 1] not in lex.COLOURS)):
+        return False
+    if word in lex.PLACES or word in {"one", "other", "first"}:
+        return not has_noun and determined and (word != "one" or begun)
+    if not word[0].islower() or word in lex.FUNCTION or word in lex.DETERMINERS:
+        return False
+    if word.endswith("ly") and word not in {"family", "jelly", "butterfly", "belly"}:
         return determined and not has_noun
-    if has_noun:
-        # "the mug 10 cm to the left": the measure is no part of the mug.
-        measure = key[0].isdigit() and (not key.isdecimal() or after in lex.SETS["measures"])
-        ends = measure or adverb or key in _BEHIND  # "will it hit the mug first?"
-    else:
-        ends = (at == start and key in {"both", "each"} and after in lex.VERBS) or (adverb and not determined)
-    if ends or key in lex.PUNCTUATION or key in lex.CLOSED:
-        return False
-    return adverb or key not in lex.VERBS or _verb_belongs(found, at, has_noun, asked, determined or inside)
-
-
-def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, begun: bool) -> bool:
-    """Whether a verb's form is read as a noun or an adjective: "the travel mug", "the red block"."""
-    verb, before, after = lex.VERBS[key_at(found, at)], key_at(found, at - 1), key_at(found, at + 1)
-    closed = after in lex.PLACES or after in lex.CLOSED or after in lex.PUNCTUATION
-    if begun and (closed or asked) and before in lex.PLACES:
-        return False  # "the balls to the left move up"
+    if word not in lex.VERBS:
+        return True
+    form = lex.VERBS[word].form
+    if words[at - 1] == "orange" and word not in set().union(*lex.NOUNS.values()):
+        return False  # a thing, where no noun follows
     if not has_noun:
-        if before in {"one", "two", "both"} and ((verb.form == "base" and asked) or (verb.form == "ing" and closed)):
-            return False  # "will the two collide?", "any chance of those two running into each other?"
-        if verb.form == "s" and before == "one":
-            return False  # "the orange one slides"
-        # "orange" is the one colour that is also a thing that moves: "the orange falls".
-        return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
-    if verb.form == "base":
-        goes_on = verb.kind == "static" or verb.lemma in lex.SETS["weak"]  # "will the mug remain standing?"
-        goes_on = goes_on and (after in {"put", "clear"} or lex.is_form(after, "ing"))
-        return not asked or (not goes_on and (after in lex.VERBS or after in _FINITE_BE))
-    return verb.form == "s" and after in {"are", "were"}
+        return begun and form != "s" and word not in {"is", "are", "will"}
+    return form == "base" and after in lex.VERBS and (lex.VERBS[after].form == "s" or after in {"is", "was"})
 
 
-def _ends_in_unknown_verb(found: Sequence[Item], start: int, first: int, end: int, asked: bool) -> bool:
-    """Verbs are a closed list here: one that is not in it is seen by its place, behind a noun that already stands."""
-    last = key_at(found, end - 1)
-    if end - first < 2 or lex.is_modifier(last) or lex.is_modifier(key_at(found, end - 2)):
-        return False
-    if asked:
-        return _is_determiner(found, end)
-    if key_at(found, start - 1) not in lex.CONDITIONALS or not last.endswith("s") or last.endswith("ss"):
-        return False
-    ahead = (item.key for item in found[end : end + 8])
-    clause = takewhile(lambda key: key not in lex.PUNCTUATION and key not in lex.AUXILIARIES, ahead)
-    return not any(word in lex.VERBS or word in lex.BE for word in clause)
+_PATH_END = re.compile(r"(?:at|on|of) the (?:(start|beginning|first|end|last)(?: position| point)? of the )?(?:\w+ )?(?:path|trail|line|track|trajectory)(?: |$)")
+_AT_PLACE = re.compile(rf"(?:on|at|in) the (?:far )?(?:{'|'.join(lex.PLACES)})(?: side)?(?= [,.?A-Z]| (?:{'|'.join(sorted(lex.VERBS))})(?: |$)|$)")
+_IN_BOX = re.compile(rf"(?:in|inside|within|marked (?:by|with)) (?:the|a) (?:(?:{_COLOUR}|bounding|drawn) )*(?:box|rectangle|bbox|circle|outline)(?= |$)")
+_WITH = re.compile(rf"with (?:an? |no |two |three )?(?:(?:{_COLOUR}|{'|'.join(lex.ADJECTIVES)}|cream) )*[a-z-]+(?= |$)")
+_SOME = {"both": "ALLOF", "all": "ALLOF", "each": "ALLOF", "every": "ALLOF", "either": "SOMEOF", "any": "SOMEOF",
+    "some": "SOMEOF", "one": "SOMEOF", "neither": "NOOF", "none": "NOOF", "no": "NOOF"}  # fmt: skip
 
 
-def _with_mark(text: str, item: Item, links: Sequence[str], mark: Item) -> Item | None:
-    noun, marking = item.phrase, mark.phrase
-    if noun is None or marking is None or noun.noun is None or noun.head in lex.ABSTRACT:
-        return None
-    words = [word for word in mark.words if word not in lex.DETERMINERS]
-    closing = text[mark.end : mark.end + 1].strip(" ,;:.!?")  # of a label in quotation marks
-    quoted = closing in {"'", '"', "’", "”"}
-    longer = replace(noun, text=" ".join(text[item.start : mark.end + quoted].split()))
-    last, coloured = words[-1] if words else "", [word in lex.COLOURS for word in words]
-    # "in the frame" is in the image; a frame with a colour is drawn.
-    box = last in lex.SETS["mark_nouns"] and (last != "frame" or any(coloured))
-    box = box and all(lex.is_modifier(word) or word == "bounding" for word in words[:-1])
-    box = box and {"on", "of", "at"}.isdisjoint(links)
-    if _NUMBERED.intersection(links) and (all(map(lex.is_count, words)) or len(last) == 1):
-        longer = replace(longer, number=marking.number)
-    elif box or (all(coloured) and lex.SETS["marked"].intersection(links)):
-        longer = replace(longer, inside_box=True)
-    elif links not in (["on"], ["at"], ["in"]) or any(word not in lex.PLACES and word != "far" for word in words):
-        return None
-    return replace(item, end=mark.end, phrase=longer)
+def _read_phrase(reader: _Reader, words: Sequence[str], at: int) -> int:
+    """Adds the noun phrase that begins at a word, else the word; returns the place behind it."""
+    first = at
+    while first < len(words) and _is_determiner(words, first):
+        first += 1
+    end, has_noun, named = first, False, None
+    while end < len(words) and end - first < 10:
+        if re.fullmatch(r"N\d+N", words[end]):
+            name = reader.names[int(words[end][1:-1])]
+            more = end + 1 < len(words) and _belongs(words, end + 1, first, at, lex.is_modifier(name) is False)
+            named = None if more and lex.is_modifier(name.lower()) else name  # "orange" in "the orange toy car"
+            words = words if named else [*words[:end], name.lower(), *words[end + 1 :]]
+            if named:
+                end += 1
+                break
+        if not _belongs(words, end, first, at, has_noun):
+            break
+        has_noun = has_noun or not (lex.is_modifier(words[end]) or words[end] == "other")
+        end += 1
+        if words[end - 1] in {"one", "ones"}:
+            break
+    bare = all(word in lex.ADJECTIVES or word in {"one", "first"} for word in words[first:end]) and words[end - 1] != "one"
+    if end == first or (bare and not named) or list(words[first:end]) == ["one"]:
+        word = words[at]
+        reader.add(lex.lemma(word), word)
+        return at + 1
+    content, determiners = list(words[first:end]), list(words[at:first])
+    # "The falling ball" says how it moves.
+    going = content[0] if len(content) > 1 and content[0] in lex.VERBS and lex.lemma(content[0]) in lex.KINDS else ""
+    content = content[1:] if going.endswith("ing") else content
+    text = list(content)
+    if named:
+        text[-1] = named
+    path_end, in_box = None, False
+    while end < len(words):
+        behind = " ".join(words[end : end + 12])
+        before = reader.plain[-1] if reader.plain else ""
+        if behind.startswith("of ") and end + 1 < len(words) and _belongs(words, end + 1, end + 1, end, False) and words[end + 1] not in lex.VERBS:
+            length = 2
+        elif (found := _WITH.match(behind)) is not None and has_noun:
+            length = len(found[0].split())
+        elif (found := _PATH_END.match(behind)) is not None:
+            length = len(found[0].split())
+            path_end = "start" if found[1] in {"start", "beginning", "first"} or (content[0] == "first" and not found[1]) else "end"
+        elif (found := _IN_BOX.match(behind)) is not None and before not in lex.VERBS and before not in {"put", "the"}:
+            length, in_box = len(found[0].split()), True
+        elif (found := _AT_PLACE.match(behind)) is not None and before not in lex.CAUSES | {"put", "place"}:
+            length = len(found[0].split())
+        else:
+            break
+        text += words[end : end + length]
+        end += length
+    said = " ".join([*determiners, *text])
+    phrase = object_phrase([*content[:-1], *named.lower().split()] if named else content, " ".join(text))
+    phrase = replace(phrase, inside_box=in_box, path_end=path_end)
+    given = named if named and text == [named] else match_given(phrase, reader.names)
+    if given is not None:
+        phrase = replace(object_phrase(given.lower().split(), given), is_given=True)
+    _add_phrase(reader, phrase, content, determiners, said)
+    if going.endswith("ing"):
+        reader.going += [".", reader.plain[-1], lex.lemma(going)]
+    return end
+
+
+def _add_phrase(reader: _Reader, phrase: ObjectPhrase, content: list[str], determiners: list[str], said: str) -> None:
+    """Adds a noun phrase as a thing, a kind, several things or one that acts."""
+    before = [word for word in reader.said[-3:]]
+    last = content[-1]
+    is_plural = not phrase.is_given and last != lex.singular(last) and last not in {"ones"}
+    counted = before[-1:] == ["of"] and before[-2:-1] and before[-2] in _SOME
+    quantifier = next((word for word in determiners if word in _SOME), before[-2] if counted else None)
+    asks = "which" in determiners or "what" in determiners
+    generic = phrase.noun is None or phrase.head in lex.GENERIC
+    if phrase.head in lex.AGENTS and not (phrase.colour or phrase.is_given):
+        reader.add("AG", said)
+    elif asks or (reader.plain[-2:] == ["how", "many"] or (reader.plain[-3:-1] == ["how", "many"] and counted is False)):
+        at = reader.thing(phrase)
+        reader.add("which" if asks else "", determiners[0] if asks else "")
+        reader.add(f"K{at[1:]}", said)
+    elif quantifier is not None and not (quantifier == "no" and not is_plural and phrase.noun):
+        if counted:
+            del reader.plain[-2:], reader.said[-2:]
+        bare = " ".join(word for word in content if word not in {"other"})
+        name = f"{quantifier} {bare}" if quantifier in {"both", "either", "neither"} else bare
+        at = reader.thing(replace(phrase, text=name))
+        reader.add(_SOME[quantifier], "")
+        reader.add(f"S{at[1:]}", said)
+    elif quantifier == "no":
+        reader.add("no", "no")
+        reader.add(reader.thing(phrase), said)
+    elif is_plural and not phrase.path_end:
+        reader.add(f"P{reader.thing(phrase)[1:]}", said)
+    elif generic and not (phrase.colour or phrase.inside_box or phrase.path_end or "other" in content or len(content) > 1):
+        reader.add("it" if phrase.noun is None else "OBJ", said)
+    else:
+        reader.add(reader.thing(_meant(phrase, reader.things)), said)
+
+
+def _meant(phrase: ObjectPhrase, before: Sequence[ObjectPhrase]) -> ObjectPhrase:
+    """What a phrase means among the things named before: "the black one" is the last of that colour, else of the one
+    kind that was named; "the car" is the red car."""
+    if phrase.is_given:
+        return phrase
+    if phrase.noun is None and phrase.colour is not None:
+        same = [each for each in before if each.colour == phrase.colour and each.noun]
+        kinds = {each.noun for each in before if each.noun} if not same else set[str | None]()
+        noun = next(iter(kinds)) if len(kinds) == 1 else None
+        if same or noun is None:
+            return same[-1] if same else phrase
+        return replace(phrase, noun=noun, text=" ".join([*phrase.text.split()[:-1], noun]))
+    # No word in it that the earlier phrase lacks.
+    fuller = [each for each in before if phrase.noun and phrase.words < each.words and each.head == phrase.head]
+    return fuller[0] if len(fuller) == 1 and not phrase.path_end else phrase
+
+
+def object_phrase(content: Sequence[str], text: str) -> ObjectPhrase:
+    """The phrase with these lower case words, behind its determiners."""
+    said = [word for word in content if word not in {"and"} and not word.isdigit()] or list(content)
+    cut = next((at for at, word in enumerate(said) if at and word in {"of", "with", "labeled", "labelled"}), len(said))
+    said = said[:cut]
+    nouns, head = [word for word in said[:-1] if not lex.is_modifier(word)], said[-1]
+    return ObjectPhrase(
+        text=text,
+        colour=next((lex.COLOURS[word] for word in said[:-1] or said if word in lex.COLOURS), None),
+        noun=None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)]),
+    )
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
-    """The first noun phrase of a text such as "the red toy car"; None if there is none."""
-    found = items("the " + text.removeprefix("the "))
-    phrase = next((item.phrase for item in found if item.phrase is not None), None)
-    if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
-        return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
-    return phrase
+    """The noun phrase of a text such as "the red toy car"; None if there is none."""
+    words = re.findall(r"[\w'-]+", text.lower())
+    while words and words[0] in lex.DETERMINERS:
+        del words[0]
+    ends = (at for at, word in enumerate(words) if at and (word in lex.FUNCTION or word in lex.DETERMINERS) and word != "one")
+    words = words[: next(ends, len(words))]
+    if not words or words[0] in lex.FUNCTION:
+        return None
+    bare = text.strip(" .,!?")
+    while bare.lower().split()[0] in lex.DETERMINERS:
+        bare = bare.split(None, 1)[1]
+    phrase = object_phrase(words, bare)
+    return replace(phrase, colour=lex.COLOURS[phrase.noun]) if phrase.colour is None and phrase.noun in lex.COLOURS else phrase
 
 
-TABLES = lex.words("table desk tabletop")
-_PLACE = lex.words(
-    "on onto upon off across over along around above atop at from to in through within under beneath below underneath"
-    " inside of leave leaves leaving"
-)
+def match_given(phrase: ObjectPhrase, names: Sequence[str]) -> str | None:
+    """The one given name that a phrase means: the same words, all words of one in the other, or the same noun."""
+    said = set(plain(phrase.text).split()) - {"one"}
+    named = [(name, set(plain(name).split()), parse_noun_phrase(name)) for name in names]
+    same = [name for name, words, _ in named if words == said]
+    within = [name for name, words, _ in named if said and (said < words or words < said) and words]
+    heads = [
+        name for name, _, other in named
+        if other is not None and other.head == phrase.head and (phrase.colour is None or other.colour == phrase.colour)
+        and len(said) == 1
+    ]  # fmt: skip
+    # "The black one": of that colour.
+    tinted = [name for name, _, other in named if phrase.noun is None and phrase.colour and other and other.colour == phrase.colour]
+    for found in (same, within, heads, tinted):
+        if found:
+            return found[0] if len(found) == 1 else None
+    return None
 
 
-def with_tables(found: Sequence[Item]) -> list[Item]:
-    """The items; "the table" is a thing where no preposition makes it a place, and a wall where it has a colour."""
-    kept = list(found)
-    for at, item in enumerate(found):
-        before, in_front = key_at(found, at - 1), key_at(found, at - 1) == "of" and key_at(found, at - 2) == "front"
-        if item.phrase is None:
-            continue
-        is_table = item.phrase.head in TABLES and (before not in _PLACE or in_front)
-        if is_table or (item.phrase.head == "wall" and item.phrase.colour is not None):
-            kept[at] = replace(item, phrase=replace(item.phrase, as_thing=True))
-    return kept
-
-
-def table_at_end(found: Sequence[Item]) -> tuple[ObjectPhrase | None, str]:
-    """The table of "will it land on the table", where a question ends so, and the word before it."""
-    at = max((place for place, item in enumerate(found) if item.phrase is not None), default=-1)
-    phrase = found[at].phrase if found else None
-    return phrase if phrase is not None and phrase.head in TABLES else None, key_at(found, at - 1)
-
-
-def with_nouns(found: Sequence[Item]) -> list[Item]:
-    """The items, with references replaced by what they mean.
-
-    "The red one" is of the kind that is asked for ("which cone", "which of the cones"), or of that of all things
-    before it.
-    """
-    which = {("which",), ("what",)}
-    asked = {
-        _kind_of(item.phrase)
-        for at, item in enumerate(found)
-        if item.words[:1] in which or (key_at(found, at - 1) == "of" and (key_at(found, at - 2),) in which)
-    } - {""}
-    before: set[str] = set()
-    said: list[Item] = []
-    things: list[ObjectPhrase] = []
-    for item in found:
-        nouns, phrase, words = asked or before, item.phrase, item.words
-        noun = next(iter(nouns)) if len(nouns) == 1 else ""
-        bare = phrase is not None and phrase.text.lower() == phrase.noun
-        last = next((each for each in reversed(things) if phrase is not None and each.noun == phrase.noun), None)
-        if words[:1] == ("that",) and bare and last is not None:  # "That mug": the mug that was named last.
-            said.append(replace(item, phrase=last, words=("that", *last.text.split())))
-            continue
-        if item.thing is not None:
-            things.append(item.thing)
-        # "The red one", "the left one".
-        one = words[-1:] == ("one",)
-        if phrase is not None and phrase.noun is None and noun and (phrase.colour or (one and len(phrase.words) > 1)):
-            text = [noun if word == "one" else word for word in phrase.text.split()]
-            text += [] if "one" in phrase.text.split() else [noun]
-            said.append(replace(item, phrase=replace(phrase, text=" ".join(text), noun=noun)))
-        else:
-            said.append(item)
-            before |= {_kind_of(phrase)} - {""}
-    return said
-
-
-def _kind_of(phrase: ObjectPhrase | None) -> str:
-    """The noun of a phrase that names a thing by one; empty otherwise."""
-    named = phrase is not None and phrase.is_thing and phrase.head not in lex.GENERIC | lex.AGENTS
-    return phrase.noun or "" if phrase is not None and named else ""
-
-
-_PUTS = lex.words("put place insert set position lower stand stick pop plonk plop")
-
-
-def with_places(found: Sequence[Item]) -> list[Item]:
-    """The items, each object joined with the words after it about its place."""
-    texts = [item.phrase.text.lower() for item in found if item.phrase is not None]
-
-    def join(at: int) -> tuple[Item, int] | None:
-        item, verb, after = found[at], lex.VERBS.get(key_at(found, at - 1)), key_at(found, at + 1)
-        thing = item.thing
-        if thing is None or at + 1 == len(found):
-            return None
-        # "Push the ball behind the mug", "put the ball on the mug": a destination, not where it is.
-        moved = lex.moves(verb) or (verb is not None and verb.lemma in _PUTS)
-        if moved and after not in {"that", "which", ","}:
-            return None
-        if (parsed := read_from("place", found, at + 1, _PLACE_WINDOW)) is None:
-            return None
-        tree, end = parsed
-        other = next((found[word.at] for word in tree.words), None)
-        if other is not None and other.thing is None:
-            return None
-        end += after == "," and key_at(found, end) == ","
-        words = " ".join(" ".join(each.words) or each.key for each in found[at + 1 : end])
-        text = f"{thing.text} {words}" if texts.count(thing.text.lower()) > 1 else thing.text
-        relation = next(name for name in tree.names if name.endswith("_it")).removesuffix("_it")
-        place = lex.PlaceWords(relation, None if other is None else other.thing)
-        return replace(item, end=found[end - 1].end, phrase=replace(thing, text=text, place=place)), end
-
-    return _joined(found, join)
-
-
-_NOUNS = {shape: lex.words(text) for shape, text in lex.TABLES["shapes"].items()}
-_SHAPES: dict[Shape, frozenset[str]] = {
-    "sphere": _NOUNS["sphere"], "box": _NOUNS["box"] | _NOUNS["vehicle"], "cone": _NOUNS["cone"],
-    "cylinder": _NOUNS["cylinder"],
+_SHAPE_NOUNS: dict[Shape, frozenset[str]] = {
+    "sphere": lex.NOUNS["sphere"], "box": lex.NOUNS["box"] | lex.NOUNS["vehicle"], "cone": lex.NOUNS["cone"],
+    "cylinder": lex.NOUNS["cylinder"],
 }  # fmt: skip
 
 
@@ -350,20 +423,17 @@ def _head(name: str) -> str | None:
 def shape_of(name: str) -> Shape | None:
     """The shape of what is called so; None if the noun does not say."""
     head = _head(name)
-    return next((shape for shape, nouns in _SHAPES.items() if head in nouns), None)
+    return next((shape for shape, nouns in _SHAPE_NOUNS.items() if head in nouns), None)
 
 
 def is_vehicle(name: str) -> bool:
     """Whether it is longer along its heading than across."""
-    return _head(name) in _NOUNS["vehicle"]
+    return _head(name) in lex.NOUNS["vehicle"]
 
 
 def is_cube(name: str) -> bool:
     """Whether it is a box as wide as high."""
-    return _head(name) in _NOUNS["cube"]
-
-
-_SAID = lex.words("any every each all no none some many a an both either neither other the")
+    return _head(name) in lex.NOUNS["cube"]
 
 
 @dataclass(frozen=True)
@@ -379,9 +449,10 @@ def kind_of(name: str) -> Kind | None:
     said = name.lower().split()
     numbers = dict.fromkeys(("both", "either", "neither"), 2) | lex.NUMBER_WORDS
     counts = [int(word) if word.isdecimal() else numbers[word] for word in said if word.isdecimal() or word in numbers]
-    rest = [word for word in said if word not in _SAID | numbers.keys() and not word.isdecimal()]
+    quantifiers = lex.words("any every each all no none some many a an other the") | numbers.keys()
+    rest = [word for word in said if word not in quantifiers and not word.isdecimal()]
     head = lex.singular(rest[-1]) if rest else ""
-    if not rest or (said[0] not in _SAID - {"the", "other"} and head == rest[-1]):
+    if not rest or (said[0] not in quantifiers - {"the", "other"} and head == rest[-1]):
         return None
     phrase = parse_noun_phrase(" ".join([*rest[:-1], head]))
     return None if phrase is None else Kind(phrase, counts[0] if counts else None)
@@ -396,21 +467,21 @@ def container_form(name: str) -> ContainerForm:
     A box is a container: a question about a solid one would not ask what goes into it.
     """
     head = _head(name)
-    if head in lex.SETS["round"]:
+    if head in lex.NOUNS["round"]:
         return "round"
-    if head in _NOUNS["square"]:
+    if head in lex.NOUNS["square"]:
         return "square"
     return "unknown" if shape_of(name) is None else "none"
 
 
 def may_name(phrase: ObjectPhrase, name: str) -> bool:
-    """Whether a phrase may mean the object of that name: they share a colour, noun or number, and differ in none."""
+    """Whether a phrase may mean the object of that name: they share a colour or a noun, and differ in none."""
     other = parse_noun_phrase(name)
     if other is None:
         return False
     if plain(phrase.text) == plain(name):
         return True
     nouns = [each.head if each.head not in lex.GENERIC else None for each in (phrase, other)]
-    pairs = ((phrase.colour, other.colour), tuple(nouns), (phrase.number, other.number))
+    pairs = ((phrase.colour, other.colour), tuple(nouns))
     said = [(one, two) for one, two in pairs if one is not None and two is not None]
     return bool(said) and all(one == two for one, two in said)

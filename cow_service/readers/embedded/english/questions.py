@@ -1,321 +1,701 @@
-"""Parses a what-if question in English with plain rules: what moves, how, what else is named, and the question itself.
+"""Reads a question by its sentence forms: what moves and how, what is changed, what is asked, and what was not read."""
 
-No model and no list of nouns: verbs and function words are closed lists, the noun phrases are what lies between.
-"""
-
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-from cow_service.readers.base import Quantity
-from cow_service.readers.embedded.english import interventions, motion, noun_phrases
+from cow_service.readers.embedded.english import forms
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import read_from
-from cow_service.readers.embedded.english.interventions import InterventionWords, TrailWords
-from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, key_at
-from cow_service.readers.embedded.english.motion import MotionCandidate, MotionWords, OtherWords
-from cow_service.readers.options import plain, split_options
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase, PlaceWords, QuantityWords
+from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
+from cow_service.readers.options import plain, says_not_sure, split_options
+from cow_service.records import Asked, InterventionKind, MotionKind, PlaceRelation, Vector
 
-MAX_WORDS = 240  # of a question that are read
-_HOW_MANY = lex.words("the all both either none two three")
-_SAME_TIME = re.compile(
-    r"\b(?:at the (?:very )?same (?:time|moment|instant)|simultaneously)\b(?P<joins> as\b)?", re.IGNORECASE
-)
-# Words that say which way, wherever they stand.
-_DIRECTION_WORDS = re.compile(
-    r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
-    r"|clockwise|counterclockwise|opposite|reversed?|towards?|away|diagonal(ly)?|degrees?|sideways|back|backwards?"
-    r"|forwards?|other way)\b",
-    re.IGNORECASE,
-)
+MAX_WORDS = 240  # of a question that is read
+
+
+@dataclass(frozen=True)
+class TrailWords:
+    """Which end of a trail is the present position; where neither field says so, the image must."""
+
+    near: ObjectPhrase | None = None
+    side: Vector | None = None  # unit vector in the image
+
+
+@dataclass(frozen=True)
+class StepWords:
+    """A leg of a motion: unit vector in the image, sine of the angle out of it, and how far or long."""
+
+    direction: Vector | None
+    depth: float
+    quantities: tuple[QuantityWords, ...] = ()
+
+
+@dataclass(frozen=True)
+class MotionWords:
+    """How the question says that something moves; None and 0 where it does not say.
+
+    `direction` is a unit vector in image pixels, x right, y down. `depth` is the sine of the angle out of the image
+    plane: -1 towards the camera, 1 away from it. `along_arrow`: else against it. `is_contradictory`: two of its words
+    are opposites. `topples`: it falls over where it stands. `in_air`: it is let go, or falls freely. `steps` are the
+    legs behind the first, `others` what moves at the same time.
+    """
+
+    kind: MotionKind | None = None
+    along_arrow: bool | None = None
+    direction: Vector | None = None
+    depth: float = 0.0
+    forward: bool | None = None
+    verb: str = ""
+    towards: ObjectPhrase | None = None
+    trail: TrailWords | None = None
+    quantities: tuple[QuantityWords, ...] = ()
+    steps: tuple[StepWords, ...] = ()
+    others: "tuple[tuple[ObjectPhrase, MotionWords], ...]" = ()
+    is_contradictory: bool = False
+    topples: bool = False
+    in_air: bool = False
+
+
+@dataclass(frozen=True)
+class ChangeWords:
+    """A change of the scene in the words of the question. `relation` and `targets` are those of `place`."""
+
+    kind: InterventionKind
+    object: ObjectPhrase
+    relation: PlaceRelation | None = None
+    targets: tuple[ObjectPhrase, ...] = ()
 
 
 @dataclass(frozen=True)
 class Question:
-    """A what-if question taken apart.
+    """A what-if question taken apart. `others` are the further things that it names; `alternatives`, those among which
+    it asks for the first. `unread` are the words of no form, those that tell the motion in `unread_motion`."""
 
-    `others` are the further objects it names, in order, without the mover and without what is taken away; `items`, all
-    its words and noun phrases, but for the options that it lists, its `interventions` and its trail.
-    `clause` are the items that tell the motion. `names_direction`: some word says which way, whether or not it was
-    understood. `read` are the places in the text of the items that tell the motion and were understood.
-    """
-
-    text: str
-    mover: ObjectPhrase | None
-    motion: MotionWords
-    others: tuple[ObjectPhrase, ...]
-    items: tuple[Item, ...]
-    interventions: tuple[InterventionWords, ...]
-    clause: tuple[Item, ...]
-    mentions_arrow: bool
-    names_direction: bool
-    beyond: str = ""  # how what is not read any more begins
-    pronoun: str = ""  # that stands for the mover where it may stand for two things
-    read: frozenset[int] = frozenset()
-
-    def has_read(self, at: int) -> bool:
-        """Whether the item at a place expresses the motion and was understood."""
-        return self.items[at].start in self.read
-
-    def means_mover(self, phrase: ObjectPhrase) -> bool:
-        """Whether a phrase speaks of the mover again: no word in it that the mover's own lacks."""
-        words = set(plain(phrase.text).split())
-        return self.mover is not None and bool(words) and words <= set(plain(self.mover.text).split())
+    mover: ObjectPhrase | None = None
+    motion: MotionWords = MotionWords()
+    says_motion: bool = False
+    changes: tuple[ChangeWords, ...] = ()
+    asked: Asked | None = None
+    others: tuple[ObjectPhrase, ...] = ()
+    alternatives: tuple[ObjectPhrase, ...] = ()
+    table: ObjectPhrase | None = None  # on which something is asked to come down
+    names_arrow: bool = False
+    names_direction: bool = False  # some word says which way, whether or not it was understood
+    unread: tuple[str, ...] = ()
+    unread_motion: tuple[str, ...] = ()
 
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
-def parse(question: str) -> Question:
-    """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    text = without_reply_form(split_options(question).rest)
-    found = lex.tokens(text)
-    beyond = ""
-    if len(found) > MAX_WORDS:
-        text, beyond = text[: found[MAX_WORDS].start], " ".join(text[found[MAX_WORDS].start :].split()[:7])
-    text = without_openings(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
-    arrow = any(token.key.startswith("arrow") for token in lex.tokens(text))
-    found = noun_phrases.with_nouns(noun_phrases.with_tables(noun_phrases.items(text)))
-    changes, found = interventions.split_interventions(noun_phrases.with_places(found))
-    trail, found = interventions.split_trail(found)
-    candidates, subjects = motion.read_clauses(found)
-    best = _best(found, candidates)
-    mover = _mover(found, subjects, best, changes)
-    clause, told = _motion(found, candidates, best, mover, changes)
-    if trail is not None and trail.near is None and trail.side is None:
-        trail = replace(trail, side=told.direction)  # "on along its trail to the right": its last end is there
-    told, fitted = replace(told, trail=trail), frozenset[int]()
-    if not changes and (best is None or (best.asked and not told.says_way)):
-        changes, fitted = interventions.implied_placing(found)
-    read = told.read.union(fitted, *(other.motion.read for other in told.others))
-    put = next((change for change in changes if change.kind == "place"), None)
-    # "If you lift the ball and put it into the mug": the lifting is a part of it.
-    lifted = best.subject if best is not None and best.verb in {"lift", "raise", "carry"} else None
-    carried = put is not None and lifted == put.object
-    if carried:
-        read = read.union(item.start for item in found[clause.start : clause.stop])
-    way = best is None and told.arrow is not None and bool(subjects)  # "on its way along the arrow"
-    if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
-        mover, told = put.object, replace(told, kind="place", verb="put")
-    return Question(
-        text=text,
-        mover=mover,
-        motion=told,
-        others=_others(found, mover, clause, changes, trail),
-        items=tuple(found),
-        interventions=changes,
-        clause=tuple(found[clause.start : clause.stop]),
-        mentions_arrow=arrow,
-        names_direction=_DIRECTION_WORDS.search(text) is not None,
-        beyond=beyond,
-        pronoun=_open_pronoun(found, best, mover),
-        read=read,
-    )
+def parse(question: str, names: tuple[str, ...] = ()) -> Question:
+    """Takes a question apart; `names` are those of the given things. Never raises: what is not said is None or empty."""
+    listed = split_options(question)
+    text = without_reply_form(listed.rest)
+    if len(text.split()) > MAX_WORDS:
+        return Question(unread=(" ".join(text.split()[MAX_WORDS : MAX_WORDS + 7]),))
+    options = [text for _, text in listed.options if not says_not_sure(text)]
+    return _Parser(tokens_of(text, names), tuple(names), options).question()
 
 
-def _best(found: Sequence[Item], candidates: Sequence[MotionCandidate]) -> MotionCandidate | None:
-    """The verb of the motion: the first of the highest rank."""
-    best = max(candidates, key=lambda candidate: candidate.rank, default=None)
-    if best is None or best.asked or not best.moves or found[best.start].key != "while":
-        return best
-    # In front of "while", where both motions are given: "the mug slides left by 20 px while the ball drops".
-    told = [
-        each
-        for each in candidates
-        if each.at < best.start and not each.asked and each.moves and motion.clause_end(found, each.at) == best.start
-        and each.subject is not None and each.subject.is_thing and each.subject.head not in lex.AGENTS
-    ]  # fmt: skip
-    return told[-1] if told else best
-
-
-def _mover(
-    found: Sequence[Item],
-    subjects: Sequence[tuple[int, ObjectPhrase]],
-    best: MotionCandidate | None,
-    changes: Sequence[InterventionWords],
-) -> ObjectPhrase | None:
-    """The moving object, in its fullest wording."""
-    at = best.at if best else len(found)
-    mover = best.subject if best else None
-    certain = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and not motion.is_vague(item)]
-    if mover is None:
-        # A pronoun, or a clause without a subject, means the agent of a passive question, else its subject.
-        acting = [
-            phrase
-            for place, phrase in certain
-            if place > 1 and found[place - 1].key == "by" and motion.is_passive(found, place - 2)
-            and phrase.head not in lex.ABSTRACT | lex.AGENTS
-        ]  # fmt: skip
-        asked = [each for each in subjects if each[1].head not in lex.ABSTRACT]
-        named = [(place, phrase) for place, phrase in certain if phrase.is_thing]
-        before = [phrase for each in (asked, named) for place, phrase in each if place < at]
-        mover = next(iter([*acting, *before, *(phrase for _, phrase in asked + named)]), None)
-    if mover is None:
-        return None
-    # "The white pawn ... if the pawn moves".
-    told = [item.phrase for item in found[:at] if item.phrase]
-    told += [phrase for change in changes for phrase in (change.object, *change.targets) if change.kind == "place"]
-    fuller = {phrase for phrase in told if phrase != mover and _repeats(mover, phrase)}
-    return fuller.pop() if len(fuller) == 1 else mover
-
-
-def _motion(
-    found: Sequence[Item],
-    candidates: Sequence[MotionCandidate],
-    best: MotionCandidate | None,
-    mover: ObjectPhrase | None,
-    changes: Sequence[InterventionWords],
-) -> tuple[range, MotionWords]:
-    """The places of the clause with the motion, and its content."""
-    at, start = (best.at, best.start) if best else (len(found), 0)
-    verb, kind = (best.verb, best.kind) if best else ("", None)
-    if best is None:
-        # "What does it touch on its way down?", "the falling ball", and "where would it land?" without its support.
-        ways = (place for place, item in enumerate(found) if item.words[-1:] == ("way",))
-        down = any(key_at(found, way - 1) == "on" and key_at(found, way + 1) == "down" for way in ways)
-        removed = any(change.kind == "remove" for change in changes)
-        lands = removed and any(lex.lemma(item.key) in {"land", "happen"} for item in found)
-        if down or lands or (mover is not None and "falling" in mover.text.lower().split()[:-1]):
-            verb, kind = "fall", "fall"
-    beside = _movers_beside(found, candidates, best)
-    end = min([motion.clause_end(found, at) if best else at, *(other.start for other in beside)])
-    asked = best is not None and best.asked
-    told = motion.read_motion(found[at:end], verb, kind, mover, asked=asked)
-    told = motion.with_front(told, found[start:at] if best else found)
-    elsewhere = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
-    speeds = {place: said for place, said in elsewhere if isinstance(said.speed, Quantity)}
-    others = dict[ObjectPhrase, OtherWords]()
-    for each in beside:
-        if each.subject is not None:
-            others.setdefault(each.subject, _other_motion(found, each, each.subject))
-    told = replace(
-        told,
-        quantities=(*told.quantities, *speeds.values()),
-        read=told.read.union(speeds),
-        others=tuple(others.values()),
-    )
-    return range(start if best else at, end), told
-
-
-def _movers_beside(
-    found: Sequence[Item], candidates: Sequence[MotionCandidate], best: MotionCandidate | None
-) -> list[MotionCandidate]:
-    """Motions of other things than the mover's, said in the same way: "the ball moves left and the car goes right"."""
-    if best is None or best.asked or best.subject is None or best.subject.head in lex.AGENTS:
-        return []
-    while_it = found[best.start].key == "while"  # "while the ball rolls right, the mug slides left"
-    return [
-        each
-        for each in candidates
-        if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
-        and each.at > best.at and each.start > best.at and each.moves
-        and each.subject is not None and (each.subject.noun or each.subject.colour)
-        and all(item.key != "whether" for item in found[best.at : each.at])  # it is a question, not a statement
-        and not _repeats(each.subject, best.subject)
-    ]  # fmt: skip
-
-
-def _other_motion(found: Sequence[Item], verb: MotionCandidate, thing: ObjectPhrase) -> OtherWords:
-    """How another thing moves at the same time.
-
-    How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
-    """
-    words = found[verb.at : motion.clause_end(found, verb.at)]
-    told = motion.read_motion(words, verb.verb, verb.kind, thing)
-    lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
-    return OtherWords(thing, replace(told, read=frozenset() if told.steps else told.read - lengths))
-
-
-def _open_pronoun(found: Sequence[Item], best: MotionCandidate | None, mover: ObjectPhrase | None) -> str:
-    """The pronoun that moves where two things were named alike before it: "the ball and the mug ... if it rolls"."""
-    if best is None or best.subject is not None:
-        return ""
-    for at in range(best.at - 2):
-        two = found[at].thing, found[at + 2].thing
-        if found[at + 1].key == "and" and mover in two and None not in two:
-            return next((item.key for item in found[at + 3 : best.at] if item.key in lex.MOVER_PRONOUNS), "")
-    return ""
-
-
-def _others(
-    found: Sequence[Item],
-    mover: ObjectPhrase | None,
-    clause: range,
-    changes: Sequence[InterventionWords],
-    trail: TrailWords | None,
-) -> tuple[ObjectPhrase, ...]:
-    """The further things that are named, each once."""
-    known = [phrase for phrase in (mover, *(change.object for change in changes)) if phrase is not None]
-    named = [phrase for change in changes for phrase in change.targets]
-    named += [] if trail is None or trail.near is None else [trail.near]
-    for at, item in enumerate(found):
-        place = item.phrase.place if item.phrase is not None else None
-        for phrase in (item.phrase, None if place is None else place.of):
-            if phrase is None or motion.is_vague(item) or _HOW_MANY.issuperset(item.words):
-                continue
-            bare = phrase.head in lex.GENERIC or phrase.noun is None
-            singled_out = phrase.colour is not None or phrase.inside_box or phrase.number is not None
-            acts = at in clause and phrase.head in lex.AGENTS
-            # "Which ball will it hit first?"
-            adjective = phrase.noun in lex.SETS["adjectives"] and item.words[0] not in lex.DETERMINERS
-            if not (singled_out if bare else phrase.is_thing) or acts or adjective:
-                continue
-            if item.words[0] == "another" or not any(_repeats(phrase, earlier) for earlier in (*known, *named)):
-                named.append(phrase)
-    return tuple(named)
-
-
-def _repeats(phrase: ObjectPhrase, known: ObjectPhrase) -> bool:
-    """Whether a later phrase means an earlier object: no word in it that the earlier one lacks."""
-    return phrase.head in {known.head, None} and phrase.words - {"one"} <= known.words
-
-
-# Sentences of the text, and what those are about that say how to reply.
-_BETWEEN_SENTENCES = re.compile(r"((?<=[.?!])\s+|\n+)")
-_BETWEEN_PARTS = re.compile(r"((?<=[.?!;:])\s+)")
-_PICTURES = lex.words("image images frame frames picture pictures photo photos")
+# Sentences of a prompt that say how to reply and nothing else, and its heading.
 _ABOUT_REPLY = re.compile(
     r"\byour (?:\w+ ){0,2}(?:response|answer|reply|output)s?\b|\bjson\b|answer\s*:\s*\$|\$\s?letter\b", re.IGNORECASE
 )
 _CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
-_YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)  # what may be replied
+_INSTRUCTION = re.compile(
+    r"(?:please )?(?:think|reason|answer|choose|select|pick|options?|choices?|explain|respond|reply|provide|return|output"
+    r"|note)\b(?! that the ball)", re.IGNORECASE,
+)  # fmt: skip
+_YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)
 _HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
 
 
 def without_reply_form(prompt: str) -> str:
     """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
-    sentences = _BETWEEN_SENTENCES.split(_YES_NO.sub("", _HEADING.sub("", prompt)))
+    sentences = re.split(r"((?<=[.?!])\s+|\n+)", _YES_NO.sub("", _HEADING.sub("", prompt)))
     kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
-    parts: list[str] = []
-    for part in _BETWEEN_PARTS.split(kept):
-        said = re.findall(r"\w+", part.lower())
-        first = next((word for word in said[:2] if word != "please"), "")
-        if not (first in lex.SETS["instructions"] or (first == "note" and not _PICTURES.isdisjoint(said))):
-            parts.append(part)  # the others say what to do, or what the images are
-    return "".join(parts)
+    parts = re.split(r"((?<=[.?!;:])\s+)", kept)
+    return "".join(part for part in parts if not _INSTRUCTION.match(part.strip()))
 
 
-_OPENING = 24  # words of the openings of one sentence
-_MAX_TRIES = 12  # of one question
-_LONGEST_FIRST = sorted(map(re.escape, lex.TABLES["said_as"]), key=len, reverse=True)
-_SAID_AS = re.compile(rf"\b(?:{'|'.join(_LONGEST_FIRST)})\b", re.IGNORECASE)
-_TAG = re.compile(rf",\s*(?:{'|'.join(lex.SETS['tags'])})\s*\?(?=\s+\S)", re.IGNORECASE)  # and something else is asked
-_CLAIM = re.compile(r"(^|[.!]\s)\s*true or false\s*[:?,]?\s+([^.?!]+)[.?]?\s*$", re.IGNORECASE)  # the last sentence
+_PLACES = {
+    "behind": "behind", "in front of": "front_of", "next to": "near", "beside": "near", "near": "near",
+    "near to": "near", "close to": "near", "nearest to": "near", "closest to": "near", "nearest": "near",
+    "farthest from": "far", "furthest from": "far", "to the left of": "left_of", "left of": "left_of",
+    "to the right of": "right_of", "right of": "right_of", "above": "above", "over": "above", "under": "below",
+    "below": "below", "on": "on", "on top of": "on",
+}  # fmt: skip
+_STAND = r"(?:,? ?(?:that|which) be )?(?:stand |lie |sit |rest )?"
+_PLACE = re.compile(
+    rf"(?P<before>(?:[\w,.?]+ )?)(?P<x>X\d+) {_STAND}(?:(?P<where>{'|'.join(sorted(_PLACES, key=len, reverse=True))}) (?P<y>X\d+)"
+    r"|(?:that|which) be (?P<near>NEAR|(?:farthest|further|farther) AWAY))(?: ,(?= that))?(?= |$)"
+)
+_MOVES_OBJECT = lex.CAUSES | lex.words("put place set insert position stand let go be")
+_PIECES = ("asked", "motion", "change", "stated", "listed", "nothing")
 
 
-def without_openings(text: str) -> str:
-    """The text without openings; what asks by a statement ("I wonder whether it ...") begins with "tell me" then.
+@dataclass
+class _Piece:
+    """A run of tokens that one form covers."""
 
-    Words of informal English are put as the grammar has them ("gonna" as "going to").
-    """
-    text = _CLAIM.sub(r"\1\2?", _TAG.sub(".", text))
-    text = _SAID_AS.sub(lambda found: lex.TABLES["said_as"][found[0].lower()], text.replace("’", "'"))
-    found, kept, end = lex.tokens(text), list[str](), 0
-    starts = [at for at in range(len(found)) if at == 0 or key_at(found, at - 1) in lex.ENDS]
-    for at in starts[:_MAX_TRIES]:
-        parsed = read_from("opening", found, at, _OPENING)
-        if parsed is not None:
-            tree, behind = parsed
-            asks = f"tell me {found[behind - 1].key} " if "asks_if" in tree else ""
-            kept += [text[end : found[at].start], asks]
-            end = found[behind].start if behind < len(found) else len(text)
-    return "".join([*kept, text[end:]])
+    what: str
+    start: int
+    end: int
+    roles: dict[str, str] = field(default_factory=dict[str, str])
+    form: forms.Form | None = None
+    relation: PlaceRelation | None = None
+    motion: MotionWords = MotionWords()
+    is_passive: bool = False  # what is acted on stands first
+
+
+class _Parser:
+    """Covers a question with forms, the longest that fits at each place, and puts together what they say."""
+
+    def __init__(self, tokens: Tokens, names: tuple[str, ...], options: Sequence[str]) -> None:
+        self.tokens, self.names, self.options = tokens, names, options
+        self.things = list(tokens.things)
+        self.plain, self.said = list(tokens.plain), list(tokens.said)
+        self._join_places()
+        self._put_behind()
+        self.text = " ".join(self.plain)
+        self.starts = [0]
+        for token in self.plain:
+            self.starts.append(self.starts[-1] + len(token) + 1)
+        self.place_of = {start: at for at, start in enumerate(self.starts)}
+        self.pieces = self._cover()
+        self.mover: str | None = None
+        self.table: ObjectPhrase | None = None
+
+    def _join_places(self) -> None:
+        """Joins "the mug behind the vase" to one thing, but for what is put or pushed there."""
+        at = 0
+        while at < len(self.plain):
+            found = _PLACE.match(" ".join(self.plain[at : at + 9])) if self.plain[at][0] == "X" else None
+            before = self.plain[at - 1] if at else ""
+            if found is None or before in _MOVES_OBJECT or (before in {"will", "be"} and found["where"] and at < 3):
+                at += 1
+                continue
+            end = at + len(found[0].split())
+            phrase = self.things[int(found["x"][1:])]
+            near = found["near"]
+            place = (
+                PlaceWords("near" if near == "NEAR" else "far", None)
+                if near
+                else PlaceWords(_PLACES[found["where"]], self.things[int(found["y"][1:])])
+            )
+            said = " ".join(self.said[at:end])
+            twice = self.plain.count(self.plain[at]) > 1
+            if twice and not phrase.is_given:
+                phrase = replace(phrase, text=" ".join([phrase.text, *said.split()[len(phrase.text.split()) + 1 :]]))
+            if phrase.is_given:
+                self.plain[at:end], self.said[at:end] = [self.plain[at]], [said]
+            else:
+                self.things.append(replace(phrase, place=place))
+                self.plain[at:end], self.said[at:end] = [f"X{len(self.things) - 1}"], [said]
+            at += 1
+
+    def _put_behind(self) -> None:
+        """Puts "the ball, rolling left," in front of the question that it interrupts."""
+        text = " ".join(self.plain)
+        found = re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ,? ?(?:when |if )?((?:{forms.VERBS})(?: [^,.?]*?)?) , (?=[a-zA-Z])", text)
+        found = found or re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ((?:{forms.VERBS}) (?:ALONG|AGAINST|LEFT|RIGHT|FORWARD|NEAR))() (?=(?:still |then )*\w)", text)
+        if found is None or ("," not in found[0] and not self.said[text[: found.start(3)].count(" ")].endswith(("ing", "n"))):
+            return
+        a, b, c = (text[: found.start(at)].count(" ") for at in (1, 3, 1))
+        length = len(found[3].split())
+        rest = b + length + (1 if "," in found[0][found.end(3) - found.start() :] else 0)
+        for words in (self.plain, self.said):
+            asks, way = words[a : a + 2], words[b : b + length]
+            words[a:rest] = [asks[1], *way, ",", *asks]
+
+    # --- covering
+
+    def _cover(self) -> list[_Piece]:
+        at, pieces = 0, list[_Piece]()
+        while at < len(self.plain):
+            piece = max(self._from(at), key=lambda each: (each.end, -_PIECES.index(each.what)), default=None)
+            pieces += [] if piece is None else [piece]
+            at = at + 1 if piece is None else piece.end
+        return pieces
+
+    def _from(self, at: int) -> list[_Piece]:
+        """What may begin at a token."""
+        start, found = self.starts[at], list[_Piece]()
+        for what, listed in (("asked", forms.ASKED), ("stated", forms.STATED)):
+            for form in listed:
+                match = form.pattern.match(self.text, start)
+                if match is not None:
+                    at_o, at_s = (min((match.start(name) for name in match.groupdict() if name[0] == role and match[name]), default=1e9) for role in "os")
+                    piece = _Piece(what, at, self._end(match), forms.roles(match), form)
+                    piece.is_passive = what == "asked" and at_o < at_s
+                    found.append(piece)
+        for pattern in forms.REMOVED:
+            if (match := pattern.match(self.text, start)) is not None:
+                found.append(_Piece("change", at, self._end(match), forms.roles(match)))
+        for relation, pattern in forms.PLACED:
+            if (match := pattern.match(self.text, start)) is not None:
+                found.append(_Piece("change", at, self._end(match), forms.roles(match), relation=relation))
+        if (match := forms.FITTING.match(self.text, start)) is not None:
+            found.append(_Piece("change", at, self._end(match), forms.roles(match), relation="into"))
+        if (match := forms.LISTED.match(self.text, start)) is not None:
+            found.append(_Piece("listed", at, self._end(match), forms.roles(match)))
+        if (match := re.compile(r"THERE X\d+(?:(?: ,| and)* X\d+)*(?: on FLOOR| in IMAGE)?(?= [,.])").match(self.text, start)):
+            found.append(_Piece("nothing", at, self._end(match)))
+        motions = [motion for pattern in forms.MOVED if (motion := self._motion(pattern, start, at)) is not None]
+        trail = forms.TRAIL.match(self.text, start)
+        if trail is not None or forms.ADVERBIAL.match(self.text, start):
+            way = self._adverbials(_Piece("motion", at, at), "")
+            motions += [way] if way.motion != MotionWords() else []
+        return found + [each for each in motions if each.end > at]
+
+    def _end(self, match: re.Match[str]) -> int:
+        """The place of the first token behind a match."""
+        return self.place_of[match.end() + 1] if match.end() + 1 in self.place_of else len(self.plain)
+
+    # --- motions
+
+    def _motion(self, pattern: re.Pattern[str], start: int, at: int) -> _Piece | None:
+        match = pattern.match(self.text, start)
+        if match is None:
+            return None
+        roles = forms.roles(match)
+        verb = roles.get("verb", "let go")
+        verb = "let go" if verb == "go" and "let" in match[0].split() else verb
+        piece = _Piece("motion", at, self._end(match), roles)
+        return self._adverbials(piece, verb)
+
+    def _adverbials(self, piece: _Piece, verb: str) -> _Piece:
+        """The piece with the words for the way that follow its verb."""
+        legs, at, verbs = [_Leg(verb)], piece.end, re.compile(rf"(?P<verb>{forms.VERBS})(?= |$)")
+        while at < len(self.plain):
+            leg, start = legs[-1], self.starts[at]
+            if (match := forms.TRAIL.match(self.text, start)) is not None:
+                said = forms.roles(match)
+                near = self.things[int(said["near"][1:])] if "near" in said else None
+                leg.trail = TrailWords(near, forms.SIDES.get(said.get("side", "")))
+            elif (match := forms.ADVERBIAL.match(self.text, start)) is not None and leg.take(forms.roles(match), self):
+                if "then" in forms.roles(match) or "leg" in forms.roles(match):
+                    after = forms.ADVERBIAL.match(self.text, self.starts[self._end(match)]) if self._end(match) < len(self.plain) else None
+                    again = verbs.match(self.text, self.starts[self._end(match)]) if self._end(match) < len(self.plain) else None
+                    if (after is None or "nothing" in forms.roles(after)) and again is None:
+                        break
+                    legs.append(_Leg(again["verb"] if again else ""))
+                    match = again or match
+            else:
+                break
+            at = self._end(match)
+        if len(legs) > 1 and not legs[-1].says_way:
+            at = piece.end if len(legs) == 2 and not legs[0].says_way else at
+        kind = lex.KINDS.get(verb, "fall" if verb == "let go" else None)
+        kind = "static" if "n" in piece.roles else kind
+        piece.end, piece.motion = at, _in_words(legs, kind)
+        return piece
+
+    # --- what the pieces say
+
+    def question(self) -> Question:
+        """What all pieces together say."""
+        asks = [each for each in self.pieces if each.what == "asked"]
+        stated = [each for each in self.pieces if each.what == "stated"]
+        last = max((at for at, token in enumerate(self.plain[:-1]) if token in {".", "?"}), default=0)
+        terse = not asks and bool(stated) and stated[-1].start >= last and ("?" in self.plain[stated[-1].end :] or "CLAIM" in self.plain or self.plain[-1] not in {".", "!"})
+        asking = asks[0] if asks else stated[-1] if terse else None
+        changes = self._changes(asking)
+        put = next((each for each in changes if each.kind == "place"), None)
+        moving, subjects = self._moving(asking, stated, changes)
+        acts = "" if asking is None else asking.roles.get("s", "")
+        self.mover = subjects[0] if subjects else self._token(put.object) if put else acts if acts[:1] == "X" else None
+        first = moving[0] if moving else None
+        motion = MotionWords() if first is None else first.motion
+        mover = None if self.mover is None else self._thing(self.mover)
+        others = list[tuple[ObjectPhrase, MotionWords]]()
+        for piece, subject in zip(moving[1:], subjects[1:], strict=True):
+            if subject != self.mover:
+                others.append((self.things[int(subject[1:])], piece.motion))
+        read = {at for each in self.pieces for at in range(each.start, each.end)}
+        unread = self._unread(read, asking, asks, stated, moving)
+        asked, alternatives = self._asked(asking, stated, changes)
+        if asking is not None and asked is None:
+            words = " ".join(word for word in self.said[asking.start : asking.end] if word)
+            unread.append(("asked", words))
+        if asked is None and asking is None and moving and not unread:
+            asked = Asked(form="what-happens", relation="touches")  # "Push the red ball to the right."
+        if put is not None and (first is None or first.motion.kind == "static" or mover is None):
+            mover, motion = put.object, MotionWords("place", verb="put")
+        elif mover is None and self.things and not moving:
+            named = [token for token in self.plain if token[0] == "X" and token[1:].isdigit()]
+            mover = self._thing(named[0]) if named else None
+        if not moving and asked is not None and asked.relation == "lands" and changes and put is None:
+            motion = MotionWords("fall", verb="fall")  # without its support
+        words = self.plain
+        return Question(
+            mover=mover,
+            motion=replace(motion, others=tuple(others)),
+            says_motion=motion != MotionWords() or bool(moving) or put is not None,
+            changes=changes,
+            asked=None if unread else asked,
+            others=self._others(mover, changes, asked),
+            alternatives=alternatives,
+            table=self.table,
+            names_arrow="ALONG" in words or "AGAINST" in words or any("arrow" in word for word in self.said),
+            names_direction=any(word in forms.WAYS or word in {"FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"} for word in words),
+            unread=tuple(dict.fromkeys(said for _, said in unread)),
+            unread_motion=tuple(dict.fromkeys(said for what, said in unread if what == "motion")),
+        )
+
+    def _thing(self, token: str) -> ObjectPhrase:
+        return self.things[int(token[1:])]
+
+    def _token(self, thing: ObjectPhrase) -> str:
+        return f"X{self.things.index(thing)}"
+
+    def _references(self, text: str) -> list[str]:
+        """The things of a list, "X1 and X2"; those of both kinds of plurals."""
+        return re.findall(r"[XPS]\d+", text)
+
+    def _changes(self, asking: _Piece | None) -> tuple[ChangeWords, ...]:
+        """What is taken away or put somewhere."""
+        found = list[ChangeWords]()
+        for piece in self.pieces:
+            roles = piece.roles
+            if "r" in roles:
+                found += [ChangeWords("remove", self._thing(token)) for token in self._references(roles["r"])]
+            if piece.relation is None or (roles["y"] == "it" and not found):
+                continue
+            y = self._resolved(roles["y"], piece.start, roles["x"])
+            if y is None or self._thing(y).head == "container":
+                if y is not None:
+                    found.append(ChangeWords("place", self._thing(roles["x"]), "into"))
+                continue
+            targets = [self._thing(y), *([self._thing(roles["z"])] if "z" in roles else [])]
+            found.append(ChangeWords("place", self._thing(roles["x"]), piece.relation, tuple(targets)))
+        fits = asking is not None and asking.form is not None and asking.form.relation == "inside" and not found
+        if fits and asking is not None and not any(each.what == "motion" for each in self.pieces):
+            subject, container = asking.roles.get("s", ""), asking.roles.get("o", "")
+            if subject.startswith("X") and (container.startswith("X") or "l" in asking.roles):
+                targets = (self._thing(container),) if container else ()
+                found.append(ChangeWords("place", self._thing(subject), "into", targets))
+        return tuple(dict.fromkeys(found))
+
+    def _moving(
+        self, asking: _Piece | None, stated: Sequence[_Piece], changes: Sequence[ChangeWords]
+    ) -> tuple[list[_Piece], list[str]]:
+        """The pieces that tell a motion, and what moves by each; that of the question first."""
+        moving, subjects = list[_Piece](), list[str]()
+        for piece in self.pieces:
+            if piece.what == "stated" and piece.roles.get("s", "").startswith("X") and piece is not asking and not moving:
+                moving.append(piece)
+                subjects.append(piece.roles["s"])
+            if piece.what != "motion":
+                continue
+            said, told = piece.roles.get("m", ""), {} if asking is None else asking.roles
+            if said == "it" and asking is not None and asking.is_passive and told.get("o", "")[:1] + told.get("s", "")[:1] == "XX":
+                subjects.append(told["o"] if "behind" in self.plain[asking.start : asking.end] else told["s"])
+                moving.append(piece)
+                continue
+            token = said if said.startswith(("X", "P")) else ""
+            before = self._named_before(piece.start)
+            if not token and asking is not None and asking.roles.get("s", "").startswith("X") and (said or not before or asking.start < piece.start):
+                token = asking.roles["s"]
+            if not token and subjects and said != "it":
+                token = subjects[-1]
+            placed = [each.object for each in changes if each.kind == "place"]
+            token = token or next((each for each in before if self._thing(each) not in placed or not said), "") or next(iter(before), "")
+            if not token:  # "Will it hit the mug if ...": a thing that is named later
+                token = next((each for each in self.plain[piece.end :] if re.fullmatch(r"X\d+", each)), "")
+            if moving and subjects[-1] == token and moving[-1].what == "motion" and not said.startswith("X"):
+                moving[-1].motion = _joined(moving[-1].motion, piece.motion)
+            elif token and moving and subjects[-1] == token and not moving[-1].motion.verb:
+                moving[-1] = piece
+            elif token:
+                moving.append(piece)
+                subjects.append(token.replace("P", "X"))
+        return moving, subjects
+
+    def _named_before(self, at: int) -> list[str]:
+        """The things named in front of a place, the first one first."""
+        return list(dict.fromkeys(token for token in self.plain[:at] if re.fullmatch(r"X\d+", token)))
+
+    def _resolved(self, token: str, at: int, subject: str) -> str | None:
+        """The thing that a word stands for: "it", "that", "them" and "the other one" are the last thing named in front
+        of a place that is not the subject, where that is clear."""
+        if re.fullmatch(r"[XS]\d+", token):
+            phrase = self._thing(token)
+            return self._other(subject, phrase) if phrase.is_other else token
+        if token == "itself":
+            return subject
+        if subject != self.mover and self.mover is not None and token == "it":
+            return self.mover
+        named = [each for each in self.plain[:at] if re.fullmatch(r"X\d+", each) and each != subject]
+        return named[-1] if named and token in {"it", "that", "this"} else None
+
+    def _other(self, subject: str, phrase: ObjectPhrase) -> str | None:
+        """The one thing, of those that are given or else named, that is not the subject."""
+        known = [each for each in self.things if not each.is_other and each != self._thing(subject) and " " .join(each.words)]
+        things = [f"X{at}" for at, each in enumerate(self.things) if each in known and f"X{at}" in self.plain]
+        if self.names:
+            left = [name for name in self.names if plain(name) != plain(self._thing(subject).text)]
+            if len(left) != 1:
+                return None
+            self.things.append(replace(parse_noun_phrase(left[0]) or phrase, text=left[0], is_given=True))
+            return f"X{len(self.things) - 1}"
+        if len(things) == 1:
+            return things[0]
+        return None if things else f"X{self.things.index(phrase)}"
+
+    def _asked(
+        self, asking: _Piece | None, stated: Sequence[_Piece], changes: Sequence[ChangeWords]
+    ) -> tuple[Asked | None, tuple[ObjectPhrase, ...]]:
+        """What is asked, and among which things; None where that is not clear."""
+        if asking is None or asking.form is None:
+            return None, ()
+        roles, form = asking.roles, asking.form
+        relation, negated = form.relation, form.negated != ("n" in roles)
+        if form.negated and "n" in roles:
+            return None, ()  # "will it not miss"
+        said_subject, said_target = roles.get("s", ""), roles.get("o", "")
+        subject = said_subject if said_subject.startswith("X") else self.mover or ""
+        acted = next((each for each in stated if each is not asking), None)
+        if acted is not None and said_subject in {"it", "that"}:
+            return None, ()
+        target, passive = None, asking.is_passive
+        if "both" in roles or said_target == "they":
+            moved = list(dict.fromkeys(each.roles.get("m", "") for each in self.pieces if each.what == "motion"))
+            pair = [each for each in moved if each.startswith("X") and each != subject]
+            pair = pair or [each for each in self._named_before(len(self.plain)) if each != subject]
+            if len(pair) != 1:
+                return None, ()
+            target = pair[0]
+        elif passive and said_target == "it":
+            target = self.mover
+        elif said_target == "EVERYTHING" and not negated:
+            return None, ()
+        elif said_target not in {"", "ANY", "EVERYTHING"}:
+            target = self._resolved(said_target, asking.start, subject)
+            if target is None:
+                return None, ()
+        doer = self._thing(subject) if subject and subject != self.mover else None
+        if relation == "covers" and target is not None and said_subject not in {"", "it"} and target == self.mover:
+            relation, target, doer = "covered", subject, None  # "the vase hides it"
+            subject = self.mover or ""
+        elif relation == "covers" and doer is not None and "be" in self.plain[asking.start : asking.start + 9] and "by" in self.plain[asking.start : asking.end]:
+            relation, target, doer = "covered", subject, self._thing(target) if target and target != self.mover else None
+        elif relation == "covers" and passive and target == self.mover:
+            relation, target = "covered", None
+        if relation in {"touches"} and passive and target == self.mover and form.form in {"whether", "when"}:
+            target = None
+        if relation == "touches" and target is not None and target == self.mover and doer is not None:
+            target, doer = subject, None
+        thing = None if target is None else self._thing(target)
+        if relation == "lands" and thing is not None:
+            thing, is_table = None, thing.head in lex.TABLES
+            if not is_table:
+                return None, ()
+        if relation == "inside" and thing is None:
+            puts = [each for each in changes if each.kind == "place" and each.targets]
+            thing = puts[0].targets[0] if puts else None
+            if form.form == "whether" and thing is None:
+                return None, ()
+        words = self.plain[asking.start : asking.end]
+        if relation == "inside" and thing is not None and "fit" not in words:
+            along = {"roll", "slide", "move", "drive", "push"} & set(words)
+            relation = "inside" if thing.head in (lex.HOLLOW if along else lex.CONTAINERS) else "touches"
+        if relation == "touches" and thing is not None and thing.head in lex.TABLES and not thing.colour and {"on", "onto"} & set(words):
+            self.table, relation, thing = thing, "lands", None
+        lists = [each for each in self.pieces if each.what == "listed"]
+        listed = [self._thing(each) for each in self._references(roles.get("l", "") or (lists[-1].roles["l"] if lists else ""))]
+        among = [self._thing(each).text for each in self._references(roles.get("a", ""))]
+        crash = [each.roles["o"] for each in stated if each is not asking and each.roles.get("o", "")[:1] == "X"]
+        if (form.form == "which-to-remove" or "r" in roles) and thing is None and crash:
+            thing = self._thing(crash[-1])  # "it will collide with the lamp. Which object ..."
+        if form.form in {"which", "which-to-remove"}:
+            among = [each.text for each in listed]
+            if form.form == "which-to-remove" and not among:
+                phrases = [parse_noun_phrase(text) for text in self.options]
+                among = [each.text for each in phrases if each is not None] if all(phrases) else []
+        kind = [self._thing(each) for each in self._references(roles.get("k", "").replace("K", "X"))]
+        if form.form == "how-many" and kind:
+            among = [each.text for each in kind]
+        is_partly = relation in {"covers", "covered"} and bool({"PARTLY", "SOMETIME"} & set(self.plain))
+        limits = [each.within for each in self.tokens.quantities if each.within is not None]
+        if relation in {"tips", "moves"} and thing is None and passive is False and said_target == "":
+            thing = None if self.mover is None else self._thing(self.mover)
+        target_text = None if thing is None or form.form in {"which", "how-many"} else thing.text
+        if form.form in {"which", "which-first", "which-to-remove", "how-many"} and form.form != "which-to-remove":
+            target_text = None
+        asked = Asked(
+            form=form.form, relation=relation, subject=None if doer is None else doer.text, target=target_text,
+            negated=negated, among=tuple(among), every=roles.get("q") == "ALLOF" and not negated,
+            partly=is_partly, within=min(limits, default=None),
+        )  # fmt: skip
+        if roles.get("q") == "NOOF":
+            asked = asked.model_copy(update={"negated": not negated})
+        return asked, tuple(listed or kind) if form.form == "which-first" else ()
+
+    def _others(
+        self, mover: ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
+    ) -> tuple[ObjectPhrase, ...]:
+        """The further things that are named, each once."""
+        removed = [each.object for each in changes if each.kind == "remove"]
+        named = [self._thing(token) for token in self._named_before(len(self.plain))]
+        places = [each.place.of for each in named if each.place is not None and each.place.of is not None]
+        phrases = [each for each in (*named, *places) if each not in (mover, *removed) and each.head != "container"]
+        if asked is not None and asked.form == "which-to-remove":
+            phrases += [each for each in map(parse_noun_phrase, asked.among) if each is not None]
+        texts = dict[str, ObjectPhrase]()
+        for each in phrases:
+            texts.setdefault(plain(each.text), each)
+        return tuple(texts.values())
+
+    def _unread(
+        self, read: set[int], asking: _Piece | None, asks: Sequence[_Piece], stated: Sequence[_Piece], moving: Sequence[_Piece]
+    ) -> list[tuple[str, str]]:
+        """The words that no form covers, each run with the part of the question to which it belongs."""
+        subject = "" if asking is None else asking.roles.get("s", "")
+        lists = [] if asking is not None and asking.form is not None and asking.form.form == "which-first" else [each for each in self.pieces if each.what == "listed"]
+        if asking is not None and asking.form is not None and (asking.form.form == "which-to-remove" or "r" in asking.roles):
+            stated = [each for each in stated if each.roles.get("s", "it") not in {"it", self.mover} or each.form is None]
+        for each in (*lists, *asks[1:], *(one for one in stated if one is not asking and one not in moving)):
+            if each.roles.get("o", "") != subject or not subject.startswith("X") or each.what != "stated":
+                read = read - set(range(each.start, each.end))
+        runs, run = list[list[int]](), list[int]()
+        for at, token in enumerate(self.plain):
+            ends = token in {".", "?", "!", ";", ","}
+            if at in read or ends:
+                runs, run = ([*runs, run] if run else runs), []
+            else:
+                run.append(at)
+        runs += [run] if run else []
+        found = list[tuple[str, str]]()
+        for run in runs:
+            words = [self.plain[at] for at in run]
+            limits = [self.tokens.quantities[int(word[1:])].within for word in words if re.fullmatch(r"Q\d+", word)]
+            if all(word in forms.CONNECTORS or re.fullmatch(r"Q\d+", word) for word in words) and None not in limits:
+                continue
+            before = [each for each in self.pieces if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])]
+            what = "motion" if before and before[-1].what == "motion" else "asked"
+            found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words).lower()))
+        return found
+
+
+def _joined(first: MotionWords, second: MotionWords) -> MotionWords:
+    """A motion that is told in two places."""
+    told = {name: value for name, value in vars(second).items() if value not in (None, 0.0, "", (), False)}
+    clash = second.kind not in (None, first.kind) or any(getattr(first, name) not in (None, 0.0, value) for name, value in told.items() if name in {"direction", "depth", "along_arrow", "forward"})
+    kept = {name: value for name, value in told.items() if getattr(first, name) in (None, 0.0, "", (), False)}
+    kept["quantities"] = (*first.quantities, *second.quantities)
+    return replace(first, **kept, is_contradictory=clash or first.is_contradictory)
+
+
+@dataclass
+class _Leg:
+    """What the words of one leg say."""
+
+    verb: str
+    ways: list[Vector] = field(default_factory=list[Vector])
+    depths: set[float] = field(default_factory=set[float])
+    senses: set[bool] = field(default_factory=set[bool])
+    ahead: set[bool] = field(default_factory=set[bool])
+    towards: ObjectPhrase | None = None
+    trail: TrailWords | None = None
+    marks: set[str] = field(default_factory=set[str])
+    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
+
+    @property
+    def says_way(self) -> bool:
+        """Whether it says more than that something moves."""
+        return bool(self.ways or self.depths or self.senses or self.ahead or self.quantities or self.towards or self.trail) or self.verb in lex.MOTIONS["fall"]
+
+    def take(self, roles: dict[str, str], parser: _Parser) -> bool:
+        """Takes an adverbial; false where it says nothing here."""
+        name, text = next(iter(roles.items()))
+        match name:
+            case "way":
+                self.ways.append(forms.WAYS[text])
+            case "depth":
+                self.depths.add(-1.0 if text == "NEAR" else 1.0)
+            case "sense":
+                self.senses.add(text == "ALONG")
+            case "ahead":
+                self.ahead.add(text == "FORWARD")
+            case "goal":
+                if self.towards is not None:
+                    return False
+                self.towards = parser.things[int(text[1:])]
+            case "quantity":
+                said = parser.tokens.quantities[int(text[1:])]
+                if said.within is not None:
+                    return False
+                self.quantities.append(said)
+            case "halt" if not self.quantities:
+                return False
+            case _:
+                self.marks.add(name)
+        return True
+
+    def way(self, kind: MotionKind | None) -> tuple[Vector | None, float]:
+        """A unit vector in the image, and the depth."""
+        x, y = (sum(way[axis] for way in self.ways) for axis in (0, 1))
+        if kind == "fall":
+            y = 0.0  # down is what a fall does; only what leads away from it is a direction
+        elif not self.ways:
+            y = -1.0 if self.verb in _RISING else 1.0 if self.verb in _SINKING else 0.0
+        length, depth = math.hypot(x, y), float(sum(self.depths))
+        return ((x / length, y / length), depth * math.sqrt(0.5)) if length > 1e-9 else (None, depth)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether two of its words are opposites."""
+        up = [way[1] for way in self.ways]
+        turned = (self.verb in lex.MOTIONS["fall"] and min(up, default=0) < 0) or (self.verb in _RISING and max(up, default=0) > 0)
+        opposed = any(a[0] * b[0] < 0 or a[1] * b[1] < 0 for a in self.ways for b in self.ways)
+        return turned or opposed or any(len(each) > 1 for each in (self.depths, self.senses, self.ahead)) or (self.says_way and "still" in self.marks)
+
+
+_RISING, _SINKING = lex.words("lift raise rise climb ascend"), lex.words("descend lower")
+
+
+def _in_words(legs: Sequence[_Leg], kind: MotionKind | None) -> MotionWords:
+    first, *rest = legs
+    over = "over" in first.marks and first.verb in lex.words("knock push tip fall turn blow topple")
+    ways = [leg.way(None) for leg in rest]
+    return MotionWords(
+        kind,
+        next(iter(first.senses), None),
+        *first.way(kind),
+        False if first.verb == "reverse" else None if first.senses else next(iter(first.ahead), None),
+        first.verb,
+        first.towards,
+        first.trail,
+        tuple(first.quantities),
+        tuple(StepWords(*way, tuple(leg.quantities)) for way, leg in zip(ways, rest, strict=True)),
+        is_contradictory=any(leg.contradicts for leg in legs),
+        topples=(over or first.verb in {"tip", "topple"}),
+        in_air=first.verb in {"drop", "release", "detach", "let go"} or "freely" in first.marks,
+    )
+
+
+_TOPICS = (
+    (r"fit|put|contain|inside", ("Does the {m} fit into the {o}?",)),
+    (r"hid|occlu|cover|behind|block|view|visible", ("If the {m} moves {way}, will it hide the {o}?", "If the {m} moves {way}, will the {o} be occluded?")),
+    (r"remov|taken? |avoid|prevent|without", ("If the {m} moves {way}, can the collision be avoided by removing the {o}?", "If the {m} moves {way}, which object should be removed to avoid the collision?")),
+    (r"first|order|which", ("If the {m} moves {way}, which object will it hit first?",)),
+    (r"", ("If the {m} moves {way}, will it hit the {o}?", "If the {m} moves {way}, what happens?")),
+)  # fmt: skip
+
+
+def rewordings(question: Question) -> tuple[str, ...]:
+    """Up to three questions in forms that are read, with the names of this one and about what it asks."""
+    names = [each.text for each in (question.mover, *question.others) if each is not None and " of " not in each.text]
+    motion, said = question.motion, " ".join(question.unread).lower()
+    ways = {(-1.0, 0.0): "to the left", (1.0, 0.0): "to the right"}
+    way = "opposite to the direction of the arrow" if motion.along_arrow is False else "in the direction of the arrow"
+    way = ways.get(motion.direction or (0.0, 0.0), way if motion.forward is None else "forward")
+    found = list[str]()
+    for topic, patterns in _TOPICS:
+        if re.search(topic, said) and names:
+            found += [each.format(m=names[0], o=names[1] if len(names) > 1 else "", way=way) for each in patterns if len(names) > 1 or "{o}" not in each]
+    read = [each for each in found if parse(each).asked is not None]
+    return tuple(dict.fromkeys(read))[:3]
