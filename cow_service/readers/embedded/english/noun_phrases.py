@@ -11,77 +11,17 @@ from typing import Literal
 
 from cow_service.readers.base import Quantity, Unit
 from cow_service.readers.embedded.english import lexicon as lex
+from cow_service.readers.embedded.english.forms import forms
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.options import plain
 from cow_service.records import Shape
 
 _COLOUR = "|".join(lex.COLOURS)
-_ARROW = rf"(?:(?:the|this|that|its) )?(?:(?:{_COLOUR}|drawn|shown) )*arrow(?:head)?"
-_SAYS = r"(?:show|indicat|point|mark|draw|giv|suggest|depict|say|tell)\w*"
-_TOLD = rf"(?:(?:that |which )?(?:is |are )?(?:shown|indicated|marked|drawn|given|depicted)(?: by {_ARROW}| in IMAGE)?)"
-_WAY = r"(?:direction|way|path)"
-_TO = r"(?:(?:straight|directly|further|over|across|off|back|away|diagonally|all the way|closer|nearer) )*"
 _NUMBER = r"(\d+(?:\.\d+)?|half an?|an?|" + "|".join((*lex.NUMBER_WORDS, "ten", "twenty", "thirty", "fifty")) + ")"
 _ABOUT = r"(?:(?:about|only|just|roughly|approximately|exactly) )?"
 _LENGTH = "(" + "|".join(("px", "pixels?", *lex.METRES)) + r")\b"
 _SECOND = r"(?:seconds?|secs?|s)\b"
 _HALT = r"(?:,? (?:but |and )?(?:then )?(?:it )?(?:stops|halts|pauses)(?: dead| there)?\b)?"
-_THINGS = r"(?:objects?|things?|items?|obstacles?|bod(?:y|ies))"
-
-# Idioms, each with what stands in its place; in this order.
-IDIOMS = tuple((re.compile(rf"(?<![\w'-])(?:{idiom})(?![\w'-])"), token) for idiom, token in (
-    # Words around the question that change nothing.
-    (r"[\"“”'‘’]\w+(?: \w+)*[\"“”'‘’] means [^.?!]*[.?!]?", ""),  # "Fit into" means that ...
-    (r"(?:^|(?<=[.?!] ))(?:question ?\d* ?:|quick question:?|excuse me,|(?:ok|okay|so|now|well|right|hi|hello|hey|and)(?: so)?,?)(?= )", ""),
-    (r", (?:right|okay|ok)(?= ?[?.])|(?:, )?(?:yes or no|or not)(?= ?[?.])|\(yes ?/ ?no\)|if any(?= ?[?.,])", ""),
-    (r"(?:please )?(?:can|could|would) you (?:please |kindly )?(?:tell me|say|predict|let me know),? (?:whether|if)", "ASK"),
-    (r"i wonder (?:whether|if)|(?:please )?(?:tell|let) me (?:know )?(?:whether|if)|what i(?:'d| would) like to know is whether", "ASK"),
-    (r"(?:do you think|would you say|is it true)(?: that)?|(?:is|are) there (?:any|a) (?:chance|risk|danger|way) (?:of|that|for)|any (?:chance|risk|danger) (?:of|that)", "ASK"),
-    (r"true or false ?[:?,]?", "CLAIM"),
-    (r"let's (?:say|assume|suppose|imagine)(?: that)?|(?:^|(?<=[.?!] ))say(?: that)?|provided(?: that)?", "if"),
-    (rf"(?:forget|ignore) {_ARROW}(?: and|,)?", ""),
-    (r"giv(?:es?|ing|en) (?:to )?((?:the |a )?[^,.?]+?|it) an? (?:\w+ )*?(push|shove|kick|nudge|flick)", r"push \1"),
-    (r"(?:the )?(?:very )?(?:tip|top) of|(?:the|its) edge of(?= the| [XN])", ""), (r"backs? up|backed up", "move BACKWARD"),
-    (r"please|kindly|pretty|what if", lambda found: "if" * (found[0] == "what if")),
-    (r"(?:on|along|in|during) (?:its|the|this) (?:way|flight|course|fall|journey|path|motion|movement)(?: (?:there|down|over|up|along))?(?! (?:of|by|that|which|where|shown)| (?:the |that |this )?arrow)", ""),
-    (r"along the way|in the (?:process|end)|at the end(?! of)|as a result|at all|in total|altogether|eventually|actually|thereby|afterwards|simply|just|also|ever|suddenly|anyway", ""),
-    (r"gonna|going to", ""), (r"carr(?:y|ies) on|keeps? on|keeps?(?= \w+ing)", "continue"), (r"sets? off", "go"), (r"at the (?:very )?same (?:time|moment|instant)|simultaneously|at once", "while"),
-    (r"before (?:it|that ball|the \w+ ball) (?:hits|reaches|touches|gets to) (?:a|the|any|one) (?:cushion|rail|wall|edge)s?", ""),
-    (r"(?:get in the way of|block\w*|obstruct\w*) (?:(?:the|our|my|your) )?(?:view|sight) of|(?:(?:be|is) )?(?:pass\w*|mov\w+|goes|go|come|stand\w*) in front of|(?:be|is|get) in front of", "hide"),
-    (r"(?:from|out of) (?:the |our |my )?(?:view|sight)|from us", ""),
-    # What is looked at, and where that stands.
-    (r"there (?:is|are|was)(?= an? | the | N)", "THERE"),
-    (rf"(?:the|this|that) (?:{'|'.join(lex.IMAGES.split('|'))})", "IMAGE"),
-    (rf"(?:the|its) (?:{lex.FLOORS})", "FLOOR"),
-    (rf"(?:the )?(?:first|last|next) (?:{_THINGS}|one)(?: that)?", lambda found: "FIRST" if "first" in found[0] else found[0]),
-    (rf"(?:any|another|some|an?|a single|one of the|any of the)(?: other)? {_THINGS}(?: else)?|(?:any|some)thing(?: else)?|any of (?:them|these|those)", "ANY"),
-    (rf"nothing(?: else)?|no(?: other)? {_THINGS}|none of (?:them|the {_THINGS})", "NONE"),
-    (rf"(?:which|what) (?:of (?:the|these|those) )?(?:other )?(?:{_THINGS}|ones?)(?: of (?:them|these|those|the {_THINGS}))?|which of (?:(?:the )?(?:two|three|four)|them|these|those)(?= (?:will|would|does|is|gets|it|do))", "WHICH"),
-    (rf"how many (?:of )?(?:the )?(?:other )?{_THINGS}", "HOWMANY"),
-    (r"at what (?:time|moment|point|instant)", "when"), (r"each other|one another", "EACH"), (r"(?:these|those|the) two(?= (?:ever |then )?(?:collide|meet|touch|hit|crash|run|bump|running))|both of them", "they"),
-    # Which way.
-    (rf"(?:in |into |along )?(?:exactly )?(?:the )?(?:opposite|reverse|contrary) (?:{_WAY} )?(?:to |of |from )?(?:the {_WAY} )?(?:of |to |in which |that |shown by |indicated by |where )?(?:{_ARROW}|(?:this|that) {_WAY})(?: (?:is )?{_SAYS})?", "AGAINST"),
-    (rf"against (?:the {_WAY} of )?{_ARROW}|(?:in |exactly )*the (?:opposite|reverse|other) {_WAY}|away from where {_ARROW} {_SAYS}|in {_ARROW}'s opposite {_WAY}|opposite to (?:the )?(?:shown|indicated) {_WAY}|opposite to (?:this|that|the) {_WAY}", "AGAINST"),
-    (rf"(?:exactly )?(?:(?:in|into|towards?|along|to|following|given|by) )?(?:exactly )?the (?:same )?{_WAY} (?:(?:of|in which|that|which|where|to which|towards which) )?(?:the )?(?:{_TOLD}|{_ARROW}(?: (?:is )?{_SAYS})?)", "ALONG"),
-    (rf"(?:in|into|along|towards?|to|following|follows?) (?:this|that|the (?:shown|indicated|marked|drawn|given|depicted|specified)|{_ARROW}(?:'s)?) {_WAY}", "ALONG"),
-    (rf"follow(?:s|ing|ed)? {_ARROW}", "move ALONG"),
-    (rf"(?:along|with|by) {_ARROW}|(?:where|as|like|how|the way) {_ARROW}(?: is)? {_SAYS}|(?:as|like) (?:it is )?(?:shown|drawn|indicated|marked|depicted)(?: by {_ARROW}| in IMAGE)?|(?:this|that) way", "ALONG"),
-    (r"(?:in|along) the (?:direction|way) (?:that )?(?:it|its \w+)(?:'s| is| are)? (?:fac|point|head)\w+|the way (?:that )?(?:it|its \w+)(?:'s| is| are)? (?:fac|point)\w+|(?:straight |nose )?(?:forwards?|ahead|first)(?<!straight first)(?<! first)|straight on", "FORWARD"),
-    (r"(?:straight )?backwards?|in reverse|tail first", "BACKWARD"),
-    (rf"{_TO}(?:towards?|to|at) (?:the |our )?(?:camera|viewer|observer|us|me)|(?:closer|nearer) to (?:the )?(?:camera|viewer)", "NEAR"),
-    (rf"{_TO}(?:away from|deeper into) (?:the )?(?:camera|viewer|observer|us|me|IMAGE)|into the (?:background|distance)|away(?= ?[,.?]|$| for | by )", "AWAY"),
-    *((rf"{_TO}(?:(?:to|towards?|into) (?:the|its) (?:far )?{word}(?:[ -]hand)?(?: side| edge| end| corner)?(?: of IMAGE)?(?! (?:of|edge|side) )|{word}wards?)", token)
-      for word, token in (("left", "LEFT"), ("right", "RIGHT"), ("top", "UP"), ("up", "UP"), ("bottom", "DOWN"), ("down", "DOWN"))),
-    (r"freely|straight down|vertically", "FREELY"), (r"from (?:its|the) (?:current|present|original|starting) (?:position|place)|from (?:where it is(?: now)?|there|rest)", ""),
-    (r"(?:on |further )?(?:along|following|follows?|continu\w+(?: on| along)?|as|on) (?:its|the|this|that) (?:\w+ )?(?:trail|trajectory|path|row)(?: of (?:its |the )?(?:earlier |past |previous )?(?:positions|places))?(?: (?:(?:that|which) (?:is|are) )?shown)?(?: suggests)?", "TRAIL"),
-    # How it is put that something is hit or hidden.
-    (r"(?:mak\w+|made) (?:\w+ )?contact with|(?:com\w+|came|gets?|got|is|be) in(?:to)? (?:\w+ )?contact with|com\w+ across", "hit"),
-    (r"(?:mak\w+|made) (?:\w+ )?contact", "collide"),
-    (r"(?:(?:the|a|any|this|that|physical|further) )*collisions?|(?:(?:the|a|any|this|that|physical) )+(?:contact|crash|impact)s?", "CRASH"),
-    (r"(?:at|in|for) (?:some|any|one|a) (?:brief |short )?(?:point|moment|time|stage|instant|while)(?: in time)?(?: (?:of|during) (?:its|the) \w+)?", "SOMETIME"),
-    (r"(?:at least )?(?:partly|partially|in part)|even if just a (?:bit|part) of it|(?:at least )?(?:a |any |some )?part of", "PARTLY"),
-    (r"get\w* rid of|got rid of", "remove"), (r"(?:is|are|was|were|be|had been|has been) (?:already )?(?:gone|absent|missing)|(?:is|are|was|were|had|has) (?:not|never) (?:been )?(?:there|here|present)", "VANISHED"),
-))  # fmt: skip
 _CONTRACTED = ((r"\bcan ?not\b", "can not"), (r"\bwo ?n't\b", "will not"), (r"\bca n't\b|\bcan't\b", "can not"), (r"n't\b", " not"),
     (r"\b(what|where|it|there|that|here|who|which)'s\b", r"\1 is"), (r"\bwhat's\b", "what is"), (r"\bit'd\b", "it would"), (r"\bi'd\b", "i would"))  # fmt: skip
 _TOKEN = re.compile(r"N\d+N|[A-Z]+\d*|\d+(?:\.\d+)?|[a-z]+(?:['-][a-z]+)*|\w+|[.,;:?!()-]")
@@ -132,7 +72,7 @@ def tokens_of(text: str, names: Sequence[str] = ()) -> Tokens:
         words = r"\s+".join(map(re.escape, name.lower().split()))
         text = re.sub(rf"(?<![\w'-]){words}(?![\w'-])", f"N{at}N", text)
     text = _with_quantities(text, reader.quantities)
-    for idiom, token in IDIOMS:
+    for token, idiom in forms()["idioms"]:
         text = " ".join(idiom.sub(token, text).split())
     words = _TOKEN.findall(text)
     at = 0

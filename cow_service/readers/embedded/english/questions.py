@@ -133,7 +133,10 @@ _PLACE = re.compile(
     r"|(?:that|which) be (?P<near>NEAR|(?:farthest|further|farther) AWAY))(?: ,(?= that))?(?= |$)"
 )
 _MOVES_OBJECT = lex.CAUSES | lex.words("put place set insert position stand let go be")
-_PIECES = ("asked", "motion", "change", "stated", "listed", "nothing")
+_PIECES = {"asked": "asked", "moved": "motion", "changes": "change", "stated": "stated"}
+_ORDER = ("asked", "motion", "change", "stated", "listed", "nothing")
+_VERBS = "|".join(sorted(lex.KINDS, key=len, reverse=True))
+_TELLING = ("sense", "ahead", "depth", "way", "goal", "quantity")
 
 
 @dataclass
@@ -145,9 +148,13 @@ class _Piece:
     end: int
     roles: dict[str, str] = field(default_factory=dict[str, str])
     form: forms.Form | None = None
-    relation: PlaceRelation | None = None
     motion: MotionWords = MotionWords()
-    is_passive: bool = False  # what is acted on stands first
+
+    @property
+    def is_passive(self) -> bool:
+        """Whether what is acted on stands in front of what acts."""
+        order = [role for role in self.roles if role in {"s", "o"}]
+        return self.what == "asked" and order[:1] == ["o"]
 
 
 class _Parser:
@@ -199,8 +206,8 @@ class _Parser:
     def _put_behind(self) -> None:
         """Puts "the ball, rolling left," in front of the question that it interrupts."""
         text = " ".join(self.plain)
-        found = re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ,? ?(?:when |if )?((?:{forms.VERBS})(?: [^,.?]*?)?) , (?=[a-zA-Z])", text)
-        found = found or re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ((?:{forms.VERBS}) (?:ALONG|AGAINST|LEFT|RIGHT|FORWARD|NEAR))() (?=(?:still |then )*\w)", text)
+        found = re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ,? ?(?:when |if )?((?:{_VERBS})(?: [^,.?]*?)?) , (?=[a-zA-Z])", text)
+        found = found or re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ((?:{_VERBS}) (?:ALONG|AGAINST|LEFT|RIGHT|FORWARD|NEAR))() (?=(?:still |then )*\w)", text)
         if found is None or ("," not in found[0] and not self.said[text[: found.start(3)].count(" ")].endswith(("ing", "n"))):
             return
         a, b, c = (text[: found.start(at)].count(" ") for at in (1, 3, 1))
@@ -215,81 +222,44 @@ class _Parser:
     def _cover(self) -> list[_Piece]:
         at, pieces = 0, list[_Piece]()
         while at < len(self.plain):
-            piece = max(self._from(at), key=lambda each: (each.end, -_PIECES.index(each.what)), default=None)
+            piece = max(self._from(at), key=lambda each: (each.end, -_ORDER.index(each.what)), default=None)
             pieces += [] if piece is None else [piece]
             at = at + 1 if piece is None else piece.end
         return pieces
 
     def _from(self, at: int) -> list[_Piece]:
         """What may begin at a token."""
-        start, found = self.starts[at], list[_Piece]()
-        for what, listed in (("asked", forms.ASKED), ("stated", forms.STATED)):
-            for form in listed:
-                match = form.pattern.match(self.text, start)
-                if match is not None:
-                    at_o, at_s = (min((match.start(name) for name in match.groupdict() if name[0] == role and match[name]), default=1e9) for role in "os")
+        found, start = list[_Piece](), self.starts[at]
+        for section in ("asked", "stated", "changes", "rest", "moved"):
+            for form in forms.forms()[section]:
+                if (match := form.pattern.match(self.text, start)) is not None:
+                    what = form.says if section == "rest" else _PIECES[section]
                     piece = _Piece(what, at, self._end(match), forms.roles(match), form)
-                    piece.is_passive = what == "asked" and at_o < at_s
-                    found.append(piece)
-        for pattern in forms.REMOVED:
-            if (match := pattern.match(self.text, start)) is not None:
-                found.append(_Piece("change", at, self._end(match), forms.roles(match)))
-        for relation, pattern in forms.PLACED:
-            if (match := pattern.match(self.text, start)) is not None:
-                found.append(_Piece("change", at, self._end(match), forms.roles(match), relation=relation))
-        if (match := forms.FITTING.match(self.text, start)) is not None:
-            found.append(_Piece("change", at, self._end(match), forms.roles(match), relation="into"))
-        if (match := forms.LISTED.match(self.text, start)) is not None:
-            found.append(_Piece("listed", at, self._end(match), forms.roles(match)))
-        if (match := re.compile(r"THERE X\d+(?:(?: ,| and)* X\d+)*(?: on FLOOR| in IMAGE)?(?= [,.])").match(self.text, start)):
-            found.append(_Piece("nothing", at, self._end(match)))
-        motions = [motion for pattern in forms.MOVED if (motion := self._motion(pattern, start, at)) is not None]
-        trail = forms.TRAIL.match(self.text, start)
-        if trail is not None or forms.ADVERBIAL.match(self.text, start):
-            way = self._adverbials(_Piece("motion", at, at), "")
-            motions += [way] if way.motion != MotionWords() else []
-        return found + [each for each in motions if each.end > at]
+                    found.append(self._adverbials(piece, piece.roles.get("verb", form.says)) if section == "moved" else piece)
+        way = self._adverbials(_Piece("motion", at, at), "")
+        return [each for each in (*found, way) if each.end > at and (each.what != "motion" or each.motion != MotionWords())]
 
     def _end(self, match: re.Match[str]) -> int:
         """The place of the first token behind a match."""
         return self.place_of[match.end() + 1] if match.end() + 1 in self.place_of else len(self.plain)
 
-    # --- motions
-
-    def _motion(self, pattern: re.Pattern[str], start: int, at: int) -> _Piece | None:
-        match = pattern.match(self.text, start)
-        if match is None:
-            return None
-        roles = forms.roles(match)
-        verb = roles.get("verb", "let go")
-        verb = "let go" if verb == "go" and "let" in match[0].split() else verb
-        piece = _Piece("motion", at, self._end(match), roles)
-        return self._adverbials(piece, verb)
-
     def _adverbials(self, piece: _Piece, verb: str) -> _Piece:
         """The piece with the words for the way that follow its verb."""
-        legs, at, verbs = [_Leg(verb)], piece.end, re.compile(rf"(?P<verb>{forms.VERBS})(?= |$)")
+        legs, at, ways = [_Leg(verb)], piece.end, {form.says: form.pattern for form in forms.forms()["ways"]}
+        verbs = re.compile(rf"(?P<verb>{_VERBS})(?! X)(?= |$)")
         while at < len(self.plain):
-            leg, start = legs[-1], self.starts[at]
-            if (match := forms.TRAIL.match(self.text, start)) is not None:
-                said = forms.roles(match)
-                near = self.things[int(said["near"][1:])] if "near" in said else None
-                leg.trail = TrailWords(near, forms.SIDES.get(said.get("side", "")))
-            elif (match := forms.ADVERBIAL.match(self.text, start)) is not None and leg.take(forms.roles(match), self):
-                if "then" in forms.roles(match) or "leg" in forms.roles(match):
-                    after = forms.ADVERBIAL.match(self.text, self.starts[self._end(match)]) if self._end(match) < len(self.plain) else None
-                    again = verbs.match(self.text, self.starts[self._end(match)]) if self._end(match) < len(self.plain) else None
-                    if (after is None or "nothing" in forms.roles(after)) and again is None:
-                        break
-                    legs.append(_Leg(again["verb"] if again else ""))
-                    match = again or match
-            else:
+            said = next(((name, match) for name, way in ways.items() if (match := way.match(self.text, self.starts[at]))), None)
+            if said is None or not legs[-1].take(said[0], forms.roles(said[1]), self):
                 break
-            at = self._end(match)
-        if len(legs) > 1 and not legs[-1].says_way:
-            at = piece.end if len(legs) == 2 and not legs[0].says_way else at
-        kind = lex.KINDS.get(verb, "fall" if verb == "let go" else None)
-        kind = "static" if "n" in piece.roles else kind
+            end = self._end(said[1])
+            if said[0] == "then":
+                again = verbs.match(self.text, self.starts[end])
+                if again is None and not any(ways[name].match(self.text, self.starts[end]) for name in _TELLING):
+                    break
+                legs.append(_Leg(again["verb"] if again else ""))
+                end = self._end(again) if again else end
+            at = end
+        kind = "static" if "n" in piece.roles else lex.KINDS.get(verb, "fall" if verb == "let go" else None)
         piece.end, piece.motion = at, _in_words(legs, kind)
         return piece
 
@@ -340,7 +310,7 @@ class _Parser:
             alternatives=alternatives,
             table=self.table,
             names_arrow="ALONG" in words or "AGAINST" in words or any("arrow" in word for word in self.said),
-            names_direction=any(word in forms.WAYS or word in {"FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"} for word in words),
+            names_direction=any(word.upper() in forms.WAYS or word in {"FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"} for word in words),
             unread=tuple(dict.fromkeys(said for _, said in unread)),
             unread_motion=tuple(dict.fromkeys(said for what, said in unread if what == "motion")),
         )
@@ -362,7 +332,8 @@ class _Parser:
             roles = piece.roles
             if "r" in roles:
                 found += [ChangeWords("remove", self._thing(token)) for token in self._references(roles["r"])]
-            if piece.relation is None or (roles["y"] == "it" and not found):
+            relation = forms.relation_of(roles)
+            if relation is None or "x" not in roles:
                 continue
             y = self._resolved(roles["y"], piece.start, roles["x"])
             if y is None or self._thing(y).head == "container":
@@ -370,8 +341,8 @@ class _Parser:
                     found.append(ChangeWords("place", self._thing(roles["x"]), "into"))
                 continue
             targets = [self._thing(y), *([self._thing(roles["z"])] if "z" in roles else [])]
-            found.append(ChangeWords("place", self._thing(roles["x"]), piece.relation, tuple(targets)))
-        fits = asking is not None and asking.form is not None and asking.form.relation == "inside" and not found
+            found.append(ChangeWords("place", self._thing(roles["x"]), relation, tuple(targets)))
+        fits = asking is not None and asking.form is not None and asking.form.asks[1] == "inside" and not found
         if fits and asking is not None and not any(each.what == "motion" for each in self.pieces):
             subject, container = asking.roles.get("s", ""), asking.roles.get("o", "")
             if subject.startswith("X") and (container.startswith("X") or "l" in asking.roles):
@@ -451,9 +422,9 @@ class _Parser:
         """What is asked, and among which things; None where that is not clear."""
         if asking is None or asking.form is None:
             return None, ()
-        roles, form = asking.roles, asking.form
-        relation, negated = form.relation, form.negated != ("n" in roles)
-        if form.negated and "n" in roles:
+        roles, (form, relation, is_negated) = asking.roles, asking.form.asks
+        negated = is_negated != ("n" in roles)
+        if is_negated and "n" in roles:
             return None, ()  # "will it not miss"
         said_subject, said_target = roles.get("s", ""), roles.get("o", "")
         subject = said_subject if said_subject.startswith("X") else self.mover or ""
@@ -484,7 +455,7 @@ class _Parser:
             relation, target, doer = "covered", subject, self._thing(target) if target and target != self.mover else None
         elif relation == "covers" and passive and target == self.mover:
             relation, target = "covered", None
-        if relation in {"touches"} and passive and target == self.mover and form.form in {"whether", "when"}:
+        if relation in {"touches"} and passive and target == self.mover and form in {"whether", "when"}:
             target = None
         if relation == "touches" and target is not None and target == self.mover and doer is not None:
             target, doer = subject, None
@@ -496,7 +467,7 @@ class _Parser:
         if relation == "inside" and thing is None:
             puts = [each for each in changes if each.kind == "place" and each.targets]
             thing = puts[0].targets[0] if puts else None
-            if form.form == "whether" and thing is None:
+            if form == "whether" and thing is None:
                 return None, ()
         words = self.plain[asking.start : asking.end]
         if relation == "inside" and thing is not None and "fit" not in words:
@@ -508,31 +479,31 @@ class _Parser:
         listed = [self._thing(each) for each in self._references(roles.get("l", "") or (lists[-1].roles["l"] if lists else ""))]
         among = [self._thing(each).text for each in self._references(roles.get("a", ""))]
         crash = [each.roles["o"] for each in stated if each is not asking and each.roles.get("o", "")[:1] == "X"]
-        if (form.form == "which-to-remove" or "r" in roles) and thing is None and crash:
+        if (form == "which-to-remove" or "r" in roles) and thing is None and crash:
             thing = self._thing(crash[-1])  # "it will collide with the lamp. Which object ..."
-        if form.form in {"which", "which-to-remove"}:
+        if form in {"which", "which-to-remove"}:
             among = [each.text for each in listed]
-            if form.form == "which-to-remove" and not among:
+            if form == "which-to-remove" and not among:
                 phrases = [parse_noun_phrase(text) for text in self.options]
                 among = [each.text for each in phrases if each is not None] if all(phrases) else []
         kind = [self._thing(each) for each in self._references(roles.get("k", "").replace("K", "X"))]
-        if form.form == "how-many" and kind:
+        if form == "how-many" and kind:
             among = [each.text for each in kind]
         is_partly = relation in {"covers", "covered"} and bool({"PARTLY", "SOMETIME"} & set(self.plain))
         limits = [each.within for each in self.tokens.quantities if each.within is not None]
         if relation in {"tips", "moves"} and thing is None and passive is False and said_target == "":
             thing = None if self.mover is None else self._thing(self.mover)
-        target_text = None if thing is None or form.form in {"which", "how-many"} else thing.text
-        if form.form in {"which", "which-first", "which-to-remove", "how-many"} and form.form != "which-to-remove":
+        target_text = None if thing is None or form in {"which", "how-many"} else thing.text
+        if form in {"which", "which-first", "which-to-remove", "how-many"} and form != "which-to-remove":
             target_text = None
         asked = Asked(
-            form=form.form, relation=relation, subject=None if doer is None else doer.text, target=target_text,
+            form=form, relation=relation, subject=None if doer is None else doer.text, target=target_text,
             negated=negated, among=tuple(among), every=roles.get("q") == "ALLOF" and not negated,
             partly=is_partly, within=min(limits, default=None),
         )  # fmt: skip
         if roles.get("q") == "NOOF":
             asked = asked.model_copy(update={"negated": not negated})
-        return asked, tuple(listed or kind) if form.form == "which-first" else ()
+        return asked, tuple(listed or kind) if form == "which-first" else ()
 
     def _others(
         self, mover: ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
@@ -554,8 +525,8 @@ class _Parser:
     ) -> list[tuple[str, str]]:
         """The words that no form covers, each run with the part of the question to which it belongs."""
         subject = "" if asking is None else asking.roles.get("s", "")
-        lists = [] if asking is not None and asking.form is not None and asking.form.form == "which-first" else [each for each in self.pieces if each.what == "listed"]
-        if asking is not None and asking.form is not None and (asking.form.form == "which-to-remove" or "r" in asking.roles):
+        lists = [] if asking is not None and asking.form is not None and asking.form.asks[0] == "which-first" else [each for each in self.pieces if each.what == "listed"]
+        if asking is not None and asking.form is not None and (asking.form.asks[0] == "which-to-remove" or "r" in asking.roles):
             stated = [each for each in stated if each.roles.get("s", "it") not in {"it", self.mover} or each.form is None]
         for each in (*lists, *asks[1:], *(one for one in stated if one is not asking and one not in moving)):
             if each.roles.get("o", "") != subject or not subject.startswith("X") or each.what != "stated":
@@ -608,12 +579,15 @@ class _Leg:
         """Whether it says more than that something moves."""
         return bool(self.ways or self.depths or self.senses or self.ahead or self.quantities or self.towards or self.trail) or self.verb in lex.MOTIONS["fall"]
 
-    def take(self, roles: dict[str, str], parser: _Parser) -> bool:
-        """Takes an adverbial; false where it says nothing here."""
-        name, text = next(iter(roles.items()))
+    def take(self, name: str, roles: dict[str, str], parser: _Parser) -> bool:
+        """Takes words for the way; false where they say nothing here."""
+        text = next(iter(roles.values()), "")
         match name:
+            case "trail":
+                near = parser.things[int(roles["near"][1:])] if "near" in roles else None
+                self.trail = TrailWords(near, forms.SIDES.get(roles.get("side", "")))
             case "way":
-                self.ways.append(forms.WAYS[text])
+                self.ways.append(forms.WAYS[text.upper()])
             case "depth":
                 self.depths.add(-1.0 if text == "NEAR" else 1.0)
             case "sense":
