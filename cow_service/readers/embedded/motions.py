@@ -92,7 +92,9 @@ def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | Loc
     raise CannotReadDirection(fault, remedy=GIVE_DIRECTION)
 
 
-def other_readings(scene: Scene, others: Sequence[tuple[ObjectPhrase, MotionWords]], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
+def other_readings(
+    scene: Scene, others: Sequence[tuple[ObjectPhrase, MotionWords]], grounding: Grounding
+) -> tuple[OtherMotionReading, ...]:
     """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
     readings: list[OtherMotionReading] = []
     for phrase, motion in others:

@@ -199,7 +199,7 @@ def _not_said(question: Question, given: ReaderInput) -> CannotGround:
     fault = f"The question does not say in words what moves and how: '{unread}' was not understood."
     if question.mover is not None and not question.unread:
         fault = f"The question does not say how the {question.mover.text} moves."
-    like = rewordings(question) or ('If the red ball moves to the left, will it hit the vase?',)
+    like = rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",)
     return CannotGround(f"{fault} Ask like: {' Or: '.join(like)}", remedy=LOCATE_IT)
 
 
@@ -270,7 +270,9 @@ class _Finder:
             return None
         # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
         beside = [
-            each for each in self.regions if each.bbox != mover and (each.called or not is_same_object(each.bbox, mover))
+            each
+            for each in self.regions
+            if each.bbox != mover and (each.called or not is_same_object(each.bbox, mover))
         ]
         if phrase.is_other:
             return LocatedObject(object=phrase.text, bbox=beside[0].bbox) if len(beside) == 1 else None

@@ -2,7 +2,6 @@
 
 import re
 from functools import cache
-from importlib.resources import files
 from itertools import count
 from typing import NamedTuple, cast
 
@@ -10,18 +9,11 @@ from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.records import AskedForm, AskedRelation, PlaceRelation, Vector
 
 LEFT, RIGHT, UP, DOWN = (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
-WAYS: dict[str, Vector] = {"LEFT": LEFT, "RIGHT": RIGHT, "UP": UP, "DOWN": DOWN}
-SIDES = {"leftmost": LEFT, "rightmost": RIGHT, "lowest": DOWN, "highest": UP, "left": LEFT, "right": RIGHT}
-_RELATIONS: dict[PlaceRelation, str] = {
-    "into": "(right |back )?{in}", "onto": "{on}", "in-front-of": "(right )?in front of", "behind": "behind",
-    "next-to": "(right )?(next to|beside|near)", "left-of": "(to|on)? ?(the )?left of", "right-of": "(to|on)? ?(the )?right of",
-}  # fmt: skip
-_BETWEEN = r"(right |halfway |midway |in )*(<between>between) (<y>[XP]\d+|ALLOF S\d+)( and (<z>X\d+))?"
+WAYS: dict[str, Vector] = {"left": LEFT, "right": RIGHT, "up": UP, "down": DOWN}
+SIDES = WAYS | {"leftmost": LEFT, "rightmost": RIGHT, "lowest": DOWN, "highest": UP}
+VERBS = "|".join(sorted(lex.KINDS, key=len, reverse=True))
 # What joins clauses, or opens them.
-CONNECTORS = lex.words(
-    ", . ? ! ; ( ) if when while once suppose supposing imagine assume assuming given and then so that as after consider CLAIM "
-    "upon it first SOMETIME THERE"
-)
+CONNECTORS = lex.words(", . ? ! ; ( ) it first") | lex.SETS["connectors"]
 
 
 class Form(NamedTuple):
@@ -43,34 +35,33 @@ def roles(found: re.Match[str]) -> dict[str, str]:
     return {name.rstrip("0123456789"): found[name] for _, name in spans}
 
 
+def relation_of(said: dict[str, str]) -> PlaceRelation | None:
+    """The relation that the groups of a placing name."""
+    names = (name for name, _ in lex.sections()["where"] if name.replace("-", "") in said)
+    return cast(PlaceRelation | None, next(names, None))
+
+
 @cache
 def forms() -> dict[str, tuple[Form, ...]]:
     """The forms by their section."""
-    text = files("cow_service.readers.embedded.english").joinpath("forms.txt").read_text(encoding="utf-8")
-    where = "|".join([*(f"(<{name.replace('-', '')}>{words}) (<y>X\\d+|it)" for name, words in _RELATIONS.items()), _BETWEEN])
-    verbs = "|".join(sorted(lex.KINDS, key=len, reverse=True))
-    macros = {"colours": "|".join(lex.COLOURS), "verbs": verbs, "causes": "|".join(sorted(lex.CAUSES)), "where": f"({where})"}
-    found, section = dict[str, tuple[Form, ...]](), ""
-    for line in text.splitlines():
-        if line.startswith("["):
-            section = line.strip("[]")
-        elif line and not line.startswith("#"):
-            says, _, pattern = line.partition("= ") if line.startswith("= ") else line.partition(" = ")
-            while "{" in pattern:
-                pattern = re.sub(r"\{(\w+)\}", lambda macro: macros[macro[1]], pattern)
-            if section == "macros":
-                macros[says] = pattern
-                continue
-            numbers, edges = count(), (r"(?<![\w'-])", r"(?![\w'-])") if section == "idioms" else ("", r"(?= |$)")
-            if "\\1" not in says:  # in front of what refers to a group, (...) is one
-                pattern = re.sub(r"(?<!\\)\((?![?<])", "(?:", f"({pattern})" + (macros["tail"] if section == "asked" else ""))
-            pattern = re.sub(r"\(<(\w+)>", lambda group: f"(?P<{group[1]}{next(numbers)}>", pattern)
-            form = Form(says.strip(), re.compile(edges[0] + pattern + edges[1]))
-            found[section] = (*found.get(section, ()), form)
-    return found
+    macros = dict(lex.sections()["macros"]) | {"verbs": VERBS, "causes": "|".join(lex.LISTS["causes"])}
+    macros |= {"colours": "|".join(lex.COLOURS), "numerals": "|".join(lex.LISTS["numerals"]), "units": "|".join(lex.METRES)}
+    macros["where"] = "|".join(f"(<{name.replace('-', '')}>){pattern}" for name, pattern in lex.sections()["where"])
 
+    def compiled(section: str, says: str, pattern: str) -> Form:
+        is_text = section in {"idioms", "quantities"}
+        if section == "asked":
+            pattern = f"({pattern}){{tail}}"
+        while "{" in pattern:
+            pattern = re.sub(r"\{(\w+)\}", lambda macro: macros[macro[1]], pattern)
+        if "\\1" not in says:  # in front of what refers to a group, (...) is one
+            pattern = re.sub(r"(?<!\\)\((?![?<])", "(?:", f"({pattern})")
+        numbers = count()
+        pattern = re.sub(r"\(<(\w+)>", lambda group: f"(?P<{group[1]}{next(numbers)}>", pattern)
+        return Form(says, re.compile(rf"(?<![\w'-]){pattern}(?![\w'-])" if is_text else rf"{pattern}(?= |$)"))
 
-def relation_of(said: dict[str, str]) -> PlaceRelation | None:
-    """The relation that the groups of a placing name."""
-    names: dict[str, PlaceRelation] = {name.replace("-", ""): name for name in (*_RELATIONS, "between")}
-    return next((names[name] for name in said if name in names), None)
+    return {
+        section: tuple(compiled(section, *line) for line in lines)
+        for section, lines in lex.sections().items()
+        if section not in {"words", "macros", "where"}
+    }

@@ -9,350 +9,279 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from cow_service.readers.base import Quantity, Unit
+from cow_service.readers.base import Quantity
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.forms import forms
+from cow_service.readers.embedded.english.forms import forms, roles
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.options import plain
 from cow_service.records import Shape
 
-_COLOUR = "|".join(lex.COLOURS)
-_NUMBER = r"(\d+(?:\.\d+)?|half an?|an?|" + "|".join((*lex.NUMBER_WORDS, "ten", "twenty", "thirty", "fifty")) + ")"
-_ABOUT = r"(?:(?:about|only|just|roughly|approximately|exactly) )?"
-_LENGTH = "(" + "|".join(("px", "pixels?", *lex.METRES)) + r")\b"
-_SECOND = r"(?:seconds?|secs?|s)\b"
-_HALT = r"(?:,? (?:but |and )?(?:then )?(?:it )?(?:stops|halts|pauses)(?: dead| there)?\b)?"
-_CONTRACTED = ((r"\bcan ?not\b", "can not"), (r"\bwo ?n't\b", "will not"), (r"\bca n't\b|\bcan't\b", "can not"), (r"n't\b", " not"),
-    (r"\b(what|where|it|there|that|here|who|which)'s\b", r"\1 is"), (r"\bwhat's\b", "what is"), (r"\bit'd\b", "it would"), (r"\bi'd\b", "i would"))  # fmt: skip
-_TOKEN = re.compile(r"N\d+N|[A-Z]+\d*|\d+(?:\.\d+)?|[a-z]+(?:['-][a-z]+)*|\w+|[.,;:?!()-]")
-_BEHIND_NOUN = lex.words("safe both last earlier hard each together neither either nearest closest farthest able")
-
-
-@dataclass(frozen=True)
-class Tokens:
-    """A question in plain tokens; `said` are its words in their place, `things` those of `X0`, `X1`, ..."""
-
-    plain: tuple[str, ...]
-    said: tuple[str, ...]
-    things: tuple[ObjectPhrase, ...]
-    quantities: tuple[QuantityWords, ...]
+_CONTRACTED = {
+    r"\bcan ?not\b|\bcan't\b": "can not", r"\bwon't\b": "will not", r"n't\b": " not",
+    r"\b(what|where|it|there|that|who|which)'s\b": r"\1 is", r"\b(it|i|you)'d\b": r"\1 would",
+    r" [–—-] |[:—–]": " , ",
+}  # fmt: skip
+_TOKEN = re.compile(r"N\d+N|[A-Z]+\d*|\d+(?:\.\d+)?|[a-z]+(?:['-][a-z]+)*|\w+|[.,;?!()-]")
+_BEHIND_NOUN = lex.words("safe both last earlier hard each together neither either nearest closest farthest first one other")
+_COLOURED = rf"(?:(?:{'|'.join(lex.COLOURS)}|{'|'.join(lex.LISTS['adjectives'])}|bounding|drawn|cream) )*"
+# What belongs to the noun in front of it, and what it says.
+_BEHIND = {
+    "path": r"(?:at|on|of) the (?:(?P<end>start|beginning|first|end|last)(?: position| point)? of the )?(?:\w+ )?"
+    r"(?:path|trail|line|track|trajectory)",
+    "box": rf"(?:in|inside|within|marked (?:by|with)) (?:the|a) {_COLOURED}(?:box|rectangle|bbox|circle|outline)",
+    "with": rf"with (?:an? |no |two |three )?{_COLOURED}[a-z-]+",
+    "place": rf"(?:on|at|in) the (?:far )?(?:{'|'.join(lex.PLACES)})(?: side)?(?! [a-z]+ (?:{'|'.join(lex.PLACES)}))",
+}
+_SOME = {"both": "ALLOF", "all": "ALLOF", "each": "ALLOF", "every": "ALLOF", "either": "SOMEOF", "any": "SOMEOF",
+    "some": "SOMEOF", "one": "SOMEOF", "neither": "NOOF", "none": "NOOF"}  # fmt: skip
 
 
 @dataclass
-class _Reader:
-    """What is made of the words from first to last."""
+class Tokens:
+    """A question in plain tokens; `said` are its words in their place, `things` those of `X0`, `X1`, ..."""
 
-    names: Sequence[str]
-    things: list[ObjectPhrase] = field(default_factory=list[ObjectPhrase])
-    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
+    names: Sequence[str] = ()
     plain: list[str] = field(default_factory=list[str])
     said: list[str] = field(default_factory=list[str])
-    going: list[str] = field(default_factory=list[str])
+    things: list[ObjectPhrase] = field(default_factory=list[ObjectPhrase])
+    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
 
     def add(self, token: str, said: str) -> None:
+        """Adds a token that stands for some words."""
         self.plain.append(token)
         self.said.append(said)
 
-    def thing(self, phrase: ObjectPhrase) -> str:
-        """The token of a thing: one that was named before keeps its own."""
-        known = next((at for at, each in enumerate(self.things) if plain(each.text) == plain(phrase.text)), None)
-        if known is None:
-            self.things.append(phrase)
-        return f"X{len(self.things) - 1 if known is None else known}"
+    def number(self, phrase: ObjectPhrase) -> int:
+        """The number of a thing: one that was named before keeps its own."""
+        known = (at for at, each in enumerate(self.things) if plain(each.text) == plain(phrase.text))
+        at = next(known, len(self.things))
+        self.things += [phrase] if at == len(self.things) else []
+        return at
 
 
 def tokens_of(text: str, names: Sequence[str] = ()) -> Tokens:
     """The question in plain tokens. A given name that stands in it is a name there, whatever its words."""
-    text = " ".join(text.replace("’", "'").lower().split())
-    for idiom, said in _CONTRACTED:
-        text = re.sub(idiom, said, text)
-    text = re.sub(r" [–—-] |[:—–]", " , ", text)
-    reader = _Reader(names)
+    text, tokens = " ".join(text.replace("’", "'").lower().split()), Tokens(names)
+    for contraction, said in _CONTRACTED.items():
+        text = re.sub(contraction, said, text)
     for at, name in sorted(enumerate(names), key=lambda each: -len(each[1])):
         words = r"\s+".join(map(re.escape, name.lower().split()))
         text = re.sub(rf"(?<![\w'-]){words}(?![\w'-])", f"N{at}N", text)
-    text = _with_quantities(text, reader.quantities)
+    for what, pattern in forms()["quantities"]:
+        text = pattern.sub(lambda found, what=what: _quantity(tokens, what, roles(found)), text)
     for token, idiom in forms()["idioms"]:
         text = " ".join(idiom.sub(token, text).split())
-    words = _TOKEN.findall(text)
-    at = 0
+    words, at, going = _TOKEN.findall(text), 0, list[str]()
     while at < len(words):
-        at = _read_phrase(reader, words, at)
-    return Tokens((*reader.plain, *reader.going), (*reader.said, *reader.going), tuple(reader.things), tuple(reader.quantities))
+        at, verb = _read_phrase(tokens, words, at)
+        going += [".", tokens.plain[-1], verb] if verb else []  # "the falling ball": how it moves
+    tokens.plain += going
+    tokens.said += going
+    return tokens
 
 
-def _value(word: str) -> float:
-    if word[0].isdigit():
-        return float(word)
-    numbers = lex.NUMBER_WORDS | {"twenty": 20, "thirty": 30, "fifty": 50, "a": 1, "an": 1}
-    return 0.5 if word.startswith("half") else float(numbers[word])
+def _quantity(tokens: Tokens, what: str, said: dict[str, str]) -> str:
+    """The token of a quantity of some kind."""
+    number, unit = said.get("n", "1"), said.get("u", "px")
+    numbers = lex.NUMBER_WORDS | {"a": 1, "an": 1, "twice": 2, "half a": 0.5, "half an": 0.5}
+    value = float(numbers.get(number, number if number[0].isdigit() else 0.5)) * lex.METRES.get(unit, 1.0)
+    is_metric = unit in lex.METRES
+    match what:
+        case "speed":
+            found = QuantityWords(speed=Quantity(value, "m/s" if is_metric else "px/s"))
+        case "slow" | "fast":
+            found = QuantityWords(speed=what)
+        case "within":
+            found = QuantityWords(within=value)
+        case "duration":
+            found = QuantityWords(duration=value)
+        case "distance":
+            found = QuantityWords(distance=Quantity(value, "m" if is_metric else "px"))
+        case "own_widths":
+            found = QuantityWords(own_widths=value)
+        case "share":
+            found = QuantityWords(share=0.5)
+        case "until":
+            found = QuantityWords(until="contact")
+        case _:
+            return ""
+    tokens.quantities.append(found)
+    return f"Q{len(tokens.quantities) - 1}"
 
 
-_QUANTITIES: tuple[tuple[str, str], ...] = (
-    (rf"(?:(?:at|with) )?(?:(?:a|an) )?(?:(?:constant|steady|initial) )?(?:(?:speed|velocity|pace) (?:of |is )?)?{_ABOUT}{_NUMBER} ?{_LENGTH} ?(?:per|/|an?) ?(?:second|sec|s)\b", "speed"),
-    (r"(?:(?:very|quite|rather) )?(slowly|gently|softly|lightly|slow)|(?:at|with) (?:a )?(low|slow|small) speed|at (?:a )?(constant|steady) (?:speed|velocity)", "slow"),
-    (r"(?:(?:very|quite|rather) )?(quickly|rapidly|swiftly|fast|hard|forcefully)|(?:at|with) (?:a )?(?:high|full|great) speed", "fast"),
-    (rf"(?:within|in less than|in under) {_ABOUT}{_NUMBER} {_SECOND}|(?:within|in|for|during) the first (?:{_NUMBER} )?{_SECOND}(?: of (?:its|the) \w+)?", "within"),
-    (rf"(?:for|during) {_ABOUT}{_NUMBER} {_SECOND}{_HALT}", "duration"),
-    (rf"(?:(?:though )?(?:by|for) )?{_ABOUT}(?:a distance of )?{_NUMBER} ?{_LENGTH}{_HALT}", "distance"),
-    (rf"(?:by |though )*{_ABOUT}(twice|{_NUMBER[1:-1]}) (?:times |of )?its own (?:width|diameter)s?{_HALT}", "own_widths"),
-    (rf"(?:,? (?:but|and|then) )?(?:(?:it )?(?:stops?|only goes|goes) )?(?:halfway|midway)(?! between){_HALT}", "share"),
-    (r"(?:until|till) it (?:hits|meets|touches|reaches|runs into|bumps into) (?:some|any)thing(?: else)?", "until"),
-)  # fmt: skip
-_COMPILED = tuple((re.compile(rf"(?<![\w'-]){idiom}(?![\w'-])"), what) for idiom, what in _QUANTITIES)
-
-
-def _with_quantities(text: str, found: list[QuantityWords]) -> str:
-    """The text, each quantity as `Q0`, `Q1`, ...; what a name says ("the slow ball") is none."""
-
-    def read(match: re.Match[str], what: str) -> str:
-        groups = [group for group in match.groups() if group is not None]
-        value = _value(groups[0]) if groups and what not in {"slow", "fast"} and groups[0] != "twice" else 2.0
-        size, unit = lex.METRES.get(groups[-1], 1.0) if groups else 1.0, "m" if groups and groups[-1] in lex.METRES else "px"
-        units: tuple[Unit, Unit] = ("m", "m/s") if unit == "m" else ("px", "px/s")
-        match what:
-            case "speed":
-                said = QuantityWords(speed=Quantity(value * size, units[1]))
-            case "slow":
-                if groups[0] in {"constant", "steady"}:
-                    return ""
-                said = QuantityWords(speed="slow")
-            case "fast":
-                said = QuantityWords(speed="fast")
-            case "within":
-                said = QuantityWords(within=value if groups else 1.0)
-            case "duration":
-                said = QuantityWords(duration=value)
-            case "distance":
-                said = QuantityWords(distance=Quantity(value * size, units[0]))
-            case "own_widths":
-                said = QuantityWords(own_widths=value)
-            case "share":
-                said = QuantityWords(share=0.5)
-            case _:
-                said = QuantityWords(until="contact")
-        found.append(said)
-        return f"Q{len(found) - 1}"
-
-    for idiom, what in _COMPILED:
-        kept = rf"(?<!\bthe )(?<!\ban )(?<!\bhow )(?<!\bas )(?:{idiom.pattern})" if what in {"slow", "fast"} else idiom
-        text = re.sub(kept, lambda match, what=what: read(match, what), text)
-    return text
+def _is_open(word: str) -> bool:
+    """Whether a word may be a noun, or a part of one."""
+    return word[0].islower() and word not in lex.FUNCTION and word not in lex.DETERMINERS
 
 
 def _is_determiner(words: Sequence[str], at: int) -> bool:
+    """A "that" or "which" in front of a verb is none."""
     word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
-    if word not in lex.DETERMINERS:
-        return False
-    if word in {"that", "this"} and after in lex.DETERMINERS:
-        return False
-    closed = not after[0].islower() and not after.startswith("N") or after in lex.FUNCTION and after not in lex.PLACES
-    return not (closed or (after in lex.VERBS and (word in {"that", "which", "what", "this"} or lex.VERBS[after].form == "s")))
+    relative = after in lex.DETERMINERS if word in {"that", "this"} else False
+    acts = after in lex.VERBS and (word in {"that", "which", "what", "this"} or lex.VERBS[after].form == "s")
+    follows = _is_open(after) or after in lex.PLACES or after in lex.DETERMINERS or after[0] == "N"
+    return word in lex.DETERMINERS and follows and not relative and not acts
 
 
 def _belongs(words: Sequence[str], at: int, first: int, start: int, has_noun: bool) -> bool:
     """Whether a word belongs to the phrase that begins at `start`, with determiners up to `first`."""
     word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
-    begun, determined = at > start, first > start
+    begun, determined, form = at > start, first > start, lex.VERBS[word].form if word in lex.VERBS else ""
     if word == "and":
         return begun and not has_noun and words[at - 1] in lex.COLOURS and after in lex.COLOURS
-    if word == "can" and not has_noun and begun:
-        return True
-    if word.isdigit():
-        return has_noun and len(word) < 3
-    if has_noun and (word in _BEHIND_NOUN or word in lex.PLACES or (word in lex.COLOURS and words[at - 1] not in lex.COLOURS)):
-        return False
+    if has_noun:
+        coloured = word in lex.COLOURS and words[at - 1] not in lex.COLOURS
+        if word in _BEHIND_NOUN or word in lex.PLACES or coloured or word.endswith("ly"):
+            return False
+        noun = form == "base" and after in lex.VERBS and (lex.VERBS[after].form == "s" or after in {"is", "was"})
+        return (_is_open(word) and (not form or noun)) or (word.isdigit() and len(word) < 3)
     if word in lex.PLACES or word in {"one", "other", "first"}:
-        return not has_noun and determined and (word != "one" or begun)
-    if not word[0].islower() or word in lex.FUNCTION or word in lex.DETERMINERS:
+        return determined and (word != "one" or begun)
+    if not _is_open(word) and not (word == "can" and begun):
         return False
-    if word.endswith("ly") and word not in {"family", "jelly", "butterfly", "belly"}:
-        return determined and not has_noun
-    if word not in lex.VERBS:
-        return True
-    form = lex.VERBS[word].form
-    if words[at - 1] == "orange" and word not in set().union(*lex.NOUNS.values()):
-        return False  # a thing, where no noun follows
-    if not has_noun:
-        return begun and form != "s" and word not in {"is", "are", "will"}
-    return form == "base" and after in lex.VERBS and (lex.VERBS[after].form == "s" or after in {"is", "was"})
+    # "Orange" is the one colour that is also a thing.
+    acts = begun and words[at - 1] == "orange" and word not in lex.NOUNS
+    return (begun and form != "s" and not acts) if form else (determined or not word.endswith("ly"))
 
 
-_PATH_END = re.compile(r"(?:at|on|of) the (?:(start|beginning|first|end|last)(?: position| point)? of the )?(?:\w+ )?(?:path|trail|line|track|trajectory)(?: |$)")
-_AT_PLACE = re.compile(rf"(?:on|at|in) the (?:far )?(?:{'|'.join(lex.PLACES)})(?: side)?(?= [,.?A-Z]| (?:{'|'.join(sorted(lex.VERBS))})(?: |$)|$)")
-_IN_BOX = re.compile(rf"(?:in|inside|within|marked (?:by|with)) (?:the|a) (?:(?:{_COLOUR}|bounding|drawn) )*(?:box|rectangle|bbox|circle|outline)(?= |$)")
-_WITH = re.compile(rf"with (?:an? |no |two |three )?(?:(?:{_COLOUR}|{'|'.join(lex.ADJECTIVES)}|cream) )*[a-z-]+(?= |$)")
-_SOME = {"both": "ALLOF", "all": "ALLOF", "each": "ALLOF", "every": "ALLOF", "either": "SOMEOF", "any": "SOMEOF",
-    "some": "SOMEOF", "one": "SOMEOF", "neither": "NOOF", "none": "NOOF", "no": "NOOF"}  # fmt: skip
-
-
-def _read_phrase(reader: _Reader, words: Sequence[str], at: int) -> int:
-    """Adds the noun phrase that begins at a word, else the word; returns the place behind it."""
-    first = at
+def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
+    """Adds the noun phrase that begins at a word, else the word; the place behind it, and a verb that its noun has."""
+    first, has_noun, name = at, False, ""
     while first < len(words) and _is_determiner(words, first):
         first += 1
-    end, has_noun, named = first, False, None
+    end = first
     while end < len(words) and end - first < 10:
-        if re.fullmatch(r"N\d+N", words[end]):
-            name = reader.names[int(words[end][1:-1])]
-            more = end + 1 < len(words) and _belongs(words, end + 1, first, at, lex.is_modifier(name) is False)
-            named = None if more and lex.is_modifier(name.lower()) else name  # "orange" in "the orange toy car"
-            words = words if named else [*words[:end], name.lower(), *words[end + 1 :]]
-            if named:
-                end += 1
+        if words[end][0] == "N" and words[end][1:-1].isdigit():
+            name = tokens.names[int(words[end][1:-1])]
+            more = end + 1 < len(words) and _belongs(words, end + 1, first, at, False) and not lex.VERBS.get(words[end + 1])
+            end += 1
+            if not (more and lex.is_modifier(name.lower())):
                 break
-        if not _belongs(words, end, first, at, has_noun):
+            words[end - 1], name = name.lower(), ""  # "orange" in "the orange toy car"
+        elif _belongs(words, end, first, at, has_noun):
+            has_noun = has_noun or not (lex.is_modifier(words[end]) or words[end] in {"other", "first"})
+            end += 1
+        else:
             break
-        has_noun = has_noun or not (lex.is_modifier(words[end]) or words[end] == "other")
-        end += 1
         if words[end - 1] in {"one", "ones"}:
             break
-    bare = all(word in lex.ADJECTIVES or word in {"one", "first"} for word in words[first:end]) and words[end - 1] != "one"
-    if end == first or (bare and not named) or list(words[first:end]) == ["one"]:
-        word = words[at]
-        reader.add(lex.lemma(word), word)
-        return at + 1
-    content, determiners = list(words[first:end]), list(words[at:first])
-    # "The falling ball" says how it moves.
-    going = content[0] if len(content) > 1 and content[0] in lex.VERBS and lex.lemma(content[0]) in lex.KINDS else ""
-    content = content[1:] if going.endswith("ing") else content
-    text = list(content)
-    if named:
-        text[-1] = named
-    path_end, in_box = None, False
+    content = words[first:end]
+    if not content or content == ["one"] or (not name and all(word in lex.SETS["adjectives"] for word in content)):
+        tokens.add(lex.lemma(words[at]), words[at])
+        return at + 1, ""
+    verb = lex.lemma(content[0]) if len(content) > 1 and content[0].endswith("ing") else ""
+    verb = verb if verb in lex.KINDS else ""
+    content = content[1:] if verb else content
+    text, phrase = [*content[:-1], name or content[-1]], object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], "")
+    before = tokens.plain[-1] if tokens.plain else ""
     while end < len(words):
-        behind = " ".join(words[end : end + 12])
-        before = reader.plain[-1] if reader.plain else ""
-        if behind.startswith("of ") and end + 1 < len(words) and _belongs(words, end + 1, end + 1, end, False) and words[end + 1] not in lex.VERBS:
-            length = 2
-        elif (found := _WITH.match(behind)) is not None and has_noun:
+        behind, length = " ".join(words[end : end + 12]), 0
+        for what, pattern in _BEHIND.items():
+            found = re.match(rf"(?:{pattern})(?= |$)", behind)
+            if found is None or length or (what in {"box", "place"} and before in {*lex.CAUSES, "put", "place", "set"}):
+                continue
             length = len(found[0].split())
-        elif (found := _PATH_END.match(behind)) is not None:
-            length = len(found[0].split())
-            path_end = "start" if found[1] in {"start", "beginning", "first"} or (content[0] == "first" and not found[1]) else "end"
-        elif (found := _IN_BOX.match(behind)) is not None and before not in lex.VERBS and before not in {"put", "the"}:
-            length, in_box = len(found[0].split()), True
-        elif (found := _AT_PLACE.match(behind)) is not None and before not in lex.CAUSES | {"put", "place"}:
-            length = len(found[0].split())
-        else:
+            if what == "path":
+                is_start = (found["end"] or content[0]) in {"start", "beginning", "first"}
+                phrase = replace(phrase, path_end="start" if is_start else "end")
+            phrase = replace(phrase, inside_box=phrase.inside_box or what == "box")
+        if not length and words[end] == "of" and end + 1 < len(words) and _is_open(words[end + 1]) and words[end + 1] not in lex.VERBS:
+            length = 2  # "stack of books"
+        if not length:
             break
         text += words[end : end + length]
         end += length
-    said = " ".join([*determiners, *text])
-    phrase = object_phrase([*content[:-1], *named.lower().split()] if named else content, " ".join(text))
-    phrase = replace(phrase, inside_box=in_box, path_end=path_end)
-    given = named if named and text == [named] else match_given(phrase, reader.names)
+    phrase = replace(phrase, text=" ".join(text))
+    given = name if name and len(text) == 1 else match_given(phrase, tokens.names)
     if given is not None:
         phrase = replace(object_phrase(given.lower().split(), given), is_given=True)
-    _add_phrase(reader, phrase, content, determiners, said)
-    if going.endswith("ing"):
-        reader.going += [".", reader.plain[-1], lex.lemma(going)]
-    return end
+    _add_phrase(tokens, phrase, content, words[at:first], " ".join([*words[at:first], *([verb] if verb else []), *text]))
+    return end, verb
 
 
-def _add_phrase(reader: _Reader, phrase: ObjectPhrase, content: list[str], determiners: list[str], said: str) -> None:
+def _add_phrase(tokens: Tokens, phrase: ObjectPhrase, content: list[str], determiners: list[str], said: str) -> None:
     """Adds a noun phrase as a thing, a kind, several things or one that acts."""
-    before = [word for word in reader.said[-3:]]
-    last = content[-1]
-    is_plural = not phrase.is_given and last != lex.singular(last) and last not in {"ones"}
-    counted = before[-1:] == ["of"] and before[-2:-1] and before[-2] in _SOME
-    quantifier = next((word for word in determiners if word in _SOME), before[-2] if counted else None)
-    asks = "which" in determiners or "what" in determiners
-    generic = phrase.noun is None or phrase.head in lex.GENERIC
-    if phrase.head in lex.AGENTS and not (phrase.colour or phrase.is_given):
-        reader.add("AG", said)
-    elif asks or (reader.plain[-2:] == ["how", "many"] or (reader.plain[-3:-1] == ["how", "many"] and counted is False)):
-        at = reader.thing(phrase)
-        reader.add("which" if asks else "", determiners[0] if asks else "")
-        reader.add(f"K{at[1:]}", said)
-    elif quantifier is not None and not (quantifier == "no" and not is_plural and phrase.noun):
+    counted = tokens.said[-2:-1] and tokens.said[-2] in _SOME and tokens.said[-1] == "of"
+    quantifier = next((word for word in determiners if word in _SOME), tokens.said[-2] if counted else None)
+    is_plural = not phrase.is_given and content[-1] != lex.singular(content[-1]) and content[-1] != "ones"
+    plain_noun = not (phrase.colour or phrase.is_given or phrase.inside_box or phrase.path_end)
+    if phrase.head in lex.AGENTS and plain_noun:
+        tokens.add("AG", said)
+    elif "which" in determiners or "what" in determiners or tokens.plain[-2:] == ["how", "many"]:
+        if determiners:
+            tokens.add("which", determiners[0])
+        tokens.add(f"K{tokens.number(phrase)}", said)
+    elif quantifier is not None:
         if counted:
-            del reader.plain[-2:], reader.said[-2:]
-        bare = " ".join(word for word in content if word not in {"other"})
+            del tokens.plain[-2:], tokens.said[-2:]
+        bare = " ".join(word for word in content if word != "other")
         name = f"{quantifier} {bare}" if quantifier in {"both", "either", "neither"} else bare
-        at = reader.thing(replace(phrase, text=name))
-        reader.add(_SOME[quantifier], "")
-        reader.add(f"S{at[1:]}", said)
-    elif quantifier == "no":
-        reader.add("no", "no")
-        reader.add(reader.thing(phrase), said)
+        tokens.add(_SOME[quantifier], quantifier)
+        tokens.add(f"S{tokens.number(replace(phrase, text=name))}", said)
     elif is_plural and not phrase.path_end:
-        reader.add(f"P{reader.thing(phrase)[1:]}", said)
-    elif generic and not (phrase.colour or phrase.inside_box or phrase.path_end or "other" in content or len(content) > 1):
-        reader.add("it" if phrase.noun is None else "OBJ", said)
+        tokens.add(f"P{tokens.number(phrase)}", said)
+    elif phrase.head in lex.GENERIC and plain_noun and len(content) == 1:
+        tokens.add("OBJ", said)
     else:
-        reader.add(reader.thing(_meant(phrase, reader.things)), said)
+        tokens.add("no", "no") if "no" in determiners else None
+        tokens.add(f"X{tokens.number(_meant(phrase, tokens.things))}", said)
 
 
 def _meant(phrase: ObjectPhrase, before: Sequence[ObjectPhrase]) -> ObjectPhrase:
     """What a phrase means among the things named before: "the black one" is the last of that colour, else of the one
     kind that was named; "the car" is the red car."""
-    if phrase.is_given:
+    if phrase.is_given or phrase.path_end:
         return phrase
     if phrase.noun is None and phrase.colour is not None:
         same = [each for each in before if each.colour == phrase.colour and each.noun]
-        kinds = {each.noun for each in before if each.noun} if not same else set[str | None]()
-        noun = next(iter(kinds)) if len(kinds) == 1 else None
-        if same or noun is None:
+        kinds = {each.noun for each in before if each.noun}
+        if same or len(kinds) != 1:
             return same[-1] if same else phrase
+        noun = kinds.pop() or ""
         return replace(phrase, noun=noun, text=" ".join([*phrase.text.split()[:-1], noun]))
     # No word in it that the earlier phrase lacks.
     fuller = [each for each in before if phrase.noun and phrase.words < each.words and each.head == phrase.head]
-    return fuller[0] if len(fuller) == 1 and not phrase.path_end else phrase
+    return fuller[0] if len(fuller) == 1 else phrase
 
 
 def object_phrase(content: Sequence[str], text: str) -> ObjectPhrase:
     """The phrase with these lower case words, behind its determiners."""
-    said = [word for word in content if word not in {"and"} and not word.isdigit()] or list(content)
-    cut = next((at for at, word in enumerate(said) if at and word in {"of", "with", "labeled", "labelled"}), len(said))
-    said = said[:cut]
+    said = [word for word in content if word != "and" and not word.isdigit()] or list(content)
+    said = said[: next((at for at, word in enumerate(said) if at and word in {"of", "with"}), len(said))]
     nouns, head = [word for word in said[:-1] if not lex.is_modifier(word)], said[-1]
-    return ObjectPhrase(
-        text=text,
-        colour=next((lex.COLOURS[word] for word in said[:-1] or said if word in lex.COLOURS), None),
-        noun=None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)]),
-    )
+    colour = next((lex.COLOURS[word] for word in said[:-1] or said if word in lex.COLOURS), None)
+    return ObjectPhrase(text, colour, None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)]))
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     """The noun phrase of a text such as "the red toy car"; None if there is none."""
-    words = re.findall(r"[\w'-]+", text.lower())
-    while words and words[0] in lex.DETERMINERS:
-        del words[0]
-    ends = (at for at, word in enumerate(words) if at and (word in lex.FUNCTION or word in lex.DETERMINERS) and word != "one")
+    said = text.strip(" .,!?").split()
+    while said and said[0].lower() in lex.DETERMINERS:
+        del said[0]
+    words = re.findall(r"[\w'-]+", " ".join(said).lower())
+    ends = (at for at, word in enumerate(words) if at and word != "one" and (word in lex.FUNCTION or word in lex.DETERMINERS))
     words = words[: next(ends, len(words))]
     if not words or words[0] in lex.FUNCTION:
         return None
-    bare = text.strip(" .,!?")
-    while bare.lower().split()[0] in lex.DETERMINERS:
-        bare = bare.split(None, 1)[1]
-    phrase = object_phrase(words, bare)
-    return replace(phrase, colour=lex.COLOURS[phrase.noun]) if phrase.colour is None and phrase.noun in lex.COLOURS else phrase
+    phrase = object_phrase(words, " ".join(said))
+    colour = lex.COLOURS.get(phrase.noun or "") if phrase.colour is None else phrase.colour
+    return replace(phrase, colour=colour)
 
 
 def match_given(phrase: ObjectPhrase, names: Sequence[str]) -> str | None:
-    """The one given name that a phrase means: the same words, all words of one in the other, or the same noun."""
+    """The one given name that a phrase means: the same words, all words of one in the other, its noun or its colour."""
     said = set(plain(phrase.text).split()) - {"one"}
     named = [(name, set(plain(name).split()), parse_noun_phrase(name)) for name in names]
-    same = [name for name, words, _ in named if words == said]
-    within = [name for name, words, _ in named if said and (said < words or words < said) and words]
-    heads = [
-        name for name, _, other in named
-        if other is not None and other.head == phrase.head and (phrase.colour is None or other.colour == phrase.colour)
-        and len(said) == 1
-    ]  # fmt: skip
-    # "The black one": of that colour.
-    tinted = [name for name, _, other in named if phrase.noun is None and phrase.colour and other and other.colour == phrase.colour]
-    for found in (same, within, heads, tinted):
+    for fits in (
+        lambda words, other: words == said,
+        lambda words, other: bool(said) and (said < words or words < said),
+        lambda words, other: len(said) == 1 and other is not None and other.head == phrase.head is not None,
+        lambda words, other: phrase.noun is None and other is not None and other.colour == phrase.colour is not None,
+    ):
+        found = [name for name, words, other in named if fits(words, other)]
         if found:
             return found[0] if len(found) == 1 else None
     return None
-
-
-_SHAPE_NOUNS: dict[Shape, frozenset[str]] = {
-    "sphere": lex.NOUNS["sphere"], "box": lex.NOUNS["box"] | lex.NOUNS["vehicle"], "cone": lex.NOUNS["cone"],
-    "cylinder": lex.NOUNS["cylinder"],
-}  # fmt: skip
 
 
 def _head(name: str) -> str | None:
@@ -362,18 +291,19 @@ def _head(name: str) -> str | None:
 
 def shape_of(name: str) -> Shape | None:
     """The shape of what is called so; None if the noun does not say."""
-    head = _head(name)
-    return next((shape for shape, nouns in _SHAPE_NOUNS.items() if head in nouns), None)
+    shapes: tuple[Shape, ...] = ("sphere", "box", "cone", "cylinder")
+    found = next((shape for shape in shapes if _head(name) in lex.SETS[shape]), None)
+    return "box" if is_vehicle(name) else found
 
 
 def is_vehicle(name: str) -> bool:
     """Whether it is longer along its heading than across."""
-    return _head(name) in lex.NOUNS["vehicle"]
+    return _head(name) in lex.SETS["vehicle"]
 
 
 def is_cube(name: str) -> bool:
     """Whether it is a box as wide as high."""
-    return _head(name) in lex.NOUNS["cube"]
+    return _head(name) in lex.SETS["cube"]
 
 
 @dataclass(frozen=True)
@@ -386,9 +316,8 @@ class Kind:
 
 def kind_of(name: str) -> Kind | None:
     """The kind that a name such as "both mugs" or "mugs" is of; None for the name of one thing."""
-    said = name.lower().split()
-    numbers = dict.fromkeys(("both", "either", "neither"), 2) | lex.NUMBER_WORDS
-    counts = [int(word) if word.isdecimal() else numbers[word] for word in said if word.isdecimal() or word in numbers]
+    said, numbers = name.lower().split(), dict.fromkeys(("both", "either", "neither"), 2) | lex.NUMBER_WORDS
+    counts = [int(numbers.get(word, word)) for word in said if word.isdecimal() or word in numbers]
     quantifiers = lex.words("any every each all no none some many a an other the") | numbers.keys()
     rest = [word for word in said if word not in quantifiers and not word.isdecimal()]
     head = lex.singular(rest[-1]) if rest else ""
@@ -398,18 +327,14 @@ def kind_of(name: str) -> Kind | None:
     return None if phrase is None else Kind(phrase, counts[0] if counts else None)
 
 
-ContainerForm = Literal["round", "square", "none", "unknown"]
-
-
-def container_form(name: str) -> ContainerForm:
+def container_form(name: str) -> Literal["round", "square", "none", "unknown"]:
     """Round or square for what is called a container, `none` for a solid thing, `unknown` where the noun says nothing.
 
     A box is a container: a question about a solid one would not ask what goes into it.
     """
-    head = _head(name)
-    if head in lex.NOUNS["round"]:
+    if _head(name) in lex.SETS["round"]:
         return "round"
-    if head in lex.NOUNS["square"]:
+    if _head(name) in lex.SETS["square"]:
         return "square"
     return "unknown" if shape_of(name) is None else "none"
 
@@ -417,11 +342,8 @@ def container_form(name: str) -> ContainerForm:
 def may_name(phrase: ObjectPhrase, name: str) -> bool:
     """Whether a phrase may mean the object of that name: they share a colour or a noun, and differ in none."""
     other = parse_noun_phrase(name)
-    if other is None:
-        return False
-    if plain(phrase.text) == plain(name):
-        return True
+    if other is None or plain(phrase.text) == plain(name):
+        return other is not None
     nouns = [each.head if each.head not in lex.GENERIC else None for each in (phrase, other)]
-    pairs = ((phrase.colour, other.colour), tuple(nouns))
-    said = [(one, two) for one, two in pairs if one is not None and two is not None]
+    said = [(one, two) for one, two in ((phrase.colour, other.colour), tuple(nouns)) if one and two]
     return bool(said) and all(one == two for one, two in said)

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from cow_service.readers.embedded.english import forms
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.lexicon import ObjectPhrase, PlaceWords, QuantityWords
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
 from cow_service.readers.options import plain, says_not_sure, split_options
 from cow_service.records import Asked, InterventionKind, MotionKind, PlaceRelation, Vector
@@ -96,7 +96,7 @@ def parse(question: str, names: tuple[str, ...] = ()) -> Question:
     if len(text.split()) > MAX_WORDS:
         return Question(unread=(" ".join(text.split()[MAX_WORDS : MAX_WORDS + 7]),))
     options = [text for _, text in listed.options if not says_not_sure(text)]
-    return _Parser(tokens_of(text, names), tuple(names), options).question()
+    return _Parser(tokens_of(text, names), options).question()
 
 
 # Sentences of a prompt that say how to reply and nothing else, and its heading.
@@ -106,7 +106,7 @@ _ABOUT_REPLY = re.compile(
 _CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
 _INSTRUCTION = re.compile(
     r"(?:please )?(?:think|reason|answer|choose|select|pick|options?|choices?|explain|respond|reply|provide|return|output"
-    r"|note)\b(?! that the ball)", re.IGNORECASE,
+    r"|note that the (?:first|second|last|image|video|frame)\w*)\b", re.IGNORECASE,
 )  # fmt: skip
 _YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)
 _HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
@@ -116,27 +116,13 @@ def without_reply_form(prompt: str) -> str:
     """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
     sentences = re.split(r"((?<=[.?!])\s+|\n+)", _YES_NO.sub("", _HEADING.sub("", prompt)))
     kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
-    parts = re.split(r"((?<=[.?!;:])\s+)", kept)
-    return "".join(part for part in parts if not _INSTRUCTION.match(part.strip()))
+    return "".join(part for part in re.split(r"((?<=[.?!;:])\s+)", kept) if not _INSTRUCTION.match(part.strip()))
 
 
-_PLACES = {
-    "behind": "behind", "in front of": "front_of", "next to": "near", "beside": "near", "near": "near",
-    "near to": "near", "close to": "near", "nearest to": "near", "closest to": "near", "nearest": "near",
-    "farthest from": "far", "furthest from": "far", "to the left of": "left_of", "left of": "left_of",
-    "to the right of": "right_of", "right of": "right_of", "above": "above", "over": "above", "under": "below",
-    "below": "below", "on": "on", "on top of": "on",
-}  # fmt: skip
-_STAND = r"(?:,? ?(?:that|which) be )?(?:stand |lie |sit |rest )?"
-_PLACE = re.compile(
-    rf"(?P<before>(?:[\w,.?]+ )?)(?P<x>X\d+) {_STAND}(?:(?P<where>{'|'.join(sorted(_PLACES, key=len, reverse=True))}) (?P<y>X\d+)"
-    r"|(?:that|which) be (?P<near>NEAR|(?:farthest|further|farther) AWAY))(?: ,(?= that))?(?= |$)"
-)
-_MOVES_OBJECT = lex.CAUSES | lex.words("put place set insert position stand let go be")
 _PIECES = {"asked": "asked", "moved": "motion", "changes": "change", "stated": "stated"}
 _ORDER = ("asked", "motion", "change", "stated", "listed", "nothing")
-_VERBS = "|".join(sorted(lex.KINDS, key=len, reverse=True))
 _TELLING = ("sense", "ahead", "depth", "way", "goal", "quantity")
+_THING = re.compile(r"X\d+")
 
 
 @dataclass
@@ -153,108 +139,80 @@ class _Piece:
     @property
     def is_passive(self) -> bool:
         """Whether what is acted on stands in front of what acts."""
-        order = [role for role in self.roles if role in {"s", "o"}]
-        return self.what == "asked" and order[:1] == ["o"]
+        return self.what == "asked" and [role for role in self.roles if role in {"s", "o"}][:1] == ["o"]
+
+    def said(self, role: str) -> str:
+        """What stands in a role."""
+        return self.roles.get(role, "")
+
+    def thing(self, role: str) -> str:
+        """The thing in a role; nothing for a pronoun."""
+        return self.said(role) if _THING.fullmatch(self.said(role)) else ""
 
 
 class _Parser:
     """Covers a question with forms, the longest that fits at each place, and puts together what they say."""
 
-    def __init__(self, tokens: Tokens, names: tuple[str, ...], options: Sequence[str]) -> None:
-        self.tokens, self.names, self.options = tokens, names, options
-        self.things = list(tokens.things)
-        self.plain, self.said = list(tokens.plain), list(tokens.said)
-        self._join_places()
+    def __init__(self, tokens: Tokens, options: Sequence[str]) -> None:
+        self.tokens, self.options, self.plain, self.said = tokens, options, tokens.plain, tokens.said
+        self.mover, self.table = "", None
         self._put_behind()
-        self.text = " ".join(self.plain)
-        self.starts = [0]
+        self.text, self.starts = " ".join(self.plain), [0]
         for token in self.plain:
             self.starts.append(self.starts[-1] + len(token) + 1)
         self.place_of = {start: at for at, start in enumerate(self.starts)}
-        self.pieces = self._cover()
-        self.mover: str | None = None
-        self.table: ObjectPhrase | None = None
-
-    def _join_places(self) -> None:
-        """Joins "the mug behind the vase" to one thing, but for what is put or pushed there."""
-        at = 0
+        at, self.pieces = 0, list[_Piece]()
         while at < len(self.plain):
-            found = _PLACE.match(" ".join(self.plain[at : at + 9])) if self.plain[at][0] == "X" else None
-            before = self.plain[at - 1] if at else ""
-            if found is None or before in _MOVES_OBJECT or (before in {"will", "be"} and found["where"] and at < 3):
-                at += 1
-                continue
-            end = at + len(found[0].split())
-            phrase = self.things[int(found["x"][1:])]
-            near = found["near"]
-            place = (
-                PlaceWords("near" if near == "NEAR" else "far", None)
-                if near
-                else PlaceWords(_PLACES[found["where"]], self.things[int(found["y"][1:])])
-            )
-            said = " ".join(self.said[at:end])
-            twice = self.plain.count(self.plain[at]) > 1
-            if twice and not phrase.is_given:
-                phrase = replace(phrase, text=" ".join([phrase.text, *said.split()[len(phrase.text.split()) + 1 :]]))
-            if phrase.is_given:
-                self.plain[at:end], self.said[at:end] = [self.plain[at]], [said]
-            else:
-                self.things.append(replace(phrase, place=place))
-                self.plain[at:end], self.said[at:end] = [f"X{len(self.things) - 1}"], [said]
-            at += 1
+            found = self._from(at)
+            self.pieces += found
+            at = found[0].end if found else at + 1
 
     def _put_behind(self) -> None:
         """Puts "the ball, rolling left," in front of the question that it interrupts."""
+        asks, way = rf"(?:^| )(?P<asks>(?:will|be|ASK) (?P<thing>X\d+|it))", rf"(?P<way>(?:{forms.VERBS})(?: [^,.?]*?)?)"
         text = " ".join(self.plain)
-        found = re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ,? ?(?:when |if )?((?:{_VERBS})(?: [^,.?]*?)?) , (?=[a-zA-Z])", text)
-        found = found or re.search(rf"(?:^| )((?:will|be|ASK) (X\d+|it)) ((?:{_VERBS}) (?:ALONG|AGAINST|LEFT|RIGHT|FORWARD|NEAR))() (?=(?:still |then )*\w)", text)
-        if found is None or ("," not in found[0] and not self.said[text[: found.start(3)].count(" ")].endswith(("ing", "n"))):
+        found = re.search(rf"{asks} ,? ?(?:when |if )?{way}(?P<comma> ,) (?=[a-zA-Z])", text) or re.search(
+            rf"{asks} {way}(?P<comma>) (?=(?:still |then )*(?!X|FLOOR|IMAGE)[a-z]+ (?:X|into|with|ANY))", text
+        )
+        if found is None:
             return
-        a, b, c = (text[: found.start(at)].count(" ") for at in (1, 3, 1))
-        length = len(found[3].split())
-        rest = b + length + (1 if "," in found[0][found.end(3) - found.start() :] else 0)
+        start, at = (text[: found.start(name)].count(" ") for name in ("asks", "way"))
+        length = len(found["way"].split())
+        if not found["comma"] and not (self.said[at].endswith("ing") or self.said[at] == "thrown"):
+            return
         for words in (self.plain, self.said):
-            asks, way = words[a : a + 2], words[b : b + length]
-            words[a:rest] = [asks[1], *way, ",", *asks]
-
-    # --- covering
-
-    def _cover(self) -> list[_Piece]:
-        at, pieces = 0, list[_Piece]()
-        while at < len(self.plain):
-            piece = max(self._from(at), key=lambda each: (each.end, -_ORDER.index(each.what)), default=None)
-            pieces += [] if piece is None else [piece]
-            at = at + 1 if piece is None else piece.end
-        return pieces
+            asking, moving = words[start : start + 2], words[at : at + length]
+            words[start : at + length + bool(found["comma"])] = [asking[1], *moving, ",", *asking]
 
     def _from(self, at: int) -> list[_Piece]:
-        """What may begin at a token."""
-        found, start = list[_Piece](), self.starts[at]
+        """The longest piece that begins at a token, if any does."""
+        found, start = [self._adverbials(_Piece("motion", at, at), "")], self.starts[at]
         for section in ("asked", "stated", "changes", "rest", "moved"):
             for form in forms.forms()[section]:
                 if (match := form.pattern.match(self.text, start)) is not None:
-                    what = form.says if section == "rest" else _PIECES[section]
-                    piece = _Piece(what, at, self._end(match), forms.roles(match), form)
-                    found.append(self._adverbials(piece, piece.roles.get("verb", form.says)) if section == "moved" else piece)
-        way = self._adverbials(_Piece("motion", at, at), "")
-        return [each for each in (*found, way) if each.end > at and (each.what != "motion" or each.motion != MotionWords())]
+                    piece = _Piece(_PIECES.get(section, form.says), at, self._end(match), forms.roles(match), form)
+                    moves = section == "moved"
+                    found.append(self._adverbials(piece, piece.roles.get("verb", form.says)) if moves else piece)
+        told = [each for each in found if each.end > at and (each.what != "motion" or each.motion != MotionWords())]
+        return sorted(told, key=lambda each: (-each.end, _ORDER.index(each.what)))[:1]
 
     def _end(self, match: re.Match[str]) -> int:
         """The place of the first token behind a match."""
-        return self.place_of[match.end() + 1] if match.end() + 1 in self.place_of else len(self.plain)
+        return self.place_of.get(match.end() + 1, len(self.plain))
 
     def _adverbials(self, piece: _Piece, verb: str) -> _Piece:
         """The piece with the words for the way that follow its verb."""
-        legs, at, ways = [_Leg(verb)], piece.end, {form.says: form.pattern for form in forms.forms()["ways"]}
-        verbs = re.compile(rf"(?P<verb>{_VERBS})(?! X)(?= |$)")
+        legs, at, ways = [_Leg(verb)], piece.end, dict(forms.forms()["ways"])
+        verbs = re.compile(rf"(?P<verb>{forms.VERBS})(?! X)(?= |$)")
         while at < len(self.plain):
-            said = next(((name, match) for name, way in ways.items() if (match := way.match(self.text, self.starts[at]))), None)
-            if said is None or not legs[-1].take(said[0], forms.roles(said[1]), self):
+            matches = ((name, way.match(self.text, self.starts[at])) for name, way in ways.items())
+            name, match = next(((name, match) for name, match in matches if match is not None), ("", None))
+            if match is None or not legs[-1].take(name, forms.roles(match), self.tokens):
                 break
-            end = self._end(said[1])
-            if said[0] == "then":
+            end = self._end(match)
+            if name == "then":
                 again = verbs.match(self.text, self.starts[end])
-                if again is None and not any(ways[name].match(self.text, self.starts[end]) for name in _TELLING):
+                if again is None and not any(ways[each].match(self.text, self.starts[end]) for each in _TELLING):
                     break
                 legs.append(_Leg(again["verb"] if again else ""))
                 end = self._end(again) if again else end
@@ -263,301 +221,259 @@ class _Parser:
         piece.end, piece.motion = at, _in_words(legs, kind)
         return piece
 
-    # --- what the pieces say
-
     def question(self) -> Question:
         """What all pieces together say."""
-        asks = [each for each in self.pieces if each.what == "asked"]
-        stated = [each for each in self.pieces if each.what == "stated"]
+        asks, stated = ([each for each in self.pieces if each.what == what] for what in ("asked", "stated"))
         last = max((at for at, token in enumerate(self.plain[:-1]) if token in {".", "?"}), default=0)
-        terse = not asks and bool(stated) and stated[-1].start >= last and ("?" in self.plain[stated[-1].end :] or "CLAIM" in self.plain or self.plain[-1] not in {".", "!"})
-        asking = asks[0] if asks else stated[-1] if terse else None
+        is_terse = not asks and stated and stated[-1].start >= last and self.plain[-1] not in {".", "!"}
+        asking = asks[0] if asks else stated[-1] if is_terse or (stated and "CLAIM" in self.plain) else None
+        told = [each for each in stated if each is not asking]
         changes = self._changes(asking)
-        put = next((each for each in changes if each.kind == "place"), None)
-        moving, subjects = self._moving(asking, stated, changes)
-        acts = "" if asking is None else asking.roles.get("s", "")
-        self.mover = subjects[0] if subjects else self._token(put.object) if put else acts if acts[:1] == "X" else None
-        first = moving[0] if moving else None
-        motion = MotionWords() if first is None else first.motion
-        mover = None if self.mover is None else self._thing(self.mover)
-        others = list[tuple[ObjectPhrase, MotionWords]]()
-        for piece, subject in zip(moving[1:], subjects[1:], strict=True):
-            if subject != self.mover:
-                others.append((self.things[int(subject[1:])], piece.motion))
-        read = {at for each in self.pieces for at in range(each.start, each.end)}
-        unread = self._unread(read, asking, asks, stated, moving)
-        asked, alternatives = self._asked(asking, stated, changes)
+        put = next((each.object for each in changes if each.kind == "place"), None)
+        moving = self._moving(asking, told, put)
+        acts = "" if asking is None else asking.thing("s")
+        self.mover = next(iter(moving), self._token(put) if put else acts)
+        first = next(iter(moving.values()), MotionWords())
+        if put is not None and (not moving or first.kind == "static"):
+            self.mover, first = self._token(put), MotionWords("place", verb="put")
+        unread = self._unread(asking, asks, told, moving)
+        asked, alternatives = (None, ()) if asking is None else self._asked(asking, told, changes)
         if asking is not None and asked is None:
-            words = " ".join(word for word in self.said[asking.start : asking.end] if word)
-            unread.append(("asked", words))
-        if asked is None and asking is None and moving and not unread:
+            unread.append(("asked", " ".join(word for word in self.said[asking.start : asking.end] if word)))
+        if asking is None and moving:
             asked = Asked(form="what-happens", relation="touches")  # "Push the red ball to the right."
-        if put is not None and (first is None or first.motion.kind == "static" or mover is None):
-            mover, motion = put.object, MotionWords("place", verb="put")
-        elif mover is None and self.things and not moving:
-            named = [token for token in self.plain if token[0] == "X" and token[1:].isdigit()]
-            mover = self._thing(named[0]) if named else None
         if not moving and asked is not None and asked.relation == "lands" and changes and put is None:
-            motion = MotionWords("fall", verb="fall")  # without its support
-        words = self.plain
+            first = MotionWords("fall", verb="fall")  # without its support
+        gone = {self._token(each.object) for each in changes if each.kind == "remove"}
+        named = next((each for each in self._named(len(self.plain)) if each not in gone), "")
+        mover = self._thing(self.mover or named) if self.mover or named else None
+        further = tuple((self._thing(each), motion) for each, motion in moving.items() if each != self.mover)
         return Question(
             mover=mover,
-            motion=replace(motion, others=tuple(others)),
-            says_motion=motion != MotionWords() or bool(moving) or put is not None,
+            motion=replace(first, others=further),
+            says_motion=bool(moving) or first != MotionWords(),
             changes=changes,
             asked=None if unread else asked,
             others=self._others(mover, changes, asked),
             alternatives=alternatives,
             table=self.table,
-            names_arrow="ALONG" in words or "AGAINST" in words or any("arrow" in word for word in self.said),
-            names_direction=any(word.upper() in forms.WAYS or word in {"FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"} for word in words),
+            names_arrow=any(word in {"ALONG", "AGAINST"} or "arrow" in word for word in (*self.plain, *self.said)),
+            names_direction=not _DIRECTIONS.isdisjoint(self.plain),
             unread=tuple(dict.fromkeys(said for _, said in unread)),
             unread_motion=tuple(dict.fromkeys(said for what, said in unread if what == "motion")),
         )
 
     def _thing(self, token: str) -> ObjectPhrase:
-        return self.things[int(token[1:])]
+        return self.tokens.things[int(token[1:])]
 
     def _token(self, thing: ObjectPhrase) -> str:
-        return f"X{self.things.index(thing)}"
+        return f"X{self.tokens.things.index(thing)}"
 
-    def _references(self, text: str) -> list[str]:
-        """The things of a list, "X1 and X2"; those of both kinds of plurals."""
-        return re.findall(r"[XPS]\d+", text)
+    def _named(self, at: int) -> list[str]:
+        """The things named in front of a place, the first one first."""
+        return list(dict.fromkeys(token for token in self.plain[:at] if _THING.fullmatch(token)))
+
+    def _phrases(self, text: str) -> list[ObjectPhrase]:
+        """The things and kinds of a list such as "X1 and X2"."""
+        return [self._thing(token) for token in re.findall(r"[XPSK]\d+", text)]
 
     def _changes(self, asking: _Piece | None) -> tuple[ChangeWords, ...]:
         """What is taken away or put somewhere."""
         found = list[ChangeWords]()
         for piece in self.pieces:
-            roles = piece.roles
-            if "r" in roles:
-                found += [ChangeWords("remove", self._thing(token)) for token in self._references(roles["r"])]
-            relation = forms.relation_of(roles)
-            if relation is None or "x" not in roles:
-                continue
-            y = self._resolved(roles["y"], piece.start, roles["x"])
-            if y is None or self._thing(y).head == "container":
-                if y is not None:
-                    found.append(ChangeWords("place", self._thing(roles["x"]), "into"))
-                continue
-            targets = [self._thing(y), *([self._thing(roles["z"])] if "z" in roles else [])]
-            found.append(ChangeWords("place", self._thing(roles["x"]), relation, tuple(targets)))
-        fits = asking is not None and asking.form is not None and asking.form.asks[1] == "inside" and not found
-        if fits and asking is not None and not any(each.what == "motion" for each in self.pieces):
-            subject, container = asking.roles.get("s", ""), asking.roles.get("o", "")
-            if subject.startswith("X") and (container.startswith("X") or "l" in asking.roles):
-                targets = (self._thing(container),) if container else ()
-                found.append(ChangeWords("place", self._thing(subject), "into", targets))
+            found += [ChangeWords("remove", phrase) for phrase in self._phrases(piece.said("r"))]
+            if (relation := forms.relation_of(piece.roles)) is not None:
+                target = self._resolved(piece.said("y"), piece.start, piece.said("x")) or ""
+                targets = [each for each in self._phrases(f"{target} {piece.said('z')}") if each.head != "container"]
+                found.append(ChangeWords("place", self._thing(piece.said("x")), relation, tuple(targets)))
+        moves = found or any(each.what == "motion" for each in self.pieces)
+        if asking is not None and asking.form is not None and asking.form.asks[1] == "inside" and not moves:
+            targets = self._phrases(asking.thing("o"))  # "Does the apple fit into the bowl?": it is put there
+            fits = asking.thing("s") and (targets or asking.said("l"))
+            found += [ChangeWords("place", self._thing(asking.said("s")), "into", tuple(targets))] if fits else []
         return tuple(dict.fromkeys(found))
 
     def _moving(
-        self, asking: _Piece | None, stated: Sequence[_Piece], changes: Sequence[ChangeWords]
-    ) -> tuple[list[_Piece], list[str]]:
-        """The pieces that tell a motion, and what moves by each; that of the question first."""
-        moving, subjects = list[_Piece](), list[str]()
+        self, asking: _Piece | None, told: Sequence[_Piece], put: ObjectPhrase | None
+    ) -> dict[str, MotionWords]:
+        """What moves and how, that of the question first."""
+        found = dict[str, MotionWords]()
         for piece in self.pieces:
-            if piece.what == "stated" and piece.roles.get("s", "").startswith("X") and piece is not asking and not moving:
-                moving.append(piece)
-                subjects.append(piece.roles["s"])
+            if piece in told and piece.thing("s") and not found:
+                found[piece.said("s")] = piece.motion  # "if the cue ball strikes the yellow ball"
             if piece.what != "motion":
                 continue
-            said, told = piece.roles.get("m", ""), {} if asking is None else asking.roles
-            if said == "it" and asking is not None and asking.is_passive and told.get("o", "")[:1] + told.get("s", "")[:1] == "XX":
-                subjects.append(told["o"] if "behind" in self.plain[asking.start : asking.end] else told["s"])
-                moving.append(piece)
-                continue
-            token = said if said.startswith(("X", "P")) else ""
-            before = self._named_before(piece.start)
-            if not token and asking is not None and asking.roles.get("s", "").startswith("X") and (said or not before or asking.start < piece.start):
-                token = asking.roles["s"]
-            if not token and subjects and said != "it":
-                token = subjects[-1]
-            placed = [each.object for each in changes if each.kind == "place"]
-            token = token or next((each for each in before if self._thing(each) not in placed or not said), "") or next(iter(before), "")
-            if not token:  # "Will it hit the mug if ...": a thing that is named later
-                token = next((each for each in self.plain[piece.end :] if re.fullmatch(r"X\d+", each)), "")
-            if moving and subjects[-1] == token and moving[-1].what == "motion" and not said.startswith("X"):
-                moving[-1].motion = _joined(moving[-1].motion, piece.motion)
-            elif token and moving and subjects[-1] == token and not moving[-1].motion.verb:
-                moving[-1] = piece
-            elif token:
-                moving.append(piece)
-                subjects.append(token.replace("P", "X"))
-        return moving, subjects
-
-    def _named_before(self, at: int) -> list[str]:
-        """The things named in front of a place, the first one first."""
-        return list(dict.fromkeys(token for token in self.plain[:at] if re.fullmatch(r"X\d+", token)))
+            said, before, token = piece.said("m"), self._named(piece.start), piece.thing("m") or piece.said("m")
+            if asking is not None and token in {"", "it"}:
+                # "Will the bottle be hidden behind the book if it moves": what the question is about.
+                acts = asking.thing("o" if asking.is_passive and "behind" in self.plain[asking.start : asking.end] else "s")
+                early = said == "it" or not before or asking.start < piece.start
+                token = acts if acts and early else ""
+            token = token if token != "it" else ""
+            token = token or (next(reversed(found), "") if said != "it" else "")
+            free = [each for each in before if put is None or self._thing(each) != put]
+            token = token or next(iter([*(free if said else before), *before]), "")
+            token = token or next((each for each in self.plain[piece.end :] if _THING.fullmatch(each)), "")
+            token = token.split()[-1].replace("P", "X").replace("S", "X") if token else ""
+            if token:
+                found[token] = _joined(found[token], piece.motion) if token in found else piece.motion
+        return found
 
     def _resolved(self, token: str, at: int, subject: str) -> str | None:
-        """The thing that a word stands for: "it", "that", "them" and "the other one" are the last thing named in front
-        of a place that is not the subject, where that is clear."""
-        if re.fullmatch(r"[XS]\d+", token):
-            phrase = self._thing(token)
-            return self._other(subject, phrase) if phrase.is_other else token
-        if token == "itself":
-            return subject
-        if subject != self.mover and self.mover is not None and token == "it":
-            return self.mover
-        named = [each for each in self.plain[:at] if re.fullmatch(r"X\d+", each) and each != subject]
+        """The thing that a word stands for. "It" and "that" are the last thing named in front of a place that is not
+        the subject; "the other one" is the one that is left of two."""
+        if _THING.fullmatch(token) and self._thing(token).is_other:
+            return self._other(subject, token)
+        if re.fullmatch(r"[XPS]\d+", token):
+            return token
+        if token == "itself" or (token == "it" and self.mover not in {"", subject}):
+            return subject if token == "itself" else self.mover
+        named = [each for each in self.plain[:at] if _THING.fullmatch(each) and each != subject]
         return named[-1] if named and token in {"it", "that", "this"} else None
 
-    def _other(self, subject: str, phrase: ObjectPhrase) -> str | None:
-        """The one thing, of those that are given or else named, that is not the subject."""
-        known = [each for each in self.things if not each.is_other and each != self._thing(subject) and " " .join(each.words)]
-        things = [f"X{at}" for at, each in enumerate(self.things) if each in known and f"X{at}" in self.plain]
-        if self.names:
-            left = [name for name in self.names if plain(name) != plain(self._thing(subject).text)]
-            if len(left) != 1:
-                return None
-            self.things.append(replace(parse_noun_phrase(left[0]) or phrase, text=left[0], is_given=True))
-            return f"X{len(self.things) - 1}"
-        if len(things) == 1:
-            return things[0]
-        return None if things else f"X{self.things.index(phrase)}"
+    def _other(self, subject: str, token: str) -> str | None:
+        """The one thing, of those that are given or else named, that is not the subject; the word itself where the
+        picture must tell."""
+        own = plain(self._thing(subject).text) if subject else ""
+        if left := [name for name in self.tokens.names if plain(name) != own]:
+            phrase = replace(parse_noun_phrase(left[0]) or self._thing(token), text=left[0], is_given=True)
+            return f"X{self.tokens.number(phrase)}" if len(left) == 1 else None
+        things = [each for each in self._named(len(self.plain)) if each not in {subject, token}]
+        return token if not things else things[0] if len(things) == 1 else None
 
     def _asked(
-        self, asking: _Piece | None, stated: Sequence[_Piece], changes: Sequence[ChangeWords]
+        self, asking: _Piece, told: Sequence[_Piece], changes: Sequence[ChangeWords]
     ) -> tuple[Asked | None, tuple[ObjectPhrase, ...]]:
         """What is asked, and among which things; None where that is not clear."""
-        if asking is None or asking.form is None:
+        if asking.form is None:
             return None, ()
-        roles, (form, relation, is_negated) = asking.roles, asking.form.asks
-        negated = is_negated != ("n" in roles)
-        if is_negated and "n" in roles:
-            return None, ()  # "will it not miss"
-        said_subject, said_target = roles.get("s", ""), roles.get("o", "")
-        subject = said_subject if said_subject.startswith("X") else self.mover or ""
-        acted = next((each for each in stated if each is not asking), None)
-        if acted is not None and said_subject in {"it", "that"}:
+        form, relation, is_negated = asking.form.asks
+        words, said, passive = self.plain[asking.start : asking.end], asking.said("o"), asking.is_passive
+        doubly = is_negated and ("n" in asking.roles or asking.said("q") == "NOOF")
+        open_it = told and asking.said("s") in {"it", "that"} and form != "which-to-remove" and not asking.said("r")
+        if doubly or open_it or (said == "EVERYTHING" and not is_negated) or said == "OBJ":
             return None, ()
-        target, passive = None, asking.is_passive
-        if "both" in roles or said_target == "they":
-            moved = list(dict.fromkeys(each.roles.get("m", "") for each in self.pieces if each.what == "motion"))
-            pair = [each for each in moved if each.startswith("X") and each != subject]
-            pair = pair or [each for each in self._named_before(len(self.plain)) if each != subject]
+        subject, target = asking.thing("s") or self.mover, ""
+        if "both" in asking.roles:
+            moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
+            pairs = ([each for each in dict.fromkeys(names) if each != subject] for names in (moved, self._named(999)))
+            pair = next((each for each in pairs if each), [])
             if len(pair) != 1:
                 return None, ()
             target = pair[0]
-        elif passive and said_target == "it":
-            target = self.mover
-        elif said_target == "EVERYTHING" and not negated:
-            return None, ()
-        elif said_target not in {"", "ANY", "EVERYTHING"}:
-            target = self._resolved(said_target, asking.start, subject)
-            if target is None:
+        elif said not in {"", "ANY", "EVERYTHING"}:
+            target = (self.mover if passive and said == "it" else self._resolved(said, asking.start, subject)) or ""
+            if not target:
                 return None, ()
-        doer = self._thing(subject) if subject and subject != self.mover else None
-        if relation == "covers" and target is not None and said_subject not in {"", "it"} and target == self.mover:
-            relation, target, doer = "covered", subject, None  # "the vase hides it"
-            subject = self.mover or ""
-        elif relation == "covers" and doer is not None and "be" in self.plain[asking.start : asking.start + 9] and "by" in self.plain[asking.start : asking.end]:
-            relation, target, doer = "covered", subject, self._thing(target) if target and target != self.mover else None
-        elif relation == "covers" and passive and target == self.mover:
-            relation, target = "covered", None
-        if relation in {"touches"} and passive and target == self.mover and form in {"whether", "when"}:
-            target = None
-        if relation == "touches" and target is not None and target == self.mover and doer is not None:
-            target, doer = subject, None
-        thing = None if target is None else self._thing(target)
-        if relation == "lands" and thing is not None:
+        doer = subject if subject != self.mover else ""
+        if relation == "covers" and target:
+            if doer and target == self.mover:  # "the vase hides it"
+                relation, target, doer = "covered", doer, ""
+            elif passive and asking.thing("s") and target == self.mover:
+                relation, target = "covered", subject
+            elif passive and doer:  # one thing by another, neither the mover
+                relation, target, doer = "covered", doer, target
+            elif passive and target == self.mover:
+                relation, target = "covered", ""
+        elif target == self.mover and doer and relation == "touches":
+            target, doer = doer, ""
+        elif passive and target == self.mover and relation == "touches":
+            target = ""
+        thing = self._thing(target) if target else None
+        if relation == "lands" and thing is not None:  # "off the table"
             thing, is_table = None, thing.head in lex.TABLES
             if not is_table:
                 return None, ()
-        if relation == "inside" and thing is None:
-            puts = [each for each in changes if each.kind == "place" and each.targets]
-            thing = puts[0].targets[0] if puts else None
-            if form == "whether" and thing is None:
+        if relation == "inside" and form == "whether":
+            puts = [each.targets[0] for each in changes if each.targets]
+            thing = thing or next(iter(puts), None)
+            along = not {"roll", "slide", "move", "drive", "push"}.isdisjoint(words)
+            holds = thing is not None and thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
+            relation = "inside" if holds or "fit" in words or changes else "touches"
+            if thing is None:
                 return None, ()
-        words = self.plain[asking.start : asking.end]
-        if relation == "inside" and thing is not None and "fit" not in words:
-            along = {"roll", "slide", "move", "drive", "push"} & set(words)
-            relation = "inside" if thing.head in (lex.HOLLOW if along else lex.CONTAINERS) else "touches"
-        if relation == "touches" and thing is not None and thing.head in lex.TABLES and not thing.colour and {"on", "onto"} & set(words):
-            self.table, relation, thing = thing, "lands", None
-        lists = [each for each in self.pieces if each.what == "listed"]
-        listed = [self._thing(each) for each in self._references(roles.get("l", "") or (lists[-1].roles["l"] if lists else ""))]
-        among = [self._thing(each).text for each in self._references(roles.get("a", ""))]
-        crash = [each.roles["o"] for each in stated if each is not asking and each.roles.get("o", "")[:1] == "X"]
-        if (form == "which-to-remove" or "r" in roles) and thing is None and crash:
-            thing = self._thing(crash[-1])  # "it will collide with the lamp. Which object ..."
+        if relation == "touches" and thing is not None and thing.head in lex.TABLES and not thing.colour:
+            on = not {"on", "onto"}.isdisjoint(words)
+            self.table, relation, thing = (thing, "lands", None) if on else (None, relation, thing)
+        crash = [each.thing("o") for each in told if each.thing("o")]
+        if (form == "which-to-remove" or asking.said("r")) and thing is None and crash:
+            thing = self._thing(crash[-1])  # "It will collide with the lamp. Which object should be removed ..."
+        lists = [each.said("l") for each in (asking, *self.pieces) if each.said("l")]
+        listed, kinds = self._phrases(lists[0]) if lists else [], self._phrases(asking.said("k"))
+        among = self._phrases(asking.said("a")) if form == "whether" else kinds if form == "how-many" else []
         if form in {"which", "which-to-remove"}:
-            among = [each.text for each in listed]
-            if form == "which-to-remove" and not among:
-                phrases = [parse_noun_phrase(text) for text in self.options]
-                among = [each.text for each in phrases if each is not None] if all(phrases) else []
-        kind = [self._thing(each) for each in self._references(roles.get("k", "").replace("K", "X"))]
-        if form == "how-many" and kind:
-            among = [each.text for each in kind]
-        is_partly = relation in {"covers", "covered"} and bool({"PARTLY", "SOMETIME"} & set(self.plain))
-        limits = [each.within for each in self.tokens.quantities if each.within is not None]
-        if relation in {"tips", "moves"} and thing is None and passive is False and said_target == "":
-            thing = None if self.mover is None else self._thing(self.mover)
-        target_text = None if thing is None or form in {"which", "how-many"} else thing.text
-        if form in {"which", "which-first", "which-to-remove", "how-many"} and form != "which-to-remove":
-            target_text = None
+            options = [parse_noun_phrase(text) for text in self.options] if form == "which-to-remove" else []
+            among = listed or ([each for each in options if each is not None] if all(options) else [])
+        names_one = form in {"whether", "when", "what-happens", "which-to-remove"}
         asked = Asked(
-            form=form, relation=relation, subject=None if doer is None else doer.text, target=target_text,
-            negated=negated, among=tuple(among), every=roles.get("q") == "ALLOF" and not negated,
-            partly=is_partly, within=min(limits, default=None),
-        )  # fmt: skip
-        if roles.get("q") == "NOOF":
-            asked = asked.model_copy(update={"negated": not negated})
-        return asked, tuple(listed or kind) if form == "which-first" else ()
+            form=form,
+            relation=relation,
+            subject=self._thing(doer).text if doer and form != "which-to-remove" else None,
+            target=thing.text if thing is not None and names_one else None,
+            negated=is_negated != ("n" in asking.roles or asking.said("q") == "NOOF"),
+            among=tuple(each.text for each in among),
+            every=asking.said("q") == "ALLOF" and not is_negated,
+            partly=relation in {"covers", "covered"} and not {"PARTLY", "SOMETIME"}.isdisjoint(self.plain),
+            within=min((each.within for each in self.tokens.quantities if each.within is not None), default=None),
+        )
+        return asked, tuple(listed or kinds) if form == "which-first" else ()
 
     def _others(
         self, mover: ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
     ) -> tuple[ObjectPhrase, ...]:
         """The further things that are named, each once."""
         removed = [each.object for each in changes if each.kind == "remove"]
-        named = [self._thing(token) for token in self._named_before(len(self.plain))]
-        places = [each.place.of for each in named if each.place is not None and each.place.of is not None]
-        phrases = [each for each in (*named, *places) if each not in (mover, *removed) and each.head != "container"]
+        phrases = [self._thing(token) for token in self._named(len(self.plain))]
         if asked is not None and asked.form == "which-to-remove":
             phrases += [each for each in map(parse_noun_phrase, asked.among) if each is not None]
-        texts = dict[str, ObjectPhrase]()
-        for each in phrases:
-            texts.setdefault(plain(each.text), each)
-        return tuple(texts.values())
+        named = {plain(each.text): each for each in reversed(phrases) if each.head != "container"}
+        return tuple(each for each in reversed(named.values()) if each not in (mover, *removed))
 
     def _unread(
-        self, read: set[int], asking: _Piece | None, asks: Sequence[_Piece], stated: Sequence[_Piece], moving: Sequence[_Piece]
+        self, asking: _Piece | None, asks: Sequence[_Piece], told: Sequence[_Piece], moving: dict[str, MotionWords]
     ) -> list[tuple[str, str]]:
         """The words that no form covers, each run with the part of the question to which it belongs."""
-        subject = "" if asking is None else asking.roles.get("s", "")
-        lists = [] if asking is not None and asking.form is not None and asking.form.asks[0] == "which-first" else [each for each in self.pieces if each.what == "listed"]
-        if asking is not None and asking.form is not None and (asking.form.asks[0] == "which-to-remove" or "r" in asking.roles):
-            stated = [each for each in stated if each.roles.get("s", "it") not in {"it", self.mover} or each.form is None]
-        for each in (*lists, *asks[1:], *(one for one in stated if one is not asking and one not in moving)):
-            if each.roles.get("o", "") != subject or not subject.startswith("X") or each.what != "stated":
-                read = read - set(range(each.start, each.end))
-        runs, run = list[list[int]](), list[int]()
+        form = "" if asking is None or asking.form is None else asking.form.asks[0]
+        names_crash = asking is not None and (form == "which-to-remove" or asking.said("r"))
+        struck = "" if asking is None else asking.thing("s")
+        lost = [each for each in asks if each is not asking]
+        lost += [each for each in self.pieces if each.what == "listed" and form != "which-first"]
+        # What is told to be hit, and is not what the question then goes on about.
+        lost += [each for each in told if not names_crash and (each.said("o") != struck or not struck)]
+        read = {at for each in self.pieces if each not in lost for at in range(each.start, each.end)}
+        runs: list[list[int]] = [[]]
         for at, token in enumerate(self.plain):
-            ends = token in {".", "?", "!", ";", ","}
-            if at in read or ends:
-                runs, run = ([*runs, run] if run else runs), []
+            if at in read or token in {".", "?", "!", ";", ","}:
+                runs.append([])
             else:
-                run.append(at)
-        runs += [run] if run else []
+                runs[-1].append(at)
         found = list[tuple[str, str]]()
         for run in runs:
             words = [self.plain[at] for at in run]
-            limits = [self.tokens.quantities[int(word[1:])].within for word in words if re.fullmatch(r"Q\d+", word)]
-            if all(word in forms.CONNECTORS or re.fullmatch(r"Q\d+", word) for word in words) and None not in limits:
+            limits = [word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].within]
+            if all(word in forms.CONNECTORS or word in limits for word in words):
                 continue
-            before = [each for each in self.pieces if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])]
-            what = "motion" if before and before[-1].what == "motion" else "asked"
-            found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words).lower()))
+            ends = [each for each in self.pieces if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])]
+            what = "motion" if ends and ends[-1].what == "motion" else "asked"
+            found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words)))
         return found
+
+
+_DIRECTIONS = {*forms.WAYS, *map(str.upper, forms.WAYS), "FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"}
 
 
 def _joined(first: MotionWords, second: MotionWords) -> MotionWords:
     """A motion that is told in two places."""
-    told = {name: value for name, value in vars(second).items() if value not in (None, 0.0, "", (), False)}
-    clash = second.kind not in (None, first.kind) or any(getattr(first, name) not in (None, 0.0, value) for name, value in told.items() if name in {"direction", "depth", "along_arrow", "forward"})
-    kept = {name: value for name, value in told.items() if getattr(first, name) in (None, 0.0, "", (), False)}
-    kept["quantities"] = (*first.quantities, *second.quantities)
-    return replace(first, **kept, is_contradictory=clash or first.is_contradictory)
+    empty = vars(MotionWords())
+    told = {name: value for name, value in vars(second).items() if value != empty[name]}
+    single = ("kind", "direction", "depth", "along_arrow", "forward")
+    clash = any(name in told and getattr(first, name) not in (empty[name], told[name]) for name in single)
+    kept = {name: value for name, value in told.items() if getattr(first, name) == empty[name]}
+    quantities = (*first.quantities, *second.quantities)
+    return replace(first, **kept | {"quantities": quantities, "is_contradictory": clash or first.is_contradictory})
+
+
+_RISING, _SINKING = lex.words("lift raise rise climb ascend"), lex.words("descend lower")
 
 
 @dataclass
@@ -574,39 +490,27 @@ class _Leg:
     marks: set[str] = field(default_factory=set[str])
     quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
 
-    @property
-    def says_way(self) -> bool:
-        """Whether it says more than that something moves."""
-        return bool(self.ways or self.depths or self.senses or self.ahead or self.quantities or self.towards or self.trail) or self.verb in lex.MOTIONS["fall"]
-
-    def take(self, name: str, roles: dict[str, str], parser: _Parser) -> bool:
+    def take(self, name: str, roles: dict[str, str], tokens: Tokens) -> bool:
         """Takes words for the way; false where they say nothing here."""
         text = next(iter(roles.values()), "")
-        match name:
-            case "trail":
-                near = parser.things[int(roles["near"][1:])] if "near" in roles else None
-                self.trail = TrailWords(near, forms.SIDES.get(roles.get("side", "")))
-            case "way":
-                self.ways.append(forms.WAYS[text.upper()])
-            case "depth":
-                self.depths.add(-1.0 if text == "NEAR" else 1.0)
-            case "sense":
-                self.senses.add(text == "ALONG")
-            case "ahead":
-                self.ahead.add(text == "FORWARD")
-            case "goal":
-                if self.towards is not None:
-                    return False
-                self.towards = parser.things[int(text[1:])]
-            case "quantity":
-                said = parser.tokens.quantities[int(text[1:])]
-                if said.within is not None:
-                    return False
-                self.quantities.append(said)
-            case "halt" if not self.quantities:
-                return False
-            case _:
-                self.marks.add(name)
+        if name == "trail":
+            near = tokens.things[int(roles["near"][1:])] if "near" in roles else None
+            self.trail = TrailWords(near, forms.SIDES.get(roles.get("side", "")))
+        elif name == "way":
+            self.ways.append(forms.WAYS[text.lower()])
+        elif name == "depth":
+            self.depths.add(-1.0 if text == "NEAR" else 1.0)
+        elif name == "sense":
+            self.senses.add(text == "ALONG")
+        elif name == "ahead":
+            self.ahead.add(text == "FORWARD")
+        elif name == "goal" and self.towards is None:
+            self.towards = tokens.things[int(text[1:])]
+        elif name == "quantity" and not tokens.quantities[int(text[1:])].within:
+            self.quantities.append(tokens.quantities[int(text[1:])])
+        elif name in {"goal", "quantity"} or (name == "halt" and not self.quantities):
+            return False
+        self.marks.add(name)
         return True
 
     def way(self, kind: MotionKind | None) -> tuple[Vector | None, float]:
@@ -622,31 +526,31 @@ class _Leg:
     @property
     def contradicts(self) -> bool:
         """Whether two of its words are opposites."""
-        up = [way[1] for way in self.ways]
-        turned = (self.verb in lex.MOTIONS["fall"] and min(up, default=0) < 0) or (self.verb in _RISING and max(up, default=0) > 0)
+        up, falls = [way[1] for way in self.ways], self.verb in lex.SETS["fall"]
+        turned = (falls and min(up, default=0) < 0) or (self.verb in _RISING and max(up, default=0) > 0)
         opposed = any(a[0] * b[0] < 0 or a[1] * b[1] < 0 for a in self.ways for b in self.ways)
-        return turned or opposed or any(len(each) > 1 for each in (self.depths, self.senses, self.ahead)) or (self.says_way and "still" in self.marks)
-
-
-_RISING, _SINKING = lex.words("lift raise rise climb ascend"), lex.words("descend lower")
+        stays = "still" in self.marks and bool(self.ways or self.depths or self.senses)
+        return turned or opposed or stays or any(len(each) > 1 for each in (self.depths, self.senses, self.ahead))
 
 
 def _in_words(legs: Sequence[_Leg], kind: MotionKind | None) -> MotionWords:
+    """The motion that some legs make."""
     first, *rest = legs
     over = "over" in first.marks and first.verb in lex.words("knock push tip fall turn blow topple")
-    ways = [leg.way(None) for leg in rest]
+    direction, depth = first.way(kind)
     return MotionWords(
-        kind,
-        next(iter(first.senses), None),
-        *first.way(kind),
-        False if first.verb == "reverse" else None if first.senses else next(iter(first.ahead), None),
-        first.verb,
-        first.towards,
-        first.trail,
-        tuple(first.quantities),
-        tuple(StepWords(*way, tuple(leg.quantities)) for way, leg in zip(ways, rest, strict=True)),
+        kind=kind,
+        along_arrow=next(iter(first.senses), None),
+        direction=direction,
+        depth=depth,
+        forward=False if first.verb == "reverse" else None if first.senses else next(iter(first.ahead), None),
+        verb=first.verb,
+        towards=first.towards,
+        trail=first.trail,
+        quantities=tuple(first.quantities),
+        steps=tuple(StepWords(*leg.way(None), tuple(leg.quantities)) for leg in rest),
         is_contradictory=any(leg.contradicts for leg in legs),
-        topples=(over or first.verb in {"tip", "topple"}),
+        topples=over or first.verb in {"tip", "topple"},
         in_air=first.verb in {"drop", "release", "detach", "let go"} or "freely" in first.marks,
     )
 
@@ -670,6 +574,10 @@ def rewordings(question: Question) -> tuple[str, ...]:
     found = list[str]()
     for topic, patterns in _TOPICS:
         if re.search(topic, said) and names:
-            found += [each.format(m=names[0], o=names[1] if len(names) > 1 else "", way=way) for each in patterns if len(names) > 1 or "{o}" not in each]
+            found += [
+                each.format(m=names[0], o=names[1] if len(names) > 1 else "", way=way)
+                for each in patterns
+                if len(names) > 1 or "{o}" not in each
+            ]
     read = [each for each in found if parse(each).asked is not None]
     return tuple(dict.fromkeys(read))[:3]
