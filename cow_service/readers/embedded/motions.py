@@ -27,6 +27,10 @@ _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so
 _T = TypeVar("_T")
 
 
+def _refused(fault: str) -> CannotReadDirection:
+    return CannotReadDirection(fault, remedy=GIVE_DIRECTION)
+
+
 class Said(TypedDict):
     """What the words say of how fast, how far and how long; fields of `MotionReading`."""
 
@@ -36,45 +40,62 @@ class Said(TypedDict):
     until: Until | None
 
 
-def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | None = None) -> Said:
+def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox) -> Said:
     """The quantities of one leg; `way`, px, is the distance to the goal; `bbox` is the moving object's.
 
     Raises `CannotReadDirection`.
     """
-    distances = [each.distance for each in words if each.distance is not None]
     shares = [each.share for each in words if each.share is not None]
     if shares and way is None:
-        raise CannotReadDirection(
-            "The question says that it moves part of the way, but not where to.",
-            remedy=f"{GIVE_DIRECTION} Or give `motion.distance`.",
-        )
+        raise _refused("The question says that it moves part of the way, but not where to.")
+    distances = [each.distance for each in words if each.distance is not None]
     distances += [Quantity(share * (way or 0.0), "px") for share in shares]
-    if bbox is not None:
-        x0, _, x1, _ = bbox
-        distances += [Quantity(each.own_widths * (x1 - x0), "px") for each in words if each.own_widths is not None]
-    speeds: list[SpeedWord | Quantity] = [each.speed for each in words if each.speed is not None]
-    ends: list[Until] = [each.until for each in words if each.until is not None]
+    distances += [Quantity(each.own_widths * (bbox[2] - bbox[0]), "px") for each in words if each.own_widths]
     return Said(
-        speed=_one("speed", speeds),
+        speed=_one("speed", [each.speed for each in words if each.speed is not None]),
         distance=_one("distance", distances),
         duration=_one("duration", [each.duration for each in words if each.duration is not None]),
-        until=_one("end", ends),
+        until=_one("end", [each.until for each in words if each.until is not None]),
     )
 
 
 def _one(name: str, values: list[_T]) -> _T | None:
     if len(set(values)) > 1:
-        raise CannotReadDirection(f"The question names more than one {name} of the motion.", remedy=GIVE_DIRECTION)
+        raise _refused(f"The question names more than one {name} of the motion.")
     return values[0] if values else None
 
 
 def step_readings(steps: Sequence[StepWords], bbox: BBox) -> tuple[StepReading, ...]:
     """The legs behind the first of what has this box."""
-    readings: list[StepReading] = []
-    for step in steps:
-        direction, depth = _way(step.direction, step.depth)
-        said = quantities(step.quantities, None, bbox)
-        readings.append(StepReading(direction, depth, said["distance"], said["duration"]))
+    said = [(_way(step.direction, step.depth), quantities(step.quantities, None, bbox)) for step in steps]
+    return tuple(StepReading(*way, each["distance"], each["duration"]) for way, each in said)
+
+
+def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
+    if direction is None and not depth:
+        raise _refused("Which way a part of the motion goes was not understood.")
+    return depth_motion(depth) if direction is None else (direction, depth)
+
+
+def other_readings(
+    others: Sequence[tuple[ObjectPhrase, MotionWords]], scene: Scene, grounding: Grounding
+) -> tuple[OtherMotionReading, ...]:
+    """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
+    readings: list[OtherMotionReading] = []
+    things = (*grounding.others, LocatedObject(object=grounding.object, bbox=grounding.bbox))
+    for phrase, motion in others:
+        found = next((each for each in grounding.others if each.object == phrase.text), None)
+        goal = next((each for each in things if motion.towards and each.object == motion.towards.text), None)
+        if found is None or motion.steps or any(each.speed is None for each in motion.quantities):
+            raise _refused(f"'{phrase.text}' moves, too, and was not found, or how far it moves is said.")
+        refuse_unclear_fall(scene, motion, found)
+        kind, direction = motion.kind or "linear", motion.direction
+        if direction is None and goal is not None:  # from centre to centre
+            (x0, y0, x1, y1), start = goal.bbox, found.bbox
+            direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
+        way = _way(direction, motion.depth) if kind in DIRECTED_KINDS else (None, 0.0)
+        speed = quantities(motion.quantities, None, found.bbox)["speed"]
+        readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
     return tuple(readings)
 
 
@@ -84,46 +105,9 @@ def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | Loc
     is_ball = shape_of(name) == "sphere" or (region is not None and region.is_disc)  # its shadow tells how high it is
     in_air = words.in_air or is_ball or scene.side_view is not None or (prior is not None and prior.stands_on == "air")
     if words.topples and not is_ball:
-        fault = f"The {name} would fall over where it stands, which is not simulated. Ask what happens if it is pushed."
-    elif words.kind == "fall" and not in_air:
-        fault = f"The reader cannot see whether the {name} stands or hangs. If it hangs, ask what happens if it drops."
-    else:
-        return
-    raise CannotReadDirection(fault, remedy=GIVE_DIRECTION)
-
-
-def other_readings(
-    scene: Scene, others: Sequence[tuple[ObjectPhrase, MotionWords]], grounding: Grounding
-) -> tuple[OtherMotionReading, ...]:
-    """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
-    readings: list[OtherMotionReading] = []
-    for phrase, motion in others:
-        name, kind = phrase.text, motion.kind or "linear"
-        found = next((each for each in grounding.others if each.object == name), None)
-        if found is None:
-            raise CannotReadDirection(f"'{name}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
-        refuse_unclear_fall(scene, motion, found)
-        way, goal = (None, 0.0), None
-        if kind in DIRECTED_KINDS:
-            direction = motion.direction
-            if direction is None and motion.towards is not None:
-                things = (*grounding.others, LocatedObject(object=grounding.object, bbox=grounding.bbox))
-                goal = next((each for each in things if each.object == motion.towards.text), None)
-                if goal is not None:  # from centre to centre
-                    (x0, y0, x1, y1), start = goal.bbox, found.bbox
-                    direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
-            way = _way(direction, motion.depth)
-        speed = quantities(motion.quantities, None)["speed"]
-        readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
-    return tuple(readings)
-
-
-def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
-    if direction is None and depth:
-        return depth_motion(depth)
-    if direction is None:
-        raise CannotReadDirection("Which way a part of the motion goes was not understood.", remedy=GIVE_DIRECTION)
-    return direction, depth
+        raise _refused(f"The {name} would fall over where it stands, which is not simulated. Ask what a push does.")
+    if words.kind == "fall" and not in_air:
+        raise _refused(f"Whether the {name} stands or hangs cannot be seen. If it hangs, say that it is dropped.")
 
 
 def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:
@@ -133,9 +117,9 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     Raises `CannotGround` if the thing that the words tell the end by was not found.
     """
     words, phrase = question.motion.trail, question.mover
-    if phrase is None or not scene.trails:
+    if phrase is None or phrase.is_given or not scene.trails:
         return scene, ()
-    fitting = best_matches(scene.regions, phrase, question.others)
+    fitting = best_matches(scene.regions, phrase)
     trails = [trail for trail in (trail_of(scene.trails, region.bbox) for region in fitting) if trail is not None]
     if len(trails) != 1:
         return scene, ()
@@ -143,8 +127,7 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
     if words is not None:
         near = None if words.near is None else match_one(beside, words.near)
-        ends = (trail.positions[0], trail.positions[-1]) if near else ()
-        gaps = sorted(math.dist(end.centre, near.centre) for end in ends if near)
+        gaps = sorted(math.dist(trail.positions[end].centre, near.centre) for end in (0, -1)) if near else []
         if words.near is not None and (not gaps or gaps[0] > NEARER * gaps[1]):
             raise CannotGround(
                 f"The question tells the end of the trail by '{words.near.text}', which was not found, not for "
@@ -173,17 +156,16 @@ def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> Motio
     Raises `CannotReadDirection` if the words speak of one all the same.
     """
     trail = trail_of(scene.trails, grounding.bbox)
-    if trail is not None:
-        thrown = is_thrown(trail.positions) or words.kind in FALLING_KINDS
-        earlier = tuple(position.centre for position in trail.older)
-        return MotionReading("projectile" if thrown else "linear", trail.heading, "trail", trail=earlier)
-    if words.trail is None:
+    if trail is None and words.trail is not None:
+        raise _refused(
+            f"The question speaks of a trail, and no three positions of the {grounding.object} one after another were "
+            f"found in the image."
+        )
+    if trail is None:
         return None
-    raise CannotReadDirection(
-        f"The question speaks of a trail, and no three positions of the {grounding.object} one after another were "
-        f"found in the image.",
-        remedy=GIVE_DIRECTION,
-    )
+    thrown = is_thrown(trail.positions) or words.kind in FALLING_KINDS
+    earlier = tuple(position.centre for position in trail.older)
+    return MotionReading("projectile" if thrown else "linear", trail.heading, "trail", trail=earlier)
 
 
 def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionReading:
@@ -192,18 +174,10 @@ def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionRe
     kind = words.kind or "linear"
     if question.unread_motion:
         unread = "', '".join(question.unread_motion)
-        raise CannotReadDirection(f"How the {name} moves was not understood: '{unread}'.", remedy=GIVE_DIRECTION)
-    if kind == "static" and question.names_direction:
-        raise CannotReadDirection(
-            f"The question says that the {name} does not move, and speaks of a direction all the same: "
-            f"which is meant was not understood.",
-            remedy=GIVE_DIRECTION,
-        )
-    if words.is_contradictory:
-        raise CannotReadDirection(
-            f"The verb '{words.verb}' and the direction that the question gives for the {name} contradict "
-            f"each other: which is meant was not understood.",
-            remedy=GIVE_DIRECTION,
+        raise _refused(f"How the {name} moves was not understood: '{unread}'.")
+    if words.is_contradictory or (kind == "static" and question.names_direction):
+        raise _refused(
+            f"What the question says of the motion of the {name} contradicts itself: which is meant was not understood."
         )
     refuse_unclear_fall(scene, words, grounding)
     if kind not in DIRECTED_KINDS:
@@ -211,10 +185,7 @@ def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionRe
     if scene.side_view is not None and words.direction == (0.0, 1.0) and kind == "linear":
         return MotionReading("fall", None, "gravity")  # down a slope, or over an edge, by its weight
     if scene.side_view is not None and words.depth:
-        raise CannotReadDirection(
-            "The image is a drawing seen from the side: nothing in it moves towards the viewer, or away.",
-            remedy=GIVE_DIRECTION,
-        )
+        raise _refused("The image is a drawing seen from the side: nothing in it moves towards the viewer, or away.")
     said = _as_said(scene, words, kind, grounding)
     if said is not None:
         return said
@@ -223,13 +194,10 @@ def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionRe
     # Forward or backward, by the way that a vehicle is seen to face.
     told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
     if not is_vehicle(name):
-        raise CannotReadDirection(
-            f"{told} The embedded reader sees only of vehicles with wheels which way they face.",
-            remedy=GIVE_DIRECTION,
-        )
+        raise _refused(f"{told} The embedded reader sees only of vehicles with wheels which way they face.")
     way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
     if way is None:
-        raise CannotReadDirection(f"{told} Which way it faces could not be seen for certain.", remedy=GIVE_DIRECTION)
+        raise _refused(f"{told} Which way it faces could not be seen for certain.")
     return MotionReading(kind, way if words.forward else (-way[0], -way[1]), "orientation")
 
 
@@ -237,23 +205,18 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
     """The motion whose direction the words give; None if they give none."""
     if words.along_arrow is not None:
         x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
-        along = words.along_arrow
-        x, y = (x, y) if along else (-x, -y)
+        x, y = (x, y) if words.along_arrow else (-x, -y)
         said = words.direction or (x, y)
         if x * said[0] + y * said[1] < AGREES * math.hypot(x, y) * math.hypot(*said):
-            raise CannotReadDirection(
-                "The question names the arrow and another direction, and the arrow does not point there.",
-                remedy=GIVE_DIRECTION,
-            )
-        return MotionReading(kind, (x, y), "arrow", along_arrow=along)
-    if words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth:
-        direction, depth = depth_motion(-math.copysign(1.0, words.direction[1]))  # up the image is away on the floor
-        return MotionReading(kind, direction, "text", depth=depth)
-    if words.direction is not None:
+            raise _refused("The question names the arrow and another direction, and the arrow does not point there.")
+        return MotionReading(kind, (x, y), "arrow", along_arrow=words.along_arrow)
+    on_floor = words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth
+    if words.direction is not None and not on_floor:
         rises = words.verb in _RISES and words.direction[1] < 0
         return MotionReading(kind, words.direction, "text", depth=words.depth, rises=rises)
-    if words.depth:
-        direction, depth = depth_motion(words.depth)
+    if words.depth or words.direction is not None:  # up the image is away on the floor
+        up = 0.0 if words.direction is None else -math.copysign(1.0, words.direction[1])
+        direction, depth = depth_motion(words.depth or up)
         return MotionReading(kind, direction, "text", depth=depth)
     if words.towards is not None:
         goal = goal_of(scene, words.towards, grounding)
@@ -264,30 +227,22 @@ def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grou
 def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
     """Along the only arrow drawn at the mover, where the question names no direction at all."""
     near = scene.arrows_near(grounding.bbox)
+    if len(near) == 1 and not question.names_direction:
+        note = "The question names no direction; the arrow drawn at the object was followed."
+        return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
     if near and question.names_direction:
-        raise CannotReadDirection(
-            "The question has words of direction that could not be read as the motion's, so the drawn arrow was "
-            "not followed either.",
-            remedy=GIVE_DIRECTION,
-        )
-    if len(near) != 1:
-        raise CannotReadDirection(
-            "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
-            f"image shows {len(near) or 'no'} arrow{'s' if len(near) > 1 else ''} at the {grounding.object}.",
-            remedy=GIVE_DIRECTION,
-        )
-    note = "The question names no direction; the arrow drawn at the object was followed."
-    return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
+        raise _refused("The question's words of direction were not read as the motion's, and no arrow was followed.")
+    raise _refused(
+        "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
+        f"image shows {len(near) or 'no'} arrow{'s' if len(near) > 1 else ''} at the {grounding.object}."
+    )
 
 
 def goal_of(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> LocatedObject:
     """The thing that the mover moves towards. Raises `CannotReadDirection`."""
     goal = next((other for other in grounding.others if other.object == phrase.text), None)
-    if goal is not None:
-        return goal
     besides = [each for each in scene.regions if not is_same_object(each.bbox, grounding.bbox)]
-    region = match_one(besides, phrase)
-    if region is None:
-        told = unclear(phrase, best_matches(besides, phrase), besides)
-        raise CannotReadDirection(f"Where the {grounding.object} moves to is not clear: {told}.", remedy=GIVE_DIRECTION)
-    return LocatedObject(object=phrase.text, bbox=region.bbox)
+    region = match_one(besides, phrase) if goal is None else None
+    if goal is None and region is None:
+        raise _refused(f"Where the {grounding.object} moves to is not clear: {unclear(phrase, besides)}.")
+    return goal or LocatedObject(object=phrase.text, bbox=region.bbox if region is not None else grounding.bbox)

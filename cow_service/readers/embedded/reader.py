@@ -14,7 +14,8 @@ from cow_service.readers.embedded import matching, motions
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.english import noun_phrases
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
-from cow_service.readers.embedded.english.questions import Question, parse, rewordings
+from cow_service.readers.embedded.english.noun_phrases import kind_of
+from cow_service.readers.embedded.english.questions import ChangeWords, Question, parse, rewordings
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, Grounding, Intervention, LocatedObject, ObjectPrior, Source
@@ -50,7 +51,7 @@ class EmbeddedReader:
         )
         drawings = frozenset(each for each in ("arrow", "box") if each in question.lower())
         said, way = read.motion, base.WayReading()
-        if not read.unread and not said.is_contradictory:
+        if not read.unread_motion and not said.is_contradictory:
             towards = None if said.towards is None else said.towards.text
             way = base.WayReading(said.along_arrow, None if said.depth else said.direction, towards)
         nouns = matching.nouns_of(read)
@@ -68,7 +69,7 @@ class EmbeddedReader:
 
     def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
         """Those of a kind such as "both mugs", where there are as many as is said; else the words themselves."""
-        kind = noun_phrases.kind_of(words)
+        kind = kind_of(words)
         if kind is None or any(plain(name) == plain(words) for name in names):
             return (words,)
         found = tuple(name for name in names if noun_phrases.may_name(kind.phrase, name))
@@ -77,66 +78,61 @@ class EmbeddedReader:
     def ground(self, given: ReaderInput) -> base.GroundingReading:
         """What is given under the mover's words, or the region that fits them. Raises `CannotGround`."""
         question = parse(given.question, names_of(given))
-        mover, changes = question.mover, question.changes if given.changes_wanted else ()
+        mover, asked, unread = question.mover, question.asked, question.unread
+        changes = question.changes if given.changes_wanted else ()
         if mover is None or (given.motion_wanted and not question.says_motion):
             raise _not_said(question, given)
+        _check_changes(question, changes)
         with given.cpu():
-            _check_changes(question, changes)
-            scene, assumed = motions.scene_of_mover(given.scene, question)
+            scene, warnings = motions.scene_of_mover(given.scene, question)
             if given.find is not None and scene.side_view is None:
                 scene = matching.with_found(scene, given.find(matching.nouns_of(question, given.sought)))
-            finder = _Finder(scene, given.known, question)
-            removed = [each for change in changes if change.kind == "remove" for each in finder.removed(change.object)]
-            finder.take_away([each.bbox for each in removed])
-            bbox = finder.mover(mover)
-            placed = [
-                Intervention(
-                    kind="place", object=things[0], relation=change.relation, targets=tuple(things[1:])
-                )
+            finder = _Finder(scene, given.known)
+            removed = [
+                Intervention(kind="remove", object=each)
                 for change in changes
-                if change.kind == "place" and change.targets
-                for things in [finder.placed(change.object, change.relation or "into", change.targets, (mover, bbox))]
-            ]  # fmt: skip
+                if change.kind == "remove"
+                for each in finder.found(change.object, f"takes '{change.object.text}' away")
+            ]
+            finder.regions = finder.without([each.object.bbox for each in removed])
+            bbox = finder.mover(mover, question.names_arrow)
+            finder.taken = {mover.text: bbox}
+            put = [finder.placed(change) for change in changes if change.kind == "place" and change.targets]
             # The other things of the question, and those that the caller wants located under other words.
             words = [phrase.text for phrase in (mover, *question.others)]
             sought = [name for name in given.sought if not any(same_name(name, each) for each in words)]
-            phrases = [(name, noun_phrases.parse_noun_phrase(name)) for name in sought]
-            wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in phrases if phrase is not None)]
-            others = dict[BBox, LocatedObject]()
-            for phrase in wanted:
-                thing = finder.other(phrase, bbox, wanted)
-                if thing is not None:
-                    others.setdefault(thing.bbox, thing)
-            located = [*others.values()]
-            located += matching.things_of_kinds(finder.regions, question, bbox, given.known)
-            boxes = {other.object: other.bbox for other in (*located, *given.known)}
-            besides = [each for each in finder.regions if each.bbox != bbox]
-            warnings = [
-                f"{matching.unclear(each, matching.best_matches(besides, each, wanted), besides)}. "
-                "No encounter is listed under that name."
-                for each in question.others
-                if each.text not in boxes and not matching.is_kind_asked(each, question)
+            parsed = [(name, noun_phrases.parse_noun_phrase(name)) for name in sought]
+            wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in parsed if phrase is not None)]
+            # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
+            beside = [
+                one for one in finder.regions if one.bbox != bbox and (one.called or not is_same_object(one.bbox, bbox))
             ]
-            asked = question.asked if given.asked_wanted else None
-            if asked is not None and question.table is not None and scene.side_view is not None:
-                # Seen from the side, a table is a thing, and the floor is another.
-                table = matching.table_among(besides)
-                update = {"relation": "touches", "target": question.table.text}
-                asked = None if table is None else asked.model_copy(update=update)
-                if table is not None:
-                    located.append(LocatedObject(object=question.table.text, bbox=table.bbox))
-            things = [(each, boxes[each.text]) for each in question.others if each.text in boxes and not each.is_given]
+            others = [(phrase, finder.other(phrase, beside)) for phrase in wanted if not phrase.is_given]
+            located = {each.bbox: each for _, each in reversed(others) if each is not None}
+            located |= {
+                each.bbox: each for each in matching.things_of_kinds(finder.regions, question, bbox, given.known)
+            }
+            warnings += tuple(
+                f"{matching.unclear(phrase, beside)}. No encounter is listed under that name."
+                for phrase, each in others
+                if each is None and phrase in question.others
+            )
+            things = [(phrase, each.bbox) for phrase, each in others if each is not None and phrase in question.others]
             things += [] if mover.is_given else [(mover, bbox)]
             doubts, doubtful = matching.noun_doubts(scene, things)
-        left = [] if not (given.asked_wanted or given.changes_wanted) else list(question.unread)
-        warnings += doubts + [f"The words '{each}' were not understood, so no outcome is sure." for each in left]
+            if question.names_table and scene.side_view is not None:
+                asked = None  # seen from the side, a table is a thing, and the floor is another
+        left = unread if given.asked_wanted or given.changes_wanted else ()
+        doubts += [f"The words '{each}' were not understood, so no outcome is sure." for each in left]
         return base.GroundingReading(
             mover.text,
             bbox,
-            others=tuple(each.model_copy(update={"is_doubtful": each.bbox in doubtful}) for each in located),
-            warnings=(*assumed, *warnings),
-            interventions=(*(Intervention(kind="remove", object=each) for each in removed), *placed),
-            asked=asked,
+            others=tuple(
+                each.model_copy(update={"is_doubtful": each.bbox in doubtful}) for each in reversed(located.values())
+            ),
+            warnings=(*warnings, *doubts),
+            interventions=(*removed, *put),
+            asked=asked if given.asked_wanted else None,
             is_doubtful=bbox in doubtful or (bool(left) and not given.asked_wanted),
         )
 
@@ -146,18 +142,18 @@ class EmbeddedReader:
         Raises `CannotReadDirection`.
         """
         with given.cpu():
-            scene = given.scene
-            question = parse(given.question, names_of(given) or tuple(each.object for each in grounding.others))
+            scene, names = given.scene, names_of(given) or tuple(each.object for each in grounding.others)
+            question = parse(given.question, names)
             words = question.motion
             on = motions.along_trail(scene, grounding, words) if words.trail is not None else None
             reading = on or motions.read_way(scene, question, grounding)
-            parted = any(each.share is not None for each in words.quantities) and words.towards is not None
-            goal = motions.goal_of(scene, words.towards, grounding) if parted and words.towards else None
+            parted = any(each.share is not None for each in words.quantities)
+            goal = motions.goal_of(scene, words.towards, grounding) if parted and words.towards is not None else None
             way = None if goal is None else way_to(goal.bbox, grounding.bbox, reading.kind == "linear")
             return replace(
                 reading,
                 steps=motions.step_readings(words.steps, grounding.bbox),
-                others=motions.other_readings(scene, words.others, grounding),
+                others=motions.other_readings(words.others, scene, grounding),
                 **motions.quantities(words.quantities, None if way is None else math.hypot(*way), grounding.bbox),
             )
 
@@ -203,16 +199,14 @@ def _not_said(question: Question, given: ReaderInput) -> CannotGround:
     return CannotGround(f"{fault} Ask like: {' Or: '.join(like)}", remedy=LOCATE_IT)
 
 
-def _check_changes(question: Question, changes: Sequence[object]) -> None:
+def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
     """Raises `CannotGround` if what is taken away moves or is asked about, or something is put into itself."""
     asked = question.asked
     about = () if asked is None else [name for name in (asked.subject, asked.target, *asked.among) if name is not None]
-    for change in question.changes if changes else ():
-        name = change.object.text
-        if change.kind == "remove" and change.object == question.mover:
-            raise CannotGround(f"The question takes '{name}' away and says that it moves: ask one of both.")
-        if change.kind == "remove" and any(same_name(each, name) for each in about):
-            raise CannotGround(f"The question takes '{name}' away and asks what becomes of it: ask one of both.")
+    for change in changes:
+        name, is_removed = change.object.text, change.kind == "remove"
+        if is_removed and (change.object == question.mover or any(same_name(each, name) for each in about)):
+            raise CannotGround(f"The question takes '{name}' away and says or asks what it does: ask one of both.")
         if change.object in change.targets:
             raise CannotGround(f"The question puts '{name}' {change.relation} itself: name another thing.")
 
@@ -220,105 +214,67 @@ def _check_changes(question: Question, changes: Sequence[object]) -> None:
 class _Finder:
     """Finds the things of one question: what is given under their words first, then what is seen."""
 
-    def __init__(self, scene: Scene, known: Sequence[LocatedObject], question: Question) -> None:
-        self.scene, self.question, self.regions = scene, question, tuple(scene.regions)
-        self._known = {each.object: each for each in known}
+    def __init__(self, scene: Scene, known: Sequence[LocatedObject]) -> None:
+        self.scene, self.regions = scene, tuple(scene.regions)
+        self.known, self.taken = {each.object: each for each in known}, dict[str, BBox]()
+        self._given = f" Given: {', '.join(self.known)}." if known else ""
 
-    def take_away(self, boxes: Sequence[BBox]) -> None:
-        """Leaves out the regions of what is taken away."""
-        self.regions = tuple(region for region in self.regions if not is_among(region.bbox, boxes))
+    def without(self, boxes: Sequence[BBox]) -> tuple[Region, ...]:
+        """The regions that are in none of some boxes."""
+        return tuple(region for region in self.regions if not is_among(region.bbox, boxes))
 
-    def _one(
-        self, phrase: ObjectPhrase, regions: Sequence[Region], others: Sequence[ObjectPhrase]
-    ) -> LocatedObject | None:
-        """What is given under the words of a phrase, or the one region that fits them."""
-        if phrase.is_given:
-            return self._known.get(phrase.text)
-        region = matching.match_one(regions, phrase, others)
-        return None if region is None else LocatedObject(object=phrase.text, bbox=region.bbox, source="embedded")
-
-    def mover(self, phrase: ObjectPhrase) -> BBox:
+    def mover(self, phrase: ObjectPhrase, names_arrow: bool) -> BBox:
         """The box of what moves. Raises `CannotGround`."""
         scene = self.scene
         if phrase.is_given:
-            return self._known[phrase.text].bbox
+            return self.known[phrase.text].bbox
         if phrase.inside_box:
             return matching.inside_drawn_box(scene, phrase)
-        if noun_phrases.kind_of(phrase.text) is not None:
-            fault = f"The question moves '{phrase.text}' at once: ask of one thing, or name each."
-            raise CannotGround(fault, remedy=GIVE_PLACE)
-        if not scene.regions:
-            raise CannotGround(
-                f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to "
-                f"tell its objects apart.{self._given_names()}",
-                remedy=LOCATE_IT,
-            )
-        fitting = matching.best_matches(self.regions, phrase, self.question.others)
-        if len(fitting) > 1 and (self.question.names_arrow or phrase.path_end == "start"):
+        fitting = matching.best_matches(self.regions, phrase)
+        if len(fitting) > 1 and (names_arrow or phrase.path_end == "start"):
             fitting = scene.at_arrow(fitting) or fitting
-        if len(fitting) != 1:
-            told = matching.unclear(phrase, fitting, scene.regions)
-            raise CannotGround(f"What moves is not clear: {told}.{self._given_names()}", remedy=LOCATE_IT)
-        return fitting[0].bbox
+        if len(fitting) == 1 and kind_of(phrase.text) is None:
+            return fitting[0].bbox
+        fault = f"What moves is not clear: {matching.unclear(phrase, scene.regions)}."
+        if kind_of(phrase.text) is not None:
+            fault = f"The question moves '{phrase.text}' at once: ask of one thing, or name each."
+        elif not scene.regions:
+            fault = (
+                f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to "
+                "tell its objects apart."
+            )
+        raise CannotGround(fault + self._given, remedy=LOCATE_IT)
 
-    def _given_names(self) -> str:
-        return f" Given: {', '.join(self._known)}." if self._known else ""
-
-    def other(self, phrase: ObjectPhrase, mover: BBox, others: Sequence[ObjectPhrase]) -> LocatedObject | None:
-        """Another thing; None where it is given, which the caller knows, or is not found for certain."""
-        if phrase.is_given:
-            return None
-        # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
-        beside = [
-            each
-            for each in self.regions
-            if each.bbox != mover and (each.called or not is_same_object(each.bbox, mover))
-        ]
-        if phrase.is_other:
-            return LocatedObject(object=phrase.text, bbox=beside[0].bbox) if len(beside) == 1 else None
-        region = matching.match_one(beside, phrase, others)
+    def other(self, phrase: ObjectPhrase, beside: Sequence[Region]) -> LocatedObject | None:
+        """Another thing; None where it is not found for certain."""
+        alone = beside[0] if len(beside) == 1 else None
+        region = alone if phrase.is_other else matching.match_one(beside, phrase)
         return None if region is None else LocatedObject(object=phrase.text, bbox=region.bbox)
 
-    def removed(self, phrase: ObjectPhrase) -> list[LocatedObject]:
-        """What is taken away, one thing or "both cylinders". Raises `CannotGround`."""
-        changed = [change.object for change in self.question.changes if change.kind == "remove"]
-        named = [self.question.mover, *self.question.others, *changed]
-        others = [each for each in named if each is not None and noun_phrases.kind_of(each.text) is None]
-        kind = None if phrase.is_given else noun_phrases.kind_of(phrase.text)
-        one = self._one(phrase, self.regions, others) if kind is None else None
-        found = [] if one is None else [one]
-        if kind is not None:
-            regions = matching.match_several(self.regions, kind.phrase, others, kind.count or 2)
-            found = [LocatedObject(object=f"{each.colour} {kind.phrase.head}", bbox=each.bbox) for each in regions]
-            found = found if kind.count in (None, 2) else []
-        if not found:
-            raise self._not_found(self.regions, f"takes '{phrase.text}' away", phrase)
-        return [each.model_copy(update={"source": each.source or "embedded"}) for each in found]
+    def found(self, phrase: ObjectPhrase, told: str, count: int | None = None) -> list[LocatedObject]:
+        """One thing, or several such as "both cylinders". Raises `CannotGround`."""
+        if phrase.is_given:
+            return [self.known[phrase.text]]
+        if phrase.text in self.taken:
+            return [LocatedObject(object=phrase.text, bbox=self.taken[phrase.text], source="embedded")]
+        free, kind = self.without(list(self.taken.values())), kind_of(phrase.text)
+        region = matching.match_one(free, phrase) if kind is None else None
+        if kind is not None and kind.count in (None, 2):
+            kind = replace(kind, count=kind.count or count)
+            things = matching.named_by_colour(matching.match_several(free, kind), kind)
+        else:
+            things = [] if region is None else [LocatedObject(object=phrase.text, bbox=region.bbox, source="embedded")]
+        if not things:
+            why = matching.unclear(phrase, free)
+            raise CannotGround(f"The question {told}, and {why}.{self._given}", remedy=GIVE_OBJECT)
+        return things
 
-    def placed(
-        self, phrase: ObjectPhrase, relation: str, targets: Sequence[ObjectPhrase], mover: tuple[ObjectPhrase, BBox]
-    ) -> list[LocatedObject]:
-        """What is put somewhere, then what it is put to. Raises `CannotGround`."""
-        known, found, others = [mover], list[LocatedObject](), [*self.question.others, phrase]
-        for each in (phrase, *targets):
-            free = [region for region in self.regions if not is_among(region.bbox, [bbox for _, bbox in known])]
-            kind = None if each.is_given else noun_phrases.kind_of(each.text)
-            if found and kind is not None and relation == "between":
-                two = matching.match_several(free, kind.phrase, others, 2)
-                found += [LocatedObject(object=f"{one.colour} {kind.phrase.head}", bbox=one.bbox) for one in two]
-                continue
-            again = next((bbox for other, bbox in known if other == each), None)
-            names = [one for one in others if all(one != other for other, _ in known)]
-            thing = self._one(each, free, names) if again is None else LocatedObject(object=each.text, bbox=again)
-            if thing is None:
-                where = f"{relation} '{each.text}'" if found else "somewhere"
-                raise self._not_found(free, f"puts '{phrase.text}' {where}", each)
-            found.append(thing)
-            known.append((each, thing.bbox))
-        if relation == "between" and len(found) != 3:
-            raise self._not_found(self.regions, f"puts '{phrase.text}' between", targets[0])
-        return [each.model_copy(update={"source": each.source or "embedded"}) for each in found]
-
-    def _not_found(self, regions: Sequence[Region], told: str, phrase: ObjectPhrase) -> CannotGround:
-        why = matching.unclear(phrase, matching.best_matches(regions, phrase), regions)
-        return CannotGround(f"The question {told}, and {why}.{self._given_names()}", remedy=GIVE_OBJECT)
+    def placed(self, change: ChangeWords) -> Intervention:
+        """What is put somewhere, and what it is put to. Raises `CannotGround`."""
+        puts, found = f"puts '{change.object.text}'", list[LocatedObject]()
+        for phrase in (change.object, *change.targets):
+            found += self.found(phrase, puts, 2)
+            self.taken[phrase.text] = found[-1].bbox
+        if len(found) != (3 if change.relation == "between" else 2):
+            raise CannotGround(f"The question {puts}, and between which things is not clear.", remedy=GIVE_OBJECT)
+        return Intervention(kind="place", object=found[0], relation=change.relation, targets=tuple(found[1:]))

@@ -45,7 +45,11 @@ def relation_of(said: dict[str, str]) -> PlaceRelation | None:
 def forms() -> dict[str, tuple[Form, ...]]:
     """The forms by their section."""
     macros = dict(lex.sections()["macros"]) | {"verbs": VERBS, "causes": "|".join(lex.LISTS["causes"])}
-    macros |= {"colours": "|".join(lex.COLOURS), "numerals": "|".join(lex.LISTS["numerals"]), "units": "|".join(lex.METRES)}
+    macros |= {
+        "colours": "|".join(lex.COLOURS),
+        "numerals": "|".join(lex.LISTS["numerals"]),
+        "units": "|".join(lex.METRES),
+    }
     macros["where"] = "|".join(f"(<{name.replace('-', '')}>){pattern}" for name, pattern in lex.sections()["where"])
 
     def compiled(section: str, says: str, pattern: str) -> Form:

@@ -22,7 +22,9 @@ _CONTRACTED = {
     r" [–—-] |[:—–]": " , ",
 }  # fmt: skip
 _TOKEN = re.compile(r"N\d+N|[A-Z]+\d*|\d+(?:\.\d+)?|[a-z]+(?:['-][a-z]+)*|\w+|[.,;?!()-]")
-_BEHIND_NOUN = lex.words("safe both last earlier hard each together neither either nearest closest farthest first one other")
+_BEHIND_NOUN = lex.words(
+    "safe both last earlier hard each together neither either nearest closest farthest first one other"
+)
 _COLOURED = rf"(?:(?:{'|'.join(lex.COLOURS)}|{'|'.join(lex.LISTS['adjectives'])}|bounding|drawn|cream) )*"
 # What belongs to the noun in front of it, and what it says.
 _BEHIND = {
@@ -153,7 +155,11 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
     while end < len(words) and end - first < 10:
         if words[end][0] == "N" and words[end][1:-1].isdigit():
             name = tokens.names[int(words[end][1:-1])]
-            more = end + 1 < len(words) and _belongs(words, end + 1, first, at, False) and not lex.VERBS.get(words[end + 1])
+            more = (
+                end + 1 < len(words)
+                and _belongs(words, end + 1, first, at, False)
+                and not lex.VERBS.get(words[end + 1])
+            )
             end += 1
             if not (more and lex.is_modifier(name.lower())):
                 break
@@ -172,7 +178,10 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
     verb = lex.lemma(content[0]) if len(content) > 1 and content[0].endswith("ing") else ""
     verb = verb if verb in lex.KINDS else ""
     content = content[1:] if verb else content
-    text, phrase = [*content[:-1], name or content[-1]], object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], "")
+    text, phrase = (
+        [*content[:-1], name or content[-1]],
+        object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], ""),
+    )
     before = tokens.plain[-1] if tokens.plain else ""
     while end < len(words):
         behind, length = " ".join(words[end : end + 12]), 0
@@ -185,7 +194,13 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
                 is_start = (found["end"] or content[0]) in {"start", "beginning", "first"}
                 phrase = replace(phrase, path_end="start" if is_start else "end")
             phrase = replace(phrase, inside_box=phrase.inside_box or what == "box")
-        if not length and words[end] == "of" and end + 1 < len(words) and _is_open(words[end + 1]) and words[end + 1] not in lex.VERBS:
+        if (
+            not length
+            and words[end] == "of"
+            and end + 1 < len(words)
+            and _is_open(words[end + 1])
+            and words[end + 1] not in lex.VERBS
+        ):
             length = 2  # "stack of books"
         if not length:
             break
@@ -195,7 +210,9 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
     given = name if name and len(text) == 1 else match_given(phrase, tokens.names)
     if given is not None:
         phrase = replace(object_phrase(given.lower().split(), given), is_given=True)
-    _add_phrase(tokens, phrase, content, words[at:first], " ".join([*words[at:first], *([verb] if verb else []), *text]))
+    _add_phrase(
+        tokens, phrase, content, words[at:first], " ".join([*words[at:first], *([verb] if verb else []), *text])
+    )
     return end, verb
 
 
@@ -250,7 +267,9 @@ def object_phrase(content: Sequence[str], text: str) -> ObjectPhrase:
     said = said[: next((at for at, word in enumerate(said) if at and word in {"of", "with"}), len(said))]
     nouns, head = [word for word in said[:-1] if not lex.is_modifier(word)], said[-1]
     colour = next((lex.COLOURS[word] for word in said[:-1] or said if word in lex.COLOURS), None)
-    return ObjectPhrase(text, colour, None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)]))
+    return ObjectPhrase(
+        text, colour, None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)])
+    )
 
 
 def parse_noun_phrase(text: str) -> ObjectPhrase | None:
@@ -259,7 +278,11 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     while said and said[0].lower() in lex.DETERMINERS:
         del said[0]
     words = re.findall(r"[\w'-]+", " ".join(said).lower())
-    ends = (at for at, word in enumerate(words) if at and word != "one" and (word in lex.FUNCTION or word in lex.DETERMINERS))
+    ends = (
+        at
+        for at, word in enumerate(words)
+        if at and word != "one" and (word in lex.FUNCTION or word in lex.DETERMINERS)
+    )
     words = words[: next(ends, len(words))]
     if not words or words[0] in lex.FUNCTION:
         return None

@@ -10,7 +10,7 @@ from cow_service.readers.embedded.english import forms
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
-from cow_service.readers.options import plain, says_not_sure, split_options
+from cow_service.readers.options import plain, says_not_sure, split_options, without_reply_form
 from cow_service.records import Asked, InterventionKind, MotionKind, PlaceRelation, Vector
 
 MAX_WORDS = 240  # of a question that is read
@@ -81,7 +81,7 @@ class Question:
     asked: Asked | None = None
     others: tuple[ObjectPhrase, ...] = ()
     alternatives: tuple[ObjectPhrase, ...] = ()
-    table: ObjectPhrase | None = None  # on which something is asked to come down
+    names_table: bool = False  # something is asked to come down on it, or to stay there
     names_arrow: bool = False
     names_direction: bool = False  # some word says which way, whether or not it was understood
     unread: tuple[str, ...] = ()
@@ -97,26 +97,6 @@ def parse(question: str, names: tuple[str, ...] = ()) -> Question:
         return Question(unread=(" ".join(text.split()[MAX_WORDS : MAX_WORDS + 7]),))
     options = [text for _, text in listed.options if not says_not_sure(text)]
     return _Parser(tokens_of(text, names), options).question()
-
-
-# Sentences of a prompt that say how to reply and nothing else, and its heading.
-_ABOUT_REPLY = re.compile(
-    r"\byour (?:\w+ ){0,2}(?:response|answer|reply|output)s?\b|\bjson\b|answer\s*:\s*\$|\$\s?letter\b", re.IGNORECASE
-)
-_CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
-_INSTRUCTION = re.compile(
-    r"(?:please )?(?:think|reason|answer|choose|select|pick|options?|choices?|explain|respond|reply|provide|return|output"
-    r"|note that the (?:first|second|last|image|video|frame)\w*)\b", re.IGNORECASE,
-)  # fmt: skip
-_YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)
-_HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
-
-
-def without_reply_form(prompt: str) -> str:
-    """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
-    sentences = re.split(r"((?<=[.?!])\s+|\n+)", _YES_NO.sub("", _HEADING.sub("", prompt)))
-    kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
-    return "".join(part for part in re.split(r"((?<=[.?!;:])\s+)", kept) if not _INSTRUCTION.match(part.strip()))
 
 
 _PIECES = {"asked": "asked", "moved": "motion", "changes": "change", "stated": "stated"}
@@ -155,7 +135,7 @@ class _Parser:
 
     def __init__(self, tokens: Tokens, options: Sequence[str]) -> None:
         self.tokens, self.options, self.plain, self.said = tokens, options, tokens.plain, tokens.said
-        self.mover, self.table = "", None
+        self.mover, self.names_table = "", False
         self._put_behind()
         self.text, self.starts = " ".join(self.plain), [0]
         for token in self.plain:
@@ -169,7 +149,10 @@ class _Parser:
 
     def _put_behind(self) -> None:
         """Puts "the ball, rolling left," in front of the question that it interrupts."""
-        asks, way = rf"(?:^| )(?P<asks>(?:will|be|ASK) (?P<thing>X\d+|it))", rf"(?P<way>(?:{forms.VERBS})(?: [^,.?]*?)?)"
+        asks, way = (
+            rf"(?:^| )(?P<asks>(?:will|be|ASK) (?P<thing>X\d+|it))",
+            rf"(?P<way>(?:{forms.VERBS})(?: [^,.?]*?)?)",
+        )
         text = " ".join(self.plain)
         found = re.search(rf"{asks} ,? ?(?:when |if )?{way}(?P<comma> ,) (?=[a-zA-Z])", text) or re.search(
             rf"{asks} {way}(?P<comma>) (?=(?:still |then )*(?!X|FLOOR|IMAGE)[a-z]+ (?:X|into|with|ANY))", text
@@ -245,7 +228,7 @@ class _Parser:
         if not moving and asked is not None and asked.relation == "lands" and changes and put is None:
             first = MotionWords("fall", verb="fall")  # without its support
         gone = {self._token(each.object) for each in changes if each.kind == "remove"}
-        named = next((each for each in self._named(len(self.plain)) if each not in gone), "")
+        named = next((each for each in self._named(len(self.plain)) if each not in gone and asking is None), "")
         mover = self._thing(self.mover or named) if self.mover or named else None
         further = tuple((self._thing(each), motion) for each, motion in moving.items() if each != self.mover)
         return Question(
@@ -256,7 +239,7 @@ class _Parser:
             asked=None if unread else asked,
             others=self._others(mover, changes, asked),
             alternatives=alternatives,
-            table=self.table,
+            names_table=self.names_table,
             names_arrow=any(word in {"ALONG", "AGAINST"} or "arrow" in word for word in (*self.plain, *self.said)),
             names_direction=not _DIRECTIONS.isdisjoint(self.plain),
             unread=tuple(dict.fromkeys(said for _, said in unread)),
@@ -300,13 +283,16 @@ class _Parser:
         found = dict[str, MotionWords]()
         for piece in self.pieces:
             if piece in told and piece.thing("s") and not found:
-                found[piece.said("s")] = piece.motion  # "if the cue ball strikes the yellow ball"
+                struck = self._thing(piece.said("o")) if piece.thing("o") else None
+                found[piece.said("s")] = MotionWords("linear", towards=struck)  # "if the cue ball strikes the red ball"
             if piece.what != "motion":
                 continue
             said, before, token = piece.said("m"), self._named(piece.start), piece.thing("m") or piece.said("m")
             if asking is not None and token in {"", "it"}:
                 # "Will the bottle be hidden behind the book if it moves": what the question is about.
-                acts = asking.thing("o" if asking.is_passive and "behind" in self.plain[asking.start : asking.end] else "s")
+                acts = asking.thing(
+                    "o" if asking.is_passive and "behind" in self.plain[asking.start : asking.end] else "s"
+                )
                 early = said == "it" or not before or asking.start < piece.start
                 token = acts if acts and early else ""
             token = token if token != "it" else ""
@@ -381,8 +367,8 @@ class _Parser:
             target = ""
         thing = self._thing(target) if target else None
         if relation == "lands" and thing is not None:  # "off the table"
-            thing, is_table = None, thing.head in lex.TABLES
-            if not is_table:
+            self.names_table, thing = thing.head in lex.TABLES, None
+            if not self.names_table:
                 return None, ()
         if relation == "inside" and form == "whether":
             puts = [each.targets[0] for each in changes if each.targets]
@@ -394,7 +380,7 @@ class _Parser:
                 return None, ()
         if relation == "touches" and thing is not None and thing.head in lex.TABLES and not thing.colour:
             on = not {"on", "onto"}.isdisjoint(words)
-            self.table, relation, thing = (thing, "lands", None) if on else (None, relation, thing)
+            self.names_table, relation, thing = (True, "lands", None) if on else (False, relation, thing)
         crash = [each.thing("o") for each in told if each.thing("o")]
         if (form == "which-to-remove" or asking.said("r")) and thing is None and crash:
             thing = self._thing(crash[-1])  # "It will collide with the lamp. Which object should be removed ..."
@@ -453,7 +439,11 @@ class _Parser:
             limits = [word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].within]
             if all(word in forms.CONNECTORS or word in limits for word in words):
                 continue
-            ends = [each for each in self.pieces if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])]
+            ends = [
+                each
+                for each in self.pieces
+                if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])
+            ]
             what = "motion" if ends and ends[-1].what == "motion" else "asked"
             found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words)))
         return found
