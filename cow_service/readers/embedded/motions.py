@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TypedDict, TypeVar
+from typing import TypedDict
 
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.perception.facing import facing
@@ -11,7 +11,8 @@ from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
-from cow_service.readers.embedded.english.questions import MotionWords, Question, StepWords
+from cow_service.readers.embedded.english.motion import MotionWords
+from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.matching import best_matches, describe, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, MotionKind, Until, Vector
@@ -23,8 +24,6 @@ NEARER = 0.75  # of the distance of the other end of a trail to what tells its l
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
 _ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
 _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
-
-_T = TypeVar("_T")
 
 
 def _refused(fault: str) -> CannotReadDirection:
@@ -45,27 +44,29 @@ def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox) ->
 
     Raises `CannotReadDirection`.
     """
-    shares = [each.share for each in words if each.share is not None]
-    if shares and way is None:
-        raise _refused("The question says that it moves part of the way, but not where to.")
-    distances = [each.distance for each in words if each.distance is not None]
-    distances += [Quantity(share * (way or 0.0), "px") for share in shares]
-    distances += [Quantity(each.own_widths * (bbox[2] - bbox[0]), "px") for each in words if each.own_widths]
+    found: dict[str, QuantityWords] = {}
+    for each in words:
+        what = "distance" if each.what in {"share", "own_widths"} else each.what
+        if found.setdefault(what, each) != each:
+            raise _refused(f"The question names more than one {what} of the motion.")
+    speed, length, duration = (found.get(what) for what in ("speed", "distance", "duration"))
+    distance = None if length is None else Quantity(length.value, "m" if length.is_metric else "px")
+    if length is not None and length.what == "own_widths":
+        distance = Quantity(length.value * (bbox[2] - bbox[0]), "px")
+    elif length is not None and length.what == "share":
+        if way is None:
+            raise _refused("The question says that it moves part of the way, but not where to.")
+        distance = Quantity(length.value * way, "px")
+    pace = None if speed is None else speed.pace or Quantity(speed.value, "m/s" if speed.is_metric else "px/s")
     return Said(
-        speed=_one("speed", [each.speed for each in words if each.speed is not None]),
-        distance=_one("distance", distances),
-        duration=_one("duration", [each.duration for each in words if each.duration is not None]),
-        until=_one("end", [each.until for each in words if each.until is not None]),
+        speed=pace,
+        distance=distance,
+        duration=None if duration is None else duration.value,
+        until="contact" if "until" in found else None,
     )
 
 
-def _one(name: str, values: list[_T]) -> _T | None:
-    if len(set(values)) > 1:
-        raise _refused(f"The question names more than one {name} of the motion.")
-    return values[0] if values else None
-
-
-def step_readings(steps: Sequence[StepWords], bbox: BBox) -> tuple[StepReading, ...]:
+def step_readings(steps: Sequence[MotionWords], bbox: BBox) -> tuple[StepReading, ...]:
     """The legs behind the first of what has this box."""
     said = [(_way(step.direction, step.depth), quantities(step.quantities, None, bbox)) for step in steps]
     return tuple(StepReading(*way, each["distance"], each["duration"]) for way, each in said)
@@ -86,7 +87,7 @@ def other_readings(
     for phrase, motion in others:
         found = next((each for each in grounding.others if each.object == phrase.text), None)
         goal = next((each for each in things if motion.towards and each.object == motion.towards.text), None)
-        if found is None or motion.steps or any(each.speed is None for each in motion.quantities):
+        if found is None or motion.steps or any(each.what != "speed" for each in motion.quantities):
             raise _refused(f"'{phrase.text}' moves, too, and was not found, or how far it moves is said.")
         refuse_unclear_fall(scene, motion, found)
         kind, direction = motion.kind or "linear", motion.direction
@@ -116,25 +117,27 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     If neither the image nor the words show the end, it is the one whose path leads on to the object in question.
     Raises `CannotGround` if the thing that the words tell the end by was not found.
     """
-    words, phrase = question.motion.trail, question.mover
+    end, phrase = question.motion.trail_end, question.mover
     if phrase is None or phrase.is_given or not scene.trails:
         return scene, ()
-    fitting = best_matches(scene.regions, phrase)
-    trails = [trail for trail in (trail_of(scene.trails, region.bbox) for region in fitting) if trail is not None]
+    found = (trail_of(scene.trails, region.bbox) for region in best_matches(scene.regions, phrase))
+    trails = [trail for trail in found if trail is not None]
     if len(trails) != 1:
         return scene, ()
     trail, warnings = trails[0], ()
     beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
-    if words is not None:
-        near = None if words.near is None else match_one(beside, words.near)
-        gaps = sorted(math.dist(trail.positions[end].centre, near.centre) for end in (0, -1)) if near else []
-        if words.near is not None and (not gaps or gaps[0] > NEARER * gaps[1]):
+    if isinstance(end, ObjectPhrase):
+        near = match_one(beside, end)
+        gaps = sorted(math.dist(trail.positions[at].centre, near.centre) for at in (0, -1)) if near else []
+        if near is None or gaps[0] > NEARER * gaps[1]:
             raise CannotGround(
-                f"The question tells the end of the trail by '{words.near.text}', which was not found, not for "
+                f"The question tells the end of the trail by '{end.text}', which was not found, not for "
                 f"certain, or about as far from either end. Seen: {describe(scene.regions)}.",
                 remedy=GIVE_PLACE,
             )
-        trail = trail.ending(None if near is None else near.bbox, words.side)
+        trail = trail.ending(near.bbox)
+    elif question.motion.trail:
+        trail = trail.ending(None, end or question.motion.direction)
     if not trail.end_known:
         # What may lie ahead: the first thing that is asked about, else the middle of the image.
         asked = ((each.text, match_one(beside, each)) for each in question.others)
@@ -156,7 +159,7 @@ def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> Motio
     Raises `CannotReadDirection` if the words speak of one all the same.
     """
     trail = trail_of(scene.trails, grounding.bbox)
-    if trail is None and words.trail is not None:
+    if trail is None and words.trail:
         raise _refused(
             f"The question speaks of a trail, and no three positions of the {grounding.object} one after another were "
             f"found in the image."

@@ -1,4 +1,4 @@
-"""The reader that needs no weights: sentence forms for the question, classical vision for the image. It never guesses."""
+"""The reader without weights: sentence forms for the question, classical vision for the image. It never guesses."""
 
 import math
 from collections.abc import Sequence
@@ -55,7 +55,7 @@ class EmbeddedReader:
             towards = None if said.towards is None else said.towards.text
             way = base.WayReading(said.along_arrow, None if said.depth else said.direction, towards)
         nouns = matching.nouns_of(read)
-        return base.QuestionReading(read.asked, changes, said.trail is not None, nouns, drawings, way)
+        return base.QuestionReading(read.asked, changes, said.trail, nouns, drawings, way)
 
     def read_name(self, name: str) -> ObjectPrior:
         """By its noun."""
@@ -145,9 +145,9 @@ class EmbeddedReader:
             scene, names = given.scene, names_of(given) or tuple(each.object for each in grounding.others)
             question = parse(given.question, names)
             words = question.motion
-            on = motions.along_trail(scene, grounding, words) if words.trail is not None else None
+            on = motions.along_trail(scene, grounding, words) if words.trail else None
             reading = on or motions.read_way(scene, question, grounding)
-            parted = any(each.share is not None for each in words.quantities)
+            parted = any(each.what == "share" for each in words.quantities)
             goal = motions.goal_of(scene, words.towards, grounding) if parted and words.towards is not None else None
             way = None if goal is None else way_to(goal.bbox, grounding.bbox, reading.kind == "linear")
             return replace(

@@ -6,8 +6,8 @@ from functools import cache
 from importlib.resources import files
 from typing import Literal, NamedTuple
 
-from cow_service.readers.base import Quantity, SpeedWord
-from cow_service.records import MotionKind, Until
+from cow_service.readers.base import SpeedWord
+from cow_service.records import MotionKind
 
 
 def words(*lists: str) -> frozenset[str]:
@@ -135,14 +135,13 @@ def like_a_colour(text: str) -> str | None:
     return next((word for word in unknown if get_close_matches(word, COLOURS, 1, NEARLY)), None)
 
 
-@dataclass(frozen=True)
-class QuantityWords:
-    """How fast, how far or how long something moves, as some words say it; one field is set."""
+Measure = Literal["speed", "distance", "share", "own_widths", "duration", "until", "within"]
 
-    speed: SpeedWord | Quantity | None = None
-    distance: Quantity | None = None
-    share: float | None = None  # of the way to what it moves towards
-    own_widths: float | None = None  # a distance, in widths of what moves
-    duration: float | None = None  # s
-    until: Until | None = None
-    within: float | None = None  # s: a limit for the event, not for the motion
+
+class QuantityWords(NamedTuple):
+    """How fast, how far or how long something moves, as some words say it."""
+
+    what: Measure
+    value: float = 1.0  # s, px or m; a share of the way to what it moves towards; widths of what moves
+    is_metric: bool = False
+    pace: SpeedWord | None = None  # a speed without a number

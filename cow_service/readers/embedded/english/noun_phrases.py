@@ -7,12 +7,12 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, cast
 
-from cow_service.readers.base import Quantity
+from cow_service.readers.base import SpeedWord
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.forms import forms, roles
-from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
+from cow_service.readers.embedded.english.lexicon import Measure, ObjectPhrase, QuantityWords
 from cow_service.readers.options import plain
 from cow_service.records import Shape
 
@@ -83,32 +83,15 @@ def tokens_of(text: str, names: Sequence[str] = ()) -> Tokens:
 
 
 def _quantity(tokens: Tokens, what: str, said: dict[str, str]) -> str:
-    """The token of a quantity of some kind."""
+    """The token of a quantity of some kind; nothing for what says none."""
     number, unit = said.get("n", "1"), said.get("u", "px")
-    numbers = lex.NUMBER_WORDS | {"a": 1, "an": 1, "twice": 2, "half a": 0.5, "half an": 0.5}
-    value = float(numbers.get(number, number if number[0].isdigit() else 0.5)) * lex.METRES.get(unit, 1.0)
-    is_metric = unit in lex.METRES
-    match what:
-        case "speed":
-            found = QuantityWords(speed=Quantity(value, "m/s" if is_metric else "px/s"))
-        case "slow" | "fast":
-            found = QuantityWords(speed=what)
-        case "within":
-            found = QuantityWords(within=value)
-        case "duration":
-            found = QuantityWords(duration=value)
-        case "distance":
-            found = QuantityWords(distance=Quantity(value, "m" if is_metric else "px"))
-        case "own_widths":
-            found = QuantityWords(own_widths=value)
-        case "share":
-            found = QuantityWords(share=0.5)
-        case "until":
-            found = QuantityWords(until="contact")
-        case _:
-            return ""
-    tokens.quantities.append(found)
-    return f"Q{len(tokens.quantities) - 1}"
+    numbers = lex.NUMBER_WORDS | {"a": 1, "an": 1, "twice": 2, "half a": 0.5, "half an": 0.5, "half": 0.5}
+    value = 0.5 if what == "share" else float(numbers.get(number, number)) * lex.METRES.get(unit, 1.0)
+    if what in {"slow", "fast"}:
+        tokens.quantities.append(QuantityWords("speed", pace=cast(SpeedWord, what)))
+    elif what:
+        tokens.quantities.append(QuantityWords(cast(Measure, what), value, unit in lex.METRES))
+    return f"Q{len(tokens.quantities) - 1}" if what else ""
 
 
 def _is_open(word: str) -> bool:

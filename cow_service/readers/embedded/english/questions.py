@@ -1,6 +1,5 @@
 """Reads a question by its sentence forms: what moves and how, what is changed, what is asked, and what was not read."""
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -8,55 +7,15 @@ from functools import lru_cache
 
 from cow_service.readers.embedded.english import forms
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase
+from cow_service.readers.embedded.english.motion import MotionWords, joined, motion_of
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
 from cow_service.readers.options import plain, says_not_sure, split_options, without_reply_form
-from cow_service.records import Asked, InterventionKind, MotionKind, PlaceRelation, Vector
+from cow_service.records import Asked, AskedRelation, InterventionKind, PlaceRelation
 
 MAX_WORDS = 240  # of a question that is read
-
-
-@dataclass(frozen=True)
-class TrailWords:
-    """Which end of a trail is the present position; where neither field says so, the image must."""
-
-    near: ObjectPhrase | None = None
-    side: Vector | None = None  # unit vector in the image
-
-
-@dataclass(frozen=True)
-class StepWords:
-    """A leg of a motion: unit vector in the image, sine of the angle out of it, and how far or long."""
-
-    direction: Vector | None
-    depth: float
-    quantities: tuple[QuantityWords, ...] = ()
-
-
-@dataclass(frozen=True)
-class MotionWords:
-    """How the question says that something moves; None and 0 where it does not say.
-
-    `direction` is a unit vector in image pixels, x right, y down. `depth` is the sine of the angle out of the image
-    plane: -1 towards the camera, 1 away from it. `along_arrow`: else against it. `is_contradictory`: two of its words
-    are opposites. `topples`: it falls over where it stands. `in_air`: it is let go, or falls freely. `steps` are the
-    legs behind the first, `others` what moves at the same time.
-    """
-
-    kind: MotionKind | None = None
-    along_arrow: bool | None = None
-    direction: Vector | None = None
-    depth: float = 0.0
-    forward: bool | None = None
-    verb: str = ""
-    towards: ObjectPhrase | None = None
-    trail: TrailWords | None = None
-    quantities: tuple[QuantityWords, ...] = ()
-    steps: tuple[StepWords, ...] = ()
-    others: "tuple[tuple[ObjectPhrase, MotionWords], ...]" = ()
-    is_contradictory: bool = False
-    topples: bool = False
-    in_air: bool = False
+_THING = re.compile(r"X\d+")
+_DIRECTIONS = {*forms.WAYS, *map(str.upper, forms.WAYS), "FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"}
 
 
 @dataclass(frozen=True)
@@ -90,7 +49,7 @@ class Question:
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
 def parse(question: str, names: tuple[str, ...] = ()) -> Question:
-    """Takes a question apart; `names` are those of the given things. Never raises: what is not said is None or empty."""
+    """Takes a question apart; `names` are those of the given things. What is not said is None or empty."""
     listed = split_options(question)
     text = without_reply_form(listed.rest)
     if len(text.split()) > MAX_WORDS:
@@ -99,10 +58,19 @@ def parse(question: str, names: tuple[str, ...] = ()) -> Question:
     return _Parser(tokens_of(text, names), options).question()
 
 
-_PIECES = {"asked": "asked", "moved": "motion", "changes": "change", "stated": "stated"}
-_ORDER = ("asked", "motion", "change", "stated", "listed", "nothing")
-_TELLING = ("sense", "ahead", "depth", "way", "goal", "quantity")
-_THING = re.compile(r"X\d+")
+def rewordings(question: Question) -> tuple[str, ...]:
+    """Up to three questions in forms that are read, with the names of this one and about what it asks."""
+    names = [each.text for each in (question.mover, *question.others) if each is not None]
+    motion, said = question.motion, " ".join(question.unread).lower()
+    way = "opposite to the direction of the arrow" if motion.along_arrow is False else "in the direction of the arrow"
+    way = next((f"to the {name}" for name in ("left", "right") if motion.direction == forms.WAYS[name]), way)
+    way, (mover, other) = "forward" if motion.forward else way, (*names, "", "")[:2]
+    like = [
+        form.replace("<m>", mover).replace("<o>", other).replace("<way>", way)
+        for topic, form in lex.sections()["rewordings"]
+        if re.search(topic, said) and mover and (other or "<o>" not in form)
+    ]
+    return tuple(dict.fromkeys(each for each in like if parse(each).asked is not None))[:3]
 
 
 @dataclass
@@ -121,6 +89,11 @@ class _Piece:
         """Whether what is acted on stands in front of what acts."""
         return self.what == "asked" and [role for role in self.roles if role in {"s", "o"}][:1] == ["o"]
 
+    @property
+    def asks_form(self) -> str:
+        """The form of what it asks; empty where it asks nothing."""
+        return "" if self.form is None or self.what not in {"asked", "stated"} else self.form.asks[0]
+
     def said(self, role: str) -> str:
         """What stands in a role."""
         return self.roles.get(role, "")
@@ -130,14 +103,19 @@ class _Piece:
         return self.said(role) if _THING.fullmatch(self.said(role)) else ""
 
 
+_KINDS = {"asked": "asked", "moved": "motion", "changes": "change", "stated": "stated"}  # of pieces, by section
+_ORDER = ("asked", "motion", "change", "stated", "listed", "nothing")
+_TELLING = ("sense", "ahead", "depth", "way", "goal", "quantity")
+_NO_PIECE = _Piece("nothing", 0, 0)
+
+
 class _Parser:
     """Covers a question with forms, the longest that fits at each place, and puts together what they say."""
 
     def __init__(self, tokens: Tokens, options: Sequence[str]) -> None:
         self.tokens, self.options, self.plain, self.said = tokens, options, tokens.plain, tokens.said
-        self.mover, self.names_table = "", False
-        self._put_behind()
         self.text, self.starts = " ".join(self.plain), [0]
+        self.mover, self.names_table = "", False
         for token in self.plain:
             self.starts.append(self.starts[-1] + len(token) + 1)
         self.place_of = {start: at for at, start in enumerate(self.starts)}
@@ -147,35 +125,15 @@ class _Parser:
             self.pieces += found
             at = found[0].end if found else at + 1
 
-    def _put_behind(self) -> None:
-        """Puts "the ball, rolling left," in front of the question that it interrupts."""
-        asks, way = (
-            rf"(?:^| )(?P<asks>(?:will|be|ASK) (?P<thing>X\d+|it))",
-            rf"(?P<way>(?:{forms.VERBS})(?: [^,.?]*?)?)",
-        )
-        text = " ".join(self.plain)
-        found = re.search(rf"{asks} ,? ?(?:when |if )?{way}(?P<comma> ,) (?=[a-zA-Z])", text) or re.search(
-            rf"{asks} {way}(?P<comma>) (?=(?:still |then )*(?!X|FLOOR|IMAGE)[a-z]+ (?:X|into|with|ANY))", text
-        )
-        if found is None:
-            return
-        start, at = (text[: found.start(name)].count(" ") for name in ("asks", "way"))
-        length = len(found["way"].split())
-        if not found["comma"] and not (self.said[at].endswith("ing") or self.said[at] == "thrown"):
-            return
-        for words in (self.plain, self.said):
-            asking, moving = words[start : start + 2], words[at : at + length]
-            words[start : at + length + bool(found["comma"])] = [asking[1], *moving, ",", *asking]
-
     def _from(self, at: int) -> list[_Piece]:
         """The longest piece that begins at a token, if any does."""
         found, start = [self._adverbials(_Piece("motion", at, at), "")], self.starts[at]
         for section in ("asked", "stated", "changes", "rest", "moved"):
             for form in forms.forms()[section]:
                 if (match := form.pattern.match(self.text, start)) is not None:
-                    piece = _Piece(_PIECES.get(section, form.says), at, self._end(match), forms.roles(match), form)
-                    moves = section == "moved"
-                    found.append(self._adverbials(piece, piece.roles.get("verb", form.says)) if moves else piece)
+                    piece = _Piece(_KINDS.get(section, form.says), at, self._end(match), forms.roles(match), form)
+                    verb = piece.roles.get("verb", form.says)
+                    found.append(self._adverbials(piece, verb) if section == "moved" else piece)
         told = [each for each in found if each.end > at and (each.what != "motion" or each.motion != MotionWords())]
         return sorted(told, key=lambda each: (-each.end, _ORDER.index(each.what)))[:1]
 
@@ -185,24 +143,37 @@ class _Parser:
 
     def _adverbials(self, piece: _Piece, verb: str) -> _Piece:
         """The piece with the words for the way that follow its verb."""
-        legs, at, ways = [_Leg(verb)], piece.end, dict(forms.forms()["ways"])
-        verbs = re.compile(rf"(?P<verb>{forms.VERBS})(?! X)(?= |$)")
+        legs, at, ways = [(verb, list[tuple[str, str]]())], piece.end, dict(forms.forms()["ways"])
+        verbs = re.compile(rf"({forms.VERBS})(?! X)(?= |$)")
         while at < len(self.plain):
             matches = ((name, way.match(self.text, self.starts[at])) for name, way in ways.items())
             name, match = next(((name, match) for name, match in matches if match is not None), ("", None))
-            if match is None or not legs[-1].take(name, forms.roles(match), self.tokens):
+            if match is None or not self._fits(name, match, legs[-1][1]):
                 break
             end = self._end(match)
             if name == "then":
                 again = verbs.match(self.text, self.starts[end])
                 if again is None and not any(ways[each].match(self.text, self.starts[end]) for each in _TELLING):
                     break
-                legs.append(_Leg(again["verb"] if again else ""))
+                legs.append((again[1] if again else "", []))
                 end = self._end(again) if again else end
+            legs[-1][1].extend(forms.roles(match).items() or [(name, "")])
+            legs[-1][1].append((name, "")) if name == "trail" else None
             at = end
         kind = "static" if "n" in piece.roles else lex.KINDS.get(verb, "fall" if verb == "let go" else None)
-        piece.end, piece.motion = at, _in_words(legs, kind)
+        first, *rest = (
+            motion_of(verb, said, self.tokens, None if leg else kind) for leg, (verb, said) in enumerate(legs)
+        )
+        clashes = any(each.is_contradictory for each in rest)
+        piece.end, piece.motion = at, replace(first, steps=tuple(rest)) if rest else first
+        piece.motion = replace(piece.motion, is_contradictory=True) if clashes else piece.motion
         return piece
+
+    def _fits(self, name: str, match: re.Match[str], said: Sequence[tuple[str, str]]) -> bool:
+        """Whether words for the way say something behind others."""
+        names = {each for each, _ in said}
+        is_limit = name == "quantity" and self.tokens.quantities[int(match[0][1:])].what == "within"
+        return not (is_limit or (name == "goal" and "goal" in names) or (name == "halt" and "quantity" not in names))
 
     def question(self) -> Question:
         """What all pieces together say."""
@@ -228,7 +199,7 @@ class _Parser:
         if not moving and asked is not None and asked.relation == "lands" and changes and put is None:
             first = MotionWords("fall", verb="fall")  # without its support
         gone = {self._token(each.object) for each in changes if each.kind == "remove"}
-        named = next((each for each in self._named(len(self.plain)) if each not in gone and asking is None), "")
+        named = next((each for each in self._named() if each not in gone and asking is None), "")
         mover = self._thing(self.mover or named) if self.mover or named else None
         further = tuple((self._thing(each), motion) for each, motion in moving.items() if each != self.mover)
         return Question(
@@ -252,8 +223,8 @@ class _Parser:
     def _token(self, thing: ObjectPhrase) -> str:
         return f"X{self.tokens.things.index(thing)}"
 
-    def _named(self, at: int) -> list[str]:
-        """The things named in front of a place, the first one first."""
+    def _named(self, at: int | None = None) -> list[str]:
+        """The things named in front of a place, or at all, the first one first."""
         return list(dict.fromkeys(token for token in self.plain[:at] if _THING.fullmatch(token)))
 
     def _phrases(self, text: str) -> list[ObjectPhrase]:
@@ -269,7 +240,7 @@ class _Parser:
                 target = self._resolved(piece.said("y"), piece.start, piece.said("x")) or ""
                 targets = [each for each in self._phrases(f"{target} {piece.said('z')}") if each.head != "container"]
                 found.append(ChangeWords("place", self._thing(piece.said("x")), relation, tuple(targets)))
-        moves = found or any(each.what == "motion" for each in self.pieces)
+        moves = found or any(each.what == "motion" and each.motion.kind != "static" for each in self.pieces)
         if asking is not None and asking.form is not None and asking.form.asks[1] == "inside" and not moves:
             targets = self._phrases(asking.thing("o"))  # "Does the apple fit into the bowl?": it is put there
             fits = asking.thing("s") and (targets or asking.said("l"))
@@ -302,7 +273,7 @@ class _Parser:
             token = token or next((each for each in self.plain[piece.end :] if _THING.fullmatch(each)), "")
             token = token.split()[-1].replace("P", "X").replace("S", "X") if token else ""
             if token:
-                found[token] = _joined(found[token], piece.motion) if token in found else piece.motion
+                found[token] = joined(found[token], piece.motion) if token in found else piece.motion
         return found
 
     def _resolved(self, token: str, at: int, subject: str) -> str | None:
@@ -324,7 +295,7 @@ class _Parser:
         if left := [name for name in self.tokens.names if plain(name) != own]:
             phrase = replace(parse_noun_phrase(left[0]) or self._thing(token), text=left[0], is_given=True)
             return f"X{self.tokens.number(phrase)}" if len(left) == 1 else None
-        things = [each for each in self._named(len(self.plain)) if each not in {subject, token}]
+        things = [each for each in self._named() if each not in {subject, token}]
         return token if not things else things[0] if len(things) == 1 else None
 
     def _asked(
@@ -334,61 +305,25 @@ class _Parser:
         if asking.form is None:
             return None, ()
         form, relation, is_negated = asking.form.asks
-        words, said, passive = self.plain[asking.start : asking.end], asking.said("o"), asking.is_passive
-        doubly = is_negated and ("n" in asking.roles or asking.said("q") == "NOOF")
-        open_it = told and asking.said("s") in {"it", "that"} and form != "which-to-remove" and not asking.said("r")
-        if doubly or open_it or (said == "EVERYTHING" and not is_negated) or said == "OBJ":
+        is_turned = "n" in asking.roles or asking.said("q") == "NOOF"
+        target = self._target(asking, told)
+        if target is None or (is_negated and is_turned) or (asking.said("o") == "EVERYTHING" and not is_negated):
             return None, ()
-        subject, target = asking.thing("s") or self.mover, ""
-        if "both" in asking.roles:
-            moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
-            pairs = ([each for each in dict.fromkeys(names) if each != subject] for names in (moved, self._named(999)))
-            pair = next((each for each in pairs if each), [])
-            if len(pair) != 1:
-                return None, ()
-            target = pair[0]
-        elif said not in {"", "ANY", "EVERYTHING"}:
-            target = (self.mover if passive and said == "it" else self._resolved(said, asking.start, subject)) or ""
-            if not target:
-                return None, ()
-        doer = subject if subject != self.mover else ""
-        if relation == "covers" and target:
-            if doer and target == self.mover:  # "the vase hides it"
-                relation, target, doer = "covered", doer, ""
-            elif passive and asking.thing("s") and target == self.mover:
-                relation, target = "covered", subject
-            elif passive and doer:  # one thing by another, neither the mover
-                relation, target, doer = "covered", doer, target
-            elif passive and target == self.mover:
-                relation, target = "covered", ""
-        elif target == self.mover and doer and relation == "touches":
-            target, doer = doer, ""
-        elif passive and target == self.mover and relation == "touches":
-            target = ""
+        subject = asking.thing("s") or self.mover
+        relation, doer, target = self._turned(asking, relation, subject if subject != self.mover else "", target)
         thing = self._thing(target) if target else None
-        if relation == "lands" and thing is not None:  # "off the table"
-            self.names_table, thing = thing.head in lex.TABLES, None
-            if not self.names_table:
-                return None, ()
-        if relation == "inside" and form == "whether":
-            puts = [each.targets[0] for each in changes if each.targets]
-            thing = thing or next(iter(puts), None)
-            along = not {"roll", "slide", "move", "drive", "push"}.isdisjoint(words)
-            holds = thing is not None and thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
-            relation = "inside" if holds or "fit" in words or changes else "touches"
-            if thing is None:
-                return None, ()
-        if relation == "touches" and thing is not None and thing.head in lex.TABLES and not thing.colour:
-            on = not {"on", "onto"}.isdisjoint(words)
-            self.names_table, relation, thing = (True, "lands", None) if on else (False, relation, thing)
+        found = self._settled(asking, relation, thing, changes)
+        if found is None:
+            return None, ()
+        relation, thing = found
         crash = [each.thing("o") for each in told if each.thing("o")]
         if (form == "which-to-remove" or asking.said("r")) and thing is None and crash:
             thing = self._thing(crash[-1])  # "It will collide with the lamp. Which object should be removed ..."
         lists = [each.said("l") for each in (asking, *self.pieces) if each.said("l")]
         listed, kinds = self._phrases(lists[0]) if lists else [], self._phrases(asking.said("k"))
-        among = self._phrases(asking.said("a")) if form == "whether" else kinds if form == "how-many" else []
-        if form in {"which", "which-to-remove"}:
-            options = [parse_noun_phrase(text) for text in self.options] if form == "which-to-remove" else []
+        among = {"whether": self._phrases(asking.said("a")), "how-many": kinds, "which": listed}.get(form, [])
+        if form == "which-to-remove":
+            options = [parse_noun_phrase(text) for text in self.options]
             among = listed or ([each for each in options if each is not None] if all(options) else [])
         names_one = form in {"whether", "when", "what-happens", "which-to-remove"}
         asked = Asked(
@@ -396,20 +331,74 @@ class _Parser:
             relation=relation,
             subject=self._thing(doer).text if doer and form != "which-to-remove" else None,
             target=thing.text if thing is not None and names_one else None,
-            negated=is_negated != ("n" in asking.roles or asking.said("q") == "NOOF"),
+            negated=is_negated != is_turned,
             among=tuple(each.text for each in among),
             every=asking.said("q") == "ALLOF" and not is_negated,
             partly=relation in {"covers", "covered"} and not {"PARTLY", "SOMETIME"}.isdisjoint(self.plain),
-            within=min((each.within for each in self.tokens.quantities if each.within is not None), default=None),
+            within=min((each.value for each in self.tokens.quantities if each.what == "within"), default=None),
         )
         return asked, tuple(listed or kinds) if form == "which-first" else ()
+
+    def _target(self, asking: _Piece, told: Sequence[_Piece]) -> str | None:
+        """The thing that is acted on; empty for any, None where it is not clear which."""
+        said, subject = asking.said("o"), asking.thing("s") or self.mover
+        is_open = told and asking.said("s") in {"it", "that"} and asking.asks_form != "which-to-remove"
+        if (is_open and not asking.said("r")) or said == "OBJ":
+            return None  # the mover, or what it strikes
+        if "both" in asking.roles:
+            moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
+            pairs = ([each for each in dict.fromkeys(names) if each != subject] for names in (moved, self._named()))
+            pair = next((each for each in pairs if each), [])
+            return pair[0] if len(pair) == 1 else None
+        if said in {"", "ANY", "EVERYTHING"}:
+            return ""
+        return self.mover if asking.is_passive and said == "it" else self._resolved(said, asking.start, subject)
+
+    def _turned(
+        self, asking: _Piece, relation: AskedRelation, doer: str, target: str
+    ) -> tuple[AskedRelation, str, str]:
+        """Relation, what acts (empty for the mover) and what it acts on, as the record words them: of the mover."""
+        passive, own = asking.is_passive, target == self.mover
+        if relation == "covers" and target:
+            if own and (doer or passive):  # "the vase hides it", "is it hidden by the vase?"
+                return "covered", "", asking.thing("s") if doer else ""
+            return ("covered", target, doer) if passive and doer else (relation, doer, target)
+        if relation == "touches" and own and target:
+            return relation, "", doer  # "the vase hits it", "is it hit?"
+        return relation, doer, target
+
+    def _settled(
+        self, asking: _Piece, relation: AskedRelation, thing: ObjectPhrase | None, changes: Sequence[ChangeWords]
+    ) -> tuple[AskedRelation, ObjectPhrase | None] | None:
+        """The relation that is meant to a thing of that kind, and the thing; None where there is none."""
+        words, is_table = self.plain[asking.start : asking.end], thing is not None and thing.head in lex.TABLES
+        if relation == "lands" and thing is not None:  # "off the table"
+            self.names_table = is_table
+            return (relation, None) if is_table else None
+        if (
+            relation == "touches"
+            and thing is not None
+            and is_table
+            and not thing.colour
+            and {"on", "onto"} & set(words)
+        ):
+            self.names_table = True
+            return "lands", None
+        if relation == "inside" and asking.asks_form == "whether":
+            puts = [each.targets[0] for each in changes if each.targets]
+            thing = thing or next(iter(puts), None)
+            along = {"roll", "slide", "move", "drive", "push"} & set(words)
+            holds = thing is not None and thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
+            relation = "inside" if holds or "fit" in words or changes else "touches"
+            return None if thing is None else (relation, thing)
+        return relation, thing
 
     def _others(
         self, mover: ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
     ) -> tuple[ObjectPhrase, ...]:
         """The further things that are named, each once."""
         removed = [each.object for each in changes if each.kind == "remove"]
-        phrases = [self._thing(token) for token in self._named(len(self.plain))]
+        phrases = [self._thing(token) for token in self._named()]
         if asked is not None and asked.form == "which-to-remove":
             phrases += [each for each in map(parse_noun_phrase, asked.among) if each is not None]
         named = {plain(each.text): each for each in reversed(phrases) if each.head != "container"}
@@ -436,7 +425,9 @@ class _Parser:
         found = list[tuple[str, str]]()
         for run in runs:
             words = [self.plain[at] for at in run]
-            limits = [word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].within]
+            limits = [
+                word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].what == "within"
+            ]
             if all(word in forms.CONNECTORS or word in limits for word in words):
                 continue
             ends = [
@@ -447,127 +438,3 @@ class _Parser:
             what = "motion" if ends and ends[-1].what == "motion" else "asked"
             found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words)))
         return found
-
-
-_DIRECTIONS = {*forms.WAYS, *map(str.upper, forms.WAYS), "FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"}
-
-
-def _joined(first: MotionWords, second: MotionWords) -> MotionWords:
-    """A motion that is told in two places."""
-    empty = vars(MotionWords())
-    told = {name: value for name, value in vars(second).items() if value != empty[name]}
-    single = ("kind", "direction", "depth", "along_arrow", "forward")
-    clash = any(name in told and getattr(first, name) not in (empty[name], told[name]) for name in single)
-    kept = {name: value for name, value in told.items() if getattr(first, name) == empty[name]}
-    quantities = (*first.quantities, *second.quantities)
-    return replace(first, **kept | {"quantities": quantities, "is_contradictory": clash or first.is_contradictory})
-
-
-_RISING, _SINKING = lex.words("lift raise rise climb ascend"), lex.words("descend lower")
-
-
-@dataclass
-class _Leg:
-    """What the words of one leg say."""
-
-    verb: str
-    ways: list[Vector] = field(default_factory=list[Vector])
-    depths: set[float] = field(default_factory=set[float])
-    senses: set[bool] = field(default_factory=set[bool])
-    ahead: set[bool] = field(default_factory=set[bool])
-    towards: ObjectPhrase | None = None
-    trail: TrailWords | None = None
-    marks: set[str] = field(default_factory=set[str])
-    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
-
-    def take(self, name: str, roles: dict[str, str], tokens: Tokens) -> bool:
-        """Takes words for the way; false where they say nothing here."""
-        text = next(iter(roles.values()), "")
-        if name == "trail":
-            near = tokens.things[int(roles["near"][1:])] if "near" in roles else None
-            self.trail = TrailWords(near, forms.SIDES.get(roles.get("side", "")))
-        elif name == "way":
-            self.ways.append(forms.WAYS[text.lower()])
-        elif name == "depth":
-            self.depths.add(-1.0 if text == "NEAR" else 1.0)
-        elif name == "sense":
-            self.senses.add(text == "ALONG")
-        elif name == "ahead":
-            self.ahead.add(text == "FORWARD")
-        elif name == "goal" and self.towards is None:
-            self.towards = tokens.things[int(text[1:])]
-        elif name == "quantity" and not tokens.quantities[int(text[1:])].within:
-            self.quantities.append(tokens.quantities[int(text[1:])])
-        elif name in {"goal", "quantity"} or (name == "halt" and not self.quantities):
-            return False
-        self.marks.add(name)
-        return True
-
-    def way(self, kind: MotionKind | None) -> tuple[Vector | None, float]:
-        """A unit vector in the image, and the depth."""
-        x, y = (sum(way[axis] for way in self.ways) for axis in (0, 1))
-        if kind == "fall":
-            y = 0.0  # down is what a fall does; only what leads away from it is a direction
-        elif not self.ways:
-            y = -1.0 if self.verb in _RISING else 1.0 if self.verb in _SINKING else 0.0
-        length, depth = math.hypot(x, y), float(sum(self.depths))
-        return ((x / length, y / length), depth * math.sqrt(0.5)) if length > 1e-9 else (None, depth)
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether two of its words are opposites."""
-        up, falls = [way[1] for way in self.ways], self.verb in lex.SETS["fall"]
-        turned = (falls and min(up, default=0) < 0) or (self.verb in _RISING and max(up, default=0) > 0)
-        opposed = any(a[0] * b[0] < 0 or a[1] * b[1] < 0 for a in self.ways for b in self.ways)
-        stays = "still" in self.marks and bool(self.ways or self.depths or self.senses)
-        return turned or opposed or stays or any(len(each) > 1 for each in (self.depths, self.senses, self.ahead))
-
-
-def _in_words(legs: Sequence[_Leg], kind: MotionKind | None) -> MotionWords:
-    """The motion that some legs make."""
-    first, *rest = legs
-    over = "over" in first.marks and first.verb in lex.words("knock push tip fall turn blow topple")
-    direction, depth = first.way(kind)
-    return MotionWords(
-        kind=kind,
-        along_arrow=next(iter(first.senses), None),
-        direction=direction,
-        depth=depth,
-        forward=False if first.verb == "reverse" else None if first.senses else next(iter(first.ahead), None),
-        verb=first.verb,
-        towards=first.towards,
-        trail=first.trail,
-        quantities=tuple(first.quantities),
-        steps=tuple(StepWords(*leg.way(None), tuple(leg.quantities)) for leg in rest),
-        is_contradictory=any(leg.contradicts for leg in legs),
-        topples=over or first.verb in {"tip", "topple"},
-        in_air=first.verb in {"drop", "release", "detach", "let go"} or "freely" in first.marks,
-    )
-
-
-_TOPICS = (
-    (r"fit|put|contain|inside", ("Does the {m} fit into the {o}?",)),
-    (r"hid|occlu|cover|behind|block|view|visible", ("If the {m} moves {way}, will it hide the {o}?", "If the {m} moves {way}, will the {o} be occluded?")),
-    (r"remov|taken? |avoid|prevent|without", ("If the {m} moves {way}, can the collision be avoided by removing the {o}?", "If the {m} moves {way}, which object should be removed to avoid the collision?")),
-    (r"first|order|which", ("If the {m} moves {way}, which object will it hit first?",)),
-    (r"", ("If the {m} moves {way}, will it hit the {o}?", "If the {m} moves {way}, what happens?")),
-)  # fmt: skip
-
-
-def rewordings(question: Question) -> tuple[str, ...]:
-    """Up to three questions in forms that are read, with the names of this one and about what it asks."""
-    names = [each.text for each in (question.mover, *question.others) if each is not None and " of " not in each.text]
-    motion, said = question.motion, " ".join(question.unread).lower()
-    ways = {(-1.0, 0.0): "to the left", (1.0, 0.0): "to the right"}
-    way = "opposite to the direction of the arrow" if motion.along_arrow is False else "in the direction of the arrow"
-    way = ways.get(motion.direction or (0.0, 0.0), way if motion.forward is None else "forward")
-    found = list[str]()
-    for topic, patterns in _TOPICS:
-        if re.search(topic, said) and names:
-            found += [
-                each.format(m=names[0], o=names[1] if len(names) > 1 else "", way=way)
-                for each in patterns
-                if len(names) > 1 or "{o}" not in each
-            ]
-    read = [each for each in found if parse(each).asked is not None]
-    return tuple(dict.fromkeys(read))[:3]
