@@ -244,8 +244,8 @@ _ABOUT_REPLY = re.compile(
 )
 _CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
 _INSTRUCTION = re.compile(
-    r"(?:please )?(?:think|reason|answer|choose|select|pick|options?|choices?|explain|respond|reply|provide|return|output"
-    r"|note that the (?:first|second|last|image|video|frame)\w*)\b", re.IGNORECASE,
+    r"(?:please )?(?:think|reason|answer|choose|select|pick|options?|choices?|explain|respond|reply|provide|return"
+    r"|output|note that the (?:first|second|last|image|video|frame)\w*)\b", re.IGNORECASE,
 )  # fmt: skip
 _YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)
 _HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)

@@ -10,8 +10,8 @@ from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
-from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
 from cow_service.readers.embedded.english.motion import MotionWords
+from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.embedded.matching import best_matches, describe, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE

@@ -46,7 +46,7 @@ TABLES = words("table desk tabletop")
 CONTAINERS = SETS["hollow"] | (SETS["round"] | SETS["square"]) - {"vase", "can"}  # to fall into
 NOUNS = frozenset[str]().union(*(SETS[name] for name in ("sphere", "box", "vehicle", "cone", "cylinder")))
 _KINDS: tuple[MotionKind, ...] = ("linear", "projectile", "fall", "static")
-KINDS = {lemma: kind for kind in _KINDS for lemma in LISTS[kind]}
+KINDS: dict[str, MotionKind] = {lemma: kind for kind in _KINDS for lemma in LISTS[kind]}
 NEARLY = 0.8  # difflib's ratio from which a word is nearly a colour's name
 
 

@@ -41,6 +41,9 @@ class MotionWords:
     in_air: bool = False
 
 
+NOT_SAID = MotionWords()
+
+
 def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: MotionKind | None) -> MotionWords:
     """The motion by a verb and words for the way, each by what it says and the word that says it."""
     found = {name: [text for each, text in said if each == name] for name, _ in said}
@@ -78,7 +81,7 @@ def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: 
 
 def joined(first: MotionWords, second: MotionWords) -> MotionWords:
     """A motion that is told in two places."""
-    empty = vars(MotionWords())
+    empty = vars(NOT_SAID)
     told = {name: value for name, value in vars(second).items() if value != empty[name]}
     single = ("kind", "direction", "depth", "along_arrow", "forward")
     clash = any(name in told and getattr(first, name) not in (empty[name], told[name]) for name in single)

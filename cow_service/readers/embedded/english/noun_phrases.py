@@ -129,31 +129,33 @@ def _belongs(words: Sequence[str], at: int, first: int, start: int, has_noun: bo
     return (begun and form != "s" and not acts) if form else (determined or not word.endswith("ly"))
 
 
-def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
-    """Adds the noun phrase that begins at a word, else the word; the place behind it, and a verb that its noun has."""
-    first, has_noun, name = at, False, ""
+def _extent(tokens: Tokens, words: list[str], at: int) -> tuple[int, int, str]:
+    """Where the content of the noun phrase that begins at a word begins and ends, and the given name that it ends in.
+
+    A name that is no more than an adjective of the phrase ("orange" in "the orange toy car") becomes a word of it.
+    """
+    first, has_noun = at, False
     while first < len(words) and _is_determiner(words, first):
         first += 1
     end = first
     while end < len(words) and end - first < 10:
         if words[end][0] == "N" and words[end][1:-1].isdigit():
-            name = tokens.names[int(words[end][1:-1])]
-            more = (
-                end + 1 < len(words)
-                and _belongs(words, end + 1, first, at, False)
-                and not lex.VERBS.get(words[end + 1])
-            )
-            end += 1
-            if not (more and lex.is_modifier(name.lower())):
-                break
-            words[end - 1], name = name.lower(), ""  # "orange" in "the orange toy car"
-        elif _belongs(words, end, first, at, has_noun):
-            has_noun = has_noun or not (lex.is_modifier(words[end]) or words[end] in {"other", "first"})
-            end += 1
-        else:
+            name, behind = tokens.names[int(words[end][1:-1])], words[end + 1] if end + 1 < len(words) else "."
+            if not (lex.is_modifier(name.lower()) and _is_open(behind) and behind not in lex.VERBS):
+                return first, end + 1, name
+            words[end] = name.lower()
+        elif not _belongs(words, end, first, at, has_noun):
             break
+        has_noun = has_noun or not (lex.is_modifier(words[end]) or words[end] in {"other", "first"})
+        end += 1
         if words[end - 1] in {"one", "ones"}:
             break
+    return first, end, ""
+
+
+def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
+    """Adds the noun phrase that begins at a word, else the word; the place behind it, and a verb that its noun has."""
+    first, end, name = _extent(tokens, words, at)
     content = words[first:end]
     if not content or content == ["one"] or (not name and all(word in lex.SETS["adjectives"] for word in content)):
         tokens.add(lex.lemma(words[at]), words[at])
@@ -161,34 +163,12 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
     verb = lex.lemma(content[0]) if len(content) > 1 and content[0].endswith("ing") else ""
     verb = verb if verb in lex.KINDS else ""
     content = content[1:] if verb else content
-    text, phrase = (
+    phrase = object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], "")
+    text, (start, end, phrase) = (
         [*content[:-1], name or content[-1]],
-        object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], ""),
+        _with_behind(tokens, words, end, phrase, content[0]),
     )
-    before = tokens.plain[-1] if tokens.plain else ""
-    while end < len(words):
-        behind, length = " ".join(words[end : end + 12]), 0
-        for what, pattern in _BEHIND.items():
-            found = re.match(rf"(?:{pattern})(?= |$)", behind)
-            if found is None or length or (what in {"box", "place"} and before in {*lex.CAUSES, "put", "place", "set"}):
-                continue
-            length = len(found[0].split())
-            if what == "path":
-                is_start = (found["end"] or content[0]) in {"start", "beginning", "first"}
-                phrase = replace(phrase, path_end="start" if is_start else "end")
-            phrase = replace(phrase, inside_box=phrase.inside_box or what == "box")
-        if (
-            not length
-            and words[end] == "of"
-            and end + 1 < len(words)
-            and _is_open(words[end + 1])
-            and words[end + 1] not in lex.VERBS
-        ):
-            length = 2  # "stack of books"
-        if not length:
-            break
-        text += words[end : end + length]
-        end += length
+    text += words[start:end]
     phrase = replace(phrase, text=" ".join(text))
     given = name if name and len(text) == 1 else match_given(phrase, tokens.names)
     if given is not None:
@@ -197,6 +177,29 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
         tokens, phrase, content, words[at:first], " ".join([*words[at:first], *([verb] if verb else []), *text])
     )
     return end, verb
+
+
+def _with_behind(
+    tokens: Tokens, words: list[str], start: int, phrase: ObjectPhrase, opening: str
+) -> tuple[int, int, ObjectPhrase]:
+    """Where the words behind a noun that belong to it begin and end, and the phrase with what they say."""
+    end, is_put = start, bool(tokens.plain) and tokens.plain[-1] in {*lex.CAUSES, "put", "place", "set"}
+    while end < len(words):
+        behind = " ".join(words[end : end + 12])
+        matches = ((what, re.match(rf"(?:{pattern})(?= |$)", behind)) for what, pattern in _BEHIND.items())
+        found = [(what, match) for what, match in matches if match and not (is_put and what in {"box", "place"})]
+        if not found and words[end] == "of" and end + 1 < len(words) and _is_open(words[end + 1]):
+            end += 2  # "stack of books"
+            continue
+        if not found:
+            break
+        what, match = found[0]
+        end += len(match[0].split())
+        if what == "path":
+            is_start = (match["end"] or opening) in {"start", "beginning", "first"}
+            phrase = replace(phrase, path_end="start" if is_start else "end")
+        phrase = replace(phrase, inside_box=phrase.inside_box or what == "box")
+    return start, end, phrase
 
 
 def _add_phrase(tokens: Tokens, phrase: ObjectPhrase, content: list[str], determiners: list[str], said: str) -> None:
@@ -224,17 +227,18 @@ def _add_phrase(tokens: Tokens, phrase: ObjectPhrase, content: list[str], determ
         tokens.add("OBJ", said)
     else:
         tokens.add("no", "no") if "no" in determiners else None
-        tokens.add(f"X{tokens.number(_meant(phrase, tokens.things))}", said)
+        tokens.add(f"X{tokens.number(_meant(phrase, tokens))}", said)
 
 
-def _meant(phrase: ObjectPhrase, before: Sequence[ObjectPhrase]) -> ObjectPhrase:
-    """What a phrase means among the things named before: "the black one" is the last of that colour, else of the one
-    kind that was named; "the car" is the red car."""
+def _meant(phrase: ObjectPhrase, tokens: Tokens) -> ObjectPhrase:
+    """What a phrase means among the things named before: "the black one" is of the kind that is asked for, or the last
+    thing of that colour, or of the one kind that was named; "the car" is the red car."""
+    before, kinds = tokens.things, {tokens.things[int(token[1:])].noun for token in tokens.plain if token[0] == "K"}
     if phrase.is_given or phrase.path_end:
         return phrase
     if phrase.noun is None and phrase.colour is not None:
-        same = [each for each in before if each.colour == phrase.colour and each.noun]
-        kinds = {each.noun for each in before if each.noun}
+        same = [each for each in before if each.colour == phrase.colour and each.noun and not kinds]
+        kinds = kinds or {each.noun for each in before if each.noun}
         if same or len(kinds) != 1:
             return same[-1] if same else phrase
         noun = kinds.pop() or ""
@@ -278,16 +282,15 @@ def match_given(phrase: ObjectPhrase, names: Sequence[str]) -> str | None:
     """The one given name that a phrase means: the same words, all words of one in the other, its noun or its colour."""
     said = set(plain(phrase.text).split()) - {"one"}
     named = [(name, set(plain(name).split()), parse_noun_phrase(name)) for name in names]
-    for fits in (
-        lambda words, other: words == said,
-        lambda words, other: bool(said) and (said < words or words < said),
-        lambda words, other: len(said) == 1 and other is not None and other.head == phrase.head is not None,
-        lambda words, other: phrase.noun is None and other is not None and other.colour == phrase.colour is not None,
-    ):
-        found = [name for name, words, other in named if fits(words, other)]
-        if found:
-            return found[0] if len(found) == 1 else None
-    return None
+    others = [(name, other) for name, _, other in named if other is not None]
+    tiers = (
+        [name for name, words, _ in named if words == said],
+        [name for name, words, _ in named if said and (said < words or words < said)],
+        [name for name, other in others if len(said) == 1 and other.head == phrase.head],
+        [name for name, other in others if phrase.noun is None and other.colour == phrase.colour],
+    )
+    found = next((tier for tier in tiers if tier), [])
+    return found[0] if len(found) == 1 else None
 
 
 def _head(name: str) -> str | None:
@@ -298,8 +301,8 @@ def _head(name: str) -> str | None:
 def shape_of(name: str) -> Shape | None:
     """The shape of what is called so; None if the noun does not say."""
     shapes: tuple[Shape, ...] = ("sphere", "box", "cone", "cylinder")
-    found = next((shape for shape in shapes if _head(name) in lex.SETS[shape]), None)
-    return "box" if is_vehicle(name) else found
+    head = _head(name)
+    return "box" if head in lex.SETS["vehicle"] else next((each for each in shapes if head in lex.SETS[each]), None)
 
 
 def is_vehicle(name: str) -> bool:

@@ -8,7 +8,7 @@ from functools import lru_cache
 from cow_service.readers.embedded.english import forms
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
-from cow_service.readers.embedded.english.motion import MotionWords, joined, motion_of
+from cow_service.readers.embedded.english.motion import NOT_SAID, MotionWords, joined, motion_of
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
 from cow_service.readers.options import plain, says_not_sure, split_options, without_reply_form
 from cow_service.records import Asked, AskedRelation, InterventionKind, PlaceRelation
@@ -34,7 +34,7 @@ class Question:
     it asks for the first. `unread` are the words of no form, those that tell the motion in `unread_motion`."""
 
     mover: ObjectPhrase | None = None
-    motion: MotionWords = MotionWords()
+    motion: MotionWords = NOT_SAID
     says_motion: bool = False
     changes: tuple[ChangeWords, ...] = ()
     asked: Asked | None = None
@@ -82,12 +82,12 @@ class _Piece:
     end: int
     roles: dict[str, str] = field(default_factory=dict[str, str])
     form: forms.Form | None = None
-    motion: MotionWords = MotionWords()
+    motion: MotionWords = NOT_SAID
 
     @property
     def is_passive(self) -> bool:
         """Whether what is acted on stands in front of what acts."""
-        return self.what == "asked" and [role for role in self.roles if role in {"s", "o"}][:1] == ["o"]
+        return self.what == "asked" and next((role for role in self.roles if role in {"s", "o", "a"}), "s") != "s"
 
     @property
     def asks_form(self) -> str:
@@ -134,7 +134,7 @@ class _Parser:
                     piece = _Piece(_KINDS.get(section, form.says), at, self._end(match), forms.roles(match), form)
                     verb = piece.roles.get("verb", form.says)
                     found.append(self._adverbials(piece, verb) if section == "moved" else piece)
-        told = [each for each in found if each.end > at and (each.what != "motion" or each.motion != MotionWords())]
+        told = [each for each in found if each.end > at and (each.what != "motion" or each.motion != NOT_SAID)]
         return sorted(told, key=lambda each: (-each.end, _ORDER.index(each.what)))[:1]
 
     def _end(self, match: re.Match[str]) -> int:
@@ -160,7 +160,8 @@ class _Parser:
             legs[-1][1].extend(forms.roles(match).items() or [(name, "")])
             legs[-1][1].append((name, "")) if name == "trail" else None
             at = end
-        kind = "static" if "n" in piece.roles else lex.KINDS.get(verb, "fall" if verb == "let go" else None)
+        kind = lex.KINDS.get(verb, "fall" if verb == "let go" else None)
+        kind = "static" if "n" in piece.roles else kind
         first, *rest = (
             motion_of(verb, said, self.tokens, None if leg else kind) for leg, (verb, said) in enumerate(legs)
         )
@@ -187,7 +188,7 @@ class _Parser:
         moving = self._moving(asking, told, put)
         acts = "" if asking is None else asking.thing("s")
         self.mover = next(iter(moving), self._token(put) if put else acts)
-        first = next(iter(moving.values()), MotionWords())
+        first = next(iter(moving.values()), NOT_SAID)
         if put is not None and (not moving or first.kind == "static"):
             self.mover, first = self._token(put), MotionWords("place", verb="put")
         unread = self._unread(asking, asks, told, moving)
@@ -205,7 +206,7 @@ class _Parser:
         return Question(
             mover=mover,
             motion=replace(first, others=further),
-            says_motion=bool(moving) or first != MotionWords(),
+            says_motion=bool(moving) or first != NOT_SAID,
             changes=changes,
             asked=None if unread else asked,
             others=self._others(mover, changes, asked),
@@ -305,9 +306,10 @@ class _Parser:
         if asking.form is None:
             return None, ()
         form, relation, is_negated = asking.form.asks
-        is_turned = "n" in asking.roles or asking.said("q") == "NOOF"
+        is_turned, counts = "n" in asking.roles or asking.said("q") == "NOOF", asking.said("q")
         target = self._target(asking, told)
-        if target is None or (is_negated and is_turned) or (asking.said("o") == "EVERYTHING" and not is_negated):
+        unclear = is_turned and (is_negated or counts == "ALLOF")
+        if target is None or unclear or (asking.said("o") == "EVERYTHING" and not is_negated):
             return None, ()
         subject = asking.thing("s") or self.mover
         relation, doer, target = self._turned(asking, relation, subject if subject != self.mover else "", target)
@@ -333,7 +335,7 @@ class _Parser:
             target=thing.text if thing is not None and names_one else None,
             negated=is_negated != is_turned,
             among=tuple(each.text for each in among),
-            every=asking.said("q") == "ALLOF" and not is_negated,
+            every=counts == "SOMEOF" if is_negated and asking.is_passive else counts == "ALLOF" and not is_negated,
             partly=relation in {"covers", "covered"} and not {"PARTLY", "SOMETIME"}.isdisjoint(self.plain),
             within=min((each.value for each in self.tokens.quantities if each.what == "within"), default=None),
         )
@@ -342,8 +344,9 @@ class _Parser:
     def _target(self, asking: _Piece, told: Sequence[_Piece]) -> str | None:
         """The thing that is acted on; empty for any, None where it is not clear which."""
         said, subject = asking.said("o"), asking.thing("s") or self.mover
-        is_open = told and asking.said("s") in {"it", "that"} and asking.asks_form != "which-to-remove"
-        if (is_open and not asking.said("r")) or said == "OBJ":
+        several = sum(each.what == "motion" and bool(each.thing("m")) for each in self.pieces) > 1
+        is_open = (told or several) and asking.said("s") == "it" and asking.asks_form != "which-to-remove"
+        if (is_open and not asking.said("r")) or said == "OBJ" or (asking.asks_form == "where" and subject != self.mover):
             return None  # the mover, or what it strikes
         if "both" in asking.roles:
             moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
