@@ -115,7 +115,7 @@ class EmbeddedReader:
             warnings += tuple(
                 f"{matching.unclear(phrase, beside)}. No encounter is listed under that name."
                 for phrase, each in others
-                if each is None and phrase in question.others
+                if each is None and phrase in question.others and (given.asked_wanted or given.changes_wanted)
             )
             things = [(phrase, each.bbox) for phrase, each in others if each is not None and phrase in question.others]
             things += [] if mover.is_given else [(mover, bbox)]

@@ -257,7 +257,7 @@ class _Parser:
             if piece in told and piece.thing("s") and not found:
                 struck = self._thing(piece.said("o")) if piece.thing("o") else None
                 found[piece.said("s")] = MotionWords("linear", towards=struck)  # "if the cue ball strikes the red ball"
-            if piece.what != "motion":
+            if piece.what != "motion" or piece.said("m") == "OBJ":
                 continue
             said, before, token = piece.said("m"), self._named(piece.start), piece.thing("m") or piece.said("m")
             if asking is not None and token in {"", "it"}:
@@ -271,7 +271,9 @@ class _Parser:
             token = token or (next(reversed(found), "") if said != "it" else "")
             free = [each for each in before if put is None or self._thing(each) != put]
             token = token or next(iter([*(free if said else before), *before]), "")
-            token = token or next((each for each in self.plain[piece.end :] if _THING.fullmatch(each)), "")
+            opens = self.plain[max(piece.start - 1, 0)] in forms.CONNECTORS or not piece.start
+            later = (each for each in self.plain[piece.end :] if opens and _THING.fullmatch(each))
+            token = token or next(later, "")  # "sent towards the mug, the ball ..."
             token = token.split()[-1].replace("P", "X").replace("S", "X") if token else ""
             if token:
                 found[token] = joined(found[token], piece.motion) if token in found else piece.motion
@@ -415,6 +417,7 @@ class _Parser:
         names_crash = asking is not None and (form == "which-to-remove" or asking.said("r"))
         struck = "" if asking is None else asking.thing("s")
         lost = [each for each in asks if each is not asking]
+        lost += [each for each in self.pieces if each.said("m") == "OBJ"]
         lost += [each for each in self.pieces if each.what == "listed" and form != "which-first"]
         # What is told to be hit, and is not what the question then goes on about.
         lost += [each for each in told if not names_crash and (each.said("o") != struck or not struck)]
