@@ -368,7 +368,7 @@ class _Parser:
             if own and (doer or passive):  # "the vase hides it", "is it hidden by the vase?"
                 return "covered", "", asking.thing("s") if doer else ""
             return ("covered", target, doer) if passive and doer else (relation, doer, target)
-        if relation == "touches" and own and target:
+        if relation == "touches" and own and target and (doer or passive):
             return relation, "", doer  # "the vase hits it", "is it hit?"
         return relation, doer, target
 
