@@ -3,7 +3,6 @@
 A thing is meant by positive evidence alone. What is merely left is not meant.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,12 +10,12 @@ import numpy as np
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.base import SeenThing
-from cow_service.readers.embedded.english.lexicon import GENERIC, SETS, TABLES, ObjectPhrase, like_a_colour
+from cow_service.readers.embedded.english.lexicon import GENERIC, TABLES, ObjectPhrase, like_a_colour
 from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, shape_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, LocatedObject
-from cow_service.vision.forms import form_of, is_cut, is_other_kind, is_unlike, log_ratio, looks_like
+from cow_service.vision import forms
 from cow_service.vision.masks import is_same_object, mask_iou
 from cow_service.vision.regions import Region
 from cow_service.vision.scene import Scene
@@ -57,51 +56,19 @@ def singled_out(regions: Sequence[Region], phrase: ObjectPhrase) -> list[Region]
     return list(regions)
 
 
-CLEARLY_WORSE = 2.5  # log ratio: what is so much less likely than the best, twelve times, is not meant
-EXACT, NEAR = 6.0, 3.0  # log ratios of the name of a region's colour, and of others that people may use for it
-LEAST = -2.0  # log ratio of an outline: lowest evidence against it; the highest is `CLEARLY_WORSE`
-CUT = 0.5  # share of its log ratio that an outline keeps which the border cuts
 CLEAR = 1.0  # log ratio of an outline from which one of several is called so
 POOR = -1.0  # log ratio of an outline: with less it is not called so, unless by its colour
-ROUND = 0.76  # roundness from which a region passes for a ball; a cube has about 0.7
-NOT_ROUND = 0.6  # roundness below which nothing passes for a ball, even half hidden
-CALLED, NOT_CALLED = 3.0, -2.0  # log ratios if a detector found the noun: for its finds, for the rest
-IMPOSSIBLE = -math.inf
 
 
 def is_known(phrase: ObjectPhrase) -> bool:
     """Whether the noun says something of a shape, or claims nothing."""
-    return phrase.noun is None or form_of(phrase.head) is not None or phrase.head in SETS["solid"] | GENERIC | TABLES
-
-
-def _log_ratios(regions: Sequence[Region], phrase: ObjectPhrase) -> list[float]:
-    """How much more likely each region is meant than not."""
-    ratios, is_found = list[float](), any(phrase.noun in region.called for region in regions)
-    for region in regions:
-        colour, shape = 0.0, _shape_ratio(region, phrase)
-        if phrase.colour is not None and region.colour != phrase.colour:
-            colour = NEAR if phrase.colour in region.colours else IMPOSSIBLE
-        elif phrase.colour is not None:
-            colour = EXACT
-        if phrase.noun in region.called:  # outlines of real things are of many forms
-            ratios.append(max(shape, LEAST) + colour + CALLED)
-        else:
-            ratios.append(shape + colour + (NOT_CALLED if is_found else 0.0))
-    return ratios
+    return (
+        phrase.noun is None or forms.form_of(phrase.head) is not None or phrase.head in forms.SOLID | GENERIC | TABLES
+    )
 
 
 def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
-    """By outline; one that the border cuts says less."""
-    form = form_of(phrase.head)
-    # A region is round where the noun names something round, and not where it does not.
-    can_be = not region.is_disc or (form is None and phrase.head not in SETS["solid"])
-    if form == "ball":
-        can_be = (region.is_hidden and phrase.colour is not None) or region.roundness >= (
-            ROUND if phrase.colour is None else NOT_ROUND
-        )
-    if form is None or not can_be:
-        return 0.0 if can_be else IMPOSSIBLE
-    return (CUT if is_cut(region, form) else 1.0) * min(CLEARLY_WORSE, max(LEAST, log_ratio(region, form)))
+    return forms.shape_ratio(region, phrase.head, phrase.colour is not None)
 
 
 def best_matches(regions: Sequence[Region], phrase: ObjectPhrase) -> list[Region]:
@@ -115,17 +82,17 @@ def best_matches(regions: Sequence[Region], phrase: ObjectPhrase) -> list[Region
 
 def _foremost(regions: Sequence[Region], phrase: ObjectPhrase, count: int = 1) -> list[Region]:
     """The given number of regions that fit a phrase best, and those not clearly worse than the last of them."""
-    ratios = _log_ratios(regions, phrase)
-    ranked = sorted((ratio for ratio in ratios if ratio > IMPOSSIBLE), reverse=True)
-    least = ranked[min(count, len(ranked)) - 1] - CLEARLY_WORSE if ranked else 0.0
-    fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(IMPOSSIBLE, least)]
+    ratios = forms.likeness(regions, phrase.noun, phrase.head, phrase.colour)
+    ranked = sorted((ratio for ratio in ratios if ratio > forms.IMPOSSIBLE), reverse=True)
+    least = ranked[min(count, len(ranked)) - 1] - forms.CLEARLY_WORSE if ranked else 0.0
+    fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(forms.IMPOSSIBLE, least)]
     # A detector called it so, its outline is that of the noun, or it has the colour and is not clearly another kind of
     # thing, such as a candle where a cone of its colour was not seen.
     names_nothing = phrase.colour is None and not is_known(phrase)
     is_sure = any(
         phrase.noun in each.called
         or (_shape_ratio(each, phrase) >= POOR and not names_nothing)
-        or (each.colour == phrase.colour and not is_other_kind(each, phrase.head))
+        or (each.colour == phrase.colour and not forms.is_other_kind(each, phrase.head))
         for each in fitting
     )
     return fitting if is_sure else []
@@ -246,9 +213,11 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         if region is None or phrase.inside_box or phrase.noun in region.called:
             continue
         # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
-        head, looks, own = phrase.head or "", looks_like(region), form_of(phrase.head)
+        head, looks, own = phrase.head or "", forms.looks_like(region), forms.form_of(phrase.head)
         # Where no colour tells that it is meant, its outline alone does.
-        is_odd = own is not None and (is_unlike(region, own) or (phrase.colour is None and looks not in (None, own)))
+        is_odd = own is not None and (
+            forms.is_unlike(region, own) or (phrase.colour is None and looks not in (None, own))
+        )
         is_other = is_odd if own is not None else shape_of(head) != shape_of(looks or "")
         colour = None if phrase.colour else like_a_colour(phrase.text)
         if colour is not None:

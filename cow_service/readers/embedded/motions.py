@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import TypedDict
 
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.perception.facing import facing
@@ -10,9 +9,8 @@ from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
-from cow_service.readers.embedded.english.motion import MotionWords
 from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
-from cow_service.readers.embedded.english.questions import Question
+from cow_service.readers.embedded.english.questions import MotionWords, Question
 from cow_service.readers.embedded.matching import best_matches, describe, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, MotionKind, Until, Vector
@@ -30,17 +28,10 @@ def _refused(fault: str) -> CannotReadDirection:
     return CannotReadDirection(fault, remedy=GIVE_DIRECTION)
 
 
-class Said(TypedDict):
-    """What the words say of how fast, how far and how long; fields of `MotionReading`."""
-
-    speed: SpeedWord | Quantity | None
-    distance: Quantity | None
-    duration: float | None
-    until: Until | None
-
-
-def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox) -> Said:
-    """The quantities of one leg; `way`, px, is the distance to the goal; `bbox` is the moving object's.
+def quantities(
+    words: Sequence[QuantityWords], way: float | None, bbox: BBox
+) -> tuple[SpeedWord | Quantity | None, Quantity | None, float | None, Until | None]:
+    """Speed, distance, duration (s) and end of one leg; `way`, px, is the distance to the goal; `bbox` is the mover's.
 
     Raises `CannotReadDirection`.
     """
@@ -51,25 +42,18 @@ def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox) ->
             raise _refused(f"The question names more than one {what} of the motion.")
     speed, length, duration = (found.get(what) for what in ("speed", "distance", "duration"))
     distance = None if length is None else Quantity(length.value, "m" if length.is_metric else "px")
-    if length is not None and length.what == "own_widths":
-        distance = Quantity(length.value * (bbox[2] - bbox[0]), "px")
-    elif length is not None and length.what == "share":
-        if way is None:
-            raise _refused("The question says that it moves part of the way, but not where to.")
-        distance = Quantity(length.value * way, "px")
+    if length is not None and length.what == "share" and way is None:
+        raise _refused("The question says that it moves part of the way, but not where to.")
+    if length is not None and length.what != "distance":
+        distance = Quantity(length.value * ((way or 0.0) if length.what == "share" else bbox[2] - bbox[0]), "px")
     pace = None if speed is None else speed.pace or Quantity(speed.value, "m/s" if speed.is_metric else "px/s")
-    return Said(
-        speed=pace,
-        distance=distance,
-        duration=None if duration is None else duration.value,
-        until="contact" if "until" in found else None,
-    )
+    return pace, distance, None if duration is None else duration.value, "contact" if "until" in found else None
 
 
 def step_readings(steps: Sequence[MotionWords], bbox: BBox) -> tuple[StepReading, ...]:
     """The legs behind the first of what has this box."""
     said = [(_way(step.direction, step.depth), quantities(step.quantities, None, bbox)) for step in steps]
-    return tuple(StepReading(*way, each["distance"], each["duration"]) for way, each in said)
+    return tuple(StepReading(*way, each[1], each[2]) for way, each in said)
 
 
 def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
@@ -95,7 +79,7 @@ def other_readings(
             (x0, y0, x1, y1), start = goal.bbox, found.bbox
             direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
         way = _way(direction, motion.depth) if kind in DIRECTED_KINDS else (None, 0.0)
-        speed = quantities(motion.quantities, None, found.bbox)["speed"]
+        speed = quantities(motion.quantities, None, found.bbox)[0]
         readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
     return tuple(readings)
 

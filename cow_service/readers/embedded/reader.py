@@ -9,16 +9,13 @@ from cow_service.errors import CannotGround
 from cow_service.narration.words import phrases_of, same_name
 from cow_service.physics.camera import way_to
 from cow_service.readers import base
-from cow_service.readers.base import MotionReading, ReaderInput
 from cow_service.readers.embedded import matching, motions
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.english import noun_phrases
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
-from cow_service.readers.embedded.english.noun_phrases import kind_of
 from cow_service.readers.embedded.english.questions import ChangeWords, Question, parse, rewordings
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import BBox, Grounding, Intervention, LocatedObject, ObjectPrior, Source
 from cow_service.settings import Settings
 from cow_service.vision.masks import is_among, is_same_object
 from cow_service.vision.regions import Region
@@ -30,7 +27,7 @@ LOCATE_IT = f"{GIVE_PLACE} Or click it on the page, or have a multimodal LLM rea
 class EmbeddedReader:
     """Colour and noun of the mover, words and arrows for its direction, encounters for the answer."""
 
-    source: Source = "embedded"
+    source: records.Source = "embedded"
     info = records.ReaderInfo(name="embedded", revision=__version__)  # rules change with the version alone
     fingerprint = f"embedded {__version__}"
 
@@ -57,10 +54,10 @@ class EmbeddedReader:
         nouns = matching.nouns_of(read)
         return base.QuestionReading(read.asked, changes, said.trail, nouns, drawings, way)
 
-    def read_name(self, name: str) -> ObjectPrior:
+    def read_name(self, name: str) -> records.ObjectPrior:
         """By its noun."""
         opening = noun_phrases.container_form(name)
-        return ObjectPrior(
+        return records.ObjectPrior(
             shape=noun_phrases.shape_of(name),
             elongated=noun_phrases.is_vehicle(name),
             equal_sided=noun_phrases.is_cube(name),
@@ -69,13 +66,13 @@ class EmbeddedReader:
 
     def names_meant(self, words: str, names: Sequence[str]) -> tuple[str, ...]:
         """Those of a kind such as "both mugs", where there are as many as is said; else the words themselves."""
-        kind = kind_of(words)
+        kind = noun_phrases.kind_of(words)
         if kind is None or any(plain(name) == plain(words) for name in names):
             return (words,)
         found = tuple(name for name in names if noun_phrases.may_name(kind.phrase, name))
         return found if found and kind.count in (None, len(found)) else (words,)
 
-    def ground(self, given: ReaderInput) -> base.GroundingReading:
+    def ground(self, given: base.ReaderInput) -> base.GroundingReading:
         """What is given under the mover's words, or the region that fits them. Raises `CannotGround`."""
         question = parse(given.question, names_of(given))
         mover, asked, unread = question.mover, question.asked, question.unread
@@ -89,7 +86,7 @@ class EmbeddedReader:
                 scene = matching.with_found(scene, given.find(matching.nouns_of(question, given.sought)))
             finder = _Finder(scene, given.known)
             removed = [
-                Intervention(kind="remove", object=each)
+                records.Intervention(kind="remove", object=each)
                 for change in changes
                 if change.kind == "remove"
                 for each in finder.found(change.object, f"takes '{change.object.text}' away")
@@ -136,7 +133,9 @@ class EmbeddedReader:
             is_doubtful=bbox in doubtful or (bool(left) and not given.asked_wanted),
         )
 
-    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: base.MotionHints | None) -> MotionReading:
+    def read_motion(
+        self, given: base.ReaderInput, grounding: records.Grounding, hints: base.MotionHints | None
+    ) -> base.MotionReading:
         """Kind and direction from the words, and from the arrow where the words speak of one.
 
         Raises `CannotReadDirection`.
@@ -150,18 +149,19 @@ class EmbeddedReader:
             parted = any(each.what == "share" for each in words.quantities)
             goal = motions.goal_of(scene, words.towards, grounding) if parted and words.towards is not None else None
             way = None if goal is None else way_to(goal.bbox, grounding.bbox, reading.kind == "linear")
+            said = motions.quantities(words.quantities, None if way is None else math.hypot(*way), grounding.bbox)
             return replace(
                 reading,
+                **dict(zip(("speed", "distance", "duration", "until"), said, strict=True)),
                 steps=motions.step_readings(words.steps, grounding.bbox),
                 others=motions.other_readings(words.others, scene, grounding),
-                **motions.quantities(words.quantities, None if way is None else math.hypot(*way), grounding.bbox),
             )
 
     def answer(
         self,
-        given: ReaderInput,
+        given: base.ReaderInput,
         options: Sequence[records.AnswerOption],
-        grounding: Grounding | None,
+        grounding: records.Grounding | None,
         imagined: base.Imagined | None,
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
@@ -184,12 +184,12 @@ def create(settings: Settings) -> EmbeddedReader:
     return EmbeddedReader()
 
 
-def names_of(given: ReaderInput) -> tuple[str, ...]:
+def names_of(given: base.ReaderInput) -> tuple[str, ...]:
     """The names of the given things."""
     return tuple(each.object for each in given.known)
 
 
-def _not_said(question: Question, given: ReaderInput) -> CannotGround:
+def _not_said(question: Question, given: base.ReaderInput) -> CannotGround:
     """What a question does not say in a form that is read, and how to say it."""
     unread = ("', '".join(question.unread) or given.question)[:MAX_UNREAD]
     fault = f"The question does not say in words what moves and how: '{unread}' was not understood."
@@ -214,16 +214,16 @@ def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
 class _Finder:
     """Finds the things of one question: what is given under their words first, then what is seen."""
 
-    def __init__(self, scene: Scene, known: Sequence[LocatedObject]) -> None:
+    def __init__(self, scene: Scene, known: Sequence[records.LocatedObject]) -> None:
         self.scene, self.regions = scene, tuple(scene.regions)
-        self.known, self.taken = {each.object: each for each in known}, dict[str, BBox]()
+        self.known, self.taken = {each.object: each for each in known}, dict[str, records.BBox]()
         self._given = f" Given: {', '.join(self.known)}." if known else ""
 
-    def without(self, boxes: Sequence[BBox]) -> tuple[Region, ...]:
+    def without(self, boxes: Sequence[records.BBox]) -> tuple[Region, ...]:
         """The regions that are in none of some boxes."""
         return tuple(region for region in self.regions if not is_among(region.bbox, boxes))
 
-    def mover(self, phrase: ObjectPhrase, names_arrow: bool) -> BBox:
+    def mover(self, phrase: ObjectPhrase, names_arrow: bool) -> records.BBox:
         """The box of what moves. Raises `CannotGround`."""
         scene = self.scene
         if phrase.is_given:
@@ -233,10 +233,10 @@ class _Finder:
         fitting = matching.best_matches(self.regions, phrase)
         if len(fitting) > 1 and (names_arrow or phrase.path_end == "start"):
             fitting = scene.at_arrow(fitting) or fitting
-        if len(fitting) == 1 and kind_of(phrase.text) is None:
+        if len(fitting) == 1 and noun_phrases.kind_of(phrase.text) is None:
             return fitting[0].bbox
         fault = f"What moves is not clear: {matching.unclear(phrase, scene.regions)}."
-        if kind_of(phrase.text) is not None:
+        if noun_phrases.kind_of(phrase.text) is not None:
             fault = f"The question moves '{phrase.text}' at once: ask of one thing, or name each."
         elif not scene.regions:
             fault = (
@@ -245,36 +245,40 @@ class _Finder:
             )
         raise CannotGround(fault + self._given, remedy=LOCATE_IT)
 
-    def other(self, phrase: ObjectPhrase, beside: Sequence[Region]) -> LocatedObject | None:
+    def other(self, phrase: ObjectPhrase, beside: Sequence[Region]) -> records.LocatedObject | None:
         """Another thing; None where it is not found for certain."""
         alone = beside[0] if len(beside) == 1 else None
         region = alone if phrase.is_other else matching.match_one(beside, phrase)
-        return None if region is None else LocatedObject(object=phrase.text, bbox=region.bbox)
+        return None if region is None else records.LocatedObject(object=phrase.text, bbox=region.bbox)
 
-    def found(self, phrase: ObjectPhrase, told: str, count: int | None = None) -> list[LocatedObject]:
+    def found(self, phrase: ObjectPhrase, told: str, count: int | None = None) -> list[records.LocatedObject]:
         """One thing, or several such as "both cylinders". Raises `CannotGround`."""
         if phrase.is_given:
             return [self.known[phrase.text]]
         if phrase.text in self.taken:
-            return [LocatedObject(object=phrase.text, bbox=self.taken[phrase.text], source="embedded")]
-        free, kind = self.without(list(self.taken.values())), kind_of(phrase.text)
+            return [records.LocatedObject(object=phrase.text, bbox=self.taken[phrase.text], source="embedded")]
+        free, kind = self.without(list(self.taken.values())), noun_phrases.kind_of(phrase.text)
         region = matching.match_one(free, phrase) if kind is None else None
         if kind is not None and kind.count in (None, 2):
             kind = replace(kind, count=kind.count or count)
             things = matching.named_by_colour(matching.match_several(free, kind), kind)
         else:
-            things = [] if region is None else [LocatedObject(object=phrase.text, bbox=region.bbox, source="embedded")]
+            things = (
+                []
+                if region is None
+                else [records.LocatedObject(object=phrase.text, bbox=region.bbox, source="embedded")]
+            )
         if not things:
             why = matching.unclear(phrase, free)
             raise CannotGround(f"The question {told}, and {why}.{self._given}", remedy=GIVE_OBJECT)
         return things
 
-    def placed(self, change: ChangeWords) -> Intervention:
+    def placed(self, change: ChangeWords) -> records.Intervention:
         """What is put somewhere, and what it is put to. Raises `CannotGround`."""
-        puts, found = f"puts '{change.object.text}'", list[LocatedObject]()
+        puts, found = f"puts '{change.object.text}'", list[records.LocatedObject]()
         for phrase in (change.object, *change.targets):
             found += self.found(phrase, puts, 2)
             self.taken[phrase.text] = found[-1].bbox
         if len(found) != (3 if change.relation == "between" else 2):
             raise CannotGround(f"The question {puts}, and between which things is not clear.", remedy=GIVE_OBJECT)
-        return Intervention(kind="place", object=found[0], relation=change.relation, targets=tuple(found[1:]))
+        return records.Intervention(kind="place", object=found[0], relation=change.relation, targets=tuple(found[1:]))

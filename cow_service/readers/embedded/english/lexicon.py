@@ -1,13 +1,15 @@
-"""The word lists of `forms.txt`, and the phrases that name things."""
+"""The word lists and the sentence forms of `forms.txt`, and the phrases that name things."""
 
+import re
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files
-from typing import Literal, NamedTuple
+from itertools import count
+from typing import Literal, NamedTuple, cast
 
 from cow_service.readers.base import SpeedWord
-from cow_service.records import MotionKind
+from cow_service.records import AskedForm, AskedRelation, MotionKind, PlaceRelation, Vector
 
 
 def words(*lists: str) -> frozenset[str]:
@@ -19,7 +21,7 @@ def words(*lists: str) -> frozenset[str]:
 def sections() -> dict[str, list[tuple[str, str]]]:
     """The lines of `forms.txt` by their section, each as what stands in front of " = " and behind it."""
     text = files("cow_service.readers.embedded.english").joinpath("forms.txt").read_text(encoding="utf-8")
-    found: dict[str, list[tuple[str, str]]] = {}
+    found, lines = dict[str, list[tuple[str, str]]](), list[tuple[str, str]]()
     for line in text.splitlines():
         if line.startswith("["):
             found[line.strip("[]")] = lines = []
@@ -46,7 +48,7 @@ TABLES = words("table desk tabletop")
 CONTAINERS = SETS["hollow"] | (SETS["round"] | SETS["square"]) - {"vase", "can"}  # to fall into
 NOUNS = frozenset[str]().union(*(SETS[name] for name in ("sphere", "box", "vehicle", "cone", "cylinder")))
 _KINDS: tuple[MotionKind, ...] = ("linear", "projectile", "fall", "static")
-KINDS: dict[str, MotionKind] = {lemma: kind for kind in _KINDS for lemma in LISTS[kind]}
+KINDS: dict[str, MotionKind] = {"let go": "fall", **{lemma: kind for kind in _KINDS for lemma in LISTS[kind]}}
 NEARLY = 0.8  # difflib's ratio from which a word is nearly a colour's name
 
 
@@ -71,8 +73,9 @@ def _inflected(lemma: str) -> dict[str, Verb]:
     return {third: Verb(lemma, "s"), f"{stem}ing": Verb(lemma, "ing"), **pasts, lemma: Verb(lemma, "base")}
 
 
+_LEMMAS = sorted({*LISTS["other"], *KINDS} - {"let go"})
 VERBS = {
-    **{word: verb for lemma in sorted({*LISTS["other"], *KINDS}) for word, verb in _inflected(lemma).items()},
+    **{word: verb for lemma in _LEMMAS for word, verb in _inflected(lemma).items()},
     **dict.fromkeys(words("be is are was were been being am"), Verb("be", "base")),
     **dict.fromkeys(words("have has had"), Verb("have", "base")),
     **dict.fromkeys(words("will would does do did can could may might shall should must"), Verb("will", "base")),
@@ -145,3 +148,66 @@ class QuantityWords(NamedTuple):
     value: float = 1.0  # s, px or m; a share of the way to what it moves towards; widths of what moves
     is_metric: bool = False
     pace: SpeedWord | None = None  # a speed without a number
+
+
+LEFT, RIGHT, UP, DOWN = (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
+WAYS: dict[str, Vector] = {"left": LEFT, "right": RIGHT, "up": UP, "down": DOWN}
+SIDES = WAYS | {"leftmost": LEFT, "rightmost": RIGHT, "lowest": DOWN, "highest": UP}
+VERB = "|".join(sorted(KINDS, key=len, reverse=True))
+# What joins clauses, or opens them.
+CONNECTORS = words(", . ? ! ; ( ) it first") | SETS["connectors"]
+
+
+class Form(NamedTuple):
+    """A pattern, and what a sentence of this form says: the words in front of it."""
+
+    says: str
+    pattern: re.Pattern[str]
+
+    @property
+    def asks(self) -> tuple[AskedForm, AskedRelation, bool]:
+        """Form, relation and whether it is negated, of what asks."""
+        form, relation, *negated = self.says.split()
+        return cast(AskedForm, form), cast(AskedRelation, relation), bool(negated)
+
+
+def roles(found: re.Match[str]) -> dict[str, str]:
+    """The groups of a match by their names, in the order in which they stand."""
+    spans = sorted((found.span(name), name) for name, text in found.groupdict().items() if text is not None)
+    return {name.rstrip("0123456789"): found[name] for _, name in spans}
+
+
+def relation_of(said: dict[str, str]) -> PlaceRelation | None:
+    """The relation that the groups of a placing name."""
+    names = (name for name, _ in sections()["where"] if name.replace("-", "") in said)
+    return cast(PlaceRelation | None, next(names, None))
+
+
+@cache
+def forms() -> dict[str, tuple[Form, ...]]:
+    """The forms by their section."""
+    macros = dict(sections()["macros"]) | {"verbs": VERB, "causes": "|".join(LISTS["causes"])}
+    macros |= {
+        "colours": "|".join(COLOURS),
+        "numerals": "|".join(LISTS["numerals"]),
+        "units": "|".join(METRES),
+    }
+    macros["where"] = "|".join(f"(<{name.replace('-', '')}>){pattern}" for name, pattern in sections()["where"])
+
+    def compiled(section: str, says: str, pattern: str) -> Form:
+        is_text = section in {"idioms", "quantities"}
+        if section == "asked":
+            pattern = f"({pattern}){{tail}}"
+        while "{" in pattern:
+            pattern = re.sub(r"\{(\w+)\}", lambda macro: macros[macro[1]], pattern)
+        if "\\1" not in says:  # in front of what refers to a group, (...) is one
+            pattern = re.sub(r"(?<!\\)\((?![?<])", "(?:", f"({pattern})")
+        numbers = count()
+        pattern = re.sub(r"\(<(\w+)>", lambda group: f"(?P<{group[1]}{next(numbers)}>", pattern)
+        return Form(says, re.compile(rf"(?<![\w'-]){pattern}(?![\w'-])" if is_text else rf"{pattern}(?= |$)"))
+
+    return {
+        section: tuple(compiled(section, *line) for line in lines)
+        for section, lines in sections().items()
+        if section not in {"words", "macros", "where"}
+    }

@@ -11,8 +11,6 @@ from typing import Literal, cast
 
 from cow_service.readers.base import SpeedWord
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.forms import forms, roles
-from cow_service.readers.embedded.english.lexicon import Measure, ObjectPhrase, QuantityWords
 from cow_service.readers.options import plain
 from cow_service.records import Shape
 
@@ -45,15 +43,15 @@ class Tokens:
     names: Sequence[str] = ()
     plain: list[str] = field(default_factory=list[str])
     said: list[str] = field(default_factory=list[str])
-    things: list[ObjectPhrase] = field(default_factory=list[ObjectPhrase])
-    quantities: list[QuantityWords] = field(default_factory=list[QuantityWords])
+    things: list[lex.ObjectPhrase] = field(default_factory=list[lex.ObjectPhrase])
+    quantities: list[lex.QuantityWords] = field(default_factory=list[lex.QuantityWords])
 
     def add(self, token: str, said: str) -> None:
         """Adds a token that stands for some words."""
         self.plain.append(token)
         self.said.append(said)
 
-    def number(self, phrase: ObjectPhrase) -> int:
+    def number(self, phrase: lex.ObjectPhrase) -> int:
         """The number of a thing: one that was named before keeps its own."""
         known = (at for at, each in enumerate(self.things) if plain(each.text) == plain(phrase.text))
         at = next(known, len(self.things))
@@ -69,9 +67,9 @@ def tokens_of(text: str, names: Sequence[str] = ()) -> Tokens:
     for at, name in sorted(enumerate(names), key=lambda each: -len(each[1])):
         words = r"\s+".join(map(re.escape, name.lower().split()))
         text = re.sub(rf"(?<![\w'-]){words}(?![\w'-])", f"N{at}N", text)
-    for what, pattern in forms()["quantities"]:
-        text = pattern.sub(lambda found, what=what: _quantity(tokens, what, roles(found)), text)
-    for token, idiom in forms()["idioms"]:
+    for what, pattern in lex.forms()["quantities"]:
+        text = pattern.sub(lambda found, what=what: _quantity(tokens, what, lex.roles(found)), text)
+    for token, idiom in lex.forms()["idioms"]:
         text = " ".join(idiom.sub(token, text).split())
     words, at, going = _TOKEN.findall(text), 0, list[str]()
     while at < len(words):
@@ -88,9 +86,9 @@ def _quantity(tokens: Tokens, what: str, said: dict[str, str]) -> str:
     numbers = lex.NUMBER_WORDS | {"a": 1, "an": 1, "twice": 2, "half a": 0.5, "half an": 0.5, "half": 0.5}
     value = 0.5 if what == "share" else float(numbers.get(number, number)) * lex.METRES.get(unit, 1.0)
     if what in {"slow", "fast"}:
-        tokens.quantities.append(QuantityWords("speed", pace=cast(SpeedWord, what)))
+        tokens.quantities.append(lex.QuantityWords("speed", pace=cast(SpeedWord, what)))
     elif what:
-        tokens.quantities.append(QuantityWords(cast(Measure, what), value, unit in lex.METRES))
+        tokens.quantities.append(lex.QuantityWords(cast(lex.Measure, what), value, unit in lex.METRES))
     return f"Q{len(tokens.quantities) - 1}" if what else ""
 
 
@@ -180,8 +178,8 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
 
 
 def _with_behind(
-    tokens: Tokens, words: list[str], start: int, phrase: ObjectPhrase, opening: str
-) -> tuple[int, int, ObjectPhrase]:
+    tokens: Tokens, words: list[str], start: int, phrase: lex.ObjectPhrase, opening: str
+) -> tuple[int, int, lex.ObjectPhrase]:
     """Where the words behind a noun that belong to it begin and end, and the phrase with what they say."""
     end, is_put = start, bool(tokens.plain) and tokens.plain[-1] in {*lex.CAUSES, "put", "place", "set"}
     while end < len(words):
@@ -202,7 +200,9 @@ def _with_behind(
     return start, end, phrase
 
 
-def _add_phrase(tokens: Tokens, phrase: ObjectPhrase, content: list[str], determiners: list[str], said: str) -> None:
+def _add_phrase(
+    tokens: Tokens, phrase: lex.ObjectPhrase, content: list[str], determiners: list[str], said: str
+) -> None:
     """Adds a noun phrase as a thing, a kind, several things or one that acts."""
     counted = tokens.said[-2:-1] and tokens.said[-2] in _SOME and tokens.said[-1] == "of"
     quantifier = next((word for word in determiners if word in _SOME), tokens.said[-2] if counted else None)
@@ -230,7 +230,7 @@ def _add_phrase(tokens: Tokens, phrase: ObjectPhrase, content: list[str], determ
         tokens.add(f"X{tokens.number(_meant(phrase, tokens))}", said)
 
 
-def _meant(phrase: ObjectPhrase, tokens: Tokens) -> ObjectPhrase:
+def _meant(phrase: lex.ObjectPhrase, tokens: Tokens) -> lex.ObjectPhrase:
     """What a phrase means among the things named before: "the black one" is of the kind that is asked for, or the last
     thing of that colour, or of the one kind that was named; "the car" is the red car."""
     before, kinds = tokens.things, {tokens.things[int(token[1:])].noun for token in tokens.plain if token[0] == "K"}
@@ -248,18 +248,18 @@ def _meant(phrase: ObjectPhrase, tokens: Tokens) -> ObjectPhrase:
     return fuller[0] if len(fuller) == 1 else phrase
 
 
-def object_phrase(content: Sequence[str], text: str) -> ObjectPhrase:
+def object_phrase(content: Sequence[str], text: str) -> lex.ObjectPhrase:
     """The phrase with these lower case words, behind its determiners."""
     said = [word for word in content if word != "and" and not word.isdigit()] or list(content)
     said = said[: next((at for at, word in enumerate(said) if at and word in {"of", "with"}), len(said))]
     nouns, head = [word for word in said[:-1] if not lex.is_modifier(word)], said[-1]
     colour = next((lex.COLOURS[word] for word in said[:-1] or said if word in lex.COLOURS), None)
-    return ObjectPhrase(
+    return lex.ObjectPhrase(
         text, colour, None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)])
     )
 
 
-def parse_noun_phrase(text: str) -> ObjectPhrase | None:
+def parse_noun_phrase(text: str) -> lex.ObjectPhrase | None:
     """The noun phrase of a text such as "the red toy car"; None if there is none."""
     said = text.strip(" .,!?").split()
     while said and said[0].lower() in lex.DETERMINERS:
@@ -278,7 +278,7 @@ def parse_noun_phrase(text: str) -> ObjectPhrase | None:
     return replace(phrase, colour=colour)
 
 
-def match_given(phrase: ObjectPhrase, names: Sequence[str]) -> str | None:
+def match_given(phrase: lex.ObjectPhrase, names: Sequence[str]) -> str | None:
     """The one given name that a phrase means: the same words, all words of one in the other, its noun or its colour."""
     said = set(plain(phrase.text).split()) - {"one"}
     named = [(name, set(plain(name).split()), parse_noun_phrase(name)) for name in names]
@@ -319,7 +319,7 @@ def is_cube(name: str) -> bool:
 class Kind:
     """What one of the things is called, and how many there are, where that is said."""
 
-    phrase: ObjectPhrase
+    phrase: lex.ObjectPhrase
     count: int | None
 
 
@@ -348,7 +348,7 @@ def container_form(name: str) -> Literal["round", "square", "none", "unknown"]:
     return "unknown" if shape_of(name) is None else "none"
 
 
-def may_name(phrase: ObjectPhrase, name: str) -> bool:
+def may_name(phrase: lex.ObjectPhrase, name: str) -> bool:
     """Whether a phrase may mean the object of that name: they share a colour or a noun, and differ in none."""
     other = parse_noun_phrase(name)
     if other is None or plain(phrase.text) == plain(name):

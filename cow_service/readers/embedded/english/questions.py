@@ -1,21 +1,53 @@
 """Reads a question by its sentence forms: what moves and how, what is changed, what is asked, and what was not read."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-from cow_service.readers.embedded.english import forms
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.lexicon import ObjectPhrase
-from cow_service.readers.embedded.english.motion import NOT_SAID, MotionWords, joined, motion_of
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
 from cow_service.readers.options import plain, says_not_sure, split_options, without_reply_form
-from cow_service.records import Asked, AskedRelation, InterventionKind, PlaceRelation
+from cow_service.records import Asked, AskedRelation, InterventionKind, MotionKind, PlaceRelation, Vector
 
 MAX_WORDS = 240  # of a question that is read
 _THING = re.compile(r"X\d+")
-_DIRECTIONS = {*forms.WAYS, *map(str.upper, forms.WAYS), "FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"}
+_DIRECTIONS = {*lex.WAYS, *map(str.upper, lex.WAYS), "FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"}
+
+
+_RISING, _SINKING = lex.words("lift raise rise climb ascend"), lex.words("descend lower")
+_TOPPLING = lex.words("knock push tip fall turn blow topple")
+
+
+@dataclass(frozen=True)
+class MotionWords:
+    """How the question says that something moves; None and 0 where it does not say.
+
+    `direction` is a unit vector in image pixels, x right, y down. `depth` is the sine of the angle out of the image
+    plane: -1 towards the camera, 1 away from it. `trail`: on along it; `trail_end`, a thing or a side, tells which end
+    of it is the present position. `topples`: it falls over where it stands. `in_air`: it is let go, or falls freely.
+    `steps` are the legs behind the first, `others` what moves at the same time.
+    """
+
+    kind: MotionKind | None = None
+    along_arrow: bool | None = None  # else against it
+    direction: Vector | None = None
+    depth: float = 0.0
+    forward: bool | None = None
+    verb: str = ""
+    towards: lex.ObjectPhrase | None = None
+    trail: bool = False
+    trail_end: lex.ObjectPhrase | Vector | None = None
+    quantities: tuple[lex.QuantityWords, ...] = ()
+    steps: "tuple[MotionWords, ...]" = ()
+    others: "tuple[tuple[lex.ObjectPhrase, MotionWords], ...]" = ()
+    is_contradictory: bool = False  # two of its words are opposites
+    topples: bool = False
+    in_air: bool = False
+
+
+NOT_SAID = MotionWords()
 
 
 @dataclass(frozen=True)
@@ -23,9 +55,9 @@ class ChangeWords:
     """A change of the scene in the words of the question. `relation` and `targets` are those of `place`."""
 
     kind: InterventionKind
-    object: ObjectPhrase
+    object: lex.ObjectPhrase
     relation: PlaceRelation | None = None
-    targets: tuple[ObjectPhrase, ...] = ()
+    targets: tuple[lex.ObjectPhrase, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -33,13 +65,13 @@ class Question:
     """A what-if question taken apart. `others` are the further things that it names; `alternatives`, those among which
     it asks for the first. `unread` are the words of no form, those that tell the motion in `unread_motion`."""
 
-    mover: ObjectPhrase | None = None
+    mover: lex.ObjectPhrase | None = None
     motion: MotionWords = NOT_SAID
     says_motion: bool = False
     changes: tuple[ChangeWords, ...] = ()
     asked: Asked | None = None
-    others: tuple[ObjectPhrase, ...] = ()
-    alternatives: tuple[ObjectPhrase, ...] = ()
+    others: tuple[lex.ObjectPhrase, ...] = ()
+    alternatives: tuple[lex.ObjectPhrase, ...] = ()
     names_table: bool = False  # something is asked to come down on it, or to stay there
     names_arrow: bool = False
     names_direction: bool = False  # some word says which way, whether or not it was understood
@@ -63,7 +95,7 @@ def rewordings(question: Question) -> tuple[str, ...]:
     names = [each.text for each in (question.mover, *question.others) if each is not None]
     motion, said = question.motion, " ".join(question.unread).lower()
     way = "opposite to the direction of the arrow" if motion.along_arrow is False else "in the direction of the arrow"
-    way = next((f"to the {name}" for name in ("left", "right") if motion.direction == forms.WAYS[name]), way)
+    way = next((f"to the {name}" for name in ("left", "right") if motion.direction == lex.WAYS[name]), way)
     way, (mover, other) = "forward" if motion.forward else way, (*names, "", "")[:2]
     like = [
         form.replace("<m>", mover).replace("<o>", other).replace("<way>", way)
@@ -81,7 +113,7 @@ class _Piece:
     start: int
     end: int
     roles: dict[str, str] = field(default_factory=dict[str, str])
-    form: forms.Form | None = None
+    form: lex.Form | None = None
     motion: MotionWords = NOT_SAID
 
     @property
@@ -129,9 +161,9 @@ class _Parser:
         """The longest piece that begins at a token, if any does."""
         found, start = [self._adverbials(_Piece("motion", at, at), "")], self.starts[at]
         for section in ("asked", "stated", "changes", "rest", "moved"):
-            for form in forms.forms()[section]:
+            for form in lex.forms()[section]:
                 if (match := form.pattern.match(self.text, start)) is not None:
-                    piece = _Piece(_KINDS.get(section, form.says), at, self._end(match), forms.roles(match), form)
+                    piece = _Piece(_KINDS.get(section, form.says), at, self._end(match), lex.roles(match), form)
                     verb = piece.roles.get("verb", form.says)
                     found.append(self._adverbials(piece, verb) if section == "moved" else piece)
         told = [each for each in found if each.end > at and (each.what != "motion" or each.motion != NOT_SAID)]
@@ -143,8 +175,8 @@ class _Parser:
 
     def _adverbials(self, piece: _Piece, verb: str) -> _Piece:
         """The piece with the words for the way that follow its verb."""
-        legs, at, ways = [(verb, list[tuple[str, str]]())], piece.end, dict(forms.forms()["ways"])
-        verbs = re.compile(rf"({forms.VERBS})(?! X)(?= |$)")
+        legs, at, ways = [(verb, list[tuple[str, str]]())], piece.end, dict(lex.forms()["ways"])
+        verbs = re.compile(rf"({lex.VERB})(?! X)(?= |$)")
         while at < len(self.plain):
             matches = ((name, way.match(self.text, self.starts[at])) for name, way in ways.items())
             name, match = next(((name, match) for name, match in matches if match is not None), ("", None))
@@ -157,11 +189,10 @@ class _Parser:
                     break
                 legs.append((again[1] if again else "", []))
                 end = self._end(again) if again else end
-            legs[-1][1].extend(forms.roles(match).items() or [(name, "")])
+            legs[-1][1].extend(lex.roles(match).items() or [(name, "")])
             legs[-1][1].append((name, "")) if name == "trail" else None
             at = end
-        kind = lex.KINDS.get(verb, "fall" if verb == "let go" else None)
-        kind = "static" if "n" in piece.roles else kind
+        kind = "static" if "n" in piece.roles else lex.KINDS.get(verb)
         first, *rest = (
             motion_of(verb, said, self.tokens, None if leg else kind) for leg, (verb, said) in enumerate(legs)
         )
@@ -218,17 +249,17 @@ class _Parser:
             unread_motion=tuple(dict.fromkeys(said for what, said in unread if what == "motion")),
         )
 
-    def _thing(self, token: str) -> ObjectPhrase:
+    def _thing(self, token: str) -> lex.ObjectPhrase:
         return self.tokens.things[int(token[1:])]
 
-    def _token(self, thing: ObjectPhrase) -> str:
+    def _token(self, thing: lex.ObjectPhrase) -> str:
         return f"X{self.tokens.things.index(thing)}"
 
     def _named(self, at: int | None = None) -> list[str]:
         """The things named in front of a place, or at all, the first one first."""
         return list(dict.fromkeys(token for token in self.plain[:at] if _THING.fullmatch(token)))
 
-    def _phrases(self, text: str) -> list[ObjectPhrase]:
+    def _phrases(self, text: str) -> list[lex.ObjectPhrase]:
         """The things and kinds of a list such as "X1 and X2"."""
         return [self._thing(token) for token in re.findall(r"[XPSK]\d+", text)]
 
@@ -237,7 +268,7 @@ class _Parser:
         found = list[ChangeWords]()
         for piece in self.pieces:
             found += [ChangeWords("remove", phrase) for phrase in self._phrases(piece.said("r"))]
-            if (relation := forms.relation_of(piece.roles)) is not None:
+            if (relation := lex.relation_of(piece.roles)) is not None:
                 target = self._resolved(piece.said("y"), piece.start, piece.said("x")) or ""
                 targets = [each for each in self._phrases(f"{target} {piece.said('z')}") if each.head != "container"]
                 found.append(ChangeWords("place", self._thing(piece.said("x")), relation, tuple(targets)))
@@ -249,7 +280,7 @@ class _Parser:
         return tuple(dict.fromkeys(found))
 
     def _moving(
-        self, asking: _Piece | None, told: Sequence[_Piece], put: ObjectPhrase | None
+        self, asking: _Piece | None, told: Sequence[_Piece], put: lex.ObjectPhrase | None
     ) -> dict[str, MotionWords]:
         """What moves and how, that of the question first."""
         found = dict[str, MotionWords]()
@@ -271,7 +302,7 @@ class _Parser:
             token = token or (next(reversed(found), "") if said != "it" else "")
             free = [each for each in before if put is None or self._thing(each) != put]
             token = token or next(iter([*(free if said else before), *before]), "")
-            opens = self.plain[max(piece.start - 1, 0)] in forms.CONNECTORS or not piece.start
+            opens = self.plain[max(piece.start - 1, 0)] in lex.CONNECTORS or not piece.start
             later = (each for each in self.plain[piece.end :] if opens and _THING.fullmatch(each))
             token = token or next(later, "")  # "sent towards the mug, the ball ..."
             token = token.split()[-1].replace("P", "X").replace("S", "X") if token else ""
@@ -303,7 +334,7 @@ class _Parser:
 
     def _asked(
         self, asking: _Piece, told: Sequence[_Piece], changes: Sequence[ChangeWords]
-    ) -> tuple[Asked | None, tuple[ObjectPhrase, ...]]:
+    ) -> tuple[Asked | None, tuple[lex.ObjectPhrase, ...]]:
         """What is asked, and among which things; None where that is not clear."""
         if asking.form is None:
             return None, ()
@@ -348,7 +379,8 @@ class _Parser:
         said, subject = asking.said("o"), asking.thing("s") or self.mover
         several = sum(each.what == "motion" and bool(each.thing("m")) for each in self.pieces) > 1
         is_open = (told or several) and asking.said("s") == "it" and asking.asks_form != "which-to-remove"
-        if (is_open and not asking.said("r")) or said == "OBJ" or (asking.asks_form == "where" and subject != self.mover):
+        elsewhere = asking.asks_form == "where" and subject != self.mover
+        if (is_open and not asking.said("r")) or said == "OBJ" or elsewhere:
             return None  # the mover, or what it strikes
         if "both" in asking.roles:
             moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
@@ -373,8 +405,8 @@ class _Parser:
         return relation, doer, target
 
     def _settled(
-        self, asking: _Piece, relation: AskedRelation, thing: ObjectPhrase | None, changes: Sequence[ChangeWords]
-    ) -> tuple[AskedRelation, ObjectPhrase | None] | None:
+        self, asking: _Piece, relation: AskedRelation, thing: lex.ObjectPhrase | None, changes: Sequence[ChangeWords]
+    ) -> tuple[AskedRelation, lex.ObjectPhrase | None] | None:
         """The relation that is meant to a thing of that kind, and the thing; None where there is none."""
         words, is_table = self.plain[asking.start : asking.end], thing is not None and thing.head in lex.TABLES
         if relation == "lands" and thing is not None:  # "off the table"
@@ -399,8 +431,8 @@ class _Parser:
         return relation, thing
 
     def _others(
-        self, mover: ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
-    ) -> tuple[ObjectPhrase, ...]:
+        self, mover: lex.ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
+    ) -> tuple[lex.ObjectPhrase, ...]:
         """The further things that are named, each once."""
         removed = [each.object for each in changes if each.kind == "remove"]
         phrases = [self._thing(token) for token in self._named()]
@@ -434,7 +466,7 @@ class _Parser:
             limits = [
                 word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].what == "within"
             ]
-            if all(word in forms.CONNECTORS or word in limits for word in words):
+            if all(word in lex.CONNECTORS or word in limits for word in words):
                 continue
             ends = [
                 each
@@ -444,3 +476,49 @@ class _Parser:
             what = "motion" if ends and ends[-1].what == "motion" else "asked"
             found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words)))
         return found
+
+
+def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: MotionKind | None) -> MotionWords:
+    """The motion by a verb and words for the way, each by what it says and the word that says it."""
+    found = {name: [text for each, text in said if each == name] for name, _ in said}
+    ways = [lex.WAYS[text.lower()] for text in found.get("way", ())]
+    senses, ahead, depths = (set(found.get(name, ())) for name in ("sense", "ahead", "depth"))
+    x, y, depth = sum(way[0] for way in ways), sum(way[1] for way in ways), 0.0
+    up, falls = [way[1] for way in ways], verb in lex.SETS["fall"]
+    turned = (falls and min(up, default=0) < 0) or (verb in _RISING and max(up, default=0) > 0)
+    opposed = any(a[0] * b[0] < 0 or a[1] * b[1] < 0 for a in ways for b in ways)
+    stays = "still" in found and bool(ways or depths or senses)
+    if kind == "fall":
+        y = 0.0  # down is what a fall does; only what leads away from it is a direction
+    elif not ways:
+        y = -1.0 if verb in _RISING else 1.0 if verb in _SINKING else 0.0
+    if depths:
+        depth = -1.0 if "NEAR" in depths else 1.0
+    length = math.hypot(x, y)
+    goal, near, side = (next(iter(found.get(name, ())), "") for name in ("goal", "near", "side"))
+    return MotionWords(
+        kind=kind,
+        along_arrow="ALONG" in senses if senses else None,
+        direction=(x / length, y / length) if length else None,
+        depth=depth * math.sqrt(0.5) if length else depth,
+        forward=False if verb == "reverse" else "FORWARD" in ahead if ahead and not senses else None,
+        verb=verb,
+        towards=tokens.things[int(goal[1:])] if goal else None,
+        trail="trail" in found,
+        trail_end=tokens.things[int(near[1:])] if near else lex.SIDES.get(side),
+        quantities=tuple(tokens.quantities[int(text[1:])] for text in found.get("quantity", ())),
+        is_contradictory=turned or opposed or stays or any(len(each) > 1 for each in (senses, ahead, depths)),
+        topples=("over" in found and verb in _TOPPLING) or verb in {"tip", "topple"},
+        in_air=verb in {"drop", "release", "detach", "let go"} or "freely" in found,
+    )
+
+
+def joined(first: MotionWords, second: MotionWords) -> MotionWords:
+    """A motion that is told in two places."""
+    empty = vars(NOT_SAID)
+    told = {name: value for name, value in vars(second).items() if value != empty[name]}
+    single = ("kind", "direction", "depth", "along_arrow", "forward")
+    clash = any(name in told and getattr(first, name) not in (empty[name], told[name]) for name in single)
+    kept = {name: value for name, value in told.items() if getattr(first, name) == empty[name]}
+    quantities = (*first.quantities, *second.quantities)
+    return replace(first, **kept | {"quantities": quantities, "is_contradictory": clash or first.is_contradictory})
