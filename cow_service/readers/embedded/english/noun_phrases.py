@@ -102,7 +102,7 @@ def _is_determiner(words: Sequence[str], at: int) -> bool:
     word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
     relative = after in lex.DETERMINERS if word in {"that", "this"} else False
     acts = after in lex.VERBS and (word in {"that", "which", "what", "this"} or lex.VERBS[after].form == "s")
-    follows = _is_open(after) or after in lex.PLACES or after in lex.DETERMINERS or after[0] == "N"
+    follows = _is_open(after) or after in lex.PLACES or after == "first" or after in lex.DETERMINERS or after[0] == "N"
     return word in lex.DETERMINERS and follows and not relative and not acts
 
 
@@ -162,18 +162,19 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
     verb = verb if verb in lex.KINDS else ""
     content = content[1:] if verb else content
     phrase = object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], "")
-    text, (start, end, phrase) = (
-        [*content[:-1], name or content[-1]],
-        _with_behind(tokens, words, end, phrase, content[0]),
-    )
-    text += words[start:end]
+    start, end, phrase = _with_behind(tokens, words, end, phrase, content[0])
+    text = [*content[:-1], name or content[-1], *words[start:end]]
     phrase = replace(phrase, text=" ".join(text))
     given = name if name and len(text) == 1 else match_given(phrase, tokens.names)
     if given is not None:
         phrase = replace(object_phrase(given.lower().split(), given), is_given=True)
-    _add_phrase(
-        tokens, phrase, content, words[at:first], " ".join([*words[at:first], *([verb] if verb else []), *text])
-    )
+    said, ahead = " ".join([*words[at:first], *([verb] if verb else []), *text]), words[end : end + 2]
+    acts = len(ahead) == 2 and lex.lemma(ahead[0]) in lex.CAUSES and (ahead[1] in lex.DETERMINERS or ahead[1][0] == "N")
+    is_agent = phrase.head in lex.AGENTS or (phrase.head in lex.SETS["beings"] and acts)  # "the child rolls the ball"
+    if is_agent and not phrase.is_given and phrase.colour is None:
+        tokens.add("AG", said)
+    else:
+        _add_phrase(tokens, phrase, content, words[at:first], said)
     return end, verb
 
 
@@ -203,14 +204,12 @@ def _with_behind(
 def _add_phrase(
     tokens: Tokens, phrase: lex.ObjectPhrase, content: list[str], determiners: list[str], said: str
 ) -> None:
-    """Adds a noun phrase as a thing, a kind, several things or one that acts."""
+    """Adds a noun phrase as a thing, a kind or several things."""
     counted = tokens.said[-2:-1] and tokens.said[-2] in _SOME and tokens.said[-1] == "of"
     quantifier = next((word for word in determiners if word in _SOME), tokens.said[-2] if counted else None)
     is_plural = not phrase.is_given and content[-1] != lex.singular(content[-1]) and content[-1] != "ones"
     plain_noun = not (phrase.colour or phrase.is_given or phrase.inside_box or phrase.path_end)
-    if phrase.head in lex.AGENTS and plain_noun:
-        tokens.add("AG", said)
-    elif "which" in determiners or "what" in determiners or tokens.plain[-2:] == ["how", "many"]:
+    if "which" in determiners or "what" in determiners or tokens.plain[-2:] == ["how", "many"]:
         if determiners:
             tokens.add("which", determiners[0])
         tokens.add(f"K{tokens.number(phrase)}", said)

@@ -138,7 +138,6 @@ class _Piece:
 _KINDS = {"asked": "asked", "moved": "motion", "changes": "change", "stated": "stated"}  # of pieces, by section
 _ORDER = ("asked", "motion", "change", "stated", "listed", "nothing")
 _TELLING = ("sense", "ahead", "depth", "way", "goal", "quantity")
-_NO_PIECE = _Piece("nothing", 0, 0)
 
 
 class _Parser:
@@ -300,6 +299,9 @@ class _Parser:
                 token = acts if acts and early else ""
             token = token if token != "it" else ""
             token = token or (next(reversed(found), "") if said != "it" else "")
+            listed = any(each.what == "nothing" and each.end < piece.start for each in self.pieces)
+            if said == "it" and not token and listed and len(before) > 1:
+                continue  # "There is a ball and a mug. If it rolls ...": which one?
             free = [each for each in before if put is None or self._thing(each) != put]
             token = token or next(iter([*(free if said else before), *before]), "")
             opens = self.plain[max(piece.start - 1, 0)] in lex.CONNECTORS or not piece.start
