@@ -121,6 +121,7 @@ class EmbeddedReader:
                 asked = None  # seen from the side, a table is a thing, and the floor is another
         left = unread if given.asked_wanted or given.changes_wanted else ()
         doubts += [f"The words '{each}' were not understood, so no outcome is sure." for each in left]
+        own = finder.known.get(mover.text)
         return base.GroundingReading(
             mover.text,
             bbox,
@@ -130,7 +131,10 @@ class EmbeddedReader:
             warnings=(*warnings, *doubts),
             interventions=(*removed, *put),
             asked=asked if given.asked_wanted else None,
-            is_doubtful=bbox in doubtful or (bool(left) and not given.asked_wanted),
+            prior=None if own is None else own.prior,
+            is_doubtful=bbox in doubtful
+            or (own is not None and own.is_doubtful)
+            or bool(left and not given.asked_wanted),
         )
 
     def read_motion(
