@@ -239,8 +239,8 @@ class AnswerReading:
 class WordReader(Protocol):
     """Reads only words, without an image, weights or calls; used for every request, whatever its reader."""
 
-    def read_question(self, question: str) -> QuestionReading:
-        """What a question says in words that it understands."""
+    def read_question(self, question: str, names: Sequence[str] = ()) -> QuestionReading:
+        """What a question says in words that it understands. `names` are those of the things that the caller gave."""
         ...
 
     def read_name(self, name: str) -> ObjectPrior:

@@ -236,3 +236,23 @@ def reply_text(prompt: str, reply: Reply) -> str:
     if reply.option is not None and (wants_text or reply.source == "question-list"):
         return reply.option
     return reply.answer
+
+
+# Sentences of a prompt that say how to reply and nothing else, and its heading.
+_ABOUT_REPLY = re.compile(
+    r"\byour (?:\w+ ){0,2}(?:response|answer|reply|output)s?\b|\bjson\b|answer\s*:\s*\$|\$\s?letter\b", re.IGNORECASE
+)
+_CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
+_INSTRUCTION = re.compile(
+    r"(?:please )?(?:think|reason|answer|choose|select|pick|options?|choices?|explain|respond|reply|provide|return"
+    r"|output|note that the (?:first|second|last|image|video|frame)\w*)\b", re.IGNORECASE,
+)  # fmt: skip
+_YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)
+_HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
+
+
+def without_reply_form(prompt: str) -> str:
+    """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
+    sentences = re.split(r"((?<=[.?!])\s+|\n+)", _YES_NO.sub("", _HEADING.sub("", prompt)))
+    kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
+    return "".join(part for part in re.split(r"((?<=[.?!;:])\s+)", kept) if not _INSTRUCTION.match(part.strip()))

@@ -96,7 +96,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     warnings += [
         f"`objects.{index}` ('{each.object}') lies where the moving object is, and was taken for it."
         for index, each in enumerate(given)
-        if each not in beside
+        if each not in beside and not same_name(each.object, reading.object)
     ]
     if drawn:
         places = ", ".join(f"{name} at ({x:.0f}, {y:.0f})" for name, (x, y) in drawn)

@@ -242,7 +242,10 @@ class Run(Generic[Request_co]):
     @cached_property
     def question(self) -> QuestionReading:
         """What the question says in words."""
-        return self.backends.words().read_question(self.request.question)
+        given = [each.object for each in self.request.objects]
+        place = self.request.place
+        given += [] if place is None or place.object is None else [place.object]
+        return self.backends.words().read_question(self.request.question, given)
 
     @contextmanager
     def with_images(self, seen: SeenImages | None, owner: str | None = None) -> abc.Generator[Self]:

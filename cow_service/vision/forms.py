@@ -181,3 +181,45 @@ def _has_handle(mask: Mask) -> bool:
     body = max(1.0, width - float(np.maximum(upper, lower).sum()))
     out = (lines - sides)[:, between].max(axis=1, initial=0.0) / body
     return bool(out.max() > _REACHES and out.min() < _BARE)
+
+
+CLEARLY_WORSE = 2.5  # log ratio: what is so much less likely than the best, twelve times, is not meant
+EXACT, NEAR = 6.0, 3.0  # log ratios of the name of a region's colour, and of others that people may use for it
+LEAST = -2.0  # log ratio of an outline: lowest evidence against it; the highest is `CLEARLY_WORSE`
+CUT = 0.5  # share of its log ratio that an outline keeps which the border cuts
+ROUND = 0.76  # roundness from which a region passes for a ball; a cube has about 0.7
+NOT_ROUND = 0.6  # roundness below which nothing passes for a ball, even half hidden
+CALLED, NOT_CALLED = 3.0, -2.0  # log ratios if a detector found the noun: for its finds, for the rest
+IMPOSSIBLE = -math.inf
+SOLID = frozenset(
+    ["glass", "chair", "book", "lamp", "robot", "pencil", "pen"]
+)  # no balls; of their outlines nothing is known
+
+
+def likeness(regions: Sequence[Region], noun: str | None, head: str | None, colour: str | None) -> list[float]:
+    """The log ratio of each region to be the thing with that noun, whose last word is `head`, and colour."""
+    ratios, is_found = list[float](), any(noun in region.called for region in regions)
+    for region in regions:
+        tint, shape = 0.0, shape_ratio(region, head, colour is not None)
+        if colour is not None and region.colour != colour:
+            tint = NEAR if colour in region.colours else IMPOSSIBLE
+        elif colour is not None:
+            tint = EXACT
+        if noun in region.called:  # outlines of real things are of many forms
+            ratios.append(max(shape, LEAST) + tint + CALLED)
+        else:
+            ratios.append(shape + tint + (NOT_CALLED if is_found else 0.0))
+    return ratios
+
+
+def shape_ratio(region: Region, head: str | None, has_colour: bool) -> float:
+    """The log ratio by outline alone; one that the border cuts says less. Without a colour a ball must be round."""
+    form = form_of(head)
+    # A region is round where the noun names something round, and not where it does not.
+    can_be = not region.is_disc or (form is None and head not in SOLID)
+    if form == "ball":
+        round_enough = region.roundness >= (NOT_ROUND if has_colour else ROUND)
+        can_be = round_enough or (region.is_hidden and has_colour)
+    if form is None or not can_be:
+        return 0.0 if can_be else IMPOSSIBLE
+    return (CUT if is_cut(region, form) else 1.0) * min(CLEARLY_WORSE, max(LEAST, log_ratio(region, form)))

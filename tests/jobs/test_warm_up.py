@@ -25,7 +25,7 @@ from cow_service.settings import Settings
 from cow_service.jobs.readiness import warm_up
 warm_up(Settings(data_dir=Path(sys.argv[1])))
 print(*(f"cow_service.{name}" in sys.modules for name in (
-    "readers.embedded.english.grammar", "generators.cutout.generator", "media.video")))
+    "readers.embedded.english.questions", "generators.cutout.generator", "media.video")))
 """
 
 

@@ -194,7 +194,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Checkout]:
 
 
 def test_every_block_has_a_language_that_is_known() -> None:
-    assert len(PAGES) == 23
+    assert len(PAGES) == 24
     found = {block.language for page in PAGES for block in blocks(page)}
     assert found <= LANGUAGES
     # What stands outside of a block would not be run.

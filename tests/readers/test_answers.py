@@ -16,7 +16,6 @@ from sdk import SIMULATION
 from cow_service.narration.words import phrases_of
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.answers import answer_from, choose_option
-from cow_service.readers.embedded.english.asked import read_alternatives
 from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.options import (
     Reply,
@@ -129,7 +128,7 @@ def test_what_no_world_can_tell_is_said_so() -> None:
         why(HIT, simulated(untold, ensemble=0)),
     ]
     assert len(set(causes)) == len(causes)
-    among = read_alternatives(parse("If the ball rolls left, will it hit the red cube or the blue mug first?"))
+    among = parse("If the ball rolls left, will it hit the red cube or the blue mug first?").alternatives
     other = answer_from((), FIRST, simulated(outcome(FIRST, first="green cone")), EN, among)
     assert (other.answer, other.not_sure) == (None, True)
     assert "green cone" in other.reasoning

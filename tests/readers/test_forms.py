@@ -109,24 +109,11 @@ def test_an_outline_that_both_could_have_decides_nothing() -> None:
         assert match_one(find_regions(jpeg(image)), phrase_of(text)) is None
 
 
-def test_names_are_told_apart_together_where_one_alone_is_not() -> None:
-    regions = find_regions(jpeg(block(block(floor(), (150, 150, 250, 250), GREEN), (400, 120, 480, 240), PURPLE)))
-    cube, cylinder = phrase_of("the cube"), phrase_of("the cylinder")
-    assert match_one(regions, cylinder) is None
-    assert match_one(regions, cube, [cylinder]) is regions[0]
-    assert match_one(regions, cylinder, [cube]) is regions[1]
-
-
-def test_no_region_has_two_names_that_differ_and_a_name_of_what_is_not_there_means_nothing() -> None:
-    regions = find_regions(jpeg(ball(block(floor(), (150, 150, 250, 250), GREEN), (440, 200), 50, PURPLE)))
-    assert match_one(regions, phrase_of("the mug"), [phrase_of("the green cube")]) is None
-    shared = match_one(regions, phrase_of("the ball"), [phrase_of("the purple ball")])
-    assert shared is not None
-    assert shared.centre[0] == pytest.approx(440, abs=3)
+def test_a_name_of_what_is_not_there_means_nothing() -> None:
     regions = find_regions(jpeg(block(block(floor(), (150, 150, 250, 250), GREEN), (400, 160, 490, 250), PURPLE)))
-    for noun in ("vase", "cone", "ball", "bottle"):
+    for noun in ("vase", "cone", "ball", "bottle", "kettle", "zorb"):
         assert match_one(regions[:1], phrase_of(f"the {noun}")) is None
-        assert match_one(regions, phrase_of(f"the {noun}"), [phrase_of("the green cube")]) is None
+        assert match_one(regions, phrase_of(f"the {noun}")) is None
 
 
 @pytest.mark.parametrize("noun", sorted(HALF_WIDTHS))

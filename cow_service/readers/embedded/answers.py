@@ -11,7 +11,6 @@ from itertools import pairwise
 from cow_service.narration.words import Phrases, same_name
 from cow_service.readers.base import AnswerReading
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.asked import Unread
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import may_name, parse_noun_phrase
 from cow_service.readers.options import not_sure_option, option_saying, plain, says_not_sure
@@ -22,7 +21,7 @@ _YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECA
 _NO = re.compile(
     r"no\s*(?:[,.;:!()\u2013\u2014-].*)?|no (?:it|the|this|that|because|they)\b.*|false", re.DOTALL | re.IGNORECASE
 )
-_TOUCHING = lex.SETS["touching"]
+_TOUCHING = lex.TOUCHING
 _COVERING = lex.words("hidden hide hides occluded occlude occludes occlusion covered obscured concealed obstructed")
 _MISSING = lex.words("miss misses missed missing avoid avoids avoided untouched")
 _SEEN = lex.words("visible unobstructed unoccluded uncovered")
@@ -63,7 +62,7 @@ def says_it_happens(text: str, asked: Asked) -> bool | None:
     about = [at for at, word in enumerate(words) if word in yes | no]
     if len(about) != 1:
         return None
-    known = yes | no | _NEGATIONS | lex.SETS["fillers"]
+    known = yes | no | _NEGATIONS | lex.FILLERS
     known = known | _ANY_WORDS if asked.target is None else (known | set(plain(asked.target).split())) - {"nothing"}
     before, after = words[: about[0]], words[about[0] + 1 :]
     acting = asked.relation != "covered" and _PASSIVE.isdisjoint(before)  # then the mover is spoken of, by any name
@@ -173,7 +172,6 @@ def _digits(text: str) -> str:
     return " ".join(said.split())
 
 
-ALL_READ = Unread()
 MAX_UNREAD = 200  # characters
 
 
@@ -183,14 +181,14 @@ def answer_from(
     simulation: Simulation | None,
     say: Phrases,
     alternatives: Sequence[ObjectPhrase] = (),
-    unread: Unread = ALL_READ,
+    unread: Sequence[str] = (),
 ) -> AnswerReading:
     """The answer, and why it is not sure, in the language of `say`. `asked` and `alternatives` are read in the
     question, `unread` was not.
     """
     outcome = None if simulation is None else simulation.trajectory.outcome
     if asked is None:
-        words = "\n".join(unread.turning or unread.beside)[:MAX_UNREAD].splitlines()
+        words = "\n".join(unread)[:MAX_UNREAD].splitlines()
         named = say.templates["names-comma"].join(say("quoted", words=each) for each in words)
         return _unsure(options, say, say("unsure-not-read", words=named or say("the-question")))
     if simulation is None or outcome is None:

@@ -2,75 +2,85 @@
 
 import math
 from collections.abc import Sequence
-from typing import TypedDict, TypeVar
 
 from cow_service.errors import CannotGround, CannotReadDirection
-from cow_service.physics.camera import depth_motion
+from cow_service.perception.facing import facing
+from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
-from cow_service.readers.embedded.english.lexicon import QuantityWords
-from cow_service.readers.embedded.english.motion import MotionWords, OtherWords, StepWords
-from cow_service.readers.embedded.english.noun_phrases import shape_of
-from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.embedded.matching import best_matches, describe, match_one
+from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
+from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
+from cow_service.readers.embedded.english.questions import MotionWords, Question
+from cow_service.readers.embedded.matching import best_matches, describe, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, Until, Vector
-from cow_service.vision.scene import Scene
+from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, MotionKind, Until, Vector
+from cow_service.vision.masks import is_same_object
+from cow_service.vision.scene import Scene, arrow_of
 from cow_service.vision.trails import trail_of
 
 NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
-
-_T = TypeVar("_T")
-
-
-class Said(TypedDict):
-    """What the words say of how fast, how far and how long; fields of `MotionReading`."""
-
-    speed: SpeedWord | Quantity | None
-    distance: Quantity | None
-    duration: float | None
-    until: Until | None
+AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
+_ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
+_RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
 
 
-def quantities(words: Sequence[QuantityWords], way: float | None, bbox: BBox | None = None) -> Said:
-    """The quantities of one leg; `way`, px, is the distance to the goal; `bbox` is the moving object's.
+def _refused(fault: str) -> CannotReadDirection:
+    return CannotReadDirection(fault, remedy=GIVE_DIRECTION)
+
+
+def quantities(
+    words: Sequence[QuantityWords], way: float | None, bbox: BBox
+) -> tuple[SpeedWord | Quantity | None, Quantity | None, float | None, Until | None]:
+    """Speed, distance, duration (s) and end of one leg; `way`, px, is the distance to the goal; `bbox` is the mover's.
 
     Raises `CannotReadDirection`.
     """
-    distances = [each.distance for each in words if each.distance is not None]
-    shares = [each.share for each in words if each.share is not None]
-    if shares and way is None:
-        raise CannotReadDirection(
-            "The question says that it moves part of the way, but not where to.",
-            remedy=f"{GIVE_DIRECTION} Or give `motion.distance`.",
-        )
-    distances += [Quantity(share * (way or 0.0), "px") for share in shares]
-    if bbox is not None:
-        x0, _, x1, _ = bbox
-        distances += [Quantity(each.own_widths * (x1 - x0), "px") for each in words if each.own_widths is not None]
-    speeds: list[SpeedWord | Quantity] = [each.speed for each in words if each.speed is not None]
-    ends: list[Until] = [each.until for each in words if each.until is not None]
-    return Said(
-        speed=_one("speed", speeds),
-        distance=_one("distance", distances),
-        duration=_one("duration", [each.duration for each in words if each.duration is not None]),
-        until=_one("end", ends),
-    )
+    found: dict[str, QuantityWords] = {}
+    for each in words:
+        what = "distance" if each.what in {"share", "own_widths"} else each.what
+        if found.setdefault(what, each) != each:
+            raise _refused(f"The question names more than one {what} of the motion.")
+    speed, length, duration = (found.get(what) for what in ("speed", "distance", "duration"))
+    distance = None if length is None else Quantity(length.value, "m" if length.is_metric else "px")
+    if length is not None and length.what == "share" and way is None:
+        raise _refused("The question says that it moves part of the way, but not where to.")
+    if length is not None and length.what != "distance":
+        distance = Quantity(length.value * ((way or 0.0) if length.what == "share" else bbox[2] - bbox[0]), "px")
+    pace = None if speed is None else speed.pace or Quantity(speed.value, "m/s" if speed.is_metric else "px/s")
+    return pace, distance, None if duration is None else duration.value, "contact" if "until" in found else None
 
 
-def _one(name: str, values: list[_T]) -> _T | None:
-    if len(set(values)) > 1:
-        raise CannotReadDirection(f"The question names more than one {name} of the motion.", remedy=GIVE_DIRECTION)
-    return values[0] if values else None
-
-
-def step_readings(steps: Sequence[StepWords], bbox: BBox) -> tuple[StepReading, ...]:
+def step_readings(steps: Sequence[MotionWords], bbox: BBox) -> tuple[StepReading, ...]:
     """The legs behind the first of what has this box."""
-    readings: list[StepReading] = []
-    for step in steps:
-        direction, depth = _way(step.direction, step.depth)
-        said = quantities(step.quantities, None, bbox)
-        readings.append(StepReading(direction, depth, said["distance"], said["duration"]))
+    said = [(_way(step.direction, step.depth), quantities(step.quantities, None, bbox)) for step in steps]
+    return tuple(StepReading(*way, each[1], each[2]) for way, each in said)
+
+
+def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
+    if direction is None and not depth:
+        raise _refused("Which way a part of the motion goes was not understood.")
+    return depth_motion(depth) if direction is None else (direction, depth)
+
+
+def other_readings(
+    others: Sequence[tuple[ObjectPhrase, MotionWords]], scene: Scene, grounding: Grounding
+) -> tuple[OtherMotionReading, ...]:
+    """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
+    readings: list[OtherMotionReading] = []
+    things = (*grounding.others, LocatedObject(object=grounding.object, bbox=grounding.bbox))
+    for phrase, motion in others:
+        found = next((each for each in grounding.others if each.object == phrase.text), None)
+        goal = next((each for each in things if motion.towards and each.object == motion.towards.text), None)
+        if found is None or motion.steps or any(each.what != "speed" for each in motion.quantities):
+            raise _refused(f"'{phrase.text}' moves, too, and was not found, or how far it moves is said.")
+        refuse_unclear_fall(scene, motion, found)
+        kind, direction = motion.kind or "linear", motion.direction
+        if direction is None and goal is not None:  # from centre to centre
+            (x0, y0, x1, y1), start = goal.bbox, found.bbox
+            direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
+        way = _way(direction, motion.depth) if kind in DIRECTED_KINDS else (None, 0.0)
+        speed = quantities(motion.quantities, None, found.bbox)[0]
+        readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
     return tuple(readings)
 
 
@@ -80,44 +90,9 @@ def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | Loc
     is_ball = shape_of(name) == "sphere" or (region is not None and region.is_disc)  # its shadow tells how high it is
     in_air = words.in_air or is_ball or scene.side_view is not None or (prior is not None and prior.stands_on == "air")
     if words.topples and not is_ball:
-        fault = f"The {name} would fall over where it stands, which is not simulated. Ask what happens if it is pushed."
-    elif words.kind == "fall" and not in_air:
-        fault = f"The reader cannot see whether the {name} stands or hangs. If it hangs, ask what happens if it drops."
-    else:
-        return
-    raise CannotReadDirection(fault, remedy=GIVE_DIRECTION)
-
-
-def other_readings(scene: Scene, others: Sequence[OtherWords], grounding: Grounding) -> tuple[OtherMotionReading, ...]:
-    """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
-    readings: list[OtherMotionReading] = []
-    for other in others:
-        name, motion, kind = other.object.text, other.motion, other.motion.kind or "linear"
-        found = next((each for each in grounding.others if each.object == name), None)
-        if found is None:
-            raise CannotReadDirection(f"'{name}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
-        refuse_unclear_fall(scene, motion, found)
-        way, goal = (None, 0.0), None
-        if kind in DIRECTED_KINDS:
-            direction = motion.direction
-            if direction is None and motion.towards is not None:
-                things = (*grounding.others, LocatedObject(object=grounding.object, bbox=grounding.bbox))
-                goal = next((each for each in things if each.object == motion.towards.text), None)
-                if goal is not None:  # from centre to centre
-                    (x0, y0, x1, y1), start = goal.bbox, found.bbox
-                    direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
-            way = _way(direction, motion.depth)
-        speed = quantities(motion.quantities, None)["speed"]
-        readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
-    return tuple(readings)
-
-
-def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
-    if direction is None and depth:
-        return depth_motion(depth)
-    if direction is None:
-        raise CannotReadDirection("Which way a part of the motion goes was not understood.", remedy=GIVE_DIRECTION)
-    return direction, depth
+        raise _refused(f"The {name} would fall over where it stands, which is not simulated. Ask what a push does.")
+    if words.kind == "fall" and not in_air:
+        raise _refused(f"Whether the {name} stands or hangs cannot be seen. If it hangs, say that it is dropped.")
 
 
 def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:
@@ -126,26 +101,27 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     If neither the image nor the words show the end, it is the one whose path leads on to the object in question.
     Raises `CannotGround` if the thing that the words tell the end by was not found.
     """
-    words, phrase = question.motion.trail, question.mover
-    if phrase is None or not scene.trails:
+    end, phrase = question.motion.trail_end, question.mover
+    if phrase is None or phrase.is_given or not scene.trails:
         return scene, ()
-    fitting = best_matches(scene.regions, phrase, question.others)
-    trails = [trail for trail in (trail_of(scene.trails, region.bbox) for region in fitting) if trail is not None]
+    found = (trail_of(scene.trails, region.bbox) for region in best_matches(scene.regions, phrase))
+    trails = [trail for trail in found if trail is not None]
     if len(trails) != 1:
         return scene, ()
     trail, warnings = trails[0], ()
     beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
-    if words is not None:
-        near = None if words.near is None else match_one(beside, words.near)
-        ends = (trail.positions[0], trail.positions[-1]) if near else ()
-        gaps = sorted(math.dist(end.centre, near.centre) for end in ends if near)
-        if words.near is not None and (not gaps or gaps[0] > NEARER * gaps[1]):
+    if isinstance(end, ObjectPhrase):
+        near = match_one(beside, end)
+        gaps = sorted(math.dist(trail.positions[at].centre, near.centre) for at in (0, -1)) if near else []
+        if near is None or gaps[0] > NEARER * gaps[1]:
             raise CannotGround(
-                f"The question tells the end of the trail by '{words.near.text}', which was not found, not for "
+                f"The question tells the end of the trail by '{end.text}', which was not found, not for "
                 f"certain, or about as far from either end. Seen: {describe(scene.regions)}.",
                 remedy=GIVE_PLACE,
             )
-        trail = trail.ending(None if near is None else near.bbox, words.side)
+        trail = trail.ending(near.bbox)
+    elif question.motion.trail:
+        trail = trail.ending(None, end or question.motion.direction)
     if not trail.end_known:
         # What may lie ahead: the first thing that is asked about, else the middle of the image.
         asked = ((each.text, match_one(beside, each)) for each in question.others)
@@ -167,14 +143,93 @@ def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> Motio
     Raises `CannotReadDirection` if the words speak of one all the same.
     """
     trail = trail_of(scene.trails, grounding.bbox)
-    if trail is not None:
-        thrown = is_thrown(trail.positions) or words.kind in FALLING_KINDS
-        earlier = tuple(position.centre for position in trail.older)
-        return MotionReading("projectile" if thrown else "linear", trail.heading, "trail", trail=earlier)
-    if words.trail is None:
+    if trail is None and words.trail:
+        raise _refused(
+            f"The question speaks of a trail, and no three positions of the {grounding.object} one after another were "
+            f"found in the image."
+        )
+    if trail is None:
         return None
-    raise CannotReadDirection(
-        f"The question speaks of a trail, and no three positions of the {grounding.object} one after another were "
-        f"found in the image.",
-        remedy=GIVE_DIRECTION,
+    thrown = is_thrown(trail.positions) or words.kind in FALLING_KINDS
+    earlier = tuple(position.centre for position in trail.older)
+    return MotionReading("projectile" if thrown else "linear", trail.heading, "trail", trail=earlier)
+
+
+def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionReading:
+    """Kind and direction by the words, else by the only arrow or trail. Raises `CannotReadDirection`."""
+    words, name = question.motion, grounding.object
+    kind = words.kind or "linear"
+    if question.unread_motion:
+        unread = "', '".join(question.unread_motion)
+        raise _refused(f"How the {name} moves was not understood: '{unread}'.")
+    if words.is_contradictory or (kind == "static" and question.names_direction):
+        raise _refused(
+            f"What the question says of the motion of the {name} contradicts itself: which is meant was not understood."
+        )
+    refuse_unclear_fall(scene, words, grounding)
+    if kind not in DIRECTED_KINDS:
+        return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
+    if scene.side_view is not None and words.direction == (0.0, 1.0) and kind == "linear":
+        return MotionReading("fall", None, "gravity")  # down a slope, or over an edge, by its weight
+    if scene.side_view is not None and words.depth:
+        raise _refused("The image is a drawing seen from the side: nothing in it moves towards the viewer, or away.")
+    said = _as_said(scene, words, kind, grounding)
+    if said is not None:
+        return said
+    if words.forward is None:
+        return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
+    # Forward or backward, by the way that a vehicle is seen to face.
+    told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
+    if not is_vehicle(name):
+        raise _refused(f"{told} The embedded reader sees only of vehicles with wheels which way they face.")
+    way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
+    if way is None:
+        raise _refused(f"{told} Which way it faces could not be seen for certain.")
+    return MotionReading(kind, way if words.forward else (-way[0], -way[1]), "orientation")
+
+
+def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grounding) -> MotionReading | None:
+    """The motion whose direction the words give; None if they give none."""
+    if words.along_arrow is not None:
+        x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
+        x, y = (x, y) if words.along_arrow else (-x, -y)
+        said = words.direction or (x, y)
+        if x * said[0] + y * said[1] < AGREES * math.hypot(x, y) * math.hypot(*said):
+            raise _refused("The question names the arrow and another direction, and the arrow does not point there.")
+        return MotionReading(kind, (x, y), "arrow", along_arrow=words.along_arrow)
+    on_floor = words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth
+    if words.direction is not None and not on_floor:
+        rises = words.verb in _RISES and words.direction[1] < 0
+        return MotionReading(kind, words.direction, "text", depth=words.depth, rises=rises)
+    if words.depth or words.direction is not None:  # up the image is away on the floor
+        up = 0.0 if words.direction is None else -math.copysign(1.0, words.direction[1])
+        direction, depth = depth_motion(words.depth or up)
+        return MotionReading(kind, direction, "text", depth=depth)
+    if words.towards is not None:
+        goal = goal_of(scene, words.towards, grounding)
+        return MotionReading(kind, way_to(goal.bbox, grounding.bbox, kind == "linear"), "text", towards=goal)
+    return None
+
+
+def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
+    """Along the only arrow drawn at the mover, where the question names no direction at all."""
+    near = scene.arrows_near(grounding.bbox)
+    if len(near) == 1 and not question.names_direction:
+        note = "The question names no direction; the arrow drawn at the object was followed."
+        return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
+    if near and question.names_direction:
+        raise _refused("The question's words of direction were not read as the motion's, and no arrow was followed.")
+    raise _refused(
+        "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
+        f"image shows {len(near) or 'no'} arrow{'s' if len(near) > 1 else ''} at the {grounding.object}."
     )
+
+
+def goal_of(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> LocatedObject:
+    """The thing that the mover moves towards. Raises `CannotReadDirection`."""
+    goal = next((other for other in grounding.others if other.object == phrase.text), None)
+    besides = [each for each in scene.regions if not is_same_object(each.bbox, grounding.bbox)]
+    region = match_one(besides, phrase) if goal is None else None
+    if goal is None and region is None:
+        raise _refused(f"Where the {grounding.object} moves to is not clear: {unclear(phrase, besides)}.")
+    return goal or LocatedObject(object=phrase.text, bbox=region.bbox if region is not None else grounding.bbox)

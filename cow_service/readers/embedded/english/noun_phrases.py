@@ -1,345 +1,295 @@
-"""Cuts a sentence into noun phrases, quantities and the words between them; and what a noun says of a shape.
+"""Puts a question into plain tokens: things as `X0`, idioms as one word in capitals, verbs in their base form.
 
-Nouns have no list. A phrase runs from its determiner up to a word that cannot be inside one: a function word, a verb
-form, a direction behind the noun. Positions are those of the question's own characters.
+"If the red ball rolls in the direction of the arrow, will it bump into the mug?" becomes
+"if X0 roll ALONG , will it bump into X1 ?". The sentence forms are written over these tokens.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import takewhile
-from typing import Literal
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, cast
 
-from cow_service.readers.base import Likeness, Quantity, SpeedWord, Unit
+from cow_service.readers.base import Likeness, SpeedWord
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import Node, read_from, terminals
-from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, QuantityWords, key_at
 from cow_service.readers.options import plain
 from cow_service.records import Shape
 
-_QUANTITY_WINDOW, _PLACE_WINDOW = 14, 9  # words
-_MEASURES = frozenset({"_SLOWLY", "_QUICKLY", "_SECOND", "_TEMPO", "LENGTH"})  # terminals
-_BARE = lex.words("width widths diameter diameters halfway midway until till push shove")  # measures, too
-_ADJECTIVE_BEHIND = lex.DETERMINERS | lex.COLOURS.keys() | lex.SETS["adjectives"] | lex.words("how as so is are be")
-_PARTS = {"half": 0.5, "halfway": 0.5, "twice": 2.0}
-
-
-def _joined(found: Sequence[Item], join: Callable[[int], tuple[Item, int] | None]) -> list[Item]:
-    """The items, some runs as one: `join` gives the one for a run that begins at a place, and the place behind it."""
-    kept: list[Item] = []
-    at = 0
-    while at < len(found):
-        item, at = join(at) or (found[at], at + 1)
-        kept.append(item)
-    return kept
-
-
-def _with_quantities(found: Sequence[Item]) -> list[Item]:
-    """The words of a question, each quantity in them joined to one item."""
-    measures = [item.key[0].isdigit() or item.key in _BARE or bool(_MEASURES & terminals(item.key)) for item in found]
-
-    def join(at: int) -> tuple[Item, int] | None:
-        key, before = found[at].key, key_at(found, at - 1)
-        adjective = key in {"slow", "fast", "hard", "halfway"} and before in _ADJECTIVE_BEHIND
-        place = key in _PARTS and key_at(found, at + 1) == "between"
-        if adjective or place or before == "number" or not any(measures[at : at + 8]):
-            return None
-        parsed = read_from("quantity", found, at, _QUANTITY_WINDOW)
-        if parsed is None:
-            return None
-        tree, end = parsed
-        words = tuple(item.key for item in found[at:end])
-        return Item("~", found[at].start, found[end - 1].end, None, words, _read_quantity(tree)), end
-
-    return _joined(found, join)
-
-
-def _read_quantity(tree: Node) -> QuantityWords:
-    names = tree.names
-    part = next((_PARTS[name] for name in names if name in _PARTS), None)
-    numeral = next((word.text for word in tree.words if word.text in lex.NUMERALS or word.text[0].isdigit()), None)
-    number = part or (1.0 if numeral is None else float(lex.NUMERALS.get(numeral, numeral)))  # 1 for "a second"
-    length = next((node.words[0].text for node in tree.find("length")), None)
-    units: tuple[float, Unit, Unit] = (1.0, "px", "px/s")
-    size, unit, per_second = (lex.METRES[length], "m", "m/s") if length in lex.METRES else units
-    match names[1]:
-        case "speed":
-            pace: SpeedWord = "fast" if {"slow", "slowly"}.isdisjoint(names) else "slow"
-            said = QuantityWords(speed=pace if length is None else Quantity(number * size, per_second))
-        case "distance" if "own_width" in names:
-            said = QuantityWords(own_widths=number)
-        case "distance":
-            said = QuantityWords(distance=Quantity(number * size, unit))
-        case "until":
-            said = QuantityWords(until="contact")
-        case "limit":
-            said = QuantityWords(within=number)
-        case "duration":
-            said = QuantityWords(duration=number)
-        case _:
-            said = QuantityWords(share=number)
-    return said
-
-
-MAX_WORDS = 12  # of one phrase; what is longer is no phrase
-# Behind a noun they are no part of it: "the ball and the mug both move".
-_BEHIND = lex.words(
-    "safe both twice earlier later last hard all each together neither either nearest closest able farthest"
-)
-_NUMBERED = lex.words("with labeled labelled marked numbered bearing carrying saying called")
-_FINITE_BE = lex.words("be is are was were 's")
-
-
-def items(text: str) -> list[Item]:
-    """Noun phrases and the words between them, in order."""
-    found = list(_chunked(text, _with_quantities(lex.tokens(text))))
-
-    def join(at: int) -> tuple[Item, int] | None:
-        """Joins an object with the mark that singles it out: "the object inside the red box", "the ball labeled 3"."""
-        end = at + 1
-        while found[at].phrase and end < len(found) and end - at < 6 and found[end].key in lex.SETS["links"]:
-            end += 1
-        if not found[at].phrase or not at + 1 < end < len(found) or not found[end].phrase:
-            return None
-        marked = _with_mark(text, found[at], [link.key for link in found[at + 1 : end]], found[end])
-        return None if marked is None else (marked, end + 1)
-
-    return _joined(found, join)
-
-
-def _chunked(text: str, found: Sequence[Item]) -> Iterator[Item]:
-    """The items, noun phrases joined.
-
-    `asked`: an auxiliary still waits for its verb, and only then can a verb behind a noun be in its base form.
-    """
-    at, verb, asked = 0, -1, False
-    while at < len(found):
-        first = at
-        while first - at < 3 and _is_determiner(found, first):
-            first += 1
-        has_noun, end = False, first
-        while end - first < MAX_WORDS and _belongs(found, end, at, first, has_noun, asked):
-            key = key_at(found, end)
-            has_noun = has_noun or not (lex.is_modifier(key) or key in lex.SETS["noun_modifiers"])
-            end += 1
-        if end == first or at == verb:
-            yield found[at]
-            key = found[at].key
-            # "Is the mug hit?": a form of "be" that opens a clause waits for a participle.
-            opens = key in {"is", "are", "was", "were"} and (at == 0 or found[at - 1].key in lex.PUNCTUATION)
-            waits = key in lex.AUXILIARIES or key in lex.CAUSATIVES or opens
-            asked = at != verb and (waits or (asked and key not in lex.ENDS and not lex.is_form(key, "base")))
-            at += 1
-            continue
-        if _ends_in_unknown_verb(found, at, first, end, asked):
-            end = verb = end - 1
-        keys = tuple(item.key for item in found[at:end])
-        start, stop = found[first].start, found[end - 1].end
-        yield Item("", start, stop, lex.object_phrase(text[start:stop], keys[first - at :]), keys)
-        at = end
-
-
-def _is_determiner(found: Sequence[Item], at: int) -> bool:
-    """A relative "that" or a bare "which" is no determiner: what follows it is no part of a noun phrase."""
-    key, after = key_at(found, at), key_at(found, at + 1)
-    closed = after in lex.CLOSED or after in lex.PUNCTUATION
-    if key == "a":  # or the letter: "ball A moves"
-        return not closed and not lex.is_form(after, "s")
-    ambiguous = key in {"that", "this", "which", "what", "any", "some"}
-    return key in lex.DETERMINERS and not (ambiguous and (closed or after in lex.VERBS))
-
-
-def _belongs(found: Sequence[Item], at: int, start: int, first: int, has_noun: bool, asked: bool) -> bool:
-    """Whether a word belongs to the phrase that begins at `start`, with determiners up to `first`."""
-    key, before, after = (key_at(found, place) for place in (at, at - 1, at + 1))
-    determined, inside = first > start, at > first
-    if key == "and":
-        return inside and not has_noun and before in lex.COLOURS and after in lex.COLOURS
-    adverb = key == "first" or (len(key) > 4 and key.endswith("ly") and key not in lex.SETS["not_adverbs"])
-    if key in lex.PLACES or key in {"one", "far", "can"}:
-        return determined and not has_noun
-    if has_noun:
-        # "the mug 10 cm to the left": the measure is no part of the mug.
-        measure = key[0].isdigit() and (not key.isdecimal() or after in lex.SETS["measures"])
-        ends = measure or adverb or key in _BEHIND  # "will it hit the mug first?"
-    else:
-        ends = (at == start and key in {"both", "each"} and after in lex.VERBS) or (adverb and not determined)
-    if ends or key in lex.PUNCTUATION or key in lex.CLOSED:
-        return False
-    return adverb or key not in lex.VERBS or _verb_belongs(found, at, has_noun, asked, determined or inside)
-
-
-def _verb_belongs(found: Sequence[Item], at: int, has_noun: bool, asked: bool, begun: bool) -> bool:
-    """Whether a verb's form is read as a noun or an adjective: "the travel mug", "the red block"."""
-    verb, before, after = lex.VERBS[key_at(found, at)], key_at(found, at - 1), key_at(found, at + 1)
-    closed = after in lex.PLACES or after in lex.CLOSED or after in lex.PUNCTUATION
-    if begun and (closed or asked) and before in lex.PLACES:
-        return False  # "the balls to the left move up"
-    if not has_noun:
-        if before in {"one", "two", "both"} and ((verb.form == "base" and asked) or (verb.form == "ing" and closed)):
-            return False  # "will the two collide?", "any chance of those two running into each other?"
-        if verb.form == "s" and before == "one":
-            return False  # "the orange one slides"
-        # "orange" is the one colour that is also a thing that moves: "the orange falls".
-        return begun and not (verb.form == "s" and verb.kind is not None and before == "orange")
-    if verb.form == "base":
-        goes_on = verb.kind == "static" or verb.lemma in lex.SETS["weak"]  # "will the mug remain standing?"
-        goes_on = goes_on and (after in {"put", "clear"} or lex.is_form(after, "ing"))
-        return not asked or (not goes_on and (after in lex.VERBS or after in _FINITE_BE))
-    return verb.form == "s" and after in {"are", "were"}
-
-
-def _ends_in_unknown_verb(found: Sequence[Item], start: int, first: int, end: int, asked: bool) -> bool:
-    """Verbs are a closed list here: one that is not in it is seen by its place, behind a noun that already stands."""
-    last = key_at(found, end - 1)
-    if end - first < 2 or lex.is_modifier(last) or lex.is_modifier(key_at(found, end - 2)):
-        return False
-    if asked:
-        return _is_determiner(found, end)
-    if key_at(found, start - 1) not in lex.CONDITIONALS or not last.endswith("s") or last.endswith("ss"):
-        return False
-    ahead = (item.key for item in found[end : end + 8])
-    clause = takewhile(lambda key: key not in lex.PUNCTUATION and key not in lex.AUXILIARIES, ahead)
-    return not any(word in lex.VERBS or word in lex.BE for word in clause)
-
-
-def _with_mark(text: str, item: Item, links: Sequence[str], mark: Item) -> Item | None:
-    noun, marking = item.phrase, mark.phrase
-    if noun is None or marking is None or noun.noun is None or noun.head in lex.ABSTRACT:
-        return None
-    words = [word for word in mark.words if word not in lex.DETERMINERS]
-    closing = text[mark.end : mark.end + 1].strip(" ,;:.!?")  # of a label in quotation marks
-    quoted = closing in {"'", '"', "’", "”"}
-    longer = replace(noun, text=" ".join(text[item.start : mark.end + quoted].split()))
-    last, coloured = words[-1] if words else "", [word in lex.COLOURS for word in words]
-    # "in the frame" is in the image; a frame with a colour is drawn.
-    box = last in lex.SETS["mark_nouns"] and (last != "frame" or any(coloured))
-    box = box and all(lex.is_modifier(word) or word == "bounding" for word in words[:-1])
-    box = box and {"on", "of", "at"}.isdisjoint(links)
-    if _NUMBERED.intersection(links) and (all(map(lex.is_count, words)) or len(last) == 1):
-        longer = replace(longer, number=marking.number)
-    elif box or (all(coloured) and lex.SETS["marked"].intersection(links)):
-        longer = replace(longer, inside_box=True)
-    elif links not in (["on"], ["at"], ["in"]) or any(word not in lex.PLACES and word != "far" for word in words):
-        return None
-    return replace(item, end=mark.end, phrase=longer)
-
-
-def parse_noun_phrase(text: str) -> ObjectPhrase | None:
-    """The first noun phrase of a text such as "the red toy car"; None if there is none."""
-    found = items("the " + text.removeprefix("the "))
-    phrase = next((item.phrase for item in found if item.phrase is not None), None)
-    if phrase is not None and phrase.colour is None and phrase.noun in lex.COLOURS:
-        return replace(phrase, colour=lex.COLOURS[phrase.noun])  # "the dark blue"
-    return phrase
-
-
-TABLES = lex.words("table desk tabletop")
-_PLACE = lex.words(
-    "on onto upon off across over along around above atop at from to in through within under beneath below underneath"
-    " inside of leave leaves leaving"
-)
-
-
-def with_tables(found: Sequence[Item]) -> list[Item]:
-    """The items; "the table" is a thing where no preposition makes it a place, and a wall where it has a colour."""
-    kept = list(found)
-    for at, item in enumerate(found):
-        before, in_front = key_at(found, at - 1), key_at(found, at - 1) == "of" and key_at(found, at - 2) == "front"
-        if item.phrase is None:
-            continue
-        is_table = item.phrase.head in TABLES and (before not in _PLACE or in_front)
-        if is_table or (item.phrase.head == "wall" and item.phrase.colour is not None):
-            kept[at] = replace(item, phrase=replace(item.phrase, as_thing=True))
-    return kept
-
-
-def table_at_end(found: Sequence[Item]) -> tuple[ObjectPhrase | None, str]:
-    """The table of "will it land on the table", where a question ends so, and the word before it."""
-    at = max((place for place, item in enumerate(found) if item.phrase is not None), default=-1)
-    phrase = found[at].phrase if found else None
-    return phrase if phrase is not None and phrase.head in TABLES else None, key_at(found, at - 1)
-
-
-def with_nouns(found: Sequence[Item]) -> list[Item]:
-    """The items, with references replaced by what they mean.
-
-    "The red one" is of the kind that is asked for ("which cone", "which of the cones"), or of that of all things
-    before it.
-    """
-    which = {("which",), ("what",)}
-    asked = {
-        _kind_of(item.phrase)
-        for at, item in enumerate(found)
-        if item.words[:1] in which or (key_at(found, at - 1) == "of" and (key_at(found, at - 2),) in which)
-    } - {""}
-    before: set[str] = set()
-    said: list[Item] = []
-    things: list[ObjectPhrase] = []
-    for item in found:
-        nouns, phrase, words = asked or before, item.phrase, item.words
-        noun = next(iter(nouns)) if len(nouns) == 1 else ""
-        bare = phrase is not None and phrase.text.lower() == phrase.noun
-        last = next((each for each in reversed(things) if phrase is not None and each.noun == phrase.noun), None)
-        if words[:1] == ("that",) and bare and last is not None:  # "That mug": the mug that was named last.
-            said.append(replace(item, phrase=last, words=("that", *last.text.split())))
-            continue
-        if item.thing is not None:
-            things.append(item.thing)
-        # "The red one", "the left one".
-        one = words[-1:] == ("one",)
-        if phrase is not None and phrase.noun is None and noun and (phrase.colour or (one and len(phrase.words) > 1)):
-            text = [noun if word == "one" else word for word in phrase.text.split()]
-            text += [] if "one" in phrase.text.split() else [noun]
-            said.append(replace(item, phrase=replace(phrase, text=" ".join(text), noun=noun)))
-        else:
-            said.append(item)
-            before |= {_kind_of(phrase)} - {""}
-    return said
-
-
-def _kind_of(phrase: ObjectPhrase | None) -> str:
-    """The noun of a phrase that names a thing by one; empty otherwise."""
-    named = phrase is not None and phrase.is_thing and phrase.head not in lex.GENERIC | lex.AGENTS
-    return phrase.noun or "" if phrase is not None and named else ""
-
-
-_PUTS = lex.words("put place insert set position lower stand stick pop plonk plop")
-
-
-def with_places(found: Sequence[Item]) -> list[Item]:
-    """The items, each object joined with the words after it about its place."""
-    texts = [item.phrase.text.lower() for item in found if item.phrase is not None]
-
-    def join(at: int) -> tuple[Item, int] | None:
-        item, verb, after = found[at], lex.VERBS.get(key_at(found, at - 1)), key_at(found, at + 1)
-        thing = item.thing
-        if thing is None or at + 1 == len(found):
-            return None
-        # "Push the ball behind the mug", "put the ball on the mug": a destination, not where it is.
-        moved = lex.moves(verb) or (verb is not None and verb.lemma in _PUTS)
-        if moved and after not in {"that", "which", ","}:
-            return None
-        if (parsed := read_from("place", found, at + 1, _PLACE_WINDOW)) is None:
-            return None
-        tree, end = parsed
-        other = next((found[word.at] for word in tree.words), None)
-        if other is not None and other.thing is None:
-            return None
-        end += after == "," and key_at(found, end) == ","
-        words = " ".join(" ".join(each.words) or each.key for each in found[at + 1 : end])
-        text = f"{thing.text} {words}" if texts.count(thing.text.lower()) > 1 else thing.text
-        relation = next(name for name in tree.names if name.endswith("_it")).removesuffix("_it")
-        place = lex.PlaceWords(relation, None if other is None else other.thing)
-        return replace(item, end=found[end - 1].end, phrase=replace(thing, text=text, place=place)), end
-
-    return _joined(found, join)
-
-
-_NOUNS = {shape: lex.words(text) for shape, text in lex.TABLES["shapes"].items()}
-_SHAPES: dict[Shape, frozenset[str]] = {
-    "sphere": _NOUNS["sphere"], "box": _NOUNS["box"] | _NOUNS["vehicle"], "cone": _NOUNS["cone"],
-    "cylinder": _NOUNS["cylinder"],
+_CONTRACTED = {
+    r"\bcan ?not\b|\bcan't\b": "can not", r"\bwon't\b": "will not", r"n't\b": " not",
+    r"\b(what|where|it|there|that|who|which)'s\b": r"\1 is", r"\b(it|i|you)'d\b": r"\1 would",
+    r" [–—-] |[:—–]": " , ",
 }  # fmt: skip
+_TOKEN = re.compile(r"N\d+N|[A-Z]+\d*|\d+(?:\.\d+)?|[a-z]+(?:['-][a-z]+)*|\w+|[.,;?!()-]")
+_BEHIND_NOUN = lex.words(
+    "safe both last earlier hard each together neither either nearest closest farthest first one other"
+)
+_COLOURED = rf"(?:(?:{'|'.join(lex.COLOURS)}|{'|'.join(lex.LISTS['adjectives'])}|bounding|drawn|cream) )*"
+# What belongs to the noun in front of it, and what it says.
+_BEHIND = {
+    "path": r"(?:at|on|of) the (?:(?P<end>start|beginning|first|end|last)(?: position| point)? of the )?(?:\w+ )?"
+    r"(?:path|trail|line|track|trajectory)",
+    "box": rf"(?:in|inside|within|marked (?:by|with)) (?:the|a) {_COLOURED}(?:box|rectangle|bbox|circle|outline)",
+    "with": rf"with (?:an? |no |two |three )?{_COLOURED}[a-z-]+",
+    "place": rf"(?:on|at|in) the (?:far )?(?:{'|'.join(lex.PLACES)})(?: side)?(?! [a-z]+ (?:{'|'.join(lex.PLACES)}))",
+}
+_SOME = {"both": "ALLOF", "all": "ALLOF", "each": "ALLOF", "every": "ALLOF", "either": "SOMEOF", "any": "SOMEOF",
+    "some": "SOMEOF", "one": "SOMEOF", "neither": "NOOF", "none": "NOOF"}  # fmt: skip
+
+
+@dataclass
+class Tokens:
+    """A question in plain tokens; `said` are its words in their place, `things` those of `X0`, `X1`, ..."""
+
+    names: Sequence[str] = ()
+    plain: list[str] = field(default_factory=list[str])
+    said: list[str] = field(default_factory=list[str])
+    things: list[lex.ObjectPhrase] = field(default_factory=list[lex.ObjectPhrase])
+    quantities: list[lex.QuantityWords] = field(default_factory=list[lex.QuantityWords])
+
+    def add(self, token: str, said: str) -> None:
+        """Adds a token that stands for some words."""
+        self.plain.append(token)
+        self.said.append(said)
+
+    def number(self, phrase: lex.ObjectPhrase) -> int:
+        """The number of a thing: one that was named before keeps its own."""
+        known = (at for at, each in enumerate(self.things) if plain(each.text) == plain(phrase.text))
+        at = next(known, len(self.things))
+        self.things += [phrase] if at == len(self.things) else []
+        return at
+
+
+def tokens_of(text: str, names: Sequence[str] = ()) -> Tokens:
+    """The question in plain tokens. A given name that stands in it is a name there, whatever its words."""
+    text, tokens = " ".join(text.replace("’", "'").lower().split()), Tokens(names)
+    for contraction, said in _CONTRACTED.items():
+        text = re.sub(contraction, said, text)
+    for at, name in sorted(enumerate(names), key=lambda each: -len(each[1])):
+        words = r"\s+".join(map(re.escape, name.lower().split()))
+        text = re.sub(rf"(?<![\w'-]){words}(?![\w'-])", f"N{at}N", text)
+    for what, pattern in lex.forms()["quantities"]:
+        text = pattern.sub(lambda found, what=what: _quantity(tokens, what, lex.roles(found)), text)
+    for token, idiom in lex.forms()["idioms"]:
+        text = " ".join(idiom.sub(token, text).split())
+    words, at, going = _TOKEN.findall(text), 0, list[str]()
+    while at < len(words):
+        at, verb = _read_phrase(tokens, words, at)
+        going += [".", tokens.plain[-1], verb] if verb else []  # "the falling ball": how it moves
+    tokens.plain += going
+    tokens.said += going
+    return tokens
+
+
+def _quantity(tokens: Tokens, what: str, said: dict[str, str]) -> str:
+    """The token of a quantity of some kind; nothing for what says none."""
+    number, unit = said.get("n", "1"), said.get("u", "px")
+    numbers = lex.NUMBER_WORDS | {"a": 1, "an": 1, "twice": 2, "half a": 0.5, "half an": 0.5, "half": 0.5}
+    value = 0.5 if what == "share" else float(numbers.get(number, number)) * lex.METRES.get(unit, 1.0)
+    if what in {"slow", "fast"}:
+        tokens.quantities.append(lex.QuantityWords("speed", pace=cast(SpeedWord, what)))
+    elif what:
+        tokens.quantities.append(lex.QuantityWords(cast(lex.Measure, what), value, unit in lex.METRES))
+    return f"Q{len(tokens.quantities) - 1}" if what else ""
+
+
+def _is_open(word: str) -> bool:
+    """Whether a word may be a noun, or a part of one."""
+    return word[0].islower() and word not in lex.FUNCTION and word not in lex.DETERMINERS
+
+
+def _is_determiner(words: Sequence[str], at: int) -> bool:
+    """A "that" or "which" in front of a verb is none."""
+    word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
+    relative = after in lex.DETERMINERS if word in {"that", "this"} else False
+    acts = after in lex.VERBS and (word in {"that", "which", "what", "this"} or lex.VERBS[after].form == "s")
+    follows = _is_open(after) or after in lex.PLACES or after == "first" or after in lex.DETERMINERS or after[0] == "N"
+    return word in lex.DETERMINERS and follows and not relative and not acts
+
+
+def _belongs(words: Sequence[str], at: int, first: int, start: int, has_noun: bool) -> bool:
+    """Whether a word belongs to the phrase that begins at `start`, with determiners up to `first`."""
+    word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
+    begun, determined, form = at > start, first > start, lex.VERBS[word].form if word in lex.VERBS else ""
+    if word == "and":
+        return begun and not has_noun and words[at - 1] in lex.COLOURS and after in lex.COLOURS
+    if has_noun:
+        coloured = word in lex.COLOURS and words[at - 1] not in lex.COLOURS
+        if word in _BEHIND_NOUN or word in lex.PLACES or coloured or word.endswith("ly"):
+            return False
+        noun = form == "base" and after in lex.VERBS and (lex.VERBS[after].form == "s" or after in {"is", "was"})
+        return (_is_open(word) and (not form or noun)) or (word.isdigit() and len(word) < 3)
+    if word in lex.PLACES or word in {"one", "other", "first"}:
+        return determined and (word != "one" or begun)
+    if not _is_open(word) and not (word == "can" and begun):
+        return False
+    # "Orange" is the one colour that is also a thing.
+    acts = begun and words[at - 1] == "orange" and word not in lex.NOUNS
+    return (begun and form != "s" and not acts) if form else (determined or not word.endswith("ly"))
+
+
+def _extent(tokens: Tokens, words: list[str], at: int) -> tuple[int, int, str]:
+    """Where the content of the noun phrase that begins at a word begins and ends, and the given name that it ends in.
+
+    A name that is no more than an adjective of the phrase ("orange" in "the orange toy car") becomes a word of it.
+    """
+    first, has_noun = at, False
+    while first < len(words) and _is_determiner(words, first):
+        first += 1
+    end = first
+    while end < len(words) and end - first < 10:
+        if words[end][0] == "N" and words[end][1:-1].isdigit():
+            name, behind = tokens.names[int(words[end][1:-1])], words[end + 1] if end + 1 < len(words) else "."
+            if not (lex.is_modifier(name.lower()) and _is_open(behind) and behind not in lex.VERBS):
+                return first, end + 1, name
+            words[end] = name.lower()
+        elif not _belongs(words, end, first, at, has_noun):
+            break
+        has_noun = has_noun or not (lex.is_modifier(words[end]) or words[end] in {"other", "first"})
+        end += 1
+        if words[end - 1] in {"one", "ones"}:
+            break
+    return first, end, ""
+
+
+def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
+    """Adds the noun phrase that begins at a word, else the word; the place behind it, and a verb that its noun has."""
+    first, end, name = _extent(tokens, words, at)
+    content = words[first:end]
+    if not content or content == ["one"] or (not name and all(word in lex.SETS["adjectives"] for word in content)):
+        tokens.add(lex.lemma(words[at]), words[at])
+        return at + 1, ""
+    verb = lex.lemma(content[0]) if len(content) > 1 and content[0].endswith("ing") else ""
+    verb = verb if verb in lex.KINDS else ""
+    content = content[1:] if verb else content
+    phrase = object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], "")
+    start, end, phrase = _with_behind(tokens, words, end, phrase, content[0])
+    text = [*content[:-1], name or content[-1], *words[start:end]]
+    phrase = replace(phrase, text=" ".join(text))
+    given = name if name and len(text) == 1 else match_given(phrase, tokens.names)
+    if given is not None:
+        phrase = replace(object_phrase(given.lower().split(), given), is_given=True)
+    said, ahead = " ".join([*words[at:first], *([verb] if verb else []), *text]), words[end : end + 2]
+    acts = len(ahead) == 2 and lex.lemma(ahead[0]) in lex.CAUSES and (ahead[1] in lex.DETERMINERS or ahead[1][0] == "N")
+    is_agent = phrase.head in lex.AGENTS or (phrase.head in lex.SETS["beings"] and acts)  # "the child rolls the ball"
+    if is_agent and not phrase.is_given and phrase.colour is None:
+        tokens.add("AG", said)
+    else:
+        _add_phrase(tokens, phrase, content, words[at:first], said)
+    return end, verb
+
+
+def _with_behind(
+    tokens: Tokens, words: list[str], start: int, phrase: lex.ObjectPhrase, opening: str
+) -> tuple[int, int, lex.ObjectPhrase]:
+    """Where the words behind a noun that belong to it begin and end, and the phrase with what they say."""
+    end, is_put = start, bool(tokens.plain) and tokens.plain[-1] in {*lex.CAUSES, "put", "place", "set"}
+    while end < len(words):
+        behind = " ".join(words[end : end + 12])
+        matches = ((what, re.match(rf"(?:{pattern})(?= |$)", behind)) for what, pattern in _BEHIND.items())
+        found = [(what, match) for what, match in matches if match and not (is_put and what in {"box", "place"})]
+        if not found and words[end] == "of" and end + 1 < len(words) and _is_open(words[end + 1]):
+            end += 2  # "stack of books"
+            continue
+        if not found:
+            break
+        what, match = found[0]
+        end += len(match[0].split())
+        if what == "path":
+            is_start = (match["end"] or opening) in {"start", "beginning", "first"}
+            phrase = replace(phrase, path_end="start" if is_start else "end")
+        phrase = replace(phrase, inside_box=phrase.inside_box or what == "box")
+    return start, end, phrase
+
+
+def _add_phrase(
+    tokens: Tokens, phrase: lex.ObjectPhrase, content: list[str], determiners: list[str], said: str
+) -> None:
+    """Adds a noun phrase as a thing, a kind or several things."""
+    counted = tokens.said[-2:-1] and tokens.said[-2] in _SOME and tokens.said[-1] == "of"
+    quantifier = next((word for word in determiners if word in _SOME), tokens.said[-2] if counted else None)
+    is_plural = not phrase.is_given and content[-1] != lex.singular(content[-1]) and content[-1] != "ones"
+    plain_noun = not (phrase.colour or phrase.is_given or phrase.inside_box or phrase.path_end)
+    if "which" in determiners or "what" in determiners or tokens.plain[-2:] == ["how", "many"]:
+        if determiners:
+            tokens.add("which", determiners[0])
+        tokens.add(f"K{tokens.number(phrase)}", said)
+    elif quantifier is not None:
+        if counted:
+            del tokens.plain[-2:], tokens.said[-2:]
+        bare = " ".join(word for word in content if word != "other")
+        name = f"{quantifier} {bare}" if quantifier in {"both", "either", "neither"} else bare
+        tokens.add(_SOME[quantifier], quantifier)
+        tokens.add(f"S{tokens.number(replace(phrase, text=name))}", said)
+    elif is_plural and not phrase.path_end:
+        tokens.add(f"P{tokens.number(phrase)}", said)
+    elif phrase.head in lex.GENERIC and plain_noun and len(content) == 1:
+        tokens.add("OBJ", said)
+    else:
+        tokens.add("no", "no") if "no" in determiners else None
+        tokens.add(f"X{tokens.number(_meant(phrase, tokens))}", said)
+
+
+def _meant(phrase: lex.ObjectPhrase, tokens: Tokens) -> lex.ObjectPhrase:
+    """What a phrase means among the things named before: "the black one" is of the kind that is asked for, or the last
+    thing of that colour, or of the one kind that was named; "the car" is the red car."""
+    before, kinds = tokens.things, {tokens.things[int(token[1:])].noun for token in tokens.plain if token[0] == "K"}
+    if phrase.is_given or phrase.path_end:
+        return phrase
+    if phrase.noun is None and phrase.colour is not None:
+        same = [each for each in before if each.colour == phrase.colour and each.noun and not kinds]
+        kinds = kinds or {each.noun for each in before if each.noun}
+        if same or len(kinds) != 1:
+            return same[-1] if same else phrase
+        noun = kinds.pop() or ""
+        return replace(phrase, noun=noun, text=" ".join([*phrase.text.split()[:-1], noun]))
+    # No word in it that the earlier phrase lacks.
+    fuller = [each for each in before if phrase.noun and phrase.words < each.words and each.head == phrase.head]
+    return fuller[0] if len(fuller) == 1 else phrase
+
+
+def object_phrase(content: Sequence[str], text: str) -> lex.ObjectPhrase:
+    """The phrase with these lower case words, behind its determiners."""
+    said = [word for word in content if word != "and" and not word.isdigit()] or list(content)
+    said = said[: next((at for at, word in enumerate(said) if at and word in {"of", "with"}), len(said))]
+    nouns, head = [word for word in said[:-1] if not lex.is_modifier(word)], said[-1]
+    colour = next((lex.COLOURS[word] for word in said[:-1] or said if word in lex.COLOURS), None)
+    return lex.ObjectPhrase(
+        text, colour, None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)])
+    )
+
+
+def parse_noun_phrase(text: str) -> lex.ObjectPhrase | None:
+    """The noun phrase of a text such as "the red toy car"; None if there is none."""
+    said = text.strip(" .,!?").split()
+    while said and said[0].lower() in lex.DETERMINERS:
+        del said[0]
+    words = re.findall(r"[\w'-]+", " ".join(said).lower())
+    ends = (
+        at
+        for at, word in enumerate(words)
+        if at and word != "one" and (word in lex.FUNCTION or word in lex.DETERMINERS)
+    )
+    words = words[: next(ends, len(words))]
+    if not words or words[0] in lex.FUNCTION:
+        return None
+    phrase = object_phrase(words, " ".join(said))
+    colour = lex.COLOURS.get(phrase.noun or "") if phrase.colour is None else phrase.colour
+    return replace(phrase, colour=colour)
+
+
+def match_given(phrase: lex.ObjectPhrase, names: Sequence[str]) -> str | None:
+    """The one given name that a phrase means: the same words, all words of one in the other, its noun or its colour."""
+    said = set(plain(phrase.text).split()) - {"one"}
+    named = [(name, set(plain(name).split()), parse_noun_phrase(name)) for name in names]
+    others = [(name, other) for name, _, other in named if other is not None]
+    tiers = (
+        [name for name, words, _ in named if words == said],
+        [name for name, words, _ in named if said and (said < words or words < said)],
+        [name for name, other in others if len(said) == 1 and other.head == phrase.head],
+        [name for name, other in others if phrase.noun is None and other.colour == phrase.colour],
+    )
+    found = next((tier for tier in tiers if tier), [])
+    return found[0] if len(found) == 1 else None
 
 
 def _head(name: str) -> str | None:
@@ -349,70 +299,61 @@ def _head(name: str) -> str | None:
 
 def shape_of(name: str) -> Shape | None:
     """The shape of what is called so; None if the noun does not say."""
+    shapes: tuple[Shape, ...] = ("sphere", "box", "cone", "cylinder")
     head = _head(name)
-    return next((shape for shape, nouns in _SHAPES.items() if head in nouns), None)
+    return "box" if head in lex.SETS["vehicle"] else next((each for each in shapes if head in lex.SETS[each]), None)
 
 
 def is_vehicle(name: str) -> bool:
     """Whether it is longer along its heading than across."""
-    return _head(name) in _NOUNS["vehicle"]
+    return _head(name) in lex.SETS["vehicle"]
 
 
 def is_cube(name: str) -> bool:
     """Whether it is a box as wide as high."""
-    return _head(name) in _NOUNS["cube"]
-
-
-_SAID = lex.words("any every each all no none some many a an both either neither other the")
+    return _head(name) in lex.SETS["cube"]
 
 
 @dataclass(frozen=True)
 class Kind:
     """What one of the things is called, and how many there are, where that is said."""
 
-    phrase: ObjectPhrase
+    phrase: lex.ObjectPhrase
     count: int | None
 
 
 def kind_of(name: str) -> Kind | None:
     """The kind that a name such as "both mugs" or "mugs" is of; None for the name of one thing."""
-    said = name.lower().split()
-    numbers = dict.fromkeys(("both", "either", "neither"), 2) | lex.NUMBER_WORDS
-    counts = [int(word) if word.isdecimal() else numbers[word] for word in said if word.isdecimal() or word in numbers]
-    rest = [word for word in said if word not in _SAID | numbers.keys() and not word.isdecimal()]
+    said, numbers = name.lower().split(), dict.fromkeys(("both", "either", "neither"), 2) | lex.NUMBER_WORDS
+    counts = [int(numbers.get(word, word)) for word in said if word.isdecimal() or word in numbers]
+    quantifiers = lex.words("any every each all no none some many a an other the") | numbers.keys()
+    rest = [word for word in said if word not in quantifiers and not word.isdecimal()]
     head = lex.singular(rest[-1]) if rest else ""
-    if not rest or (said[0] not in _SAID - {"the", "other"} and head == rest[-1]):
+    if not rest or (said[0] not in quantifiers - {"the", "other"} and head == rest[-1]):
         return None
     phrase = parse_noun_phrase(" ".join([*rest[:-1], head]))
     return None if phrase is None else Kind(phrase, counts[0] if counts else None)
 
 
-ContainerForm = Literal["round", "square", "none", "unknown"]
-
-
-def container_form(name: str) -> ContainerForm:
+def container_form(name: str) -> Literal["round", "square", "none", "unknown"]:
     """Round or square for what is called a container, `none` for a solid thing, `unknown` where the noun says nothing.
 
     A box is a container: a question about a solid one would not ask what goes into it.
     """
-    head = _head(name)
-    if head in lex.SETS["round"]:
+    if _head(name) in lex.SETS["round"]:
         return "round"
-    if head in _NOUNS["square"]:
+    if _head(name) in lex.SETS["square"]:
         return "square"
     return "unknown" if shape_of(name) is None else "none"
 
 
-def may_name(phrase: ObjectPhrase, name: str) -> bool:
-    """Whether a phrase may mean the object of that name: they share a colour, noun or number, and differ in none."""
+def may_name(phrase: lex.ObjectPhrase, name: str) -> bool:
+    """Whether a phrase may mean the object of that name: they share a colour or a noun, and differ in none."""
     other = parse_noun_phrase(name)
-    if other is None:
-        return False
-    if plain(phrase.text) == plain(name):
-        return True
+    if other is None or plain(phrase.text) == plain(name):
+        return other is not None
     nouns = [each.head if each.head not in lex.GENERIC else None for each in (phrase, other)]
-    pairs = ((phrase.colour, other.colour), tuple(nouns), (phrase.number, other.number))
-    said = [(one, two) for one, two in pairs if one is not None and two is not None]
+    said = [(one, two) for one, two in ((phrase.colour, other.colour), tuple(nouns)) if one and two]
     return bool(said) and all(one == two for one, two in said)
 
 
@@ -422,7 +363,6 @@ def likeness(words: str, name: str) -> Likeness:
     if phrase is None or other is None:
         return "same" if plain(words) == plain(name) else "unknown"
     shapes = (shape_of(words), shape_of(name))
-    differ = [(phrase.colour, other.colour), (phrase.number, other.number), shapes]
-    if any(one is not None and two is not None and one != two for one, two in differ):
+    if any(one is not None and two is not None and one != two for one, two in ((phrase.colour, other.colour), shapes)):
         return "other"
     return "same" if may_name(phrase, name) else "unknown"

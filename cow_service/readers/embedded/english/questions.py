@@ -1,321 +1,526 @@
-"""Parses a what-if question in English with plain rules: what moves, how, what else is named, and the question itself.
+"""Reads a question by its sentence forms: what moves and how, what is changed, what is asked, and what was not read."""
 
-No model and no list of nouns: verbs and function words are closed lists, the noun phrases are what lies between.
-"""
-
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
-from cow_service.readers.base import Quantity
-from cow_service.readers.embedded.english import interventions, motion, noun_phrases
 from cow_service.readers.embedded.english import lexicon as lex
-from cow_service.readers.embedded.english.grammar import read_from
-from cow_service.readers.embedded.english.interventions import InterventionWords, TrailWords
-from cow_service.readers.embedded.english.lexicon import Item, ObjectPhrase, key_at
-from cow_service.readers.embedded.english.motion import MotionCandidate, MotionWords, OtherWords
-from cow_service.readers.options import plain, split_options
+from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
+from cow_service.readers.options import plain, says_not_sure, split_options, without_reply_form
+from cow_service.records import Asked, AskedRelation, InterventionKind, MotionKind, PlaceRelation, Vector
 
-MAX_WORDS = 240  # of a question that are read
-_HOW_MANY = lex.words("the all both either none two three")
-_SAME_TIME = re.compile(
-    r"\b(?:at the (?:very )?same (?:time|moment|instant)|simultaneously)\b(?P<joins> as\b)?", re.IGNORECASE
-)
-# Words that say which way, wherever they stand.
-_DIRECTION_WORDS = re.compile(
-    r"\b(left|right|up|down|upwards?|downwards?|leftwards?|rightwards?|north|south|east|west|(north|south)-?(east|west)"
-    r"|clockwise|counterclockwise|opposite|reversed?|towards?|away|diagonal(ly)?|degrees?|sideways|back|backwards?"
-    r"|forwards?|other way)\b",
-    re.IGNORECASE,
-)
+MAX_WORDS = 240  # of a question that is read
+_THING = re.compile(r"X\d+")
+_DIRECTIONS = {*lex.WAYS, *map(str.upper, lex.WAYS), "FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"}
+
+
+_RISING, _SINKING = lex.words("lift raise rise climb ascend"), lex.words("descend lower")
+_TOPPLING = lex.words("knock push tip fall turn blow topple")
+
+
+@dataclass(frozen=True)
+class MotionWords:
+    """How the question says that something moves; None and 0 where it does not say.
+
+    `direction` is a unit vector in image pixels, x right, y down. `depth` is the sine of the angle out of the image
+    plane: -1 towards the camera, 1 away from it. `trail`: on along it; `trail_end`, a thing or a side, tells which end
+    of it is the present position. `topples`: it falls over where it stands. `in_air`: it is let go, or falls freely.
+    `steps` are the legs behind the first, `others` what moves at the same time.
+    """
+
+    kind: MotionKind | None = None
+    along_arrow: bool | None = None  # else against it
+    direction: Vector | None = None
+    depth: float = 0.0
+    forward: bool | None = None
+    verb: str = ""
+    towards: lex.ObjectPhrase | None = None
+    trail: bool = False
+    trail_end: lex.ObjectPhrase | Vector | None = None
+    quantities: tuple[lex.QuantityWords, ...] = ()
+    steps: "tuple[MotionWords, ...]" = ()
+    others: "tuple[tuple[lex.ObjectPhrase, MotionWords], ...]" = ()
+    is_contradictory: bool = False  # two of its words are opposites
+    topples: bool = False
+    in_air: bool = False
+
+
+NOT_SAID = MotionWords()
+
+
+@dataclass(frozen=True)
+class ChangeWords:
+    """A change of the scene in the words of the question. `relation` and `targets` are those of `place`."""
+
+    kind: InterventionKind
+    object: lex.ObjectPhrase
+    relation: PlaceRelation | None = None
+    targets: tuple[lex.ObjectPhrase, ...] = ()
 
 
 @dataclass(frozen=True)
 class Question:
-    """A what-if question taken apart.
+    """A what-if question taken apart. `others` are the further things that it names; `alternatives`, those among which
+    it asks for the first. `unread` are the words of no form, those that tell the motion in `unread_motion`."""
 
-    `others` are the further objects it names, in order, without the mover and without what is taken away; `items`, all
-    its words and noun phrases, but for the options that it lists, its `interventions` and its trail.
-    `clause` are the items that tell the motion. `names_direction`: some word says which way, whether or not it was
-    understood. `read` are the places in the text of the items that tell the motion and were understood.
-    """
-
-    text: str
-    mover: ObjectPhrase | None
-    motion: MotionWords
-    others: tuple[ObjectPhrase, ...]
-    items: tuple[Item, ...]
-    interventions: tuple[InterventionWords, ...]
-    clause: tuple[Item, ...]
-    mentions_arrow: bool
-    names_direction: bool
-    beyond: str = ""  # how what is not read any more begins
-    pronoun: str = ""  # that stands for the mover where it may stand for two things
-    read: frozenset[int] = frozenset()
-
-    def has_read(self, at: int) -> bool:
-        """Whether the item at a place expresses the motion and was understood."""
-        return self.items[at].start in self.read
-
-    def means_mover(self, phrase: ObjectPhrase) -> bool:
-        """Whether a phrase speaks of the mover again: no word in it that the mover's own lacks."""
-        words = set(plain(phrase.text).split())
-        return self.mover is not None and bool(words) and words <= set(plain(self.mover.text).split())
+    mover: lex.ObjectPhrase | None = None
+    motion: MotionWords = NOT_SAID
+    says_motion: bool = False
+    changes: tuple[ChangeWords, ...] = ()
+    asked: Asked | None = None
+    others: tuple[lex.ObjectPhrase, ...] = ()
+    alternatives: tuple[lex.ObjectPhrase, ...] = ()
+    names_table: bool = False  # something is asked to come down on it, or to stay there
+    names_arrow: bool = False
+    names_direction: bool = False  # some word says which way, whether or not it was understood
+    unread: tuple[str, ...] = ()
+    unread_motion: tuple[str, ...] = ()
 
 
 @lru_cache(maxsize=64)  # every stage of a request asks for it
-def parse(question: str) -> Question:
-    """Takes a question apart. Never raises: what the question does not say is None or empty."""
-    text = without_reply_form(split_options(question).rest)
-    found = lex.tokens(text)
-    beyond = ""
-    if len(found) > MAX_WORDS:
-        text, beyond = text[: found[MAX_WORDS].start], " ".join(text[found[MAX_WORDS].start :].split()[:7])
-    text = without_openings(_SAME_TIME.sub(lambda same: "and" if same["joins"] else "", text))
-    arrow = any(token.key.startswith("arrow") for token in lex.tokens(text))
-    found = noun_phrases.with_nouns(noun_phrases.with_tables(noun_phrases.items(text)))
-    changes, found = interventions.split_interventions(noun_phrases.with_places(found))
-    trail, found = interventions.split_trail(found)
-    candidates, subjects = motion.read_clauses(found)
-    best = _best(found, candidates)
-    mover = _mover(found, subjects, best, changes)
-    clause, told = _motion(found, candidates, best, mover, changes)
-    if trail is not None and trail.near is None and trail.side is None:
-        trail = replace(trail, side=told.direction)  # "on along its trail to the right": its last end is there
-    told, fitted = replace(told, trail=trail), frozenset[int]()
-    if not changes and (best is None or (best.asked and not told.says_way)):
-        changes, fitted = interventions.implied_placing(found)
-    read = told.read.union(fitted, *(other.motion.read for other in told.others))
-    put = next((change for change in changes if change.kind == "place"), None)
-    # "If you lift the ball and put it into the mug": the lifting is a part of it.
-    lifted = best.subject if best is not None and best.verb in {"lift", "raise", "carry"} else None
-    carried = put is not None and lifted == put.object
-    if carried:
-        read = read.union(item.start for item in found[clause.start : clause.stop])
-    way = best is None and told.arrow is not None and bool(subjects)  # "on its way along the arrow"
-    if put is not None and not way and (best is None or best.asked or best.kind == "static" or carried):
-        mover, told = put.object, replace(told, kind="place", verb="put")
-    return Question(
-        text=text,
-        mover=mover,
-        motion=told,
-        others=_others(found, mover, clause, changes, trail),
-        items=tuple(found),
-        interventions=changes,
-        clause=tuple(found[clause.start : clause.stop]),
-        mentions_arrow=arrow,
-        names_direction=_DIRECTION_WORDS.search(text) is not None,
-        beyond=beyond,
-        pronoun=_open_pronoun(found, best, mover),
-        read=read,
+def parse(question: str, names: tuple[str, ...] = ()) -> Question:
+    """Takes a question apart; `names` are those of the given things. What is not said is None or empty."""
+    listed = split_options(question)
+    text = without_reply_form(listed.rest)
+    if len(text.split()) > MAX_WORDS:
+        return Question(unread=(" ".join(text.split()[MAX_WORDS : MAX_WORDS + 7]),))
+    options = [text for _, text in listed.options if not says_not_sure(text)]
+    return _Parser(tokens_of(text, names), options).question()
+
+
+def rewordings(question: Question) -> tuple[str, ...]:
+    """Up to three questions in forms that are read, with the names of this one and about what it asks."""
+    names = [each.text for each in (question.mover, *question.others) if each is not None]
+    motion, said = question.motion, " ".join(question.unread).lower()
+    way = "opposite to the direction of the arrow" if motion.along_arrow is False else "in the direction of the arrow"
+    way = next((f"to the {name}" for name in ("left", "right") if motion.direction == lex.WAYS[name]), way)
+    way, (mover, other) = "forward" if motion.forward else way, (*names, "", "")[:2]
+    like = [
+        form.replace("<m>", mover).replace("<o>", other).replace("<way>", way)
+        for topic, form in lex.sections()["rewordings"]
+        if re.search(topic, said) and mover and (other or "<o>" not in form)
+    ]
+    return tuple(dict.fromkeys(each for each in like if parse(each).asked is not None))[:3]
+
+
+@dataclass
+class _Piece:
+    """A run of tokens that one form covers."""
+
+    what: str
+    start: int
+    end: int
+    roles: dict[str, str] = field(default_factory=dict[str, str])
+    form: lex.Form | None = None
+    motion: MotionWords = NOT_SAID
+
+    @property
+    def is_passive(self) -> bool:
+        """Whether what is acted on stands in front of what acts."""
+        return self.what == "asked" and next((role for role in self.roles if role in {"s", "o", "a"}), "s") != "s"
+
+    @property
+    def asks_form(self) -> str:
+        """The form of what it asks; empty where it asks nothing."""
+        return "" if self.form is None or self.what not in {"asked", "stated"} else self.form.asks[0]
+
+    def said(self, role: str) -> str:
+        """What stands in a role."""
+        return self.roles.get(role, "")
+
+    def thing(self, role: str) -> str:
+        """The thing in a role; nothing for a pronoun."""
+        return self.said(role) if _THING.fullmatch(self.said(role)) else ""
+
+
+_KINDS = {"asked": "asked", "moved": "motion", "changes": "change", "stated": "stated"}  # of pieces, by section
+_ORDER = ("asked", "motion", "change", "stated", "listed", "nothing")
+_TELLING = ("sense", "ahead", "depth", "way", "goal", "quantity")
+
+
+class _Parser:
+    """Covers a question with forms, the longest that fits at each place, and puts together what they say."""
+
+    def __init__(self, tokens: Tokens, options: Sequence[str]) -> None:
+        self.tokens, self.options, self.plain, self.said = tokens, options, tokens.plain, tokens.said
+        self.text, self.starts = " ".join(self.plain), [0]
+        self.mover, self.names_table = "", False
+        for token in self.plain:
+            self.starts.append(self.starts[-1] + len(token) + 1)
+        self.place_of = {start: at for at, start in enumerate(self.starts)}
+        at, self.pieces = 0, list[_Piece]()
+        while at < len(self.plain):
+            found = self._from(at)
+            self.pieces += found
+            at = found[0].end if found else at + 1
+
+    def _from(self, at: int) -> list[_Piece]:
+        """The longest piece that begins at a token, if any does."""
+        found, start = [self._adverbials(_Piece("motion", at, at), "")], self.starts[at]
+        for section in ("asked", "stated", "changes", "rest", "moved"):
+            for form in lex.forms()[section]:
+                if (match := form.pattern.match(self.text, start)) is not None:
+                    piece = _Piece(_KINDS.get(section, form.says), at, self._end(match), lex.roles(match), form)
+                    verb = piece.roles.get("verb", form.says)
+                    found.append(self._adverbials(piece, verb) if section == "moved" else piece)
+        told = [each for each in found if each.end > at and (each.what != "motion" or each.motion != NOT_SAID)]
+        return sorted(told, key=lambda each: (-each.end, _ORDER.index(each.what)))[:1]
+
+    def _end(self, match: re.Match[str]) -> int:
+        """The place of the first token behind a match."""
+        return self.place_of.get(match.end() + 1, len(self.plain))
+
+    def _adverbials(self, piece: _Piece, verb: str) -> _Piece:
+        """The piece with the words for the way that follow its verb."""
+        legs, at, ways = [(verb, list[tuple[str, str]]())], piece.end, dict(lex.forms()["ways"])
+        verbs = re.compile(rf"({lex.VERB})(?! X)(?= |$)")
+        while at < len(self.plain):
+            matches = ((name, way.match(self.text, self.starts[at])) for name, way in ways.items())
+            name, match = next(((name, match) for name, match in matches if match is not None), ("", None))
+            if match is None or not self._fits(name, match, legs[-1][1]):
+                break
+            end = self._end(match)
+            if name == "then":
+                again = verbs.match(self.text, self.starts[end])
+                if again is None and not any(ways[each].match(self.text, self.starts[end]) for each in _TELLING):
+                    break
+                legs.append((again[1] if again else "", []))
+                end = self._end(again) if again else end
+            legs[-1][1].extend(lex.roles(match).items() or [(name, "")])
+            legs[-1][1].append((name, "")) if name == "trail" else None
+            at = end
+        kind = "static" if "n" in piece.roles else lex.KINDS.get(verb)
+        first, *rest = (
+            motion_of(verb, said, self.tokens, None if leg else kind) for leg, (verb, said) in enumerate(legs)
+        )
+        clashes = any(each.is_contradictory for each in rest)
+        piece.end, piece.motion = at, replace(first, steps=tuple(rest)) if rest else first
+        piece.motion = replace(piece.motion, is_contradictory=True) if clashes else piece.motion
+        return piece
+
+    def _fits(self, name: str, match: re.Match[str], said: Sequence[tuple[str, str]]) -> bool:
+        """Whether words for the way say something behind others."""
+        names = {each for each, _ in said}
+        is_limit = name == "quantity" and self.tokens.quantities[int(match[0][1:])].what == "within"
+        return not (is_limit or (name == "goal" and "goal" in names) or (name == "halt" and "quantity" not in names))
+
+    def question(self) -> Question:
+        """What all pieces together say."""
+        asks, stated = ([each for each in self.pieces if each.what == what] for what in ("asked", "stated"))
+        last = max((at for at, token in enumerate(self.plain[:-1]) if token in {".", "?"}), default=0)
+        is_terse = not asks and stated and stated[-1].start >= last and self.plain[-1] not in {".", "!"}
+        asking = asks[0] if asks else stated[-1] if is_terse or (stated and "CLAIM" in self.plain) else None
+        told = [each for each in stated if each is not asking]
+        changes = self._changes(asking)
+        put = next((each.object for each in changes if each.kind == "place"), None)
+        moving = self._moving(asking, told, put)
+        acts = "" if asking is None else asking.thing("s")
+        self.mover = next(iter(moving), self._token(put) if put else acts)
+        first = next(iter(moving.values()), NOT_SAID)
+        if put is not None and (not moving or first.kind == "static"):
+            self.mover, first = self._token(put), MotionWords("place", verb="put")
+        unread = self._unread(asking, asks, told, moving)
+        asked, alternatives = (None, ()) if asking is None else self._asked(asking, told, changes)
+        if asking is not None and asked is None:
+            unread.append(("asked", " ".join(word for word in self.said[asking.start : asking.end] if word)))
+        if asking is None and moving:
+            asked = Asked(form="what-happens", relation="touches")  # "Push the red ball to the right."
+        if not moving and asked is not None and asked.relation == "lands" and changes and put is None:
+            first = MotionWords("fall", verb="fall")  # without its support
+        gone = {self._token(each.object) for each in changes if each.kind == "remove"}
+        named = next((each for each in self._named() if each not in gone and asking is None), "")
+        mover = self._thing(self.mover or named) if self.mover or named else None
+        further = tuple((self._thing(each), motion) for each, motion in moving.items() if each != self.mover)
+        return Question(
+            mover=mover,
+            motion=replace(first, others=further),
+            says_motion=bool(moving) or first != NOT_SAID,
+            changes=changes,
+            asked=None if unread else asked,
+            others=self._others(mover, changes, asked),
+            alternatives=alternatives,
+            names_table=self.names_table,
+            names_arrow=any(word in {"ALONG", "AGAINST"} or "arrow" in word for word in (*self.plain, *self.said)),
+            names_direction=not _DIRECTIONS.isdisjoint(self.plain),
+            unread=tuple(dict.fromkeys(said for _, said in unread)),
+            unread_motion=tuple(dict.fromkeys(said for what, said in unread if what == "motion")),
+        )
+
+    def _thing(self, token: str) -> lex.ObjectPhrase:
+        return self.tokens.things[int(token[1:])]
+
+    def _token(self, thing: lex.ObjectPhrase) -> str:
+        return f"X{self.tokens.things.index(thing)}"
+
+    def _named(self, at: int | None = None) -> list[str]:
+        """The things named in front of a place, or at all, the first one first."""
+        return list(dict.fromkeys(token for token in self.plain[:at] if _THING.fullmatch(token)))
+
+    def _phrases(self, text: str) -> list[lex.ObjectPhrase]:
+        """The things and kinds of a list such as "X1 and X2"."""
+        return [self._thing(token) for token in re.findall(r"[XPSK]\d+", text)]
+
+    def _changes(self, asking: _Piece | None) -> tuple[ChangeWords, ...]:
+        """What is taken away or put somewhere."""
+        found = list[ChangeWords]()
+        for piece in self.pieces:
+            found += [ChangeWords("remove", phrase) for phrase in self._phrases(piece.said("r"))]
+            if (relation := lex.relation_of(piece.roles)) is not None:
+                target = self._resolved(piece.said("y"), piece.start, piece.said("x")) or ""
+                targets = [each for each in self._phrases(f"{target} {piece.said('z')}") if each.head != "container"]
+                found.append(ChangeWords("place", self._thing(piece.said("x")), relation, tuple(targets)))
+        moves = found or any(each.what == "motion" and each.motion.kind != "static" for each in self.pieces)
+        if asking is not None and asking.form is not None and asking.form.asks[1] == "inside" and not moves:
+            targets = self._phrases(asking.thing("o"))  # "Does the apple fit into the bowl?": it is put there
+            fits = asking.thing("s") and (targets or asking.said("l"))
+            found += [ChangeWords("place", self._thing(asking.said("s")), "into", tuple(targets))] if fits else []
+        return tuple(dict.fromkeys(found))
+
+    def _moving(
+        self, asking: _Piece | None, told: Sequence[_Piece], put: lex.ObjectPhrase | None
+    ) -> dict[str, MotionWords]:
+        """What moves and how, that of the question first."""
+        found = dict[str, MotionWords]()
+        for piece in self.pieces:
+            if piece in told and piece.thing("s") and not found:
+                struck = self._thing(piece.said("o")) if piece.thing("o") else None
+                found[piece.said("s")] = MotionWords("linear", towards=struck)  # "if the cue ball strikes the red ball"
+            if piece.what != "motion" or piece.said("m") == "OBJ":
+                continue
+            said, before, token = piece.said("m"), self._named(piece.start), piece.thing("m") or piece.said("m")
+            if asking is not None and token in {"", "it"}:
+                # "Will the bottle be hidden behind the book if it moves": what the question is about.
+                acts = asking.thing(
+                    "o" if asking.is_passive and "behind" in self.plain[asking.start : asking.end] else "s"
+                )
+                early = said == "it" or not before or asking.start < piece.start
+                token = acts if acts and early else ""
+            token = token if token != "it" else ""
+            token = token or (next(reversed(found), "") if said != "it" else "")
+            listed = any(each.what == "nothing" and each.end < piece.start for each in self.pieces)
+            if said == "it" and not token and listed and len(before) > 1:
+                continue  # "There is a ball and a mug. If it rolls ...": which one?
+            free = [each for each in before if put is None or self._thing(each) != put]
+            token = token or next(iter([*(free if said else before), *before]), "")
+            opens = self.plain[max(piece.start - 1, 0)] in lex.CONNECTORS or not piece.start
+            later = (each for each in self.plain[piece.end :] if opens and _THING.fullmatch(each))
+            token = token or next(later, "")  # "sent towards the mug, the ball ..."
+            token = token.split()[-1].replace("P", "X").replace("S", "X") if token else ""
+            if token:
+                found[token] = joined(found[token], piece.motion) if token in found else piece.motion
+        return found
+
+    def _resolved(self, token: str, at: int, subject: str) -> str | None:
+        """The thing that a word stands for. "It" and "that" are the last thing named in front of a place that is not
+        the subject; "the other one" is the one that is left of two."""
+        if _THING.fullmatch(token) and self._thing(token).is_other:
+            return self._other(subject, token)
+        if re.fullmatch(r"[XPS]\d+", token):
+            return token
+        if token == "itself" or (token == "it" and self.mover not in {"", subject}):
+            return subject if token == "itself" else self.mover
+        named = [each for each in self.plain[:at] if _THING.fullmatch(each) and each != subject]
+        return named[-1] if named and token in {"it", "that", "this"} else None
+
+    def _other(self, subject: str, token: str) -> str | None:
+        """The one thing, of those that are given or else named, that is not the subject; the word itself where the
+        picture must tell."""
+        own = plain(self._thing(subject).text) if subject else ""
+        if left := [name for name in self.tokens.names if plain(name) != own]:
+            phrase = replace(parse_noun_phrase(left[0]) or self._thing(token), text=left[0], is_given=True)
+            return f"X{self.tokens.number(phrase)}" if len(left) == 1 else None
+        things = [each for each in self._named() if each not in {subject, token}]
+        return token if not things else things[0] if len(things) == 1 else None
+
+    def _asked(
+        self, asking: _Piece, told: Sequence[_Piece], changes: Sequence[ChangeWords]
+    ) -> tuple[Asked | None, tuple[lex.ObjectPhrase, ...]]:
+        """What is asked, and among which things; None where that is not clear."""
+        if asking.form is None:
+            return None, ()
+        form, relation, is_negated = asking.form.asks
+        is_turned, counts = "n" in asking.roles or asking.said("q") == "NOOF", asking.said("q")
+        target = self._target(asking, told)
+        unclear = is_turned and (is_negated or counts == "ALLOF")
+        if target is None or unclear or (asking.said("o") == "EVERYTHING" and not is_negated):
+            return None, ()
+        subject = asking.thing("s") or self.mover
+        relation, doer, target = self._turned(asking, relation, subject if subject != self.mover else "", target)
+        thing = self._thing(target) if target else None
+        found = self._settled(asking, relation, thing, changes)
+        if found is None:
+            return None, ()
+        relation, thing = found
+        crash = [each.thing("o") for each in told if each.thing("o")]
+        if (form == "which-to-remove" or asking.said("r")) and thing is None and crash:
+            thing = self._thing(crash[-1])  # "It will collide with the lamp. Which object should be removed ..."
+        lists = [each.said("l") for each in (asking, *self.pieces) if each.said("l")]
+        listed, kinds = self._phrases(lists[0]) if lists else [], self._phrases(asking.said("k"))
+        among = {"whether": self._phrases(asking.said("a")), "how-many": kinds, "which": listed}.get(form, [])
+        if form == "which-to-remove":
+            options = [parse_noun_phrase(text) for text in self.options]
+            among = listed or ([each for each in options if each is not None] if all(options) else [])
+        names_one = form in {"whether", "when", "what-happens", "which-to-remove"}
+        asked = Asked(
+            form=form,
+            relation=relation,
+            subject=self._thing(doer).text if doer and form != "which-to-remove" else None,
+            target=thing.text if thing is not None and names_one else None,
+            negated=is_negated != is_turned,
+            among=tuple(each.text for each in among),
+            every=counts == "SOMEOF" if is_negated and asking.is_passive else counts == "ALLOF" and not is_negated,
+            partly=relation in {"covers", "covered"} and not {"PARTLY", "SOMETIME"}.isdisjoint(self.plain),
+            within=min((each.value for each in self.tokens.quantities if each.what == "within"), default=None),
+        )
+        return asked, tuple(listed or kinds) if form == "which-first" else ()
+
+    def _target(self, asking: _Piece, told: Sequence[_Piece]) -> str | None:
+        """The thing that is acted on; empty for any, None where it is not clear which."""
+        said, subject = asking.said("o"), asking.thing("s") or self.mover
+        several = sum(each.what == "motion" and bool(each.thing("m")) for each in self.pieces) > 1
+        is_open = (told or several) and asking.said("s") == "it" and asking.asks_form != "which-to-remove"
+        elsewhere = asking.asks_form == "where" and subject != self.mover
+        if (is_open and not asking.said("r")) or said == "OBJ" or elsewhere:
+            return None  # the mover, or what it strikes
+        if "both" in asking.roles:
+            moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
+            pairs = ([each for each in dict.fromkeys(names) if each != subject] for names in (moved, self._named()))
+            pair = next((each for each in pairs if each), [])
+            return pair[0] if len(pair) == 1 else None
+        if said in {"", "ANY", "EVERYTHING"}:
+            return ""
+        return self.mover if asking.is_passive and said == "it" else self._resolved(said, asking.start, subject)
+
+    def _turned(
+        self, asking: _Piece, relation: AskedRelation, doer: str, target: str
+    ) -> tuple[AskedRelation, str, str]:
+        """Relation, what acts (empty for the mover) and what it acts on, as the record words them: of the mover."""
+        passive, own = asking.is_passive, target == self.mover
+        if relation == "covers" and target:
+            if own and (doer or passive):  # "the vase hides it", "is it hidden by the vase?"
+                return "covered", "", asking.thing("s") if doer else ""
+            return ("covered", target, doer) if passive and doer else (relation, doer, target)
+        if relation == "touches" and own and target and (doer or passive):
+            return relation, "", doer  # "the vase hits it", "is it hit?"
+        return relation, doer, target
+
+    def _settled(
+        self, asking: _Piece, relation: AskedRelation, thing: lex.ObjectPhrase | None, changes: Sequence[ChangeWords]
+    ) -> tuple[AskedRelation, lex.ObjectPhrase | None] | None:
+        """The relation that is meant to a thing of that kind, and the thing; None where there is none."""
+        words, is_table = self.plain[asking.start : asking.end], thing is not None and thing.head in lex.TABLES
+        if relation == "lands" and thing is not None:  # "off the table"
+            self.names_table = is_table
+            return (relation, None) if is_table else None
+        if (
+            relation == "touches"
+            and thing is not None
+            and is_table
+            and not thing.colour
+            and {"on", "onto"} & set(words)
+        ):
+            self.names_table = True
+            return "lands", None
+        if relation == "inside" and asking.asks_form == "whether":
+            puts = [each.targets[0] for each in changes if each.targets]
+            thing = thing or next(iter(puts), None)
+            along = {"roll", "slide", "move", "drive", "push"} & set(words)
+            holds = thing is not None and thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
+            relation = "inside" if holds or "fit" in words or changes else "touches"
+            return None if thing is None else (relation, thing)
+        return relation, thing
+
+    def _others(
+        self, mover: lex.ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
+    ) -> tuple[lex.ObjectPhrase, ...]:
+        """The further things that are named, each once."""
+        removed = [each.object for each in changes if each.kind == "remove"]
+        phrases = [self._thing(token) for token in self._named()]
+        if asked is not None and asked.form == "which-to-remove":
+            phrases += [each for each in map(parse_noun_phrase, asked.among) if each is not None]
+        named = {plain(each.text): each for each in reversed(phrases) if each.head != "container"}
+        return tuple(each for each in reversed(named.values()) if each not in (mover, *removed))
+
+    def _unread(
+        self, asking: _Piece | None, asks: Sequence[_Piece], told: Sequence[_Piece], moving: dict[str, MotionWords]
+    ) -> list[tuple[str, str]]:
+        """The words that no form covers, each run with the part of the question to which it belongs."""
+        form = "" if asking is None or asking.form is None else asking.form.asks[0]
+        names_crash = asking is not None and (form == "which-to-remove" or asking.said("r"))
+        struck = "" if asking is None else asking.thing("s")
+        lost = [each for each in asks if each is not asking]
+        lost += [each for each in self.pieces if each.said("m") == "OBJ"]
+        lost += [each for each in self.pieces if each.what == "listed" and form != "which-first"]
+        # What is told to be hit, and is not what the question then goes on about.
+        lost += [each for each in told if not names_crash and (each.said("o") != struck or not struck)]
+        read = {at for each in self.pieces if each not in lost for at in range(each.start, each.end)}
+        runs: list[list[int]] = [[]]
+        for at, token in enumerate(self.plain):
+            if at in read or token in {".", "?", "!", ";", ","}:
+                runs.append([])
+            else:
+                runs[-1].append(at)
+        found = list[tuple[str, str]]()
+        for run in runs:
+            words = [self.plain[at] for at in run]
+            limits = [
+                word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].what == "within"
+            ]
+            if all(word in lex.CONNECTORS or word in limits for word in words):
+                continue
+            ends = [
+                each
+                for each in self.pieces
+                if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])
+            ]
+            what = "motion" if ends and ends[-1].what == "motion" else "asked"
+            found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words)))
+        return found
+
+
+def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: MotionKind | None) -> MotionWords:
+    """The motion by a verb and words for the way, each by what it says and the word that says it."""
+    found = {name: [text for each, text in said if each == name] for name, _ in said}
+    ways = [lex.WAYS[text.lower()] for text in found.get("way", ())]
+    senses, ahead, depths = (set(found.get(name, ())) for name in ("sense", "ahead", "depth"))
+    x, y, depth = sum(way[0] for way in ways), sum(way[1] for way in ways), 0.0
+    up, falls = [way[1] for way in ways], verb in lex.SETS["fall"]
+    turned = (falls and min(up, default=0) < 0) or (verb in _RISING and max(up, default=0) > 0)
+    opposed = any(a[0] * b[0] < 0 or a[1] * b[1] < 0 for a in ways for b in ways)
+    stays = "still" in found and bool(ways or depths or senses)
+    if kind == "fall":
+        y = 0.0  # down is what a fall does; only what leads away from it is a direction
+    elif not ways:
+        y = -1.0 if verb in _RISING else 1.0 if verb in _SINKING else 0.0
+    if depths:
+        depth = -1.0 if "NEAR" in depths else 1.0
+    length = math.hypot(x, y)
+    goal, near, side = (next(iter(found.get(name, ())), "") for name in ("goal", "near", "side"))
+    return MotionWords(
+        kind=kind,
+        along_arrow="ALONG" in senses if senses else None,
+        direction=(x / length, y / length) if length else None,
+        depth=depth * math.sqrt(0.5) if length else depth,
+        forward=False if verb == "reverse" else "FORWARD" in ahead if ahead and not senses else None,
+        verb=verb,
+        towards=tokens.things[int(goal[1:])] if goal else None,
+        trail="trail" in found,
+        trail_end=tokens.things[int(near[1:])] if near else lex.SIDES.get(side),
+        quantities=tuple(tokens.quantities[int(text[1:])] for text in found.get("quantity", ())),
+        is_contradictory=turned or opposed or stays or any(len(each) > 1 for each in (senses, ahead, depths)),
+        topples=("over" in found and verb in _TOPPLING) or verb in {"tip", "topple"},
+        in_air=verb in {"drop", "release", "detach", "let go"} or "freely" in found,
     )
 
 
-def _best(found: Sequence[Item], candidates: Sequence[MotionCandidate]) -> MotionCandidate | None:
-    """The verb of the motion: the first of the highest rank."""
-    best = max(candidates, key=lambda candidate: candidate.rank, default=None)
-    if best is None or best.asked or not best.moves or found[best.start].key != "while":
-        return best
-    # In front of "while", where both motions are given: "the mug slides left by 20 px while the ball drops".
-    told = [
-        each
-        for each in candidates
-        if each.at < best.start and not each.asked and each.moves and motion.clause_end(found, each.at) == best.start
-        and each.subject is not None and each.subject.is_thing and each.subject.head not in lex.AGENTS
-    ]  # fmt: skip
-    return told[-1] if told else best
-
-
-def _mover(
-    found: Sequence[Item],
-    subjects: Sequence[tuple[int, ObjectPhrase]],
-    best: MotionCandidate | None,
-    changes: Sequence[InterventionWords],
-) -> ObjectPhrase | None:
-    """The moving object, in its fullest wording."""
-    at = best.at if best else len(found)
-    mover = best.subject if best else None
-    certain = [(place, item.phrase) for place, item in enumerate(found) if item.phrase and not motion.is_vague(item)]
-    if mover is None:
-        # A pronoun, or a clause without a subject, means the agent of a passive question, else its subject.
-        acting = [
-            phrase
-            for place, phrase in certain
-            if place > 1 and found[place - 1].key == "by" and motion.is_passive(found, place - 2)
-            and phrase.head not in lex.ABSTRACT | lex.AGENTS
-        ]  # fmt: skip
-        asked = [each for each in subjects if each[1].head not in lex.ABSTRACT]
-        named = [(place, phrase) for place, phrase in certain if phrase.is_thing]
-        before = [phrase for each in (asked, named) for place, phrase in each if place < at]
-        mover = next(iter([*acting, *before, *(phrase for _, phrase in asked + named)]), None)
-    if mover is None:
-        return None
-    # "The white pawn ... if the pawn moves".
-    told = [item.phrase for item in found[:at] if item.phrase]
-    told += [phrase for change in changes for phrase in (change.object, *change.targets) if change.kind == "place"]
-    fuller = {phrase for phrase in told if phrase != mover and _repeats(mover, phrase)}
-    return fuller.pop() if len(fuller) == 1 else mover
-
-
-def _motion(
-    found: Sequence[Item],
-    candidates: Sequence[MotionCandidate],
-    best: MotionCandidate | None,
-    mover: ObjectPhrase | None,
-    changes: Sequence[InterventionWords],
-) -> tuple[range, MotionWords]:
-    """The places of the clause with the motion, and its content."""
-    at, start = (best.at, best.start) if best else (len(found), 0)
-    verb, kind = (best.verb, best.kind) if best else ("", None)
-    if best is None:
-        # "What does it touch on its way down?", "the falling ball", and "where would it land?" without its support.
-        ways = (place for place, item in enumerate(found) if item.words[-1:] == ("way",))
-        down = any(key_at(found, way - 1) == "on" and key_at(found, way + 1) == "down" for way in ways)
-        removed = any(change.kind == "remove" for change in changes)
-        lands = removed and any(lex.lemma(item.key) in {"land", "happen"} for item in found)
-        if down or lands or (mover is not None and "falling" in mover.text.lower().split()[:-1]):
-            verb, kind = "fall", "fall"
-    beside = _movers_beside(found, candidates, best)
-    end = min([motion.clause_end(found, at) if best else at, *(other.start for other in beside)])
-    asked = best is not None and best.asked
-    told = motion.read_motion(found[at:end], verb, kind, mover, asked=asked)
-    told = motion.with_front(told, found[start:at] if best else found)
-    elsewhere = [(item.start, item.quantity) for item in [*found[:start], *found[end:]] if item.quantity]
-    speeds = {place: said for place, said in elsewhere if isinstance(said.speed, Quantity)}
-    others = dict[ObjectPhrase, OtherWords]()
-    for each in beside:
-        if each.subject is not None:
-            others.setdefault(each.subject, _other_motion(found, each, each.subject))
-    told = replace(
-        told,
-        quantities=(*told.quantities, *speeds.values()),
-        read=told.read.union(speeds),
-        others=tuple(others.values()),
-    )
-    return range(start if best else at, end), told
-
-
-def _movers_beside(
-    found: Sequence[Item], candidates: Sequence[MotionCandidate], best: MotionCandidate | None
-) -> list[MotionCandidate]:
-    """Motions of other things than the mover's, said in the same way: "the ball moves left and the car goes right"."""
-    if best is None or best.asked or best.subject is None or best.subject.head in lex.AGENTS:
-        return []
-    while_it = found[best.start].key == "while"  # "while the ball rolls right, the mug slides left"
-    return [
-        each
-        for each in candidates
-        if (each.rank == best.rank or (not each.asked and (while_it or found[each.start].key == "while")))
-        and each.at > best.at and each.start > best.at and each.moves
-        and each.subject is not None and (each.subject.noun or each.subject.colour)
-        and all(item.key != "whether" for item in found[best.at : each.at])  # it is a question, not a statement
-        and not _repeats(each.subject, best.subject)
-    ]  # fmt: skip
-
-
-def _other_motion(found: Sequence[Item], verb: MotionCandidate, thing: ObjectPhrase) -> OtherWords:
-    """How another thing moves at the same time.
-
-    How far and how long a second mover moves is beyond the reader, and so is a second leg: left unread.
-    """
-    words = found[verb.at : motion.clause_end(found, verb.at)]
-    told = motion.read_motion(words, verb.verb, verb.kind, thing)
-    lengths = {item.start for item in words if item.quantity is not None and item.quantity.speed is None}
-    return OtherWords(thing, replace(told, read=frozenset() if told.steps else told.read - lengths))
-
-
-def _open_pronoun(found: Sequence[Item], best: MotionCandidate | None, mover: ObjectPhrase | None) -> str:
-    """The pronoun that moves where two things were named alike before it: "the ball and the mug ... if it rolls"."""
-    if best is None or best.subject is not None:
-        return ""
-    for at in range(best.at - 2):
-        two = found[at].thing, found[at + 2].thing
-        if found[at + 1].key == "and" and mover in two and None not in two:
-            return next((item.key for item in found[at + 3 : best.at] if item.key in lex.MOVER_PRONOUNS), "")
-    return ""
-
-
-def _others(
-    found: Sequence[Item],
-    mover: ObjectPhrase | None,
-    clause: range,
-    changes: Sequence[InterventionWords],
-    trail: TrailWords | None,
-) -> tuple[ObjectPhrase, ...]:
-    """The further things that are named, each once."""
-    known = [phrase for phrase in (mover, *(change.object for change in changes)) if phrase is not None]
-    named = [phrase for change in changes for phrase in change.targets]
-    named += [] if trail is None or trail.near is None else [trail.near]
-    for at, item in enumerate(found):
-        place = item.phrase.place if item.phrase is not None else None
-        for phrase in (item.phrase, None if place is None else place.of):
-            if phrase is None or motion.is_vague(item) or _HOW_MANY.issuperset(item.words):
-                continue
-            bare = phrase.head in lex.GENERIC or phrase.noun is None
-            singled_out = phrase.colour is not None or phrase.inside_box or phrase.number is not None
-            acts = at in clause and phrase.head in lex.AGENTS
-            # "Which ball will it hit first?"
-            adjective = phrase.noun in lex.SETS["adjectives"] and item.words[0] not in lex.DETERMINERS
-            if not (singled_out if bare else phrase.is_thing) or acts or adjective:
-                continue
-            if item.words[0] == "another" or not any(_repeats(phrase, earlier) for earlier in (*known, *named)):
-                named.append(phrase)
-    return tuple(named)
-
-
-def _repeats(phrase: ObjectPhrase, known: ObjectPhrase) -> bool:
-    """Whether a later phrase means an earlier object: no word in it that the earlier one lacks."""
-    return phrase.head in {known.head, None} and phrase.words - {"one"} <= known.words
-
-
-# Sentences of the text, and what those are about that say how to reply.
-_BETWEEN_SENTENCES = re.compile(r"((?<=[.?!])\s+|\n+)")
-_BETWEEN_PARTS = re.compile(r"((?<=[.?!;:])\s+)")
-_PICTURES = lex.words("image images frame frames picture pictures photo photos")
-_ABOUT_REPLY = re.compile(
-    r"\byour (?:\w+ ){0,2}(?:response|answer|reply|output)s?\b|\bjson\b|answer\s*:\s*\$|\$\s?letter\b", re.IGNORECASE
-)
-_CONDITION = re.compile(r"\b(?:if|when|once|suppose|assum\w+|imagine)\b", re.IGNORECASE)
-_YES_NO = re.compile(r"[\s,]*[(\[]\s*yes\s*(?:/|\bor\b|,)\s*no\s*[)\]]?\.?\s*$", re.IGNORECASE)  # what may be replied
-_HEADING = re.compile(r"^[ \t]*question[ \t]*(?:\d+[ \t]*)?:[ \t]*", re.IGNORECASE | re.MULTILINE)
-
-
-def without_reply_form(prompt: str) -> str:
-    """The prompt without the heading of its question, and without sentences that say how to reply and nothing else."""
-    sentences = _BETWEEN_SENTENCES.split(_YES_NO.sub("", _HEADING.sub("", prompt)))
-    kept = "".join(each for each in sentences if not _ABOUT_REPLY.search(each) or _CONDITION.search(each))
-    parts: list[str] = []
-    for part in _BETWEEN_PARTS.split(kept):
-        said = re.findall(r"\w+", part.lower())
-        first = next((word for word in said[:2] if word != "please"), "")
-        if not (first in lex.SETS["instructions"] or (first == "note" and not _PICTURES.isdisjoint(said))):
-            parts.append(part)  # the others say what to do, or what the images are
-    return "".join(parts)
-
-
-_OPENING = 24  # words of the openings of one sentence
-_MAX_TRIES = 12  # of one question
-_LONGEST_FIRST = sorted(map(re.escape, lex.TABLES["said_as"]), key=len, reverse=True)
-_SAID_AS = re.compile(rf"\b(?:{'|'.join(_LONGEST_FIRST)})\b", re.IGNORECASE)
-_TAG = re.compile(rf",\s*(?:{'|'.join(lex.SETS['tags'])})\s*\?(?=\s+\S)", re.IGNORECASE)  # and something else is asked
-_CLAIM = re.compile(r"(^|[.!]\s)\s*true or false\s*[:?,]?\s+([^.?!]+)[.?]?\s*$", re.IGNORECASE)  # the last sentence
-
-
-def without_openings(text: str) -> str:
-    """The text without openings; what asks by a statement ("I wonder whether it ...") begins with "tell me" then.
-
-    Words of informal English are put as the grammar has them ("gonna" as "going to").
-    """
-    text = _CLAIM.sub(r"\1\2?", _TAG.sub(".", text))
-    text = _SAID_AS.sub(lambda found: lex.TABLES["said_as"][found[0].lower()], text.replace("’", "'"))
-    found, kept, end = lex.tokens(text), list[str](), 0
-    starts = [at for at in range(len(found)) if at == 0 or key_at(found, at - 1) in lex.ENDS]
-    for at in starts[:_MAX_TRIES]:
-        parsed = read_from("opening", found, at, _OPENING)
-        if parsed is not None:
-            tree, behind = parsed
-            asks = f"tell me {found[behind - 1].key} " if "asks_if" in tree else ""
-            kept += [text[end : found[at].start], asks]
-            end = found[behind].start if behind < len(found) else len(text)
-    return "".join([*kept, text[end:]])
+def joined(first: MotionWords, second: MotionWords) -> MotionWords:
+    """A motion that is told in two places."""
+    empty = vars(NOT_SAID)
+    told = {name: value for name, value in vars(second).items() if value != empty[name]}
+    single = ("kind", "direction", "depth", "along_arrow", "forward")
+    clash = any(name in told and getattr(first, name) not in (empty[name], told[name]) for name in single)
+    kept = {name: value for name, value in told.items() if getattr(first, name) == empty[name]}
+    quantities = (*first.quantities, *second.quantities)
+    return replace(first, **kept | {"quantities": quantities, "is_contradictory": clash or first.is_contradictory})
