@@ -12,9 +12,10 @@ from typing import Any
 
 import httpx
 import mllm_server as say
+import numpy as np
 import pytest
 from conftest import example
-from drawn import floor
+from drawn import block, floor
 from mllm_server import MllmServer
 from refusals import refused
 from servers import data_url
@@ -76,7 +77,8 @@ def answered(service: Service, image: bytes | None = None, **body: Any) -> Answe
 
 
 def simulated(service: Service, **body: Any) -> Simulation:
-    return service.simulate(SimulateRequest.model_validate(body_of(service, blank(320, 240), body)))
+    image = encode_png(np.ascontiguousarray(block(floor(320, 240), (128, 96, 192, 144), (40, 60, 200))))
+    return service.simulate(SimulateRequest.model_validate(body_of(service, image, body)))
 
 
 def replying(mllm: MllmServer, reply: Callable[[str], object]) -> None:
@@ -121,11 +123,14 @@ def test_settings_that_name_no_model_are_told_at_the_start(settings: dict[str, s
     assert "COW_MLLM" in caught.value.detail
 
 
-def test_a_model_that_no_manifest_describes_is_doubted_aloud(mllm, make) -> None:
-    mllm.say(json.dumps(IDENTIFIED), json.dumps({"label": "the toy car", "bbox": [0.4, 0.4, 0.6, 0.6]}))
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_a_model_that_no_manifest_describes_is_doubted_unless_its_box_is_proved(is_seen: bool, mllm, make) -> None:
+    bbox = [0.4, 0.4, 0.6, 0.6] if is_seen else [0.1, 0.7, 0.2, 0.9]
+    mllm.say(*map(json.dumps, (IDENTIFIED, {"label": "the toy car", "bbox": bbox}) * (1 if is_seen else 2)))
     told = simulated(make("generic", mllm_model="new-thing"), motion=HEADING)
-    assert any("'new-thing'" in warning for warning in told.warnings)
-    assert told.grounding.bbox == pytest.approx((128, 96, 192, 144))
+    assert any("'new-thing'" in warning for warning in told.warnings) is told.grounding.is_doubtful is not is_seen
+    if is_seen:
+        assert told.grounding.bbox == pytest.approx((128, 96, 192, 144))
     assert "response_format" not in mllm.asked[-1], "such a server may not know schemas"
     assert '{"reasoning":' in mllm.text(-1), "so the prompt shows the shape"
 
