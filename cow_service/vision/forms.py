@@ -218,7 +218,7 @@ def shape_ratio(region: Region, head: str | None, has_colour: bool) -> float:
     # A region is round where the noun names something round, and not where it does not.
     can_be = not region.is_disc or (form is None and head not in SOLID)
     if form == "ball":
-        round_enough = region.roundness >= (NOT_ROUND if has_colour else ROUND)
+        round_enough = region.roundness >= (NOT_ROUND if has_colour or region.is_hidden else ROUND)
         can_be = round_enough or (region.is_hidden and has_colour)
     if form is None or not can_be:
         return 0.0 if can_be else IMPOSSIBLE

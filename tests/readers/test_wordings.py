@@ -42,7 +42,7 @@ CORE = {
     "several things": "If the yellow ball moves along the arrow, does it avoid both mugs?",
     "when": "When will the red bottle start to cover the white cylinder if it moves at 50 px/s along the blue arrow?",
     "hidden": "If the blue cube slides right, will part of it be hidden behind the white cube at some point?",
-    "count": "How many things will the black ball touch on its way down, not counting the floor?",
+    "count": "How many objects does the ball run into on its way to the right-hand edge of the picture?",
     "vehicle": "car backs up - touches anything?",
     "several legs": "The car moves 40 pixels to the left and then 200 pixels up. Where does it end up?",
 }

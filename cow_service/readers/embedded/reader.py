@@ -149,8 +149,7 @@ class EmbeddedReader:
         Raises `CannotReadDirection`.
         """
         with given.cpu():
-            scene, names = given.scene, names_of(given) or tuple(each.object for each in grounding.others)
-            question = parse(given.question, names)
+            scene, question = given.scene, parse(given.question, names_of(given, grounding))
             words = question.motion
             on = motions.along_trail(scene, grounding, words) if words.trail else None
             reading = on or motions.read_way(scene, question, grounding)
@@ -174,8 +173,7 @@ class EmbeddedReader:
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
         """The world's answer to the question, the same for every vote; not sure if it has none."""
-        names = () if grounding is None else (grounding.object, *(each.object for each in grounding.others))
-        question = parse(given.question, names_of(given) or names)
+        question = parse(given.question, names_of(given, grounding))
         simulation = None if imagined is None else imagined.simulation
         asked, say = question.asked if grounding is None else grounding.asked, phrases_of(given.language)
         reading = answer_from(options, asked, simulation, say, question.alternatives, question.unread)
@@ -192,9 +190,10 @@ def create(settings: Settings) -> EmbeddedReader:
     return EmbeddedReader()
 
 
-def names_of(given: base.ReaderInput) -> tuple[str, ...]:
-    """The names of the given things."""
-    return tuple(each.object for each in given.known)
+def names_of(given: base.ReaderInput, grounding: records.Grounding | None = None) -> tuple[str, ...]:
+    """The names of the given things, or of those that were found."""
+    found = () if grounding is None else (grounding.object, *(each.object for each in grounding.others))
+    return tuple(each.object for each in given.known) or found
 
 
 def _not_said(question: Question, given: base.ReaderInput) -> CannotGround:

@@ -1,1 +1,1 @@
-"""The English of the embedded reader: what a question says, as records, by a grammar and word lists."""
+"""The English of the embedded reader: what a question says, as records, by sentence forms and word lists."""
