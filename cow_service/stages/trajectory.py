@@ -113,7 +113,7 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
             doubts.append("outline")
         if world.measured is not None and not all(world.measured.footprints[body] for body in matter):
             doubts.append("depth")
-        if any(moves_over(bodies[0].bbox, each, world.faint) for each in ways):
+        if world.placement is None and any(moves_over(bodies[0].bbox, each, world.faint) for each in ways):
             doubts.append("faint")
         return doubts
 
