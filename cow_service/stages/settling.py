@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.readers.base import GroundingReading, MotionReading, QuestionReading, WayReading, WordReader
-from cow_service.records import Asked, BBox, Cue, Intervention, LocatedObject, Vector
+from cow_service.records import Asked, BBox, Cue, LocatedObject, Vector
 from cow_service.vision.masks import iou
 from cow_service.vision.regions import Region
 
@@ -251,15 +251,14 @@ def settle_question(
             told = (f"`{name}` {_shown(getattr(plain, name))}, not {_shown(getattr(asked, name))}" for name in differ)
             objections.append(f"By its words the question asks with {', '.join(told)}.")
         asked = followed
-    names = [[each.object for each in said.changes if each.kind == "remove"], _removed(read.interventions)]
+    names = [
+        [each.object for each in said.changes if each.kind == "remove"],
+        [each.object.object for each in read.interventions if each.kind == "remove"],
+    ]
     if len(names[0]) != len(names[1]):
         told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in names]
         objections.append(f"By its words the question takes {told[0]} away beforehand, and {told[1]} was read.")
     return replace(read, asked=asked or plain, asked_is_doubtful=bool(objections)), tuple(objections)
-
-
-def _removed(changes: Sequence[Intervention]) -> list[str]:
-    return [each.object.object for each in changes if each.kind == "remove"]
 
 
 def _shown(value: object) -> str:
