@@ -62,7 +62,8 @@ def direct(outcome: Outcome, say: Phrases) -> str:
             return say("after", time=say.seconds(outcome.time or 0.0)) if is_known else say("never")
         case "which" | "which-to-remove":
             meant = [] if outcome.is_needless else [each.object for each in outcome.candidates if each.is_meant]
-            none = "nothing" if outcome.is_needless or not outcome.asked.among else "none-of-them"
+            is_open = outcome.asked.form == "which" and not outcome.asked.among
+            none = "nothing" if outcome.is_needless or is_open else "none-of-them"
             last = "names-and" if outcome.asked.form == "which" else "names-or"
             return say.joined(meant, last) if meant else say(none)
         case "how-many":

@@ -246,7 +246,7 @@ SENTENCES: dict[str, Trajectory] = {
         ensemble=10,
         encounters=(touch("vase"),),
     ),
-    "Nothing: It hits something and removing the cube does not prevent that.": world(
+    "None of them: It hits something and removing the cube does not prevent that.": world(
         asks("touches", form="which-to-remove", candidates=candidates(cube=False), as_it_is=0.9), **HITS
     ),
     "Nothing: Nothing has to be removed: it misses the vase.": world(
