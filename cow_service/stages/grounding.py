@@ -1,10 +1,11 @@
 """Stage 1: which object moves and where it is, where the others are that matter, and what is asked of them."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
-from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
+from cow_service.errors import CannotGround, FieldError, InvalidRequest, MllmBadReply, field_of
 from cow_service.media.images import decode, encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
@@ -126,14 +127,16 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
 def _read_and_settle(run: Run[SimulateRequest], given: ReaderInput) -> GroundingReading:
     """What the reader says of places and of what is asked, settled with the words and with what is seen.
 
-    A reader that may be wrong is asked once more with what speaks against its reading. Raises what it raises.
+    A reader that may be wrong is asked once more with what speaks against its reading; a reply that cannot be used then
+    leaves the first. Raises what the reader raises.
     """
-    reading, objections = run.reader.ground(given), ()
+    reading = run.reader.ground(given)
     if not run.reader.heeds_objections:
         return reading
     settled, objections = _settled(run, reading)
     if objections:
-        settled, objections = _settled(run, run.reader.ground(replace(given, objections=objections)))
+        with suppress(CannotGround, MllmBadReply):
+            settled, objections = _settled(run, run.reader.ground(replace(given, objections=objections)))
     return replace(settled, warnings=(*settled.warnings, *objections))
 
 
@@ -330,7 +333,7 @@ def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> Grounding
             doubted.append(thing.object)
             return thing.model_copy(update={"is_doubtful": True})
         mask = run.backends.artifacts.put(encode_png(outline.mask), "image/png")
-        return thing.model_copy(update={"bbox": outline.bbox, "mask": mask})
+        return thing.model_copy(update={"bbox": outline.bbox, "bbox_deviation": 0.0, "mask": mask})
 
     others = tuple(outlined(each) for each in reading.others)
     interventions = tuple(
@@ -344,6 +347,7 @@ def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> Grounding
     return replace(
         reading,
         bbox=own.bbox,
+        bbox_deviation=0.0,
         mask=own.mask,
         others=others,
         interventions=interventions,

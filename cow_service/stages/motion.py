@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
@@ -9,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from cow_service import records
-from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, field_of
+from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, MllmBadReply, field_of
 from cow_service.narration.words import bare_name, direction_words, place_words, same_name
 from cow_service.perception.facing import facing
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
@@ -56,8 +57,9 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         way, source = run.question.way, run.reader.source
         reading, objections = settle_way(run.reader.read_motion(given, grounding, hints), way, seen, grounding.bbox)
         if objections:
-            again = run.reader.read_motion(replace(given, objections=objections), grounding, hints)
-            reading, objections = settle_way(again, way, seen, grounding.bbox)
+            with suppress(CannotReadDirection, MllmBadReply):
+                again = run.reader.read_motion(replace(given, objections=objections), grounding, hints)
+                reading, objections = settle_way(again, way, seen, grounding.bbox)
         reading = replace(reading, warnings=(*reading.warnings, *objections))
         if reading.direction is None and reading.kind in records.DIRECTED_KINDS:
             raise CannotReadDirection(

@@ -10,13 +10,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from drawn import block, floor
 from hypothesis import given
 from hypothesis import strategies as st
+from runs import run_of
 
+from cow_service.errors import CowError, MllmBadReply
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
-from cow_service.readers.base import GroundingReading, MotionReading, NamedChange, QuestionReading, WayReading
+from cow_service.readers.base import (
+    GroundingReading,
+    MotionReading,
+    NamedChange,
+    QuestionReading,
+    ReaderInput,
+    WayReading,
+)
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Asked, BBox, Cue, Intervention, LocatedObject, Vector
+from cow_service.stages.grounding import ground
 from cow_service.stages.settling import (
     APART,
     BBOX_DEVIATION,
@@ -219,3 +230,50 @@ def test_what_speaks_against_a_name_or_a_place_is_a_doubt(
     assert settled.is_doubtful is is_doubtful
     assert any(each.is_doubtful for each in settled.others) is is_other_doubtful
     assert bool(objections) is (is_doubtful or is_other_doubtful)
+
+
+class Estimating:
+    """A reader that may be wrong: its readings one after another, and what it was told against them."""
+
+    source, heeds_objections = "mllm", True
+
+    def __init__(self, *readings: GroundingReading | CowError) -> None:
+        self.left, self.objections = list(readings), list[tuple[str, ...]]()
+
+    def ground(self, given: ReaderInput) -> GroundingReading:
+        self.objections.append(given.objections)
+        reading = self.left.pop(0)
+        if isinstance(reading, CowError):
+            raise reading
+        return reading
+
+
+RIGHT_PLACE, BARE_PLACE = (
+    GroundingReading("red block", (98.0, 101.0, 141.0, 139.0)),
+    GroundingReading("red block", ELSEWHERE),
+)
+AGAIN = {
+    "it looks again and finds it": (RIGHT_PLACE, False),
+    "it stays": (BARE_PLACE, True),
+    "its second reply cannot be used": (MllmBadReply("nothing usable"), True),
+}
+
+
+@pytest.mark.parametrize(("second", "is_doubtful"), AGAIN.values(), ids=AGAIN)
+def test_a_reader_is_asked_once_more_with_what_speaks_against_it(
+    second: GroundingReading | CowError, is_doubtful: bool
+) -> None:
+    image = np.ascontiguousarray(block(floor(), (100, 100, 140, 140), (200, 40, 40)))
+    reader = Estimating(BARE_PLACE, second)
+    told = ground(run_of(image, reader=lambda: reader, question="What happens?"))
+    assert [len(each) for each in reader.objections] == [0, 1]
+    assert told.value.is_doubtful is is_doubtful
+    assert any("nothing stands" in warning for warning in told.warnings) is is_doubtful
+    if not is_doubtful:
+        assert told.value.bbox == (100.0, 100.0, 140.0, 140.0), "moved onto what is seen there"
+
+
+def test_a_reading_that_nothing_speaks_against_is_not_asked_again() -> None:
+    image = np.ascontiguousarray(block(floor(), (100, 100, 140, 140), (200, 40, 40)))
+    reader = Estimating(RIGHT_PLACE)
+    assert not ground(run_of(image, reader=lambda: reader, question="What happens?")).value.is_doubtful
