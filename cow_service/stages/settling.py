@@ -12,7 +12,7 @@ from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.readers.base import GroundingReading, MotionReading, QuestionReading, WayReading, WordReader
 from cow_service.records import Asked, BBox, Cue, LocatedObject, Vector
-from cow_service.vision.masks import iou
+from cow_service.vision.masks import iou, is_same_object
 from cow_service.vision.regions import Region
 
 Objections = tuple[str, ...]
@@ -201,6 +201,7 @@ def _fault_of(thing: LocatedObject, region: Region | None, seen: SeenThings) -> 
     if region is None and thing.bbox in seen.bare:
         return f"In the box of '{thing.object}' nothing stands."
     named = set(thing.object.lower().split())
+    region = region or next((each for each in seen.regions if is_same_object(each.bbox, thing.bbox)), None)
     if region is None or not named.isdisjoint((region.colour, *region.colours)):
         return None
     there = [each for each in seen.regions if each.colour in named]

@@ -364,14 +364,6 @@ def test_a_drawn_arrow_is_surer_than_the_reader(
     assert (outcome.depends_on[:1] == ("reading",)) is is_doubtful
 
 
-def test_a_box_that_the_image_speaks_against_is_reported(scene, mllm, reader) -> None:
-    for box, is_warned in (([672, 375, 812, 625], True), (PLACE["bbox_2d"], False)):
-        mllm.say(json.dumps(BALL), json.dumps({"label": "red ball", "bbox_2d": box}))
-        warnings = reader.ground(ReaderInput(scene, "What if it moves?", motion_wanted=False)).warnings
-        assert bool(warnings) is is_warned
-        assert not is_warned or "blue" in warnings[0]
-
-
 # What a network and a server do
 
 

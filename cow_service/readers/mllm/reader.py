@@ -25,8 +25,6 @@ from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.settings import Settings
-from cow_service.vision.masks import is_same_object
-from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import PROMPTS
 
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
@@ -97,7 +95,6 @@ class MllmReader:
             raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image.", remedy=GIVE_PLACE)
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
-            warnings = box_warnings(given.scene, bbox, identified.object)
         mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
         others, doubles = separate_objects(mover, located.others)
         known = {name_words(each.object): each for each in (mover, *others)}
@@ -120,10 +117,10 @@ class MllmReader:
             )
             for each in identified.changes
         )
-        removed, is_other = {each.object.bbox for each in interventions if each.kind == "remove"}, False
-        if located.label and set(name_words(located.label)).isdisjoint(name_words(identified.object)):
-            mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
-            warnings, is_other = (*warnings, mismatch), True
+        removed = {each.object.bbox for each in interventions if each.kind == "remove"}
+        is_other = bool(located.label) and set(name_words(located.label)).isdisjoint(name_words(identified.object))
+        mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
+        warnings = (*((mismatch,) if is_other else ()), *identified.warnings, *located.warnings, *doubles)
         return GroundingReading(
             object=identified.object,
             bbox=bbox,
@@ -131,7 +128,7 @@ class MllmReader:
             others=tuple(other for other in others if other.bbox not in removed),
             objects_complete=located.objects_complete and not doubles,
             interventions=interventions,
-            warnings=(*warnings, *identified.warnings, *located.warnings, *doubles),
+            warnings=warnings,
             place_doubts=self._family_warnings,
             is_doubtful=is_other,
             hints=hints if given.motion_wanted else None,
@@ -273,17 +270,3 @@ class MllmReader:
 def create(settings: Settings) -> MllmReader:
     """Factory for the registry. Raises `ReaderUnavailable` if COW_MLLM cannot be used."""
     return MllmReader("mllm", MllmClient(configure(settings), settings), settings.mllm_base_url or "")
-
-
-def box_warnings(scene: Scene, bbox: BBox, name: str) -> tuple[str, ...]:
-    """What speaks against a box that was given for an object of this name; empty if nothing does."""
-    colours = set(name_words(name))
-    there = [each for each in scene.regions if each.colour in colours and not is_same_object(each.bbox, bbox)]
-    here = scene.region_of(bbox) if there else None
-    if here is None or not colours.isdisjoint((here.colour, *here.colours)):
-        return ()
-    x, y = there[0].centre
-    return (
-        f"The reader's box is around something {here.colour}, while something {there[0].colour} is at "
-        f"({x:.0f}, {y:.0f}): the box may be wrong.",
-    )
