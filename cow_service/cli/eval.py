@@ -1,6 +1,7 @@
 """`cow eval`: measures whether imagination helps a multimodal LLM, by how much, and at what cost."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from cow_service.cli.batch import EXIT_INTERRUPTED, EXIT_SOME_FAILED
-from cow_service.cli.options import Texts, argument, option, printable
+from cow_service.cli.options import Texts, argument, option, printable, with_options
 from cow_service.client.options import CONCURRENCY
 from cow_service.errors import CowError, InvalidRequest, install_line
 
@@ -48,42 +49,54 @@ DATA = (
     "A folder in CausalSpatial's layout, a folder of scenes, a file (JSONL, CSV, TSV, Parquet), or the name of a data "
     "set on the Hugging Face hub, such as Mwxinnn/CausalSpatial."
 )
-# Options of both `run` and `plan`.
-Mllm = Annotated[
-    str | None, option("Multimodal LLM, as Inspect names it, such as openai/gpt-5.", shown="the embedded reader")
-]
-Revision = Annotated[str | None, option("Commit or snapshot of its weights, kept in the record.", shown="none")]
-Arms = Annotated[
-    Texts,
-    option(
-        "Ways to ask: never, always, auto, placebo-still, placebo-direction, placebo-item, encounters, frames-only, "
-        "gate, oracle, each with suffixes such as :initial or :vote-3; or factors: "
-        "content=simulated,frames=events,votes=1. May be repeated, or several names separated by commas.",
-        shown="the preset's",
-    ),
-]
-PresetName = Annotated[
-    Literal["default", "paper", "controls", "dose"] | None,
-    option(
-        "Set of arms. default: with placebos; paper: the paper's protocol; controls: votes, gate, frames, words; dose: "
-        "degraded frames. Arms of --arm are added.",
-        shown="default, or only the arms of --arm",
-    ),
-]
-Repeats = Annotated[int | None, option("How often each question is asked in each arm.", min=1, shown="the preset's: 1")]
-Order = Annotated[Literal["shuffled", "data"] | None, option("Order of the options.", shown="the preset's: shuffled")]
-Subsets = Annotated[Texts, option("Only this subset of CausalSpatial's layout; may be repeated.")]
-Limit = Annotated[int | None, option("Only this many questions, from the first.", min=1, shown="all")]
-Seed = Annotated[int | None, option("Random seed of the order of options.", shown="0")]
-Reader = Annotated[str | None, option("Reader of the simulations (`cow models`).", shown="the server's")]
-GeneratorName = Annotated[str | None, option("Generator of their frames.", shown="the server's")]
-BaseUrl = Annotated[str | None, option("URL of the server of the multimodal LLM.", shown="the provider's")]
-Temperature = Annotated[float | None, option("Sampling temperature of its replies.", shown="the provider's")]
-MaxTokens = Annotated[int | None, option("Most tokens in a reply.", min=1, shown="8192")]
-SkipFaulty = Annotated[bool, option("Skip rows that cannot be asked, and unknown columns.", "--skip-faulty")]
+
+
+def shared_options(
+    mllm_revision: Annotated[
+        str | None, option("Commit or snapshot of its weights, kept in the record.", shown="none")
+    ] = None,
+    arm: Annotated[
+        Texts,
+        option(
+            "Ways to ask: never, always, auto, placebo-still, placebo-direction, placebo-item, encounters, "
+            "frames-only, gate, oracle, each with suffixes such as :initial or :vote-3; or factors: "
+            "content=simulated,frames=events,votes=1. May be repeated, or several names separated by commas.",
+            shown="the preset's",
+        ),
+    ] = None,
+    preset: Annotated[
+        Literal["default", "paper", "controls", "dose"] | None,
+        option(
+            "Set of arms. default: with placebos; paper: the paper's protocol; controls: votes, gate, frames, words; "
+            "dose: degraded frames. Arms of --arm are added.",
+            shown="default, or only the arms of --arm",
+        ),
+    ] = None,
+    repeats: Annotated[
+        int | None, option("How often each question is asked in each arm.", min=1, shown="the preset's: 1")
+    ] = None,
+    order: Annotated[
+        Literal["shuffled", "data"] | None, option("Order of the options.", shown="the preset's: shuffled")
+    ] = None,
+    subset: Annotated[Texts, option("Only this subset of CausalSpatial's layout; may be repeated.")] = None,
+    limit: Annotated[int | None, option("Only this many questions, from the first.", min=1, shown="all")] = None,
+    seed: Annotated[int | None, option("Random seed of the order of options.", shown="0")] = None,
+    reader: Annotated[str | None, option("Reader of the simulations (`cow models`).", shown="the server's")] = None,
+    generator: Annotated[str | None, option("Generator of their frames.", shown="the server's")] = None,
+    base_url: Annotated[str | None, option("URL of the server of the multimodal LLM.", shown="the provider's")] = None,
+    temperature: Annotated[float | None, option("Sampling temperature of its replies.", shown="the provider's")] = None,
+    max_tokens: Annotated[int | None, option("Most tokens in a reply.", min=1, shown="8192")] = None,
+    skip_faulty: Annotated[
+        bool, option("Skip rows that cannot be asked, and unknown columns.", "--skip-faulty")
+    ] = False,
+    prices: Prices = None,
+) -> dict[str, Any]:
+    """The options that `run` and `plan` have both."""
+    return locals()
 
 
 @app.command(epilog="Example: cow eval run questions.jsonl --mllm openai/gpt-5 --out run")
+@partial(with_options, read=shared_options)
 def run(
     out: Out,
     data: Annotated[str | None, argument(DATA)] = None,
@@ -91,11 +104,9 @@ def run(
         Path | None,
         option("File of `cow eval plan`: ask what it says, and report whether it was followed.", shown="none"),
     ] = None,
-    mllm: Mllm = None,
-    mllm_revision: Revision = None,
-    arm: Arms = None,
-    preset: PresetName = None,
-    repeats: Repeats = None,
+    mllm: Annotated[
+        str | None, option("Multimodal LLM, as Inspect names it, such as openai/gpt-5.", shown="the embedded reader")
+    ] = None,
     ask: Annotated[
         Literal["prompt", "answer"] | None,
         option(
@@ -103,21 +114,12 @@ def run(
             shown="prompt with --mllm, else answer",
         ),
     ] = None,
-    order: Order = None,
-    subset: Subsets = None,
-    limit: Limit = None,
-    seed: Seed = None,
-    reader: Reader = None,
-    generator: GeneratorName = None,
     url: Annotated[str | None, option("URL of the COW server.", shown="a server in this process")] = None,
-    base_url: BaseUrl = None,
-    temperature: Temperature = None,
-    max_tokens: MaxTokens = None,
     concurrency: Annotated[int, option("Most questions at the same time, in each arm.", min=1)] = CONCURRENCY,
-    skip_faulty: SkipFaulty = False,
     retry_failed: Annotated[bool, option("Ask failed questions again.", "--retry-failed")] = False,
     log_images: Annotated[bool, option("Keep pictures in Inspect's logs, for `inspect view`.")] = False,
-    prices: Prices = None,
+    *,
+    shared: dict[str, Any],
 ) -> None:
     """Ask every question in every arm, and report.
 
@@ -125,12 +127,12 @@ def run(
 
     Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not start or go on.
     """
-    given = locals()
+    given = {**locals(), **shared}
     _check_installed()
     from cow_service.evals.run import evaluate  # noqa: PLC0415
     from cow_service.evals.runs import REPORT  # noqa: PLC0415
 
-    priced = _priced(prices)
+    priced = _priced(shared["prices"])
     wanted = _request(given)
     try:
         done = evaluate(wanted, lambda told: typer.echo(printable(told), err=True))
@@ -150,6 +152,7 @@ def run(
 
 
 @app.command(epilog="Example: cow eval plan questions.jsonl --mllm openai/gpt-5 --out plan.json")
+@partial(with_options, read=shared_options)
 def plan(
     data: Annotated[str, argument(DATA)],
     out: Annotated[Path, option("The file to write.", "--out", "-o")],
@@ -159,32 +162,19 @@ def plan(
         Path | None,
         option("Folder of a smaller run, from which variance and costs are estimated.", shown="none"),
     ] = None,
-    mllm_revision: Revision = None,
-    arm: Arms = None,
-    preset: PresetName = None,
-    repeats: Repeats = None,
-    order: Order = None,
-    subset: Subsets = None,
-    limit: Limit = None,
-    seed: Seed = None,
-    reader: Reader = None,
-    generator: GeneratorName = None,
-    base_url: BaseUrl = None,
-    temperature: Temperature = None,
-    max_tokens: MaxTokens = None,
-    skip_faulty: SkipFaulty = False,
-    prices: Prices = None,
+    *,
+    shared: dict[str, Any],
 ) -> None:
     """Fix the analysis before the run, and estimate its cost.
 
     The file names the primary question, its test and the scenes it needs. Nothing is asked yet: run it with
     `cow eval run --plan FILE --out DIR`. The report says whether the plan was followed.
     """
-    given = {**locals(), "ask": "prompt", "plan": None}
+    given = {**locals(), **shared, "ask": "prompt", "plan": None}
     _check_installed()
     from cow_service.evals.run import write_plan  # noqa: PLC0415
 
-    typer.echo(printable(write_plan(_request(given), out, effect / 100, pilot, _priced(prices))))
+    typer.echo(printable(write_plan(_request(given), out, effect / 100, pilot, _priced(shared["prices"]))))
     typer.echo(f"\nThe plan: {out}. Run it with: cow eval run --plan {out} --out DIR")
 
 

@@ -9,7 +9,7 @@ import typer
 
 from cow_service import __version__
 from cow_service.cli import batch, eval, models, options, server
-from cow_service.cli.options import AsJson, Commands, Grouped, Texts, option, with_request_options
+from cow_service.cli.options import AsJson, Commands, Grouped, Texts, option, with_options
 from cow_service.cli.server import open_service
 
 app = typer.Typer(
@@ -35,7 +35,7 @@ def main(
 
 
 @app.command(cls=Grouped, epilog='Example: cow simulate photo.jpg "If the ball falls, what does it hit?"')
-@with_request_options
+@with_options
 def simulate(
     image: options.Image,
     question: options.Question,
@@ -83,7 +83,7 @@ def demo(
 
 
 @app.command(cls=Grouped, epilog='Example: cow answer photo.jpg "If the red ball moves left, will it hit the vase?"')
-@with_request_options
+@with_options
 def answer(
     image: options.Image,
     question: options.Question,

@@ -262,18 +262,20 @@ def request_body(
     return body | more
 
 
-def with_request_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with its last parameter, `request`, replaced by the options of `request_body`."""
-    shared = signature(request_body, eval_str=True).parameters
-    own = [parameter for name, parameter in signature(command, eval_str=True).parameters.items() if name != "request"]
+def with_options(
+    command: Callable[..., None], read: Callable[..., dict[str, Any]] = request_body
+) -> Callable[..., None]:
+    """The command with its last parameter replaced by the options of `read`, of which it gets what that returns."""
+    shared = signature(read, eval_str=True).parameters
+    *own, last = signature(command, eval_str=True).parameters.values()
 
     @wraps(command)
-    def with_options(**given: Any) -> None:
-        command(request=request_body(**{name: given.pop(name) for name in shared}), **given)
+    def with_shared(**given: Any) -> None:
+        command(**{last.name: read(**{name: given.pop(name) for name in shared})}, **given)
 
     keyword_only = [parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in (*own, *shared.values())]
-    cast("Any", with_options).__signature__ = signature(command).replace(parameters=keyword_only)
-    return with_options
+    cast("Any", with_shared).__signature__ = signature(command).replace(parameters=keyword_only)
+    return with_shared
 
 
 def open_client(url: str | None) -> Client:
