@@ -73,14 +73,6 @@ def _draws(*parts: object) -> random.Random:
     return random.Random(int.from_bytes(digest, "big"))
 
 
-def read_reply(reply: str, options: Sequence[AnswerOption]) -> str | None:
-    """The letter of the shown option that a reply chooses; None if it chooses none, or several."""
-    try:
-        return read_answer(reply, options).answer
-    except ReplyError:
-        return None
-
-
 def read_as_paper(reply: str) -> str | None:
     """The letter that the rules of the paper's public scoring script read in a reply; None if they find none.
 
@@ -124,7 +116,10 @@ class Case:
 
     def read(self, reply: str) -> str | None:
         """The letter, in the data's order, that a reply chooses; None if it chooses none, or several."""
-        return self._in_data_order(read_reply(reply, self.options))
+        try:
+            return self._in_data_order(read_answer(reply, self.options).answer)
+        except ReplyError:
+            return None
 
     def read_as_paper(self, reply: str) -> str | None:
         """The same by the rules of the paper's public scripts."""

@@ -28,6 +28,10 @@ PROMPTS = ("eval-question", "identify", "locate", "scale", "answer-from-image", 
 # Providers that Inspect and the server in this process both know, and where both look for the key.
 KEYS = {"openai": "OPENAI_API_KEY", "anthropic": "ANTHROPIC_API_KEY", "google": "GOOGLE_API_KEY"}
 MAX_TOKENS = 8192  # of a reply, as in the paper
+# Options that decide what is asked, beside arms, repeats and subsets.
+DECIDING = (
+    "data", "mllm", "mllm_revision", "base_url", "ask", "order", "seed", "limit", "skip_faulty", "reader", "generator",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,21 +65,8 @@ class EvalRequest:
     def options(self) -> dict[str, Any]:
         """What decides the replies, by the names of the options, without arms and repeats."""
         prompted = {"temperature": self.temperature, "max_tokens": self.max_tokens or MAX_TOKENS}
-        return {
-            "data": self.data,
-            "mllm": self.mllm,
-            "mllm_revision": self.mllm_revision,
-            "base_url": self.base_url,
-            "ask": self.ask,
-            "order": self.order,
-            "seed": self.seed,
-            "subset": list(self.subsets),
-            "limit": self.limit,
-            "skip_faulty": self.skip_faulty,
-            "reader": self.reader,
-            "generator": self.generator,
-            **(prompted if self.ask == "prompt" else {}),
-        }
+        named = {name: getattr(self, name) for name in DECIDING}
+        return {**named, "subset": list(self.subsets), **(prompted if self.ask == "prompt" else {})}
 
 
 def check_request(wanted: EvalRequest) -> None:

@@ -448,23 +448,11 @@ _OF_QUEUE = JOBS.c.queue == sa.bindparam("queue", type_=sa.Text)
 _OPEN_JOBS = sa.select(sa.func.count(), sa.func.count(sa.case((_OF_OWNER, 1)))).where(JOBS.c.status.in_(OPEN))
 _TURNS = sa.select(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.priority).where(_OF_QUEUE, JOBS.c.status.in_(OPEN))
 _FIRST_TURN, _TURNS_OF_OWNER = _TURNS.order_by(JOBS.c.turn).limit(1), _TURNS.where(_OF_OWNER)
-_SHOWN = [
-    JOBS.c[name]
-    for name in [
-        "id",
-        "kind",
-        "owner",
-        "status",
-        "created_at",
-        "ended",
-        "generator",
-        "question",
-        "answer",
-        "given",
-        "image",
-        "error",
-    ]
-]
+_NAMES = (
+    "id", "kind", "owner", "status", "created_at", "ended",
+    "generator", "question", "answer", "given", "image", "error",
+)  # fmt: skip
+_SHOWN = [JOBS.c[name] for name in _NAMES]
 
 
 def error_as_json(error: CowError) -> dict[str, Any]:

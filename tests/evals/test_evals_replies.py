@@ -37,10 +37,13 @@ DIFFERENT: dict[str, tuple[str | None, str | None]] = {
 
 @pytest.mark.parametrize("reply", [*SAME, *DIFFERENT])
 def test_replies_are_read_by_both_rules(reply: str) -> None:
-    from cow_service.evals.asking import read_as_paper, read_reply
+    from cow_service.evals.asking import Case, read_as_paper
+    from cow_service.evals.design import Arm
+    from cow_service.evals.items import Item
 
+    item = Item.model_construct(options=OPTIONS)
     wanted = DIFFERENT[reply] if reply in DIFFERENT else (SAME[reply], SAME[reply])
-    assert (read_reply(reply, OPTIONS), read_as_paper(reply)) == wanted
+    assert (Case(item, Arm(), 0, (0, 1, 2)).read(reply), read_as_paper(reply)) == wanted
 
 
 def test_the_extra_has_the_packages_of_the_reader_that_reads_replies() -> None:

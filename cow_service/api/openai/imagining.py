@@ -14,9 +14,9 @@ from cow_service.api.openai.chats import EXTENSION, Chat, ImagePart, images_of, 
 from cow_service.api.openai.records import WITHOUT, Answerer, ChatImagination
 from cow_service.api.problems import invalid
 from cow_service.media.artifacts import ArtifactStore
-from cow_service.media.images import decode, decode_own, encode_png
+from cow_service.media.images import decode, decode_own, encode_png, fit_within
 from cow_service.readers.base import Imagined
-from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion, other_item, still_frame
+from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion, other_item
 from cow_service.readers.mllm.hypothesis import hypothesis, pictures
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt
@@ -32,15 +32,8 @@ OF_ANSWERS = {  # fields of an `AnswerRequest`, and what does the same for a cha
     "options": "the MLLM reads them in the messages",
 }
 NAMED_FRAMES = {"count": 3, "max_side": 512}  # in addition to the policy in a model's name: as in the paper
-OF_CLIP = (
-    "generator",
-    "generator_options",
-    "num_frames",
-    "fps",
-    "seed",
-    "video",
-    "priority",
-)  # the same for another item
+# The same for another item.
+OF_CLIP = ("generator", "generator_options", "num_frames", "fps", "seed", "video", "priority")
 # Why something cannot be imagined from a chat that the MLLM may still answer. Other errors are faults of the server, or
 # of what the caller told COW itself: those are not passed over, or a figure would be that of another condition.
 PASSED_OVER = (
@@ -154,7 +147,7 @@ class WhatIf:
             found: list[NDArray[Any]] = []
             for like, frame in zip(wanted, frames, strict=True):
                 size = like.width, like.height
-                png = artifacts.read(frame.sha256) if image is None else still_frame(image, max(size))
+                png = artifacts.read(frame.sha256) if image is None else encode_png(fit_within(image, max(size)))
                 found.append(as_large_as(decode_own(png), *size))
             return tuple(found)
 

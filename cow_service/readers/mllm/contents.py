@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from cow_service.errors import CannotReadDirection
-from cow_service.media.images import decode, encode_png, fit_within
+from cow_service.media.images import decode
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.hypothesis import hypothesis
 from cow_service.records import DIRECTED_KINDS, Simulation
@@ -28,11 +28,6 @@ QUESTIONS = {  # about the example pictures
     "thrown-ball": "If the pink ball is thrown in the direction of the arrow, will it hit the white cube?",
 }
 _ENDS = ("distance", "duration", "until")
-
-
-def still_frame(image: NDArray[np.uint8], max_side: int) -> bytes:
-    """PNG of the image itself (height, width, 3), scaled like a frame of a maximum size in px."""
-    return encode_png(fit_within(image, max_side))
 
 
 def facts_of(simulation: Simulation) -> tuple[str, ...]:
