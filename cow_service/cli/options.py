@@ -245,8 +245,11 @@ def request_body(
                 value = _numbers(f"--{option_name}", value, _NUMBERS[option_name])
             body.setdefault(record, {})[field] = value
     body["frames"]["max_side"] = max_side or None
-    if depth is not None or depth_scale is not None:
-        body["depth"] = _depth_map(depth, depth_scale)
+    if depth is not None:
+        url = f"data:image/png;base64,{base64.b64encode(read_file(depth)).decode()}"
+        body["depth"] = {"map": url, "scale": depth_scale}
+    elif depth_scale is not None:
+        raise InvalidRequest("--depth-scale needs --depth, the file of the depth map.")
     if trajectory is not None:
         body["trajectory"] = object_in(read_file(trajectory), trajectory.name)
     if body.get("grounding", {}).keys() == {"object"}:
@@ -326,13 +329,6 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
         example = {"--direction": "-1,0 for to the left (x right, y down)"}.get(option, "10,20,90,140"[: 4 * count - 3])
         raise InvalidRequest(f"{option} takes {count} numbers separated by commas, such as {example}; got '{text}'.")
     return values
-
-
-def _depth_map(path: Path | None, scale: float | None) -> dict[str, object]:
-    """The `depth` of a request, from the file of a map."""
-    if path is None:
-        raise InvalidRequest("--depth-scale needs --depth, the file of the depth map.")
-    return {"map": f"data:image/png;base64,{base64.b64encode(read_file(path)).decode()}", "scale": scale}
 
 
 def _placement(text: str) -> dict[str, object]:

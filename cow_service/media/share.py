@@ -205,7 +205,9 @@ def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
     parts = {name.rpartition("/")[2]: (WEB / name).read_text() for name in MODULES}
     parts["wasm"] = base64.b64encode((WEB / "vendor" / "rapier.wasm.gz").read_bytes()).decode()
     parts["world"] = world.replace("<", "\\u003c")  # a JSON text that ends no script
-    scripts = [f'<script type="text/plain" id="{name}">{_inside(text)}</script>' for name, text in parts.items()]
+    if any(re.search(r"</script|<!--", text, re.IGNORECASE) for text in parts.values()):
+        raise ValueError("A part of the page ends its own script.")
+    scripts = [f'<script type="text/plain" id="{name}">{text}</script>' for name, text in parts.items()]
     words = {"question": told.question, "verdict": told.verdict}
     template = Template((WEB / "live" / "file.html").read_text())
     return template.substitute(
@@ -216,13 +218,6 @@ def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
         worlds=json.loads(world)["worlds"],
         data="\n".join(scripts),
     ).encode()
-
-
-def _inside(text: str) -> str:
-    """A text as it can stand in a script element. Raises `ValueError` for one that would end it."""
-    if re.search(r"</script|<!--", text, re.IGNORECASE):
-        raise ValueError("A part of the page ends its own script.")
-    return text
 
 
 def _line(canvas: Image, points: Sequence[tuple[float, float]], width: int, thickness: int) -> None:

@@ -52,7 +52,8 @@ def write_page(
     """
     folder.mkdir(parents=True, exist_ok=True)
     core, replies = page_data(runs, findings.arms)
-    core["pictures"] = _addresses(folder, runs, core["pictures"])
+    known = {path.stem: path for run in reversed(runs) for path in (run.folder / PICTURES).rglob("*.*")}
+    core["pictures"] = [_address(folder, known[digest]) if digest in known else None for digest in core["pictures"]]
     style, script = "".join(map(_source, STYLES)), "'use strict';\n" + "".join(map(_source, SCRIPTS))
     # Nothing but this script, this style, and pictures beside the page: whatever a reply says, it does nothing.
     allowed = {
@@ -103,15 +104,6 @@ def _digest(text: str) -> str:
 def _place(known: dict[str, int], value: str | None) -> int | None:
     """The place of a value among those that are known, where it is added if it is new; None for None."""
     return None if value is None else known.setdefault(value, len(known))
-
-
-def _addresses(folder: Path, runs: Sequence[EvalRun], digests: Sequence[str]) -> list[str | None]:
-    """Where the pictures of these digests are; None for a file that is not there."""
-    known: dict[str, Path] = {}
-    for run in reversed(runs):
-        known |= {path.stem: path for path in (run.folder / PICTURES).rglob("*.*")}
-    found = (known.get(digest) for digest in digests)
-    return [None if path is None else _address(folder, path) for path in found]
 
 
 def _address(folder: Path, path: Path) -> str:

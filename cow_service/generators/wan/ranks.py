@@ -108,7 +108,10 @@ class RankGroup:
 
         def meet() -> None:
             try:
-                self._sharing = self._met(transformer)
+                store = distributed.TCPStore(HOST, 0, self._wanted.ranks, is_master=True, wait_for_workers=False)
+                for rank in self._ranks:
+                    rank.send(store.port)
+                self._sharing = Sharing(transformer, self._wanted, 0, self._device, store)
             except BaseException as error:  # noqa: BLE001 - raised below
                 errors.append(error)
             finally:
@@ -121,12 +124,6 @@ class RankGroup:
         if errors:
             self._check()
             raise errors[0]
-
-    def _met(self, transformer: object) -> Sharing:
-        store = distributed.TCPStore(HOST, 0, self._wanted.ranks, is_master=True, wait_for_workers=False)
-        for rank in self._ranks:
-            rank.send(store.port)
-        return Sharing(transformer, self._wanted, 0, self._device, store)
 
     def denoise(self, noise: Tensor, given: Conditioning, sampling: Sampling, on_step: StepCallback) -> Tensor:
         """As `pipeline.denoise`, with all ranks. Raises `DeviceFailed` if one of them was lost."""
