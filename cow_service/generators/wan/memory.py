@@ -76,7 +76,9 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
         if not parameters:
             return ""
         need = need_of(profile, parameters, int(manifest.architecture["num_layers"]))
-        room, host = _room(device), _host()
+        room, host = _room(device), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        limit = CGROUP.read_text().strip() if CGROUP.is_file() else "max"
+        host = min(host, int(limit)) if limit.isdecimal() else host
         if device.type == "cpu":  # where both are the same memory
             need = Need(0, max(need.device, need.host))
         if need.device > room:
@@ -112,13 +114,6 @@ def _read_headers(folders: Mapping[str, Path], parts: Sequence[str]) -> tuple[di
 def _room(device: torch.device) -> int:
     """Bytes that a GPU has in all."""
     return torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else 0
-
-
-def _host() -> int:
-    """Bytes that this machine, or its container, has in all."""
-    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    limit = CGROUP.read_text().strip() if CGROUP.is_file() else "max"
-    return min(there, int(limit)) if limit.isdecimal() else there
 
 
 def wait_until_done(device: torch.device) -> None:
