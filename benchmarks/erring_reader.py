@@ -36,7 +36,9 @@ LEVELS: dict[str, dict[str, Any]] = {
     **{f"dir{degrees}, no cue": {"angle": degrees, "no_cue": True} for degrees in (20, 40)},
     "box10 and dir10": {"box": 0.1, "angle": 10},
     "mirrored": {"angle": 180},
+    "sense passed over": {"angle": 180, "other_sense": True},
     "negated": {"negated": True},
+    "no target": {"no_target": True},
     "another mover": {"another_mover": True},
     "one thing missed": {"missed": 1},
     "two things missed": {"missed": 2},
@@ -114,6 +116,8 @@ class StandIn(BaseHTTPRequestHandler):
         """What is asked, and what moves."""
         meta, asked = self.meta, asked_of(self.meta)
         asked["negated"] = bool(self.level.get("negated"))
+        if self.level.get("no_target"):
+            asked["target"] = None
         removed = meta.get("removed") or []
         gone = [] if self.level.get("removal_missed") else [removed] if isinstance(removed, str) else removed
         changes: list[dict[str, Any]] = [{"kind": "remove", "object": name} for name in gone]
@@ -155,7 +159,7 @@ class StandIn(BaseHTTPRequestHandler):
         points = (x, y), (x + reach * dx, y + reach * dy)
         start, end = ([round(1000 * a / width), round(1000 * b / height)] for a, b in points)
         has_arrow = "arrow" in meta["question"] and not level.get("no_cue")
-        along = "opposite" not in meta["question"]
+        along = ("opposite" not in meta["question"]) != bool(level.get("other_sense"))
         return {
             "label": self.mover, "bbox_2d": told(self.mover),
             "others": [{"label": name, "bbox_2d": told(name)} for name in others if name not in missing],

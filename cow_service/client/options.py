@@ -30,6 +30,7 @@ class SimulateOptions(TypedDict, total=False):
     motion: requests.MotionRequest | Given | None
     trajectory: requests.TrajectoryRequest | Given | None
     objects: Sequence[requests.ObjectRequest | Given] | None
+    objects_complete: bool
     interventions: Sequence[requests.InterventionRequest | Given] | None
     asked: requests.AskedRequest | Given | None
     camera: requests.CameraRequest | Given | None

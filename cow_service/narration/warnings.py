@@ -80,8 +80,7 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
         found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
     found += _of_depth(request, grounding, trajectory)
     found += [
-        f"Something that could not be made out for certain may stand at ({(left + right) / 2:.0f}, {bottom:.0f}); "
-        "it is not simulated."
+        f"Something else may stand at ({(left + right) / 2:.0f}, {bottom:.0f}); it is not simulated."
         for left, _, right, bottom in trajectory.faint
     ]
     if trajectory.outcome is not None and "outline" in trajectory.outcome.depends_on:

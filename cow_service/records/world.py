@@ -124,7 +124,7 @@ Doubt = Literal[
 ]  # fmt: skip
 """What a world is uncertain about. `place`: how far away and how high bodies are; `reading`: whether question and image
 were read rightly; `identity`: whether objects are the named ones; `outline`: where their outlines run; `faint`: whether
-a faint mark is an object; `depth`: whether the depth map fits the scene."""
+something else that is seen is an object in the way; `depth`: whether the depth map fits the scene."""
 CLEAR = 0.77  # confidence of a body below which no outcome that rests on it is sure
 CameraSource = Literal["request", "exif", "depth", "edges", "shadow", "side-view", "prior"]
 

@@ -428,7 +428,7 @@ class SimulateRequest(Record):
     interventions: tuple[InterventionRequest, ...] = Field(
         default=(),
         max_length=8,
-        description="Objects to take away or put somewhere before the motion, in addition to the question's.",
+        description="Objects to take away or put somewhere before the motion, instead of the question's.",
     )
     asked: AskedRequest | None = Field(
         default=None, description="What the question wants to know; by default it is read from the question."

@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
-from cow_service.errors import CannotGround, FieldError, InvalidRequest, MllmBadReply, field_of
+from cow_service.errors import CannotGround, FieldError, InvalidRequest, MllmBadReply, MllmUnavailable, field_of
 from cow_service.media.images import decode, encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
@@ -24,7 +24,7 @@ from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObj
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
-from cow_service.stages.settling import SeenThings, settle_places, settle_question
+from cow_service.stages.settling import SeenThings, settle_places, settle_question, things_of
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object, mask_iou
 from cow_service.vision.segmentation import mask_from_bbox
 from cow_service.vision.types import Mask
@@ -133,26 +133,31 @@ def _read_and_settle(run: Run[SimulateRequest], given: ReaderInput) -> Grounding
     reading = run.reader.ground(given)
     if not run.reader.heeds_objections:
         return reading
-    settled, objections = _settled(run, reading)
+    settled, objections = _settled(run, reading, given.known)
     if objections:
-        with suppress(CannotGround, MllmBadReply):
-            settled, objections = _settled(run, run.reader.ground(replace(given, objections=objections)))
+        with suppress(CannotGround, MllmBadReply, MllmUnavailable):
+            again = run.reader.ground(replace(given, objections=objections))
+            settled, objections = _settled(run, again, given.known)
     return replace(settled, warnings=(*settled.warnings, *objections))
 
 
-def _settled(run: Run[SimulateRequest], reading: GroundingReading) -> tuple[GroundingReading, tuple[str, ...]]:
+def _settled(
+    run: Run[SimulateRequest], reading: GroundingReading, known: Sequence[LocatedObject]
+) -> tuple[GroundingReading, tuple[str, ...]]:
+    """The reading without what the request says: the places of things that are `known`, what is asked and changed."""
     words, question, request = run.backends.words(), run.question, run.request
+    if request.interventions:
+        question, reading = replace(question, changes=()), replace(reading, interventions=())
+    others = (each for each in reading.others if not any(same_name(each.object, given.object) for given in known))
+    if request.objects_complete:
+        others = (each for each in others if each.role == "target")
+    reading = replace(reading, others=tuple(others))
     with run.cpu():
         scene = run.scene
-        boxes = [reading.bbox, *(each.bbox for each in reading.others)]
+        boxes = [reading.bbox, *(each.bbox for each in things_of(reading))]
         bare = frozenset(bbox for bbox in boxes if not scene.shows_thing(bbox))
         placed, objections = settle_places(reading, question, SeenThings(scene.regions, bare), words)
-    # What the request says of what is asked and changed is not the reader's to say.
-    if request.asked is not None:
-        return placed, objections
-    if request.interventions:
-        question, placed = replace(question, changes=()), replace(placed, interventions=())
-    asked, misread = settle_question(placed, question, words)
+    asked, misread = settle_question(placed, question, words, is_given=request.asked is not None)
     return asked, (*objections, *misread)
 
 

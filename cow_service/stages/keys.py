@@ -71,7 +71,7 @@ def digest_of(values: Mapping[str, Any]) -> str:
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 17  # of stored results; raised where what a stage means or stores changes
+FORMAT = 18  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,17 @@ class KeyFields:
     read_with: str | None = None  # a stage: where the reader reads for it, too, it says no less of this one
 
 
-TRAJECTORY_FIELDS = ("grounding", "motion", "trajectory", "camera", "depth", "ensemble", "num_frames", "fps", "live")
+TRAJECTORY_FIELDS = (
+    *("grounding", "motion", "trajectory", "objects_complete", "camera", "depth", "ensemble", "num_frames", "fps"),
+    "live",
+)
 KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "language", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "grounding": KeyFields(
         ("seed", "left_to_reader"),
         "reader",
         set_by_request=("place",),
-        always=("question", "asked", "objects", "interventions"),
+        always=("question", "asked", "objects", "objects_complete", "interventions"),
         perception=("detector", "segmenter"),
         # The reader is asked the same of the place; hints for the motion are not used where the request gives it.
         read_with="motion",

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from cow_service import records
-from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, MllmBadReply, field_of
+from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, MllmBadReply, MllmUnavailable, field_of
 from cow_service.narration.words import bare_name, direction_words, place_words, same_name
 from cow_service.perception.facing import facing
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
@@ -57,7 +57,7 @@ def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHi
         way, source = run.question.way, run.reader.source
         reading, objections = settle_way(run.reader.read_motion(given, grounding, hints), way, seen, grounding.bbox)
         if objections:
-            with suppress(CannotReadDirection, MllmBadReply):
+            with suppress(CannotReadDirection, MllmBadReply, MllmUnavailable):
                 again = run.reader.read_motion(replace(given, objections=objections), grounding, hints)
                 reading, objections = settle_way(again, way, seen, grounding.bbox)
         reading = replace(reading, warnings=(*reading.warnings, *objections))
@@ -113,7 +113,8 @@ def _way_seen(run: Run[SimulateRequest], scene: Scene, grounding: Grounding) -> 
     if way.forward is not None and grounding.prior is not None and grounding.prior.elongated:
         front = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
     goals = [each for each in grounding.others if way.towards and words.likeness(way.towards, each.object) == "same"]
-    return SeenWay(None if arrow is None else arrow.direction, goals[0] if len(goals) == 1 else None, front)
+    has_trail = trail_of(scene.trails, grounding.bbox) is not None
+    return SeenWay(None if arrow is None else arrow.direction, goals[0] if len(goals) == 1 else None, front, has_trail)
 
 
 # --- what the request says

@@ -53,7 +53,8 @@ class Situation:
     def of(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: Motion) -> Situation:
         """With the obstacles that the scene shows."""
         obstacles, removed = obstacles_of(scene, grounding)
-        unlisted = () if not grounding.objects_complete else unlisted_of(scene, grounding)
+        is_estimate = grounding.objects_complete and not run.request.objects_complete
+        unlisted = unlisted_of(scene, grounding) if is_estimate else ()
         return Situation(scene, grounding, motion, run.request, obstacles, removed, unlisted, run.depth, run.focal)
 
     @property
@@ -163,7 +164,8 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
     # What else moves has a way and a speed of its own, and no end but what it meets.
     fields = ("kind", "direction", "direction_deviation", "depth", "towards", "speed", "speed_deviation")
-    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": (), "rises": False}
+    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": (), "rises": False,
+             "other_direction": None}  # fmt: skip
     others = {
         index: motion.model_copy(update=alone | {name: getattr(each, name) for name in fields})
         for each in motion.others
@@ -234,7 +236,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
             source=(None if thing is None else thing.source) or "embedded",
             confidence=seen.confidence,
             prior=said,
-            bbox_deviation=(thing if thing is not None and bodies else grounding).bbox_deviation,
+            bbox_deviation=grounding.bbox_deviation if not bodies else 0.0 if thing is None else thing.bbox_deviation,
             point=None if bodies else grounding.point,
             stands_out=region is not None or situation.side_view is not None,
         )

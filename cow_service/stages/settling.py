@@ -21,6 +21,7 @@ Objections = tuple[str, ...]
 # --- which way
 
 APART = 2.0  # spreads between two sources from which they contradict each other
+FORWARD: Vector = (0.0, 1.0)  # which way, where something moves and nothing tells which
 WORDS_APART = 60.0  # degrees between a drawn arrow and a direction in words, which is a rough one: "to the right"
 
 
@@ -31,6 +32,7 @@ class SeenWay:
     arrow: Vector | None = None  # of the arrow that is drawn at it
     goal: LocatedObject | None = None  # where the thing is that the words have it move towards
     front: Vector | None = None  # the way that it faces
+    has_trail: bool = False  # which is measured
 
 
 def settle_way(read: MotionReading, said: WayReading, seen: SeenWay, mover: BBox) -> tuple[MotionReading, Objections]:
@@ -40,17 +42,29 @@ def settle_way(read: MotionReading, said: WayReading, seen: SeenWay, mover: BBox
     away from what was taken, worlds are drawn from both. A direction that was not estimated stays as it is, and so does
     one along a trail, which is measured.
     """
-    if read.direction_deviation is None or (read.cue == "trail" and not said.speaks_of_arrow):
+    if read.kind == "static" and said != WayReading():
+        way = said.direction or seen.arrow or FORWARD
+        stays = replace(read, other_direction=way, sentence=None)
+        return stays, ("The question has it move, and it was read to stay where it is.",)
+    is_measured = read.cue == "trail" and seen.has_trail and said == WayReading()
+    if read.direction_deviation is None or is_measured:
         return read, ()
     taken = _by_arrow(read, said, seen.arrow) or _by_words(read, said, seen.goal, mover) or _by_front(read, said, seen)
     if taken is None or taken.direction is None:
-        return read, ()
+        senses = {said.along_arrow, read.along_arrow}
+        if read.direction is None or senses != {True, False}:
+            return read, ()
+        told = "The question and the reading have it move to opposite ends of an arrow that is not seen."
+        return replace(read, other_direction=(-read.direction[0], -read.direction[1]), sentence=None), (told,)
     objections, rival = list[str](), None
     goal = None if seen.goal is None else way_to(seen.goal.bbox, mover, is_on_floor=read.kind == "linear")
     words = said.direction or goal
     if taken.cue == "arrow" and words is not None and angle(words, taken.direction) > WORDS_APART:
         objections.append("The question's words for the direction contradict the arrow drawn at the object.")
         rival = words
+    if taken.cue == "arrow" and said == WayReading() and read.along_arrow is None and read.direction is None:
+        objections.append("Nothing tells whether it moves along the arrow drawn at it or against it.")
+        rival = (-taken.direction[0], -taken.direction[1])
     off = 0.0 if read.direction is None else angle(read.direction, taken.direction)
     if off > APART * math.hypot(read.direction_deviation, DIRECTION_DEVIATIONS[taken.cue]):
         source = {"arrow": "the arrow drawn at the object", "orientation": "its front"}.get(taken.cue, "the question")
@@ -132,10 +146,10 @@ def settle_places(
     A box in which nothing stands, or something of another colour while the named one is elsewhere, is doubtful, and so
     is a mover that is another one than the words say.
     """
-    boxes = list(dict.fromkeys([read.bbox, *(each.bbox for each in _things_of(read))]))
+    boxes = list(dict.fromkeys([read.bbox, *(each.bbox for each in things_of(read))]))
     moved, objections, doubtful = _onto_regions(boxes, seen.regions), list[str](), set[BBox]()
     mover = LocatedObject(object=read.object, bbox=read.bbox)
-    for thing in dict.fromkeys((mover, *_things_of(read))):
+    for thing in dict.fromkeys((mover, *things_of(read))):
         fault = _fault_of(thing, moved[thing.bbox], seen)
         if fault is not None and thing.bbox not in doubtful:
             objections.append(fault)
@@ -170,7 +184,8 @@ def settle_places(
     return reading, tuple(objections)
 
 
-def _things_of(read: GroundingReading) -> list[LocatedObject]:
+def things_of(read: GroundingReading) -> list[LocatedObject]:
+    """All that was located besides the mover."""
     changed = (thing for each in read.interventions for thing in (each.object, *each.targets))
     return [*read.others, *changed]
 
@@ -228,17 +243,18 @@ PLAIN, DETAILS = ("form", "relation", "negated"), ("every", "partly", "within")
 
 
 def settle_question(
-    read: GroundingReading, said: QuestionReading, words: WordReader
+    read: GroundingReading, said: QuestionReading, words: WordReader, is_given: bool = False
 ) -> tuple[GroundingReading, Objections]:
     """The reading with what is asked, and what speaks against it: the words decide what they plainly say.
 
-    Names stay as they were read: the things that were found have them. Words that were not understood say nothing.
+    Names stay as they were read: the things that were found have them. Words that were not understood say nothing;
+    where what is asked `is_given`, they tell only what is changed.
     """
     asked, plain = read.asked, said.asked
     if plain is None:
         return read, ()
-    objections = list[str]()
-    if asked is not None:
+    objections, names = list[str](), [read.object, *(each.object for each in things_of(read))]
+    if asked is not None and not is_given:
         # What is left at its default was not said: the words complete it.
         usual = Asked(relation=asked.relation)
         differ = [name for name in PLAIN if getattr(asked, name) != getattr(plain, name)]
@@ -246,20 +262,41 @@ def settle_question(
         followed = asked.model_copy(update={name: getattr(plain, name) for name in (*PLAIN, *DETAILS)})
         for name in ("subject", "target"):
             wanted, taken = getattr(plain, name), getattr(asked, name)
-            if wanted is not None and taken is not None and words.likeness(wanted, taken) == "other":
-                differ.append(name)
+            if wanted is None or taken is None:
+                # The place that something is put into tells what it is to be inside of.
+                differs = wanted is not taken and not (wanted is None and asked.relation == "inside")
+            else:
+                differs = not _is_meant(wanted, taken, names, words)
+            differ += [name] if differs else []
+        if len(plain.among) > 1 and not _are_meant(plain.among, asked.among, names, words):
+            differ.append("among")
         if differ:
             told = (f"`{name}` {_shown(getattr(plain, name))}, not {_shown(getattr(asked, name))}" for name in differ)
             objections.append(f"By its words the question asks with {', '.join(told)}.")
         asked = followed
-    names = [
-        [each.object for each in said.changes if each.kind == "remove"],
-        [each.object.object for each in read.interventions if each.kind == "remove"],
-    ]
-    if len(names[0]) != len(names[1]):
-        told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in names]
+    removed = tuple(each.object for each in said.changes if each.kind == "remove")
+    taken = tuple(each.object.object for each in read.interventions if each.kind == "remove")
+    if not _are_meant(removed, taken, names, words):
+        told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in (removed, taken)]
         objections.append(f"By its words the question takes {told[0]} away beforehand, and {told[1]} was read.")
-    return replace(read, asked=asked or plain, asked_is_doubtful=bool(objections)), tuple(objections)
+    return replace(read, asked=asked or plain, asked_is_doubtful=read.asked_is_doubtful or bool(objections)), tuple(
+        objections
+    )
+
+
+def _is_meant(wanted: str, taken: str, names: Sequence[str], words: WordReader) -> bool:
+    """Whether the words for a thing may mean what was taken for it: of the things that were read none fits better."""
+    likeness = words.likeness(wanted, taken)
+    return likeness == "same" or (
+        likeness == "unknown" and all(words.likeness(wanted, name) != "same" for name in names)
+    )
+
+
+def _are_meant(wanted: Sequence[str], taken: Sequence[str], names: Sequence[str], words: WordReader) -> bool:
+    """Whether as many things are meant as were taken, each of them one of those."""
+    return len(wanted) == len(taken) and all(
+        any(_is_meant(name, each, names, words) for each in taken) for name in wanted
+    )
 
 
 def _shown(value: object) -> str:

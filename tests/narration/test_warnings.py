@@ -57,7 +57,7 @@ CASES: dict[str, tuple[dict[str, Any], Trajectory, list[str]]] = {
         "The given trajectory lasts 1.84 s and the clip 2.00 s: after the path ends, the object stays where it is."
     ]),
     "something faint": ({}, world(faint=((10.0, 20.0, 30.0, 50.0),)), [
-        "Something that could not be made out for certain may stand at (20, 50); it is not simulated."
+        "Something else may stand at (20, 50); it is not simulated."
     ]),
     "outlines in doubt": ({}, world(OUTLINE, encounters=(touch(),), bodies=tuple(
         body(name, confidence=value) for name, value in (("ball", 0.76), ("cube", 0.5), ("vase", 0.77), ("mug", 0))

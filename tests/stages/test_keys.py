@@ -18,6 +18,7 @@ DECIDE: dict[str, tuple[dict[str, Any], str, str]] = {
     "seed": ({"seed": 1}, "gating grounding motion generation answering", "gating generation answering"),
     "asked": ({"asked": {"relation": "touches", "target": "cube"}}, "grounding", "grounding"),
     "objects": ({"objects": [{"object": "mug", "bbox": [0, 0, 90, 90]}]}, "grounding", "grounding"),
+    "objects_complete": ({"objects_complete": True}, "grounding trajectory", "grounding trajectory"),
     "interventions": ({"interventions": [{"kind": "remove", "object": "mug"}]}, "grounding", "grounding"),
     "law": ({"motion": {"kind": "fall", "law": "ballistic"}}, "grounding motion trajectory", "motion trajectory"),
     "path": (PATH, "grounding motion trajectory", "motion trajectory"),

@@ -131,6 +131,7 @@ class MllmReader:
             warnings=warnings,
             place_doubts=self._family_warnings,
             is_doubtful=is_other,
+            asked_is_doubtful=bool(identified.warnings),
             hints=hints if given.motion_wanted else None,
             prior=located.prior,
             asked=identified.asked,
@@ -175,7 +176,7 @@ class MllmReader:
                 default = "the default one was taken"
                 warnings.append(f"The scale of the scene could not be read ({hints.scale_error}): {default}.")
         reading = replace(reading, warnings=tuple(warnings))
-        return self._directed(given, grounding, reading, hints) if kind in records.DIRECTED_KINDS else reading
+        return self._directed(reading, hints) if kind in records.DIRECTED_KINDS else reading
 
     def answer(
         self,
@@ -241,9 +242,7 @@ class MllmReader:
             hints["scale_error"] = scaled.code
         return located, MotionHints(**hints)
 
-    def _directed(
-        self, given: ReaderInput, grounding: Grounding, reading: MotionReading, hints: MotionHints
-    ) -> MotionReading:
+    def _directed(self, reading: MotionReading, hints: MotionHints) -> MotionReading:
         """The reading with its direction."""
         deviation = SPEED_DEVIATION if isinstance(hints.speed, str) else None
         ends = {"distance": hints.distance, "duration": hints.duration, "until": hints.until, "steps": hints.then}
@@ -253,6 +252,7 @@ class MllmReader:
             speed_deviation=deviation,
             cue=hints.cue or "orientation",
             direction_deviation=self._direction_deviation,
+            along_arrow=hints.along_arrow,
             **ends,
         )
         if hints.camera is not None:
@@ -264,7 +264,7 @@ class MllmReader:
             depth = math.sin(math.radians(hints.depth_degrees))
             reading = replace(reading, depth=depth, depth_deviation=HEADING_DEVIATION)
         (x0, y0), (x1, y1) = hints.ends
-        return replace(reading, direction=(x1 - x0, y1 - y0), along_arrow=hints.along_arrow)
+        return replace(reading, direction=(x1 - x0, y1 - y0))
 
 
 def create(settings: Settings) -> MllmReader:
