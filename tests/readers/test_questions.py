@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from cow_service.narration.words import phrases_of
-from cow_service.readers.embedded.answers import answer_from, count_of, says_it_happens, seconds_of
+from cow_service.readers.embedded.answers import answer_from, says_it_happens, span_of
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.questions import parse
 from cow_service.readers.options import read_choices, without_reply_form
@@ -316,8 +316,7 @@ def test_no_question_breaks_the_reading(text: str) -> None:
     for option in read_choices(text, None):
         assert option.letter
         says_it_happens(option.text, Asked(relation="touches", target="vase"))
-        seconds_of(option.text)
-        count_of(option.text)
+        span_of(option.text)
 
 
 EXTRA = ("not", "almost", "before", "and the cube", "twice", "unless it stops", "last", "hardly")
