@@ -11,7 +11,7 @@ from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.base import SeenThing
 from cow_service.readers.embedded.english.lexicon import GENERIC, TABLES, ObjectPhrase, like_a_colour
-from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, shape_of
+from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, prior_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, LocatedObject
@@ -218,7 +218,7 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         is_odd = own is not None and (
             forms.is_unlike(region, own) or (phrase.colour is None and looks not in (None, own))
         )
-        is_other = is_odd if own is not None else shape_of(head) != shape_of(looks or "")
+        is_other = is_odd if own is not None else prior_of(head).shape != prior_of(looks or "").shape
         colour = None if phrase.colour else like_a_colour(phrase.text)
         if colour is not None:
             reason = f": '{colour}' is no colour that is known."

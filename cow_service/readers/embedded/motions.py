@@ -9,7 +9,7 @@ from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
-from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
+from cow_service.readers.embedded.english.noun_phrases import prior_of
 from cow_service.readers.embedded.english.questions import MotionWords, Question
 from cow_service.readers.embedded.matching import best_matches, describe, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
@@ -87,7 +87,8 @@ def other_readings(
 def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | LocatedObject) -> None:
     """Raises `CannotReadDirection` for what falls over where it stands, and for a fall of what may stand."""
     name, prior, region = thing.object, thing.prior, scene.region_of(thing.bbox)
-    is_ball = shape_of(name) == "sphere" or (region is not None and region.is_disc)  # its shadow tells how high it is
+    # The shadow of a ball tells how high it is.
+    is_ball = prior_of(name).shape == "sphere" or (region is not None and region.is_disc)
     in_air = words.in_air or is_ball or scene.side_view is not None or (prior is not None and prior.stands_on == "air")
     if words.topples and not is_ball:
         raise _refused(f"The {name} would fall over where it stands, which is not simulated. Ask what a push does.")
@@ -180,7 +181,7 @@ def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionRe
         return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
     # Forward or backward, by the way that a vehicle is seen to face.
     told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
-    if not is_vehicle(name):
+    if not prior_of(name).elongated:
         raise _refused(f"{told} The embedded reader sees only of vehicles with wheels which way they face.")
     way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
     if way is None:

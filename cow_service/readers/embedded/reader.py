@@ -56,13 +56,7 @@ class EmbeddedReader:
 
     def read_name(self, name: str) -> records.ObjectPrior:
         """By its noun."""
-        opening = noun_phrases.container_form(name)
-        return records.ObjectPrior(
-            shape=noun_phrases.shape_of(name),
-            elongated=noun_phrases.is_vehicle(name),
-            equal_sided=noun_phrases.is_cube(name),
-            opening=None if opening == "unknown" else opening,
-        )
+        return noun_phrases.prior_of(name)
 
     def likeness(self, words: str, name: str) -> base.Likeness:
         """By their colours, nouns and numbers, and the forms of their nouns."""
@@ -262,19 +256,15 @@ class _Finder:
         """One thing, or several such as "both cylinders". Raises `CannotGround`."""
         if phrase.is_given:
             return [self.known[phrase.text]]
-        if phrase.text in self.taken:
-            return [records.LocatedObject(object=phrase.text, bbox=self.taken[phrase.text], source="embedded")]
-        free, kind = self.without(list(self.taken.values())), noun_phrases.kind_of(phrase.text)
-        region = matching.match_one(free, phrase) if kind is None else None
-        if kind is not None and kind.count in (None, 2):
-            kind = replace(kind, count=kind.count or count)
+        taken, kind = self.taken.get(phrase.text), noun_phrases.kind_of(phrase.text)
+        free = self.without(list(self.taken.values()))
+        if kind is not None and kind.count in (None, 2) and taken is None:
+            kind = kind._replace(count=kind.count or count)
             things = matching.named_by_colour(matching.match_several(free, kind), kind)
         else:
-            things = (
-                []
-                if region is None
-                else [records.LocatedObject(object=phrase.text, bbox=region.bbox, source="embedded")]
-            )
+            region = matching.match_one(free, phrase) if kind is None and taken is None else None
+            box = region.bbox if region is not None else taken
+            things = [records.LocatedObject(object=phrase.text, bbox=box, source="embedded")] if box else []
         if not things:
             why = matching.unclear(phrase, free)
             raise CannotGround(f"The question {told}, and {why}.{self._given}", remedy=GIVE_OBJECT)

@@ -7,12 +7,12 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, cast
+from typing import NamedTuple, cast
 
 from cow_service.readers.base import Likeness, SpeedWord
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.options import plain
-from cow_service.records import Shape
+from cow_service.records import ObjectPrior
 
 _CONTRACTED = {
     r"\bcan ?not\b|\bcan't\b": "can not", r"\bwon't\b": "will not", r"n't\b": " not",
@@ -264,12 +264,8 @@ def parse_noun_phrase(text: str) -> lex.ObjectPhrase | None:
     while said and said[0].lower() in lex.DETERMINERS:
         del said[0]
     words = re.findall(r"[\w'-]+", " ".join(said).lower())
-    ends = (
-        at
-        for at, word in enumerate(words)
-        if at and word != "one" and (word in lex.FUNCTION or word in lex.DETERMINERS)
-    )
-    words = words[: next(ends, len(words))]
+    closing = (lex.FUNCTION | lex.DETERMINERS) - {"one"}
+    words = words[: next((at for at, word in enumerate(words) if at and word in closing), len(words))]
     if not words or words[0] in lex.FUNCTION:
         return None
     phrase = object_phrase(words, " ".join(said))
@@ -292,30 +288,20 @@ def match_given(phrase: lex.ObjectPhrase, names: Sequence[str]) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _head(name: str) -> str | None:
+def prior_of(name: str) -> ObjectPrior:
+    """What the noun of a name says of its shape.
+
+    A box is a container: a question about a solid one would not ask what goes into it.
+    """
     phrase = parse_noun_phrase(name)
-    return None if phrase is None else phrase.head
+    head, shapes = phrase and phrase.head, ("sphere", "box", "cone", "cylinder")
+    is_vehicle = head in lex.SETS["vehicle"]  # longer along its heading than across
+    shape = "box" if is_vehicle else next((each for each in shapes if head in lex.SETS[each]), None)
+    opening = next((each for each in ("round", "square") if head in lex.SETS[each]), "none" if shape else None)
+    return ObjectPrior(shape=shape, elongated=is_vehicle, equal_sided=head in lex.SETS["cube"], opening=opening)
 
 
-def shape_of(name: str) -> Shape | None:
-    """The shape of what is called so; None if the noun does not say."""
-    shapes: tuple[Shape, ...] = ("sphere", "box", "cone", "cylinder")
-    head = _head(name)
-    return "box" if head in lex.SETS["vehicle"] else next((each for each in shapes if head in lex.SETS[each]), None)
-
-
-def is_vehicle(name: str) -> bool:
-    """Whether it is longer along its heading than across."""
-    return _head(name) in lex.SETS["vehicle"]
-
-
-def is_cube(name: str) -> bool:
-    """Whether it is a box as wide as high."""
-    return _head(name) in lex.SETS["cube"]
-
-
-@dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """What one of the things is called, and how many there are, where that is said."""
 
     phrase: lex.ObjectPhrase
@@ -335,18 +321,6 @@ def kind_of(name: str) -> Kind | None:
     return None if phrase is None else Kind(phrase, counts[0] if counts else None)
 
 
-def container_form(name: str) -> Literal["round", "square", "none", "unknown"]:
-    """Round or square for what is called a container, `none` for a solid thing, `unknown` where the noun says nothing.
-
-    A box is a container: a question about a solid one would not ask what goes into it.
-    """
-    if _head(name) in lex.SETS["round"]:
-        return "round"
-    if _head(name) in lex.SETS["square"]:
-        return "square"
-    return "unknown" if shape_of(name) is None else "none"
-
-
 def may_name(phrase: lex.ObjectPhrase, name: str) -> bool:
     """Whether a phrase may mean the object of that name: they share a colour or a noun, and differ in none."""
     other = parse_noun_phrase(name)
@@ -362,7 +336,7 @@ def likeness(words: str, name: str) -> Likeness:
     phrase, other = parse_noun_phrase(words), parse_noun_phrase(name)
     if phrase is None or other is None:
         return "same" if plain(words) == plain(name) else "unknown"
-    shapes = (shape_of(words), shape_of(name))
+    shapes = (prior_of(words).shape, prior_of(name).shape)
     if any(one is not None and two is not None and one != two for one, two in ((phrase.colour, other.colour), shapes)):
         return "other"
     return "same" if may_name(phrase, name) else "unknown"
