@@ -89,7 +89,7 @@ def _quantity(tokens: Tokens, what: str, said: dict[str, str]) -> str:
         tokens.quantities.append(lex.QuantityWords("speed", pace=cast(SpeedWord, what)))
     elif what:
         tokens.quantities.append(lex.QuantityWords(cast(lex.Measure, what), value, unit in lex.METRES))
-    return f"Q{len(tokens.quantities) - 1}" if what else ""
+    return f"{'W' if what == 'within' else 'Q'}{len(tokens.quantities) - 1}" if what else ""
 
 
 def _is_open(word: str) -> bool:

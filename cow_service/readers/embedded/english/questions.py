@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import groupby
 
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
@@ -179,32 +180,25 @@ class _Parser:
         while at < len(self.plain):
             matches = ((name, way.match(self.text, self.starts[at])) for name, way in ways.items())
             name, match = next(((name, match) for name, match in matches if match is not None), ("", None))
-            if match is None or not self._fits(name, match, legs[-1][1]):
+            names = {each for each, _ in legs[-1][1]}
+            again = (name == "goal" and "goal" in names) or (name == "halt" and "quantity" not in names)
+            if match is None or again:
                 break
             end = self._end(match)
             if name == "then":
-                again = verbs.match(self.text, self.starts[end])
-                if again is None and not any(ways[each].match(self.text, self.starts[end]) for each in _TELLING):
+                verb_of_leg = verbs.match(self.text, self.starts[end])
+                if verb_of_leg is None and not any(ways[each].match(self.text, self.starts[end]) for each in _TELLING):
                     break
-                legs.append((again[1] if again else "", []))
-                end = self._end(again) if again else end
+                legs.append((verb_of_leg[1] if verb_of_leg else "", []))
+                end = self._end(verb_of_leg) if verb_of_leg else end
             legs[-1][1].extend(lex.roles(match).items() or [(name, "")])
             legs[-1][1].append((name, "")) if name == "trail" else None
             at = end
         kind = "static" if "n" in piece.roles else lex.KINDS.get(verb)
-        first, *rest = (
-            motion_of(verb, said, self.tokens, None if leg else kind) for leg, (verb, said) in enumerate(legs)
-        )
-        clashes = any(each.is_contradictory for each in rest)
-        piece.end, piece.motion = at, replace(first, steps=tuple(rest)) if rest else first
-        piece.motion = replace(piece.motion, is_contradictory=True) if clashes else piece.motion
+        motions = [motion_of(*leg, self.tokens, None if at else kind) for at, leg in enumerate(legs)]
+        clashes = any(each.is_contradictory for each in motions)
+        piece.end, piece.motion = at, replace(motions[0], steps=tuple(motions[1:]), is_contradictory=clashes)
         return piece
-
-    def _fits(self, name: str, match: re.Match[str], said: Sequence[tuple[str, str]]) -> bool:
-        """Whether words for the way say something behind others."""
-        names = {each for each, _ in said}
-        is_limit = name == "quantity" and self.tokens.quantities[int(match[0][1:])].what == "within"
-        return not (is_limit or (name == "goal" and "goal" in names) or (name == "halt" and "quantity" not in names))
 
     def question(self) -> Question:
         """What all pieces together say."""
@@ -292,9 +286,8 @@ class _Parser:
             said, before, token = piece.said("m"), self._named(piece.start), piece.thing("m") or piece.said("m")
             if asking is not None and token in {"", "it"}:
                 # "Will the bottle be hidden behind the book if it moves": what the question is about.
-                acts = asking.thing(
-                    "o" if asking.is_passive and "behind" in self.plain[asking.start : asking.end] else "s"
-                )
+                is_hidden = asking.is_passive and "behind" in self.plain[asking.start : asking.end]
+                acts = asking.thing("o" if is_hidden else "s")
                 early = said == "it" or not before or asking.start < piece.start
                 token = acts if acts and early else ""
             token = token if token != "it" else ""
@@ -410,17 +403,12 @@ class _Parser:
         self, asking: _Piece, relation: AskedRelation, thing: lex.ObjectPhrase | None, changes: Sequence[ChangeWords]
     ) -> tuple[AskedRelation, lex.ObjectPhrase | None] | None:
         """The relation that is meant to a thing of that kind, and the thing; None where there is none."""
-        words, is_table = self.plain[asking.start : asking.end], thing is not None and thing.head in lex.TABLES
+        words = self.plain[asking.start : asking.end]
         if relation == "lands" and thing is not None:  # "off the table"
-            self.names_table = is_table
-            return (relation, None) if is_table else None
-        if (
-            relation == "touches"
-            and thing is not None
-            and is_table
-            and not thing.colour
-            and {"on", "onto"} & set(words)
-        ):
+            self.names_table = thing.head in lex.TABLES
+            return (relation, None) if self.names_table else None
+        on_table = thing is not None and thing.head in lex.TABLES and not thing.colour
+        if relation == "touches" and on_table and not {"on", "onto"}.isdisjoint(words):
             self.names_table = True
             return "lands", None
         if relation == "inside" and asking.asks_form == "whether":
@@ -455,28 +443,18 @@ class _Parser:
         lost += [each for each in self.pieces if each.what == "listed" and form != "which-first"]
         # What is told to be hit, and is not what the question then goes on about.
         lost += [each for each in told if not names_crash and (each.said("o") != struck or not struck)]
-        read = {at for each in self.pieces if each not in lost for at in range(each.start, each.end)}
-        runs: list[list[int]] = [[]]
-        for at, token in enumerate(self.plain):
-            if at in read or token in {".", "?", "!", ";", ","}:
-                runs.append([])
-            else:
-                runs[-1].append(at)
-        found = list[tuple[str, str]]()
-        for run in runs:
-            words = [self.plain[at] for at in run]
-            limits = [
-                word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].what == "within"
-            ]
-            if all(word in lex.CONNECTORS or word in limits for word in words):
+        closed = {at for each in self.pieces if each not in lost for at in range(each.start, each.end)}
+        closed |= {at for at, token in enumerate(self.plain) if token in {".", "?", "!", ";", ","}}
+        found, ends = list[tuple[str, str]](), {each.end: each.what for each in self.pieces}
+        for is_closed, run in groupby(range(len(self.plain)), key=lambda at: at in closed):
+            at = list(run)
+            words = [self.plain[each] for each in at]
+            if is_closed or all(word in lex.CONNECTORS or re.fullmatch(r"W\d+", word) for word in words):
                 continue
-            ends = [
-                each
-                for each in self.pieces
-                if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])
-            ]
-            what = "motion" if ends and ends[-1].what == "motion" else "asked"
-            found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words)))
+            sentence = max((end for end in range(at[0]) if self.plain[end] in {".", "?"}), default=-1)
+            before = [ends[end] for end in range(sentence + 1, at[0] + 1) if end in ends]
+            what = "motion" if before[-1:] == ["motion"] else "asked"
+            found.append((what, " ".join(self.said[each] for each in at if self.said[each]) or " ".join(words)))
         return found
 
 
