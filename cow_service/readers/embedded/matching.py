@@ -4,13 +4,14 @@ A thing is meant by positive evidence alone. What is merely left is not meant.
 """
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.base import SeenThing
-from cow_service.readers.embedded.english.lexicon import GENERIC, TABLES, ObjectPhrase, like_a_colour
+from cow_service.readers.embedded.english.lexicon import COLOURS, GENERIC, PLACES, SETS, TABLES, ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, prior_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
@@ -62,9 +63,8 @@ POOR = -1.0  # log ratio of an outline: with less it is not called so, unless by
 
 def is_known(phrase: ObjectPhrase) -> bool:
     """Whether the noun says something of a shape, or claims nothing."""
-    return (
-        phrase.noun is None or forms.form_of(phrase.head) is not None or phrase.head in forms.SOLID | GENERIC | TABLES
-    )
+    head = phrase.head
+    return head is None or forms.form_of(head) is not None or head in forms.SOLID | GENERIC | TABLES
 
 
 def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
@@ -107,10 +107,8 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
 def match_several(regions: Sequence[Region], kind: Kind) -> list[Region]:
     """The regions that fit a kind such as "both mugs", as many as it says, or all; empty if it is not clear which."""
     fitting = _foremost(regions, kind.phrase, kind.count or 1)
-    is_clear = len(fitting) == kind.count
-    if kind.count is None:
-        is_clear = all(_shape_ratio(region, kind.phrase) > CLEAR for region in fitting)
-    return fitting if is_clear else []
+    are_clear = kind.count is None and all(_shape_ratio(region, kind.phrase) > CLEAR for region in fitting)
+    return fitting if are_clear or len(fitting) == kind.count else []
 
 
 def unclear(phrase: ObjectPhrase, regions: Sequence[Region]) -> str:
@@ -165,11 +163,8 @@ def things_of_kinds(
             continue
         fitting = match_several(left, kind)
         if not fitting and kind in kinds[: len(among)]:
-            raise CannotGround(
-                f"The question asks about '{kind.phrase.text}', and which things those are the image does not tell for "
-                f"certain. Seen: {describe(regions)}.",
-                remedy=GIVE_OBJECT,
-            )
+            told = f"Which things '{kind.phrase.text}' are, the image does not tell for certain."
+            raise CannotGround(f"{told} Seen: {describe(regions)}.", remedy=GIVE_OBJECT)
         found += named_by_colour(fitting, kind)
     return found
 
@@ -189,6 +184,7 @@ def nouns_of(question: Question, sought: Sequence[str] = ()) -> tuple[str, ...]:
     return tuple(dict.fromkeys(each.noun for each in named if each is not None and each.noun))
 
 
+NEARLY = 0.8  # difflib's ratio from which a word is nearly a colour's name: "grean"
 SAME = 0.7  # IoU from which two masks are one thing's
 
 
@@ -212,16 +208,16 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         region = scene.region_of(bbox)
         if region is None or phrase.inside_box or phrase.noun in region.called:
             continue
-        # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
+        # What cannot be told by its outline is believed, unless the thing is clearly one of another kind. Where no
+        # colour tells that it is meant, its outline alone does.
         head, looks, own = phrase.head or "", forms.looks_like(region), forms.form_of(phrase.head)
-        # Where no colour tells that it is meant, its outline alone does.
-        is_odd = own is not None and (
-            forms.is_unlike(region, own) or (phrase.colour is None and looks not in (None, own))
-        )
+        is_other_form = phrase.colour is None and looks not in (None, own)
+        is_odd = own is not None and (forms.is_unlike(region, own) or is_other_form)
         is_other = is_odd if own is not None else prior_of(head).shape != prior_of(looks or "").shape
-        colour = None if phrase.colour else like_a_colour(phrase.text)
-        if colour is not None:
-            reason = f": '{colour}' is no colour that is known."
+        odd = [each for each in phrase.text.lower().split()[:-1] if each not in SETS["adjectives"] | PLACES]
+        colours = [each for each in odd if phrase.colour is None and get_close_matches(each, COLOURS, 1, NEARLY)]
+        if colours:
+            reason = f": '{colours[0]}' is no colour that is known."
         elif any(phrase.noun in each.called for each in scene.regions) and _shape_ratio(region, phrase) <= CLEAR:
             reason = ": the detector calls another thing so."  # a detector misses some
         elif looks is not None and is_other and phrase.noun is not None and head not in GENERIC:
