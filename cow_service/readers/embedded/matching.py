@@ -88,14 +88,12 @@ def _foremost(regions: Sequence[Region], phrase: ObjectPhrase, count: int = 1) -
     fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(forms.IMPOSSIBLE, least)]
     # A detector called it so, its outline is that of the noun, or it has the colour and is not clearly another kind of
     # thing, such as a candle where a cone of its colour was not seen.
-    names_nothing = phrase.colour is None and not is_known(phrase)
-    is_sure = any(
-        phrase.noun in each.called
-        or (_shape_ratio(each, phrase) >= POOR and not names_nothing)
-        or (each.colour == phrase.colour and not forms.is_other_kind(each, phrase.head))
-        for each in fitting
-    )
-    return fitting if is_sure else []
+    says_shape = phrase.colour is not None or is_known(phrase)
+    for each in fitting:
+        has_colour = each.colour == phrase.colour and not forms.is_other_kind(each, phrase.head)
+        if phrase.noun in each.called or (says_shape and _shape_ratio(each, phrase) >= POOR) or has_colour:
+            return fitting
+    return []
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
@@ -115,8 +113,7 @@ def unclear(phrase: ObjectPhrase, regions: Sequence[Region]) -> str:
     """Why not one of the regions is what a phrase names, for a message."""
     fitting = best_matches(regions, phrase)
     if len(fitting) > 1:
-        what = "its place" if phrase.colour else "its colour or its place"
-        return f"'{phrase.text}' may be any of {len(fitting)}: {describe(fitting)}. Name {what}"
+        return f"'{phrase.text}' may be any of {len(fitting)}: {describe(fitting)}. Name its colour or its place"
     if phrase.colour is None and not is_known(phrase):
         return f"'{phrase.text}' names no colour and no shape that is known here. Seen: {describe(regions)}"
     return f"'{phrase.text}' was not found, or not for certain. Seen: {describe(regions)}"
@@ -128,8 +125,7 @@ WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thin
 def inside_drawn_box(scene: Scene, phrase: ObjectPhrase) -> BBox:
     """The object inside the only box drawn over the image."""
     if len(scene.boxes) != 1:
-        count = f"{len(scene.boxes)} boxes" if scene.boxes else "no box"
-        told = f"Looked for '{phrase.text}' inside a drawn box, but the image shows {count}."
+        told = f"'{phrase.text}' is said to be inside a drawn box, and the image shows {len(scene.boxes) or 'none'}."
         raise CannotGround(told, remedy=GIVE_PLACE)
     x0, y0, x1, y1 = scene.boxes[0].bbox
     inside = np.zeros((scene.height, scene.width), bool)
@@ -220,10 +216,8 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
             reason = f": '{colours[0]}' is no colour that is known."
         elif any(phrase.noun in each.called for each in scene.regions) and _shape_ratio(region, phrase) <= CLEAR:
             reason = ": the detector calls another thing so."  # a detector misses some
-        elif looks is not None and is_other and phrase.noun is not None and head not in GENERIC:
-            reason = f", which looks like a {looks}, not '{head}'."
-        elif is_odd:
-            reason = f", which does not look like '{head}'."
+        elif is_odd or (looks is not None and is_other and phrase.noun is not None and head not in GENERIC):
+            reason = f", which looks like {f'a {looks}' if looks else 'something else'}, not '{head}'."
         elif not is_known(phrase):
             reason = f": whether '{phrase.head}' is right, the embedded reader cannot tell."
         else:

@@ -47,10 +47,9 @@ class EmbeddedReader:
             if each.kind == "remove" or each.targets
         )
         drawings = frozenset(each for each in ("arrow", "box") if each in question.lower())
-        said, way = read.motion, base.WayReading()
-        if not read.unread_motion and not said.is_contradictory:
-            towards = None if said.towards is None else said.towards.text
-            way = base.WayReading(said.along_arrow, said.direction, said.depth, towards, said.forward)
+        said, towards = read.motion, None if read.motion.towards is None else read.motion.towards.text
+        way = base.WayReading(said.along_arrow, said.direction, said.depth, towards, said.forward)
+        way = base.WayReading() if read.unread_motion or said.is_contradictory else way
         nouns, mover = matching.nouns_of(read), None if read.asked is None or read.mover is None else read.mover.text
         return base.QuestionReading(read.asked, mover, changes, said.trail, nouns, drawings, way)
 
@@ -145,10 +144,9 @@ class EmbeddedReader:
             words = question.motion
             on = motions.along_trail(scene, grounding, words) if words.trail else None
             reading = on or motions.read_way(scene, question, grounding)
-            parted = any(each.what == "share" for each in words.quantities)
-            goal = motions.goal_of(scene, words.towards, grounding) if parted and words.towards is not None else None
-            way = None if goal is None else way_to(goal.bbox, grounding.bbox, reading.kind == "linear")
-            said = motions.quantities(words.quantities, None if way is None else math.hypot(*way), grounding.bbox)
+            goal, on_floor = reading.towards, reading.kind == "linear"
+            way = None if goal is None else math.hypot(*way_to(goal.bbox, grounding.bbox, on_floor))
+            said = motions.quantities(words.quantities, way, grounding.bbox)
             return replace(
                 reading,
                 **dict(zip(("speed", "distance", "duration", "until"), said, strict=True)),

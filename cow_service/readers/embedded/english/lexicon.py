@@ -92,9 +92,8 @@ def singular(noun: str) -> str:
     """A plural noun made singular, by its ending."""
     if noun in SETS["unchanged"] or len(noun) < 4 or not noun.endswith("s") or noun.endswith(("ss", "us", "is")):
         return noun
-    if noun.endswith(("sses", "xes", "ches", "shes", "toes")):
-        return noun[:-2]
-    return noun[:-3] + "y" if noun.endswith("ies") else noun[:-1]
+    is_long = noun.endswith(("sses", "xes", "ches", "shes", "toes"))
+    return noun[:-2] if is_long else noun[:-3] + "y" if noun.endswith("ies") else noun[:-1]
 
 
 @dataclass(frozen=True)

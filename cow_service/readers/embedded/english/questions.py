@@ -444,8 +444,8 @@ def joined(first: MotionWords, second: MotionWords) -> MotionWords:
     """A motion that is told in two places."""
     empty = vars(NOT_SAID)
     told = {name: value for name, value in vars(second).items() if value != empty[name]}
-    single = ("kind", "direction", "depth", "along_arrow", "forward")
-    clash = any(name in told and getattr(first, name) not in (empty[name], told[name]) for name in single)
     kept = {name: value for name, value in told.items() if getattr(first, name) == empty[name]}
+    single = {"kind", "direction", "depth", "along_arrow", "forward"} & (told.keys() - kept.keys())
+    clash = any(getattr(first, name) != told[name] for name in single)
     quantities = (*first.quantities, *second.quantities)
     return replace(first, **kept | {"quantities": quantities, "is_contradictory": clash or first.is_contradictory})
