@@ -106,14 +106,7 @@ def test_an_end_that_nothing_tells_is_that_nearest_to_what_is_asked_about() -> N
     assert run.results["grounding"].warnings
 
 
-@pytest.mark.slow
-def test_an_end_that_is_as_far_as_the_other_and_a_trail_that_is_not_there_are_refused() -> None:
-    cube = block(floor(), (310, 290, 370, 350), GREEN)
-    with refused("cannot-ground"):
-        grounded(
-            jpeg(trail(cube, PLACES, [26.0] * 4, ORANGE, [1.0] * 4), 95),
-            ", the last of which is the one nearest to the green cube",
-        )
+def test_a_trail_that_is_not_there_is_refused() -> None:
     run, grounding = grounded(ball(SCENE, (300, 110), 26, ORANGE), "")
     with refused("cannot-read-direction"):
         run.stage("motion", read_motion, grounding, run.hints)

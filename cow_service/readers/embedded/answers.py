@@ -6,7 +6,6 @@ One rule for every form: `Outcome.sure` decides whether an answer is given, and 
 import math
 import re
 from collections.abc import Sequence
-from itertools import pairwise
 
 from cow_service.narration.words import Phrases, same_name
 from cow_service.readers.base import AnswerReading
@@ -21,28 +20,21 @@ _YES = re.compile(r"(?:yes\b(?! (?:and|or) no).*|true)", re.DOTALL | re.IGNORECA
 _NO = re.compile(
     r"no\s*(?:[,.;:!()\u2013\u2014-].*)?|no (?:it|the|this|that|because|they)\b.*|false", re.DOTALL | re.IGNORECASE
 )
-_TOUCHING = lex.TOUCHING
 _COVERING = lex.words("hidden hide hides occluded occlude occludes occlusion covered obscured concealed obstructed")
 _MISSING = lex.words("miss misses missed missing avoid avoids avoided untouched")
 _SEEN = lex.words("visible unobstructed unoccluded uncovered")
 _NEGATIONS = lex.words("not no never n't without nothing neither")
 _ANY_WORDS = lex.words("anything something any object objects nothing")
 _PASSIVE = lex.words("is are be get gets stays stay remains remain being")
-_BARE = dict.fromkeys(("it will", "it does", "it would"), True) | dict.fromkeys(
-    ("it will not", "it does not", "it would not", "it can not"), False
-)
+_IT = r"(?:it |the \w+(?: \w+)? )?"
 _NONE = re.compile(
-    r"none|nothing|neither|never|not at all|no (?:object|objects|thing|collision|contact|one|time|hit)"
-    r"|none of (?:them|these|the above|the objects)|neither of (?:them|these|the two)"
-    r"|(?:it |the \w+(?: \w+)? )?(?:hits|touches|reaches) (?:nothing|none|none of them)"
-    r"|(?:it |the \w+(?: \w+)? )?misses (?:it|both|all|everything|both of them|all of them)"
-    r"|(?:it |the \w+(?: \w+)? )?never (?:hits|touches|reaches)(?: (?:it|anything|any of them))?"
-    r"|(?:it |the \w+(?: \w+)? )?(?:does|will) not(?: (?:hit|touch|reach|collide with))?"
-    r"(?: (?:it|anything|any object|any of them|happen))?"
+    rf"{_IT}(?:(?:hits|touches|reaches) )?(?:none|nothing|neither)(?: of (?:them|these|the \w+))?|neither .+ nor .+"
+    rf"|{_IT}misses (?:it|both|all|everything)(?: of them)?|not at all|no (?:objects?|things?|collision|contact|one)"
+    rf"|{_IT}(?:never|(?:does|will) not)(?: (?:hits?|touch(?:es)?|reach(?:es)?))?(?: (?:it|anything|any of them))?"
 )
 _ALL = re.compile(r"(both|all|each)(?: of (?:them|these|the \w+))?(?: (?:objects|things))?")
 _ONLY = re.compile(
-    r"(?:(?:it is )?(?:only|just|both) )?(?:(?:by )?(?:removing|remove|taking away|take away) )?(?:only |just |both )?"
+    r"(?:(?:only|just|both) )?(?:(?:removing|remove|taking away|take away) )?(?:(?:only|just|both) )?"
     r"(.+?)(?:,? (?:only|alone))?"
 )
 _SEVERAL = re.compile(r"\b(?:both|all|several|more than one|at the same time|simultaneously|each)\b", re.IGNORECASE)
@@ -56,9 +48,9 @@ def says_it_happens(text: str, asked: Asked) -> bool | None:
     bare, said = text.strip().rstrip(".!"), _unfolded(text)
     if _YES.fullmatch(bare) or _NO.fullmatch(bare):
         return _YES.fullmatch(bare) is not None
-    if said in _BARE:
-        return _BARE[said]
-    words, (yes, no) = said.split(), (_TOUCHING, _MISSING) if asked.relation == "touches" else (_COVERING, _SEEN)
+    if whole := re.fullmatch(r"it (?:will|does|would)( not)?", said):
+        return whole[1] is None
+    words, (yes, no) = said.split(), (lex.TOUCHING, _MISSING) if asked.relation == "touches" else (_COVERING, _SEEN)
     about = [at for at, word in enumerate(words) if word in yes | no]
     if len(about) != 1:
         return None
@@ -84,92 +76,47 @@ def _unfolded(text: str) -> str:
 
 Span = tuple[float, float]  # from, to; both the same where one value is named
 
-MOST = 1000  # of what is counted
 ALONE = 0.25  # share of a single value that it may be off
-_WORDS = {"zero": "0", "no": "0", **{word: str(value) for word, value in lex.NUMBER_WORDS.items()}}
-_UNITS = {"ms": 0.001, "milliseconds": 0.001, "millisecond": 0.001, "min": 60.0, "minute": 60.0, "minutes": 60.0}
-_N = r"(\d{1,6}(?:\.\d{1,6})?)"
-_UNIT = r"(?: ?(ms|milliseconds?|s|secs?|seconds?|min|minutes?))?"
-_ABOUT = r"(?:at|after|in|about|around|approximately|roughly|circa|ca|exactly|almost|nearly|it hits|it takes|~)"
-_BELOW = r"(?:less than|under|below|fewer than|within|before|in under|in less than|sooner than|<)"
-_ABOVE = r"(?:more than|over|above|longer than|later than|after more than|>)"
-_TIME_FORMS: tuple[tuple[re.Pattern[str], str], ...] = (
-    (re.compile(rf"(?:between|from)? ?{_N}{_UNIT} ?(?:and|to|-|–) ?{_N}{_UNIT}"), "range"),
-    (re.compile(rf"{_BELOW} ?{_N}{_UNIT}|(?:the )?first {_N}{_UNIT}"), "below"),
-    (re.compile(rf"{_ABOVE} ?{_N}{_UNIT}|{_N}{_UNIT} or (?:more|longer|later)"), "above"),
-    (re.compile(rf"(?:{_ABOUT} )*{_N}{_UNIT}(?: later)?"), "value"),
-)
-_THINGS = r"(?:(?: of (?:them|these|the objects))|(?: (?:other )?(?:objects?|things?|items?|obstacles?|bodies|body)))?"
-_COUNT_FORMS: tuple[tuple[re.Pattern[str], str], ...] = (
-    (re.compile(rf"(?:exactly |only |just )?(\d{{1,3}}){_THINGS}"), "value"),
-    (re.compile(rf"(?:between )?(\d{{1,3}}) ?(?:and|to|-|–|or) ?(\d{{1,3}}){_THINGS}"), "range"),
-    (re.compile(rf"(?:more than|over) (\d{{1,3}}){_THINGS}"), "above"),
-    (re.compile(rf"at least (\d{{1,3}}){_THINGS}|(\d{{1,3}})(?: ?\+| or more){_THINGS}"), "least"),
-    (re.compile(rf"(?:less than|fewer than) (\d{{1,3}}){_THINGS}"), "below"),
-    (re.compile(rf"(?:at most|up to) (\d{{1,3}}){_THINGS}|(\d{{1,3}}) or (?:less|fewer){_THINGS}"), "most"),
-)
+_WORDS = {"zero": "0", "no": "0", "half": "0.5", **{word: str(value) for word, value in lex.NUMBER_WORDS.items()}}
+_NUMBER = re.compile(r"(\d{1,6}(?:[.,]\d{1,6})?) ?(?:(ms|milliseconds?)|(min|minutes?)|(?:s|secs?|(?:a )?seconds?))?\b")
+# What an option says around its numbers, and what it allows then.
+_SPANS = {
+    "value": "(?:about|around|roughly|approximately|exactly|only|just|almost|nearly|at|after|in|it hits|it takes| )*#",
+    "range": "(?:between|from)? ?# ?(?:and|to|or|-|–) ?#",
+    "above": "(?:(?:after )?more than|over|above|longer than|later than|>) ?#",
+    "least": "at least #|# ?(?:[+]|or (?:more|longer|later))",
+    "below": "(?:(?:in )?(?:less than|under)|below|fewer than|before|sooner than|<) ?#",
+    "most": "(?:at most|up to|within|(?:the )?first) #|# or (?:less|fewer)",
+}
+_THINGS = r"(?: of (?:them|these|the objects)| (?:other )?(?:objects?|things?|items?|bodies|body)| later)?"
 
 
-def seconds_of(text: str) -> Span | None:
-    """The time that a text names, s; None where it names none, or more than a time."""
-    said = _digits(text)
-    for pattern, form in _TIME_FORMS:
-        match = pattern.fullmatch(said)
-        if match is None:
-            continue
-        found = [group for group in match.groups() if group is not None]
-        numbers = [float(group) for group in found if group[0].isdigit()]
-        units = [_UNITS.get(group, 1.0) for group in found if not group[0].isdigit()] or [1.0]
-        values = [number * unit for number, unit in zip(numbers, (units * 2)[-len(numbers) :], strict=False)]
-        if form == "range":
-            return (values[0], values[1]) if values[0] < values[1] else None
-        return {"below": (0.0, values[0]), "above": (values[0], math.inf), "value": (values[0], values[0])}[form]
-    return None
+def span_of(text: str, step: int = 0) -> Span | None:
+    """The numbers that an option allows; None where it names none, or something else. Times are in s; what is counted
+    has a `step` of 1: more than two is three or more."""
+    said = " ".join(_WORDS.get(word, word) for word in text.lower().rstrip(".!").split())
+    found = [
+        float(number.replace(",", ".")) * (0.001 if milli else 60.0 if minute else 1.0)
+        for number, milli, minute in _NUMBER.findall(said)
+    ]
+    around = _NUMBER.sub("#", said)
+    form = next((form for form, words in _SPANS.items() if re.fullmatch(f"(?:{words}){_THINGS}", around)), None)
+    if form is None or found != sorted(found):
+        return None
+    low = 0.0 if form in {"below", "most"} else found[0] + (step if form == "above" else 0)
+    return low, math.inf if form in {"above", "least"} else found[-1] - (step if form == "below" else 0)
 
 
-def spans(said: Sequence[Span]) -> list[Span]:
-    """The span that each time stands for: a value, for all that is nearer to it than to another value named."""
-    values = sorted({low for low, high in said if low == high})
-    gaps = [high - low for low, high in pairwise(values)]
-    found: list[Span] = []
-    for low, high in said:
-        if low != high:
-            found.append((low, high))
-        elif gaps:
-            at = values.index(low)
-            before, after = gaps[max(at - 1, 0)], gaps[min(at, len(gaps) - 1)]
-            found.append((max(low - before / 2, 0.0), low + after / 2))
-        else:
-            found.append((low * (1 - ALONE), low * (1 + ALONE)))
-    return found
-
-
-def count_of(text: str) -> range | None:
-    """The numbers that a text allows for what is counted; None where it names none."""
-    said = _digits(text)
-    if said in {"none", "nothing", "0 of them", "none of them"}:
-        return range(1)
-    for pattern, form in _COUNT_FORMS:
-        match = pattern.fullmatch(said)
-        if match is not None:
-            first, *rest = (int(group) for group in match.groups() if group is not None)
-            spans = {
-                "value": (first, first + 1), "range": (first, rest[0] + 1 if rest else 0), "above": (first + 1, MOST),
-                "least": (first, MOST), "below": (0, first), "most": (0, first + 1),
-            }  # fmt: skip
-            return range(*spans[form])
-    return None
-
-
-def _digits(text: str) -> str:
-    """Lower case, number words as digits, without a full stop at the end."""
-    said = re.sub(r"(?<=\d),(?=\d)", ".", text.lower().strip()).rstrip(".!")
-    said = re.sub(r"\bhalf a (?=second)", "0.5 ", said)
-    said = re.sub(r"\ba (?=second)", "1 ", said)
-    said = re.sub(r"\band a half\b", "and_a_half", said)
-    said = " ".join(_WORDS.get(word, word) for word in re.split(r"[\s]+", said))
-    said = re.sub(r"(\d+) and_a_half\b", r"\1.5", said)
-    return " ".join(said.split())
+def _times(options: Sequence[AnswerOption]) -> list[tuple[AnswerOption, Span]]:
+    """The options that name a time, s, with the span that it stands for: a value, for what is nearer to it than to
+    any other value that is named."""
+    said = [(option, span) for option in options if (span := span_of(option.text)) is not None]
+    values = {low for _, (low, high) in said if low == high}
+    gaps = {one: min((abs(one - two) / 2 for two in values - {one}), default=one * ALONE) for one in values}
+    return [
+        (option, span if span[0] != span[1] else (span[0] - gaps[span[0]], span[0] + gaps[span[0]]))
+        for option, span in said
+    ]
 
 
 MAX_UNREAD = 200  # characters
@@ -228,21 +175,20 @@ def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOp
         is_yes = outcome.happens
         return [option for option in options if says_it_happens(option.text, outcome.asked) is is_yes]
     if form == "how-many":
-        return [option for option in options if outcome.count in (count_of(option.text) or range(0))]
+        counts = [(option, (0, 0) if names_none(option.text) else span_of(option.text, 1)) for option in options]
+        return [option for option, span in counts if span and span[0] <= (outcome.count or 0) <= span[1]]
     if (form == "which-first" and first is None) or (form == "when" and not outcome.happens):
         return [option for option in options if names_none(option.text)]
     if form == "which-first" and first is not None:
-        things = [option for option in options if not names_none(option.text)]
-        several = any(_SEVERAL.search(option.text) for option in things)
-        named = [(option, parse_noun_phrase(option.text)) for option in things if not several]
-        return [option for option, phrase in named if phrase is not None and may_name(phrase, first)]
+        things = [(each, parse_noun_phrase(each.text)) for each in options if not names_none(each.text)]
+        several = any(_SEVERAL.search(option.text) for option, _ in things)
+        return [each for each, phrase in things if phrase is not None and may_name(phrase, first) and not several]
     if form == "when" and outcome.time is not None:
-        # The one option in whose span the time lies, where no other option's meets the band of times.
-        said = [(option, span) for option in options if (span := seconds_of(option.text)) is not None]
+        # The only option whose span meets the band of times, where all of the band lies in it.
         low, high = outcome.time_band or (outcome.time, outcome.time)
-        placed = zip([option for option, _ in said], spans([span for _, span in said]), strict=True)
-        met = [(option, span) for option, span in placed if span[0] <= high and span[1] >= low]
-        return [option for option, (start, end) in met if len(met) == 1 and start <= outcome.time <= end]
+        met = [(option, start <= low and high <= end) for option, (start, end) in _times(options)
+               if start <= high and end >= low]  # fmt: skip
+        return [option for option, is_inside in met if is_inside and len(met) == 1]
     return []
 
 
@@ -252,22 +198,18 @@ def _fitting_set(options: Sequence[AnswerOption], outcome: Outcome) -> list[Answ
     names = [each.object for each in outcome.candidates]
     meant = frozenset(each.object for each in outcome.candidates if each.is_meant and not outcome.is_needless)
     if not outcome.asked.among:
-        chosen = [_named_in(option.text, names) or frozenset[str]() for option in options if not _says_all(option.text)]
-        named = frozenset[str]().union(*chosen)
+        single = [option.text for option in options if not _ALL.fullmatch(_unfolded(option.text))]
+        named = frozenset[str]().union(*(_named_in(text, names) or () for text in single))
         names = [name for name in names if name in named] or names
     return [option for option in options if _named_in(option.text, names) == meant & frozenset(names)]
-
-
-def _says_all(text: str) -> re.Match[str] | None:
-    return _ALL.fullmatch(_unfolded(text))
 
 
 def _named_in(text: str, names: Sequence[str]) -> frozenset[str] | None:
     """Which of some objects an option names, as in: only the mug; the mug and the box; both; neither. None where it
     names something else, or does not single one out."""
-    if names_none(text) or re.fullmatch(r"neither .+ nor .+", _unfolded(text)):
+    if names_none(text):
         return frozenset()
-    if said := _says_all(text):
+    if said := _ALL.fullmatch(_unfolded(text)):
         return frozenset(names) if said[1] != "both" or len(names) == 2 else None
 
     def named(part: str) -> str | None:

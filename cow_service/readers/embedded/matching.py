@@ -4,14 +4,15 @@ A thing is meant by positive evidence alone. What is merely left is not meant.
 """
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.base import SeenThing
-from cow_service.readers.embedded.english.lexicon import GENERIC, TABLES, ObjectPhrase, like_a_colour
-from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, shape_of
+from cow_service.readers.embedded.english.lexicon import COLOURS, GENERIC, PLACES, SETS, TABLES, ObjectPhrase
+from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, prior_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, LocatedObject
@@ -62,9 +63,8 @@ POOR = -1.0  # log ratio of an outline: with less it is not called so, unless by
 
 def is_known(phrase: ObjectPhrase) -> bool:
     """Whether the noun says something of a shape, or claims nothing."""
-    return (
-        phrase.noun is None or forms.form_of(phrase.head) is not None or phrase.head in forms.SOLID | GENERIC | TABLES
-    )
+    head = phrase.head
+    return head is None or forms.form_of(head) is not None or head in forms.SOLID | GENERIC | TABLES
 
 
 def _shape_ratio(region: Region, phrase: ObjectPhrase) -> float:
@@ -88,14 +88,12 @@ def _foremost(regions: Sequence[Region], phrase: ObjectPhrase, count: int = 1) -
     fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(forms.IMPOSSIBLE, least)]
     # A detector called it so, its outline is that of the noun, or it has the colour and is not clearly another kind of
     # thing, such as a candle where a cone of its colour was not seen.
-    names_nothing = phrase.colour is None and not is_known(phrase)
-    is_sure = any(
-        phrase.noun in each.called
-        or (_shape_ratio(each, phrase) >= POOR and not names_nothing)
-        or (each.colour == phrase.colour and not forms.is_other_kind(each, phrase.head))
-        for each in fitting
-    )
-    return fitting if is_sure else []
+    says_shape = phrase.colour is not None or is_known(phrase)
+    for each in fitting:
+        has_colour = each.colour == phrase.colour and not forms.is_other_kind(each, phrase.head)
+        if phrase.noun in each.called or (says_shape and _shape_ratio(each, phrase) >= POOR) or has_colour:
+            return fitting
+    return []
 
 
 def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
@@ -107,18 +105,15 @@ def match_one(regions: Sequence[Region], phrase: ObjectPhrase) -> Region | None:
 def match_several(regions: Sequence[Region], kind: Kind) -> list[Region]:
     """The regions that fit a kind such as "both mugs", as many as it says, or all; empty if it is not clear which."""
     fitting = _foremost(regions, kind.phrase, kind.count or 1)
-    is_clear = len(fitting) == kind.count
-    if kind.count is None:
-        is_clear = all(_shape_ratio(region, kind.phrase) > CLEAR for region in fitting)
-    return fitting if is_clear else []
+    are_clear = kind.count is None and all(_shape_ratio(region, kind.phrase) > CLEAR for region in fitting)
+    return fitting if are_clear or len(fitting) == kind.count else []
 
 
 def unclear(phrase: ObjectPhrase, regions: Sequence[Region]) -> str:
     """Why not one of the regions is what a phrase names, for a message."""
     fitting = best_matches(regions, phrase)
     if len(fitting) > 1:
-        what = "its place" if phrase.colour else "its colour or its place"
-        return f"'{phrase.text}' may be any of {len(fitting)}: {describe(fitting)}. Name {what}"
+        return f"'{phrase.text}' may be any of {len(fitting)}: {describe(fitting)}. Name its colour or its place"
     if phrase.colour is None and not is_known(phrase):
         return f"'{phrase.text}' names no colour and no shape that is known here. Seen: {describe(regions)}"
     return f"'{phrase.text}' was not found, or not for certain. Seen: {describe(regions)}"
@@ -130,8 +125,7 @@ WHOLE = 0.7  # share of a region that must lie inside a drawn box to be the thin
 def inside_drawn_box(scene: Scene, phrase: ObjectPhrase) -> BBox:
     """The object inside the only box drawn over the image."""
     if len(scene.boxes) != 1:
-        count = f"{len(scene.boxes)} boxes" if scene.boxes else "no box"
-        told = f"Looked for '{phrase.text}' inside a drawn box, but the image shows {count}."
+        told = f"'{phrase.text}' is said to be inside a drawn box, and the image shows {len(scene.boxes) or 'none'}."
         raise CannotGround(told, remedy=GIVE_PLACE)
     x0, y0, x1, y1 = scene.boxes[0].bbox
     inside = np.zeros((scene.height, scene.width), bool)
@@ -165,11 +159,8 @@ def things_of_kinds(
             continue
         fitting = match_several(left, kind)
         if not fitting and kind in kinds[: len(among)]:
-            raise CannotGround(
-                f"The question asks about '{kind.phrase.text}', and which things those are the image does not tell for "
-                f"certain. Seen: {describe(regions)}.",
-                remedy=GIVE_OBJECT,
-            )
+            told = f"Which things '{kind.phrase.text}' are, the image does not tell for certain."
+            raise CannotGround(f"{told} Seen: {describe(regions)}.", remedy=GIVE_OBJECT)
         found += named_by_colour(fitting, kind)
     return found
 
@@ -189,6 +180,7 @@ def nouns_of(question: Question, sought: Sequence[str] = ()) -> tuple[str, ...]:
     return tuple(dict.fromkeys(each.noun for each in named if each is not None and each.noun))
 
 
+NEARLY = 0.8  # difflib's ratio from which a word is nearly a colour's name: "grean"
 SAME = 0.7  # IoU from which two masks are one thing's
 
 
@@ -212,22 +204,20 @@ def noun_doubts(scene: Scene, found: Sequence[tuple[ObjectPhrase, BBox]]) -> tup
         region = scene.region_of(bbox)
         if region is None or phrase.inside_box or phrase.noun in region.called:
             continue
-        # What cannot be told by its outline is believed, unless the thing is clearly one of another kind.
+        # What cannot be told by its outline is believed, unless the thing is clearly one of another kind. Where no
+        # colour tells that it is meant, its outline alone does.
         head, looks, own = phrase.head or "", forms.looks_like(region), forms.form_of(phrase.head)
-        # Where no colour tells that it is meant, its outline alone does.
-        is_odd = own is not None and (
-            forms.is_unlike(region, own) or (phrase.colour is None and looks not in (None, own))
-        )
-        is_other = is_odd if own is not None else shape_of(head) != shape_of(looks or "")
-        colour = None if phrase.colour else like_a_colour(phrase.text)
-        if colour is not None:
-            reason = f": '{colour}' is no colour that is known."
+        is_other_form = phrase.colour is None and looks not in (None, own)
+        is_odd = own is not None and (forms.is_unlike(region, own) or is_other_form)
+        is_other = is_odd if own is not None else prior_of(head).shape != prior_of(looks or "").shape
+        odd = [each for each in phrase.text.lower().split()[:-1] if each not in SETS["adjectives"] | PLACES]
+        colours = [each for each in odd if phrase.colour is None and get_close_matches(each, COLOURS, 1, NEARLY)]
+        if colours:
+            reason = f": '{colours[0]}' is no colour that is known."
         elif any(phrase.noun in each.called for each in scene.regions) and _shape_ratio(region, phrase) <= CLEAR:
             reason = ": the detector calls another thing so."  # a detector misses some
-        elif looks is not None and is_other and phrase.noun is not None and head not in GENERIC:
-            reason = f", which looks like a {looks}, not '{head}'."
-        elif is_odd:
-            reason = f", which does not look like '{head}'."
+        elif is_odd or (looks is not None and is_other and phrase.noun is not None and head not in GENERIC):
+            reason = f", which looks like {f'a {looks}' if looks else 'something else'}, not '{head}'."
         elif not is_known(phrase):
             reason = f": whether '{phrase.head}' is right, the embedded reader cannot tell."
         else:

@@ -3,22 +3,21 @@
 import math
 from collections.abc import Sequence
 
-from cow_service.errors import CannotGround, CannotReadDirection
+from cow_service.errors import CannotReadDirection
 from cow_service.perception.facing import facing
 from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
-from cow_service.readers.embedded.english.noun_phrases import is_vehicle, shape_of
+from cow_service.readers.embedded.english.noun_phrases import prior_of
 from cow_service.readers.embedded.english.questions import MotionWords, Question
-from cow_service.readers.embedded.matching import best_matches, describe, match_one, unclear
+from cow_service.readers.embedded.matching import best_matches, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, MotionKind, Until, Vector
 from cow_service.vision.masks import is_same_object
 from cow_service.vision.scene import Scene, arrow_of
 from cow_service.vision.trails import trail_of
 
-NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
 _ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
 _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
@@ -50,16 +49,16 @@ def quantities(
     return pace, distance, None if duration is None else duration.value, "contact" if "until" in found else None
 
 
+def _way(motion: MotionWords, direction: Vector | None = None) -> tuple[Vector, float]:
+    direction = direction or motion.direction
+    if direction is None and not motion.depth:
+        raise _refused("Which way a part of the motion goes was not understood.")
+    return depth_motion(motion.depth) if direction is None else (direction, motion.depth)
+
+
 def step_readings(steps: Sequence[MotionWords], bbox: BBox) -> tuple[StepReading, ...]:
     """The legs behind the first of what has this box."""
-    said = [(_way(step.direction, step.depth), quantities(step.quantities, None, bbox)) for step in steps]
-    return tuple(StepReading(*way, each[1], each[2]) for way, each in said)
-
-
-def _way(direction: Vector | None, depth: float) -> tuple[Vector, float]:
-    if direction is None and not depth:
-        raise _refused("Which way a part of the motion goes was not understood.")
-    return depth_motion(depth) if direction is None else (direction, depth)
+    return tuple(StepReading(*_way(step), *quantities(step.quantities, None, bbox)[1:3]) for step in steps)
 
 
 def other_readings(
@@ -74,11 +73,9 @@ def other_readings(
         if found is None or motion.steps or any(each.what != "speed" for each in motion.quantities):
             raise _refused(f"'{phrase.text}' moves, too, and was not found, or how far it moves is said.")
         refuse_unclear_fall(scene, motion, found)
-        kind, direction = motion.kind or "linear", motion.direction
-        if direction is None and goal is not None:  # from centre to centre
-            (x0, y0, x1, y1), start = goal.bbox, found.bbox
-            direction = (x0 + x1 - start[0] - start[2]) / 2, (y0 + y1 - start[1] - start[3]) / 2
-        way = _way(direction, motion.depth) if kind in DIRECTED_KINDS else (None, 0.0)
+        kind = motion.kind or "linear"
+        ahead = None if motion.direction or goal is None else way_to(goal.bbox, found.bbox, is_on_floor=False)
+        way = _way(motion, ahead) if kind in DIRECTED_KINDS else (None, 0.0)
         speed = quantities(motion.quantities, None, found.bbox)[0]
         readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
     return tuple(readings)
@@ -87,7 +84,8 @@ def other_readings(
 def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | LocatedObject) -> None:
     """Raises `CannotReadDirection` for what falls over where it stands, and for a fall of what may stand."""
     name, prior, region = thing.object, thing.prior, scene.region_of(thing.bbox)
-    is_ball = shape_of(name) == "sphere" or (region is not None and region.is_disc)  # its shadow tells how high it is
+    # The shadow of a ball tells how high it is.
+    is_ball = prior_of(name).shape == "sphere" or (region is not None and region.is_disc)
     in_air = words.in_air or is_ball or scene.side_view is not None or (prior is not None and prior.stands_on == "air")
     if words.topples and not is_ball:
         raise _refused(f"The {name} would fall over where it stands, which is not simulated. Ask what a push does.")
@@ -99,7 +97,6 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     """The scene in which the trail that the question may be about ends where the question says, and a warning.
 
     If neither the image nor the words show the end, it is the one whose path leads on to the object in question.
-    Raises `CannotGround` if the thing that the words tell the end by was not found.
     """
     end, phrase = question.motion.trail_end, question.mover
     if phrase is None or phrase.is_given or not scene.trails:
@@ -109,21 +106,11 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     if len(trails) != 1:
         return scene, ()
     trail, warnings = trails[0], ()
-    beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
-    if isinstance(end, ObjectPhrase):
-        near = match_one(beside, end)
-        gaps = sorted(math.dist(trail.positions[at].centre, near.centre) for at in (0, -1)) if near else []
-        if near is None or gaps[0] > NEARER * gaps[1]:
-            raise CannotGround(
-                f"The question tells the end of the trail by '{end.text}', which was not found, not for "
-                f"certain, or about as far from either end. Seen: {describe(scene.regions)}.",
-                remedy=GIVE_PLACE,
-            )
-        trail = trail.ending(near.bbox)
-    elif question.motion.trail:
+    if question.motion.trail:
         trail = trail.ending(None, end or question.motion.direction)
     if not trail.end_known:
         # What may lie ahead: the first thing that is asked about, else the middle of the image.
+        beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
         asked = ((each.text, match_one(beside, each)) for each in question.others)
         x, y = scene.width / 2, scene.height / 2
         ahead = ((name, region.bbox) for name, region in asked if region is not None)
@@ -143,12 +130,10 @@ def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> Motio
     Raises `CannotReadDirection` if the words speak of one all the same.
     """
     trail = trail_of(scene.trails, grounding.bbox)
-    if trail is None and words.trail:
-        raise _refused(
-            f"The question speaks of a trail, and no three positions of the {grounding.object} one after another were "
-            f"found in the image."
-        )
     if trail is None:
+        if words.trail:
+            told = f"no three positions of the {grounding.object} one after another were found in the image"
+            raise _refused(f"The question speaks of a trail, and {told}.")
         return None
     thrown = is_thrown(trail.positions) or words.kind in FALLING_KINDS
     earlier = tuple(position.centre for position in trail.older)
@@ -163,9 +148,7 @@ def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionRe
         unread = "', '".join(question.unread_motion)
         raise _refused(f"How the {name} moves was not understood: '{unread}'.")
     if words.is_contradictory or (kind == "static" and question.names_direction):
-        raise _refused(
-            f"What the question says of the motion of the {name} contradicts itself: which is meant was not understood."
-        )
+        raise _refused(f"What the question says of the motion of the {name} contradicts itself.")
     refuse_unclear_fall(scene, words, grounding)
     if kind not in DIRECTED_KINDS:
         return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
@@ -180,7 +163,7 @@ def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionRe
         return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
     # Forward or backward, by the way that a vehicle is seen to face.
     told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
-    if not is_vehicle(name):
+    if not prior_of(name).elongated:
         raise _refused(f"{told} The embedded reader sees only of vehicles with wheels which way they face.")
     way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
     if way is None:
@@ -217,11 +200,9 @@ def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: M
     if len(near) == 1 and not question.names_direction:
         note = "The question names no direction; the arrow drawn at the object was followed."
         return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
-    if near and question.names_direction:
-        raise _refused("The question's words of direction were not read as the motion's, and no arrow was followed.")
     raise _refused(
-        "The question names no direction (left, right, up, down, towards, away, along the arrow), and the "
-        f"image shows {len(near) or 'no'} arrow{'s' if len(near) > 1 else ''} at the {grounding.object}."
+        "No direction was read in the question (left, right, up, down, towards, away, along the arrow), and the image "
+        f"shows {len(near) or 'no'} arrow{'s' * (len(near) != 1)} at the {grounding.object}, and none was followed."
     )
 
 

@@ -47,22 +47,15 @@ class EmbeddedReader:
             if each.kind == "remove" or each.targets
         )
         drawings = frozenset(each for each in ("arrow", "box") if each in question.lower())
-        said, way = read.motion, base.WayReading()
-        if not read.unread_motion and not said.is_contradictory:
-            towards = None if said.towards is None else said.towards.text
-            way = base.WayReading(said.along_arrow, said.direction, said.depth, towards, said.forward)
+        said, towards = read.motion, None if read.motion.towards is None else read.motion.towards.text
+        way = base.WayReading(said.along_arrow, said.direction, said.depth, towards, said.forward)
+        way = base.WayReading() if read.unread_motion or said.is_contradictory else way
         nouns, mover = matching.nouns_of(read), None if read.asked is None or read.mover is None else read.mover.text
         return base.QuestionReading(read.asked, mover, changes, said.trail, nouns, drawings, way)
 
     def read_name(self, name: str) -> records.ObjectPrior:
         """By its noun."""
-        opening = noun_phrases.container_form(name)
-        return records.ObjectPrior(
-            shape=noun_phrases.shape_of(name),
-            elongated=noun_phrases.is_vehicle(name),
-            equal_sided=noun_phrases.is_cube(name),
-            opening=None if opening == "unknown" else opening,
-        )
+        return noun_phrases.prior_of(name)
 
     def likeness(self, words: str, name: str) -> base.Likeness:
         """By their colours, nouns and numbers, and the forms of their nouns."""
@@ -82,20 +75,20 @@ class EmbeddedReader:
         mover, asked, unread = question.mover, question.asked, question.unread
         changes = question.changes if given.changes_wanted else ()
         if mover is None or (given.motion_wanted and not question.says_motion):
-            raise _not_said(question, given)
+            words = ("', '".join(unread) or given.question)[:MAX_UNREAD]
+            like = " Or: ".join(rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",))
+            fault = f"The question does not say in words what moves and how: '{words}' was not understood."
+            raise CannotGround(f"{fault} Ask like: {like}", remedy=LOCATE_IT)
         _check_changes(question, changes)
         with given.cpu():
             scene, warnings = motions.scene_of_mover(given.scene, question)
             if given.find is not None and scene.side_view is None:
                 scene = matching.with_found(scene, given.find(matching.nouns_of(question, given.sought)))
             finder = _Finder(scene, given.known)
-            removed = [
-                records.Intervention(kind="remove", object=each)
-                for change in changes
-                if change.kind == "remove"
-                for each in finder.found(change.object, f"takes '{change.object.text}' away")
-            ]
-            finder.regions = finder.without([each.object.bbox for each in removed])
+            gone = [change.object for change in changes if change.kind == "remove"]
+            away = [each for phrase in gone for each in finder.found(phrase, f"takes '{phrase.text}' away")]
+            removed = [records.Intervention(kind="remove", object=each) for each in away]
+            finder.regions = finder.without([each.bbox for each in away])
             bbox = finder.mover(mover, question.names_arrow)
             finder.taken = {mover.text: bbox}
             put = [finder.placed(change) for change in changes if change.kind == "place" and change.targets]
@@ -105,14 +98,14 @@ class EmbeddedReader:
             parsed = [(name, noun_phrases.parse_noun_phrase(name)) for name in sought]
             wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in parsed if phrase is not None)]
             # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
-            beside = [
-                one for one in finder.regions if one.bbox != bbox and (one.called or not is_same_object(one.bbox, bbox))
-            ]
-            others = [(phrase, finder.other(phrase, beside)) for phrase in wanted if not phrase.is_given]
-            located = {each.bbox: each for _, each in reversed(others) if each is not None}
-            located |= {
-                each.bbox: each for each in matching.things_of_kinds(finder.regions, question, bbox, given.known)
-            }
+            apart = [each for each in finder.regions if each.bbox != bbox]
+            beside = [each for each in apart if each.called or not is_same_object(each.bbox, bbox)]
+            alone, sought = beside[0] if len(beside) == 1 else None, [each for each in wanted if not each.is_given]
+            others = [(each, alone if each.is_other else matching.match_one(beside, each)) for each in sought]
+            of_kinds = matching.things_of_kinds(finder.regions, question, bbox, given.known)
+            named = ((phrase.text, each.bbox) for phrase, each in reversed(others) if each is not None)
+            located = {bbox: records.LocatedObject(object=name, bbox=bbox) for name, bbox in named}
+            located |= {each.bbox: each for each in of_kinds}
             warnings += tuple(
                 f"{matching.unclear(phrase, beside)}. No encounter is listed under that name."
                 for phrase, each in others
@@ -126,19 +119,17 @@ class EmbeddedReader:
         left = unread if given.asked_wanted or given.changes_wanted else ()
         doubts += [f"The words '{each}' were not understood, so no outcome is sure." for each in left]
         own = finder.known.get(mover.text)
+        seen = reversed(located.values())
+        in_doubt = bbox in doubtful or (own is not None and own.is_doubtful) or bool(left and not given.asked_wanted)
         return base.GroundingReading(
             mover.text,
             bbox,
-            others=tuple(
-                each.model_copy(update={"is_doubtful": each.bbox in doubtful}) for each in reversed(located.values())
-            ),
+            others=tuple(each.model_copy(update={"is_doubtful": each.bbox in doubtful}) for each in seen),
             warnings=(*warnings, *doubts),
             interventions=(*removed, *put),
             asked=asked if given.asked_wanted else None,
             prior=None if own is None else own.prior,
-            is_doubtful=bbox in doubtful
-            or (own is not None and own.is_doubtful)
-            or bool(left and not given.asked_wanted),
+            is_doubtful=in_doubt,
         )
 
     def read_motion(
@@ -153,10 +144,9 @@ class EmbeddedReader:
             words = question.motion
             on = motions.along_trail(scene, grounding, words) if words.trail else None
             reading = on or motions.read_way(scene, question, grounding)
-            parted = any(each.what == "share" for each in words.quantities)
-            goal = motions.goal_of(scene, words.towards, grounding) if parted and words.towards is not None else None
-            way = None if goal is None else way_to(goal.bbox, grounding.bbox, reading.kind == "linear")
-            said = motions.quantities(words.quantities, None if way is None else math.hypot(*way), grounding.bbox)
+            goal, on_floor = reading.towards, reading.kind == "linear"
+            way = None if goal is None else math.hypot(*way_to(goal.bbox, grounding.bbox, on_floor))
+            said = motions.quantities(words.quantities, way, grounding.bbox)
             return replace(
                 reading,
                 **dict(zip(("speed", "distance", "duration", "until"), said, strict=True)),
@@ -194,16 +184,6 @@ def names_of(given: base.ReaderInput, grounding: records.Grounding | None = None
     """The names of the given things, or of those that were found."""
     found = () if grounding is None else (grounding.object, *(each.object for each in grounding.others))
     return tuple(each.object for each in given.known) or found
-
-
-def _not_said(question: Question, given: base.ReaderInput) -> CannotGround:
-    """What a question does not say in a form that is read, and how to say it."""
-    unread = ("', '".join(question.unread) or given.question)[:MAX_UNREAD]
-    fault = f"The question does not say in words what moves and how: '{unread}' was not understood."
-    if question.mover is not None and not question.unread:
-        fault = f"The question does not say how the {question.mover.text} moves."
-    like = rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",)
-    return CannotGround(f"{fault} Ask like: {' Or: '.join(like)}", remedy=LOCATE_IT)
 
 
 def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
@@ -246,35 +226,22 @@ class _Finder:
         if noun_phrases.kind_of(phrase.text) is not None:
             fault = f"The question moves '{phrase.text}' at once: ask of one thing, or name each."
         elif not scene.regions:
-            fault = (
-                f"Looked for '{phrase.text}', but the image is too cluttered (or too plain) for the embedded reader to "
-                "tell its objects apart."
-            )
+            fault = f"Looked for '{phrase.text}', but no objects could be told apart in the image."
         raise CannotGround(fault + self._given, remedy=LOCATE_IT)
-
-    def other(self, phrase: ObjectPhrase, beside: Sequence[Region]) -> records.LocatedObject | None:
-        """Another thing; None where it is not found for certain."""
-        alone = beside[0] if len(beside) == 1 else None
-        region = alone if phrase.is_other else matching.match_one(beside, phrase)
-        return None if region is None else records.LocatedObject(object=phrase.text, bbox=region.bbox)
 
     def found(self, phrase: ObjectPhrase, told: str, count: int | None = None) -> list[records.LocatedObject]:
         """One thing, or several such as "both cylinders". Raises `CannotGround`."""
         if phrase.is_given:
             return [self.known[phrase.text]]
-        if phrase.text in self.taken:
-            return [records.LocatedObject(object=phrase.text, bbox=self.taken[phrase.text], source="embedded")]
-        free, kind = self.without(list(self.taken.values())), noun_phrases.kind_of(phrase.text)
-        region = matching.match_one(free, phrase) if kind is None else None
-        if kind is not None and kind.count in (None, 2):
+        taken, kind = self.taken.get(phrase.text), noun_phrases.kind_of(phrase.text)
+        free = self.without(list(self.taken.values()))
+        if kind is not None and kind.count in (None, 2) and taken is None:
             kind = replace(kind, count=kind.count or count)
             things = matching.named_by_colour(matching.match_several(free, kind), kind)
         else:
-            things = (
-                []
-                if region is None
-                else [records.LocatedObject(object=phrase.text, bbox=region.bbox, source="embedded")]
-            )
+            region = matching.match_one(free, phrase) if kind is None and taken is None else None
+            box = region.bbox if region is not None else taken
+            things = [records.LocatedObject(object=phrase.text, bbox=box, source="embedded")] if box else []
         if not things:
             why = matching.unclear(phrase, free)
             raise CannotGround(f"The question {told}, and {why}.{self._given}", remedy=GIVE_OBJECT)

@@ -2,14 +2,13 @@
 
 import re
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache
 from importlib.resources import files
 from itertools import count
 from typing import Literal, NamedTuple, cast
 
 from cow_service.readers.base import SpeedWord
-from cow_service.records import AskedForm, AskedRelation, MotionKind, PlaceRelation, Vector
+from cow_service.records import AskedForm, AskedRelation, MotionKind, Vector
 
 
 def words(*lists: str) -> frozenset[str]:
@@ -37,11 +36,8 @@ for _name, _text in sections()["words"]:
 SETS = {name: frozenset(listed) for name, listed in LISTS.items()}
 COLOURS = {word: group.split("/")[0] for group in LISTS["colours"] for word in group.split("/")}
 NUMBER_WORDS = {word: value for value, word in enumerate(LISTS["numerals"], 1)}
-METRES = {
-    word: size
-    for size, group in zip((1.0, 0.01, 0.001, 0.0254, 0.3048), LISTS["metres"], strict=True)
-    for word in group.split("/")
-}
+_SIZES = zip((1.0, 0.01, 0.001, 0.0254, 0.3048), LISTS["metres"], strict=True)
+METRES = {word: size for size, group in _SIZES for word in group.split("/")}
 FUNCTION, DETERMINERS, PLACES, CAUSES = (SETS[name] for name in ("function", "determiners", "places", "causes"))
 GENERIC, AGENTS, TOUCHING, FILLERS = (SETS[name] for name in ("generic", "agents", "touching", "fillers"))
 TABLES = words("table desk tabletop")
@@ -49,7 +45,6 @@ CONTAINERS = SETS["hollow"] | (SETS["round"] | SETS["square"]) - {"vase", "can"}
 NOUNS = frozenset[str]().union(*(SETS[name] for name in ("sphere", "box", "vehicle", "cone", "cylinder")))
 _KINDS: tuple[MotionKind, ...] = ("linear", "projectile", "fall", "static")
 KINDS: dict[str, MotionKind] = {"let go": "fall", **{lemma: kind for kind in _KINDS for lemma in LISTS[kind]}}
-NEARLY = 0.8  # difflib's ratio from which a word is nearly a colour's name
 
 
 class Verb(NamedTuple):
@@ -97,9 +92,8 @@ def singular(noun: str) -> str:
     """A plural noun made singular, by its ending."""
     if noun in SETS["unchanged"] or len(noun) < 4 or not noun.endswith("s") or noun.endswith(("ss", "us", "is")):
         return noun
-    if noun.endswith(("sses", "xes", "ches", "shes", "toes")):
-        return noun[:-2]
-    return noun[:-3] + "y" if noun.endswith("ies") else noun[:-1]
+    is_long = noun.endswith(("sses", "xes", "ches", "shes", "toes"))
+    return noun[:-2] if is_long else noun[:-3] + "y" if noun.endswith("ies") else noun[:-1]
 
 
 @dataclass(frozen=True)
@@ -125,17 +119,6 @@ class ObjectPhrase:
     def is_other(self) -> bool:
         """Whether it is "the other one": whatever else there is."""
         return self.text in {"other one", "other"}
-
-    @property
-    def words(self) -> set[str]:
-        """The lower case words of the text."""
-        return set(self.text.lower().split())
-
-
-def like_a_colour(text: str) -> str | None:
-    """A word of a noun phrase that is nearly a colour's name, and no other word that is known: "grean"; or None."""
-    unknown = (word for word in text.lower().split()[:-1] if word not in SETS["adjectives"] and word not in PLACES)
-    return next((word for word in unknown if get_close_matches(word, COLOURS, 1, NEARLY)), None)
 
 
 Measure = Literal["speed", "distance", "share", "own_widths", "duration", "until", "within"]
@@ -167,7 +150,7 @@ class Form(NamedTuple):
     @property
     def asks(self) -> tuple[AskedForm, AskedRelation, bool]:
         """Form, relation and whether it is negated, of what asks."""
-        form, relation, *negated = self.says.split()
+        form, relation, negated = (*self.says.split(), "", "", "")[:3]
         return cast(AskedForm, form), cast(AskedRelation, relation), bool(negated)
 
 
@@ -177,21 +160,11 @@ def roles(found: re.Match[str]) -> dict[str, str]:
     return {name.rstrip("0123456789"): found[name] for _, name in spans}
 
 
-def relation_of(said: dict[str, str]) -> PlaceRelation | None:
-    """The relation that the groups of a placing name."""
-    names = (name for name, _ in sections()["where"] if name.replace("-", "") in said)
-    return cast(PlaceRelation | None, next(names, None))
-
-
 @cache
 def forms() -> dict[str, tuple[Form, ...]]:
     """The forms by their section."""
     macros = dict(sections()["macros"]) | {"verbs": VERB, "causes": "|".join(LISTS["causes"])}
-    macros |= {
-        "colours": "|".join(COLOURS),
-        "numerals": "|".join(LISTS["numerals"]),
-        "units": "|".join(METRES),
-    }
+    macros |= {"colours": "|".join(COLOURS), "numerals": "|".join(NUMBER_WORDS), "units": "|".join(METRES)}
     macros["where"] = "|".join(f"(<{name.replace('-', '')}>){pattern}" for name, pattern in sections()["where"])
 
     def compiled(section: str, says: str, pattern: str) -> Form:

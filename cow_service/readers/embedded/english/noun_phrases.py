@@ -7,12 +7,12 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, cast
+from typing import cast
 
 from cow_service.readers.base import Likeness, SpeedWord
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.options import plain
-from cow_service.records import Shape
+from cow_service.records import ObjectPrior
 
 _CONTRACTED = {
     r"\bcan ?not\b|\bcan't\b": "can not", r"\bwon't\b": "will not", r"n't\b": " not",
@@ -75,8 +75,7 @@ def tokens_of(text: str, names: Sequence[str] = ()) -> Tokens:
     while at < len(words):
         at, verb = _read_phrase(tokens, words, at)
         going += [".", tokens.plain[-1], verb] if verb else []  # "the falling ball": how it moves
-    tokens.plain += going
-    tokens.said += going
+    tokens.plain, tokens.said = tokens.plain + going, tokens.said + going
     return tokens
 
 
@@ -89,7 +88,7 @@ def _quantity(tokens: Tokens, what: str, said: dict[str, str]) -> str:
         tokens.quantities.append(lex.QuantityWords("speed", pace=cast(SpeedWord, what)))
     elif what:
         tokens.quantities.append(lex.QuantityWords(cast(lex.Measure, what), value, unit in lex.METRES))
-    return f"Q{len(tokens.quantities) - 1}" if what else ""
+    return f"{'W' if what == 'within' else 'Q'}{len(tokens.quantities) - 1}" if what else ""
 
 
 def _is_open(word: str) -> bool:
@@ -100,7 +99,7 @@ def _is_open(word: str) -> bool:
 def _is_determiner(words: Sequence[str], at: int) -> bool:
     """A "that" or "which" in front of a verb is none."""
     word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
-    relative = after in lex.DETERMINERS if word in {"that", "this"} else False
+    relative = word in {"that", "this"} and after in lex.DETERMINERS
     acts = after in lex.VERBS and (word in {"that", "which", "what", "this"} or lex.VERBS[after].form == "s")
     follows = _is_open(after) or after in lex.PLACES or after == "first" or after in lex.DETERMINERS or after[0] == "N"
     return word in lex.DETERMINERS and follows and not relative and not acts
@@ -108,23 +107,17 @@ def _is_determiner(words: Sequence[str], at: int) -> bool:
 
 def _belongs(words: Sequence[str], at: int, first: int, start: int, has_noun: bool) -> bool:
     """Whether a word belongs to the phrase that begins at `start`, with determiners up to `first`."""
-    word, after = words[at], words[at + 1] if at + 1 < len(words) else "."
+    word = words[at]
     begun, determined, form = at > start, first > start, lex.VERBS[word].form if word in lex.VERBS else ""
-    if word == "and":
-        return begun and not has_noun and words[at - 1] in lex.COLOURS and after in lex.COLOURS
     if has_noun:
         coloured = word in lex.COLOURS and words[at - 1] not in lex.COLOURS
-        if word in _BEHIND_NOUN or word in lex.PLACES or coloured or word.endswith("ly"):
-            return False
-        noun = form == "base" and after in lex.VERBS and (lex.VERBS[after].form == "s" or after in {"is", "was"})
-        return (_is_open(word) and (not form or noun)) or (word.isdigit() and len(word) < 3)
+        is_behind = word in _BEHIND_NOUN or word in lex.PLACES or coloured or word.endswith("ly")
+        return not is_behind and ((_is_open(word) and not form) or (word.isdigit() and len(word) < 3))
     if word in lex.PLACES or word in {"one", "other", "first"}:
         return determined and (word != "one" or begun)
-    if not _is_open(word) and not (word == "can" and begun):
-        return False
-    # "Orange" is the one colour that is also a thing.
-    acts = begun and words[at - 1] == "orange" and word not in lex.NOUNS
-    return (begun and form != "s" and not acts) if form else (determined or not word.endswith("ly"))
+    if not _is_open(word) or form:
+        return _is_open(word) and begun and form != "s"
+    return determined or not word.endswith("ly")
 
 
 def _extent(tokens: Tokens, words: list[str], at: int) -> tuple[int, int, str]:
@@ -162,16 +155,14 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
     verb = verb if verb in lex.KINDS else ""
     content = content[1:] if verb else content
     phrase = object_phrase([*content[:-1], *(name.lower().split() or content[-1:])], "")
-    start, end, phrase = _with_behind(tokens, words, end, phrase, content[0])
+    start, (end, phrase) = end, _with_behind(tokens, words, end, phrase, content[0])
     text = [*content[:-1], name or content[-1], *words[start:end]]
     phrase = replace(phrase, text=" ".join(text))
     given = name if name and len(text) == 1 else match_given(phrase, tokens.names)
     if given is not None:
         phrase = replace(object_phrase(given.lower().split(), given), is_given=True)
-    said, ahead = " ".join([*words[at:first], *([verb] if verb else []), *text]), words[end : end + 2]
-    acts = len(ahead) == 2 and lex.lemma(ahead[0]) in lex.CAUSES and (ahead[1] in lex.DETERMINERS or ahead[1][0] == "N")
-    is_agent = phrase.head in lex.AGENTS or (phrase.head in lex.SETS["beings"] and acts)  # "the child rolls the ball"
-    if is_agent and not phrase.is_given and phrase.colour is None:
+    said = " ".join([*words[at:first], *([verb] if verb else []), *text])
+    if phrase.head in lex.AGENTS and not phrase.is_given and phrase.colour is None:
         tokens.add("AG", said)
     else:
         _add_phrase(tokens, phrase, content, words[at:first], said)
@@ -179,26 +170,25 @@ def _read_phrase(tokens: Tokens, words: list[str], at: int) -> tuple[int, str]:
 
 
 def _with_behind(
-    tokens: Tokens, words: list[str], start: int, phrase: lex.ObjectPhrase, opening: str
-) -> tuple[int, int, lex.ObjectPhrase]:
-    """Where the words behind a noun that belong to it begin and end, and the phrase with what they say."""
-    end, is_put = start, bool(tokens.plain) and tokens.plain[-1] in {*lex.CAUSES, "put", "place", "set"}
+    tokens: Tokens, words: list[str], end: int, phrase: lex.ObjectPhrase, opening: str
+) -> tuple[int, lex.ObjectPhrase]:
+    """Where the words behind a noun that belong to it end, and the phrase with what they say."""
+    is_put = bool(tokens.plain) and tokens.plain[-1] in {*lex.CAUSES, "put", "place", "set"}
     while end < len(words):
         behind = " ".join(words[end : end + 12])
         matches = ((what, re.match(rf"(?:{pattern})(?= |$)", behind)) for what, pattern in _BEHIND.items())
         found = [(what, match) for what, match in matches if match and not (is_put and what in {"box", "place"})]
-        if not found and words[end] == "of" and end + 1 < len(words) and _is_open(words[end + 1]):
+        if found:
+            what, match = found[0]
+            end += len(match[0].split())
+            is_start = what == "path" and (match["end"] or opening) in {"start", "beginning", "first"}
+            path_end = phrase.path_end if what != "path" else "start" if is_start else "end"
+            phrase = replace(phrase, inside_box=phrase.inside_box or what == "box", path_end=path_end)
+        elif words[end] == "of" and end + 1 < len(words) and _is_open(words[end + 1]):
             end += 2  # "stack of books"
-            continue
-        if not found:
+        else:
             break
-        what, match = found[0]
-        end += len(match[0].split())
-        if what == "path":
-            is_start = (match["end"] or opening) in {"start", "beginning", "first"}
-            phrase = replace(phrase, path_end="start" if is_start else "end")
-        phrase = replace(phrase, inside_box=phrase.inside_box or what == "box")
-    return start, end, phrase
+    return end, phrase
 
 
 def _add_phrase(
@@ -243,19 +233,19 @@ def _meant(phrase: lex.ObjectPhrase, tokens: Tokens) -> lex.ObjectPhrase:
         noun = kinds.pop() or ""
         return replace(phrase, noun=noun, text=" ".join([*phrase.text.split()[:-1], noun]))
     # No word in it that the earlier phrase lacks.
-    fuller = [each for each in before if phrase.noun and phrase.words < each.words and each.head == phrase.head]
+    said, same_noun = set(phrase.text.lower().split()), [each for each in before if each.head == phrase.head]
+    fuller = [each for each in same_noun if phrase.noun and said < set(each.text.lower().split())]
     return fuller[0] if len(fuller) == 1 else phrase
 
 
 def object_phrase(content: Sequence[str], text: str) -> lex.ObjectPhrase:
     """The phrase with these lower case words, behind its determiners."""
-    said = [word for word in content if word != "and" and not word.isdigit()] or list(content)
+    said = [word for word in content if not word.isdigit()] or list(content)
     said = said[: next((at for at, word in enumerate(said) if at and word in {"of", "with"}), len(said))]
     nouns, head = [word for word in said[:-1] if not lex.is_modifier(word)], said[-1]
     colour = next((lex.COLOURS[word] for word in said[:-1] or said if word in lex.COLOURS), None)
-    return lex.ObjectPhrase(
-        text, colour, None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)])
-    )
+    noun = None if head in {"one", "ones", "other"} else " ".join([*nouns, lex.singular(head)])
+    return lex.ObjectPhrase(text, colour, noun)
 
 
 def parse_noun_phrase(text: str) -> lex.ObjectPhrase | None:
@@ -264,12 +254,8 @@ def parse_noun_phrase(text: str) -> lex.ObjectPhrase | None:
     while said and said[0].lower() in lex.DETERMINERS:
         del said[0]
     words = re.findall(r"[\w'-]+", " ".join(said).lower())
-    ends = (
-        at
-        for at, word in enumerate(words)
-        if at and word != "one" and (word in lex.FUNCTION or word in lex.DETERMINERS)
-    )
-    words = words[: next(ends, len(words))]
+    closing = (lex.FUNCTION | lex.DETERMINERS) - {"one"}
+    words = words[: next((at for at, word in enumerate(words) if at and word in closing), len(words))]
     if not words or words[0] in lex.FUNCTION:
         return None
     phrase = object_phrase(words, " ".join(said))
@@ -292,26 +278,18 @@ def match_given(phrase: lex.ObjectPhrase, names: Sequence[str]) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _head(name: str) -> str | None:
+def prior_of(name: str) -> ObjectPrior:
+    """What the noun of a name says of its shape.
+
+    A box is a container: a question about a solid one would not ask what goes into it.
+    """
     phrase = parse_noun_phrase(name)
-    return None if phrase is None else phrase.head
-
-
-def shape_of(name: str) -> Shape | None:
-    """The shape of what is called so; None if the noun does not say."""
-    shapes: tuple[Shape, ...] = ("sphere", "box", "cone", "cylinder")
-    head = _head(name)
-    return "box" if head in lex.SETS["vehicle"] else next((each for each in shapes if head in lex.SETS[each]), None)
-
-
-def is_vehicle(name: str) -> bool:
-    """Whether it is longer along its heading than across."""
-    return _head(name) in lex.SETS["vehicle"]
-
-
-def is_cube(name: str) -> bool:
-    """Whether it is a box as wide as high."""
-    return _head(name) in lex.SETS["cube"]
+    head, shapes = phrase and phrase.head, ("sphere", "box", "cone", "cylinder")
+    is_vehicle = head in lex.SETS["vehicle"]  # longer along its heading than across
+    shape = "box" if is_vehicle else next((each for each in shapes if head in lex.SETS[each]), None)
+    opening = next((each for each in ("round", "square") if head in lex.SETS[each]), "none" if shape else None)
+    says = {"shape": shape, "elongated": is_vehicle, "equal_sided": head in lex.SETS["cube"], "opening": opening}
+    return ObjectPrior.model_validate(says)
 
 
 @dataclass(frozen=True)
@@ -335,18 +313,6 @@ def kind_of(name: str) -> Kind | None:
     return None if phrase is None else Kind(phrase, counts[0] if counts else None)
 
 
-def container_form(name: str) -> Literal["round", "square", "none", "unknown"]:
-    """Round or square for what is called a container, `none` for a solid thing, `unknown` where the noun says nothing.
-
-    A box is a container: a question about a solid one would not ask what goes into it.
-    """
-    if _head(name) in lex.SETS["round"]:
-        return "round"
-    if _head(name) in lex.SETS["square"]:
-        return "square"
-    return "unknown" if shape_of(name) is None else "none"
-
-
 def may_name(phrase: lex.ObjectPhrase, name: str) -> bool:
     """Whether a phrase may mean the object of that name: they share a colour or a noun, and differ in none."""
     other = parse_noun_phrase(name)
@@ -362,7 +328,7 @@ def likeness(words: str, name: str) -> Likeness:
     phrase, other = parse_noun_phrase(words), parse_noun_phrase(name)
     if phrase is None or other is None:
         return "same" if plain(words) == plain(name) else "unknown"
-    shapes = (shape_of(words), shape_of(name))
+    shapes = (prior_of(words).shape, prior_of(name).shape)
     if any(one is not None and two is not None and one != two for one, two in ((phrase.colour, other.colour), shapes)):
         return "other"
     return "same" if may_name(phrase, name) else "unknown"

@@ -5,6 +5,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import accumulate, groupby
+from typing import cast
 
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
@@ -14,40 +16,33 @@ from cow_service.records import Asked, AskedRelation, InterventionKind, MotionKi
 MAX_WORDS = 240  # of a question that is read
 _THING = re.compile(r"X\d+")
 _DIRECTIONS = {*lex.WAYS, *map(str.upper, lex.WAYS), "FORWARD", "BACKWARD", "NEAR", "AWAY", "opposite"}
-
-
 _RISING, _SINKING = lex.words("lift raise rise climb ascend"), lex.words("descend lower")
 _TOPPLING = lex.words("knock push tip fall turn blow topple")
 
 
 @dataclass(frozen=True)
 class MotionWords:
-    """How the question says that something moves; None and 0 where it does not say.
-
-    `direction` is a unit vector in image pixels, x right, y down. `depth` is the sine of the angle out of the image
-    plane: -1 towards the camera, 1 away from it. `trail`: on along it; `trail_end`, a thing or a side, tells which end
-    of it is the present position. `topples`: it falls over where it stands. `in_air`: it is let go, or falls freely.
-    `steps` are the legs behind the first, `others` what moves at the same time.
-    """
+    """How the question says that something moves; None and 0 where it does not say."""
 
     kind: MotionKind | None = None
     along_arrow: bool | None = None  # else against it
-    direction: Vector | None = None
-    depth: float = 0.0
+    direction: Vector | None = None  # a unit vector in image pixels, x right, y down
+    depth: float = 0.0  # sine of the angle out of the image plane: -1 towards the camera, 1 away from it
     forward: bool | None = None
     verb: str = ""
     towards: lex.ObjectPhrase | None = None
-    trail: bool = False
-    trail_end: lex.ObjectPhrase | Vector | None = None
+    trail: bool = False  # on along it
+    trail_end: Vector | None = None  # the side on which its present position is
     quantities: tuple[lex.QuantityWords, ...] = ()
-    steps: "tuple[MotionWords, ...]" = ()
-    others: "tuple[tuple[lex.ObjectPhrase, MotionWords], ...]" = ()
+    steps: "tuple[MotionWords, ...]" = ()  # the legs behind the first
+    others: "tuple[tuple[lex.ObjectPhrase, MotionWords], ...]" = ()  # what moves at the same time
     is_contradictory: bool = False  # two of its words are opposites
-    topples: bool = False
-    in_air: bool = False
+    topples: bool = False  # it falls over where it stands
+    in_air: bool = False  # it is let go, or falls freely
 
 
 NOT_SAID = MotionWords()
+_NO_FORM = lex.Form("", re.compile(""))
 
 
 @dataclass(frozen=True)
@@ -113,18 +108,13 @@ class _Piece:
     start: int
     end: int
     roles: dict[str, str] = field(default_factory=dict[str, str])
-    form: lex.Form | None = None
+    form: lex.Form = _NO_FORM
     motion: MotionWords = NOT_SAID
 
     @property
     def is_passive(self) -> bool:
         """Whether what is acted on stands in front of what acts."""
         return self.what == "asked" and next((role for role in self.roles if role in {"s", "o", "a"}), "s") != "s"
-
-    @property
-    def asks_form(self) -> str:
-        """The form of what it asks; empty where it asks nothing."""
-        return "" if self.form is None or self.what not in {"asked", "stated"} else self.form.asks[0]
 
     def said(self, role: str) -> str:
         """What stands in a role."""
@@ -145,10 +135,9 @@ class _Parser:
 
     def __init__(self, tokens: Tokens, options: Sequence[str]) -> None:
         self.tokens, self.options, self.plain, self.said = tokens, options, tokens.plain, tokens.said
-        self.text, self.starts = " ".join(self.plain), [0]
+        self.text, self.starts = " ".join(self.plain), [0, *accumulate(len(token) + 1 for token in self.plain)]
         self.mover, self.names_table = "", False
-        for token in self.plain:
-            self.starts.append(self.starts[-1] + len(token) + 1)
+        self.told, self.changes = list[_Piece](), tuple[ChangeWords, ...]()
         self.place_of = {start: at for at, start in enumerate(self.starts)}
         at, self.pieces = 0, list[_Piece]()
         while at < len(self.plain):
@@ -179,32 +168,25 @@ class _Parser:
         while at < len(self.plain):
             matches = ((name, way.match(self.text, self.starts[at])) for name, way in ways.items())
             name, match = next(((name, match) for name, match in matches if match is not None), ("", None))
-            if match is None or not self._fits(name, match, legs[-1][1]):
+            names = {each for each, _ in legs[-1][1]}
+            again = (name == "goal" and "goal" in names) or (name == "halt" and "quantity" not in names)
+            if match is None or again:
                 break
             end = self._end(match)
             if name == "then":
-                again = verbs.match(self.text, self.starts[end])
-                if again is None and not any(ways[each].match(self.text, self.starts[end]) for each in _TELLING):
+                verb_of_leg = verbs.match(self.text, self.starts[end])
+                if verb_of_leg is None and not any(ways[each].match(self.text, self.starts[end]) for each in _TELLING):
                     break
-                legs.append((again[1] if again else "", []))
-                end = self._end(again) if again else end
+                legs.append((verb_of_leg[1] if verb_of_leg else "", []))
+                end = self._end(verb_of_leg) if verb_of_leg else end
             legs[-1][1].extend(lex.roles(match).items() or [(name, "")])
             legs[-1][1].append((name, "")) if name == "trail" else None
             at = end
         kind = "static" if "n" in piece.roles else lex.KINDS.get(verb)
-        first, *rest = (
-            motion_of(verb, said, self.tokens, None if leg else kind) for leg, (verb, said) in enumerate(legs)
-        )
-        clashes = any(each.is_contradictory for each in rest)
-        piece.end, piece.motion = at, replace(first, steps=tuple(rest)) if rest else first
-        piece.motion = replace(piece.motion, is_contradictory=True) if clashes else piece.motion
+        motions = [motion_of(*leg, self.tokens, None if at else kind) for at, leg in enumerate(legs)]
+        clashes = any(each.is_contradictory for each in motions)
+        piece.end, piece.motion = at, replace(motions[0], steps=tuple(motions[1:]), is_contradictory=clashes)
         return piece
-
-    def _fits(self, name: str, match: re.Match[str], said: Sequence[tuple[str, str]]) -> bool:
-        """Whether words for the way say something behind others."""
-        names = {each for each, _ in said}
-        is_limit = name == "quantity" and self.tokens.quantities[int(match[0][1:])].what == "within"
-        return not (is_limit or (name == "goal" and "goal" in names) or (name == "halt" and "quantity" not in names))
 
     def question(self) -> Question:
         """What all pieces together say."""
@@ -212,26 +194,27 @@ class _Parser:
         last = max((at for at, token in enumerate(self.plain[:-1]) if token in {".", "?"}), default=0)
         is_terse = not asks and stated and stated[-1].start >= last and self.plain[-1] not in {".", "!"}
         asking = asks[0] if asks else stated[-1] if is_terse or (stated and "CLAIM" in self.plain) else None
-        told = [each for each in stated if each is not asking]
-        changes = self._changes(asking)
+        self.told = [each for each in stated if each is not asking]
+        self.changes = changes = self._changes(asking)
         put = next((each.object for each in changes if each.kind == "place"), None)
-        moving = self._moving(asking, told, put)
+        moving = self._moving(asking)
         acts = "" if asking is None else asking.thing("s")
         self.mover = next(iter(moving), self._token(put) if put else acts)
         first = next(iter(moving.values()), NOT_SAID)
         if put is not None and (not moving or first.kind == "static"):
             self.mover, first = self._token(put), MotionWords("place", verb="put")
-        unread = self._unread(asking, asks, told, moving)
-        asked, alternatives = (None, ()) if asking is None else self._asked(asking, told, changes)
+        unread = self._unread(asking, [each for each in asks if each is not asking])
+        asked, alternatives = (None, ()) if asking is None else self._asked(asking)
         if asking is not None and asked is None:
             unread.append(("asked", " ".join(word for word in self.said[asking.start : asking.end] if word)))
         if asking is None and moving:
             asked = Asked(form="what-happens", relation="touches")  # "Push the red ball to the right."
-        if not moving and asked is not None and asked.relation == "lands" and changes and put is None:
-            first = MotionWords("fall", verb="fall")  # without its support
-        gone = {self._token(each.object) for each in changes if each.kind == "remove"}
-        named = next((each for each in self._named() if each not in gone and asking is None), "")
-        mover = self._thing(self.mover or named) if self.mover or named else None
+        gone, phrases = [each.object for each in changes if each.kind == "remove"], [*map(self._thing, self._named())]
+        named = next((each for each in phrases if each not in gone and asking is None), None)
+        mover = self._thing(self.mover) if self.mover else named
+        if asked is not None and asked.form == "which-to-remove":
+            phrases += [each for each in map(parse_noun_phrase, asked.among) if each is not None]
+        others = {plain(each.text): each for each in reversed(phrases) if each.head != "container"}
         further = tuple((self._thing(each), motion) for each, motion in moving.items() if each != self.mover)
         return Question(
             mover=mover,
@@ -239,7 +222,7 @@ class _Parser:
             says_motion=bool(moving) or first != NOT_SAID,
             changes=changes,
             asked=None if unread else asked,
-            others=self._others(mover, changes, asked),
+            others=tuple(each for each in reversed(others.values()) if each not in (mover, *gone)),
             alternatives=alternatives,
             names_table=self.names_table,
             names_arrow=any(word in {"ALONG", "AGAINST"} or "arrow" in word for word in (*self.plain, *self.said)),
@@ -267,24 +250,24 @@ class _Parser:
         found = list[ChangeWords]()
         for piece in self.pieces:
             found += [ChangeWords("remove", phrase) for phrase in self._phrases(piece.said("r"))]
-            if (relation := lex.relation_of(piece.roles)) is not None:
+            relations = [name for name, _ in lex.sections()["where"] if name.replace("-", "") in piece.roles]
+            if relations:
                 target = self._resolved(piece.said("y"), piece.start, piece.said("x")) or ""
                 targets = [each for each in self._phrases(f"{target} {piece.said('z')}") if each.head != "container"]
-                found.append(ChangeWords("place", self._thing(piece.said("x")), relation, tuple(targets)))
+                put, relation = self._thing(piece.said("x")), cast(PlaceRelation, relations[0])
+                found.append(ChangeWords("place", put, relation, tuple(targets)))
         moves = found or any(each.what == "motion" and each.motion.kind != "static" for each in self.pieces)
-        if asking is not None and asking.form is not None and asking.form.asks[1] == "inside" and not moves:
+        if asking is not None and asking.form.asks[1] == "inside" and not moves:
             targets = self._phrases(asking.thing("o"))  # "Does the apple fit into the bowl?": it is put there
             fits = asking.thing("s") and (targets or asking.said("l"))
             found += [ChangeWords("place", self._thing(asking.said("s")), "into", tuple(targets))] if fits else []
         return tuple(dict.fromkeys(found))
 
-    def _moving(
-        self, asking: _Piece | None, told: Sequence[_Piece], put: lex.ObjectPhrase | None
-    ) -> dict[str, MotionWords]:
+    def _moving(self, asking: _Piece | None) -> dict[str, MotionWords]:
         """What moves and how, that of the question first."""
         found = dict[str, MotionWords]()
         for piece in self.pieces:
-            if piece in told and piece.thing("s") and not found:
+            if piece in self.told and piece.thing("s") and not found:
                 struck = self._thing(piece.said("o")) if piece.thing("o") else None
                 found[piece.said("s")] = MotionWords("linear", towards=struck)  # "if the cue ball strikes the red ball"
             if piece.what != "motion" or piece.said("m") == "OBJ":
@@ -292,22 +275,15 @@ class _Parser:
             said, before, token = piece.said("m"), self._named(piece.start), piece.thing("m") or piece.said("m")
             if asking is not None and token in {"", "it"}:
                 # "Will the bottle be hidden behind the book if it moves": what the question is about.
-                acts = asking.thing(
-                    "o" if asking.is_passive and "behind" in self.plain[asking.start : asking.end] else "s"
-                )
+                is_hidden = asking.is_passive and "behind" in self.plain[asking.start : asking.end]
+                acts = asking.thing("o" if is_hidden else "s")
                 early = said == "it" or not before or asking.start < piece.start
                 token = acts if acts and early else ""
-            token = token if token != "it" else ""
-            token = token or (next(reversed(found), "") if said != "it" else "")
+            token = token if token not in {"", "it"} else next(reversed(found), "") if said != "it" else ""
             listed = any(each.what == "nothing" and each.end < piece.start for each in self.pieces)
             if said == "it" and not token and listed and len(before) > 1:
                 continue  # "There is a ball and a mug. If it rolls ...": which one?
-            free = [each for each in before if put is None or self._thing(each) != put]
-            token = token or next(iter([*(free if said else before), *before]), "")
-            opens = self.plain[max(piece.start - 1, 0)] in lex.CONNECTORS or not piece.start
-            later = (each for each in self.plain[piece.end :] if opens and _THING.fullmatch(each))
-            token = token or next(later, "")  # "sent towards the mug, the ball ..."
-            token = token.split()[-1].replace("P", "X").replace("S", "X") if token else ""
+            token = (token or next(iter(before), "")).split(" ")[-1].replace("P", "X").replace("S", "X")
             if token:
                 found[token] = joined(found[token], piece.motion) if token in found else piece.motion
         return found
@@ -316,7 +292,14 @@ class _Parser:
         """The thing that a word stands for. "It" and "that" are the last thing named in front of a place that is not
         the subject; "the other one" is the one that is left of two."""
         if _THING.fullmatch(token) and self._thing(token).is_other:
-            return self._other(subject, token)
+            # The one thing, of those that are given or else named, that is not the subject; else the picture tells.
+            own = plain(self._thing(subject).text) if subject else ""
+            left = [name for name in self.tokens.names if plain(name) != own]
+            if len(left) == 1:
+                phrase = parse_noun_phrase(left[0]) or self._thing(token)
+                return f"X{self.tokens.number(replace(phrase, text=left[0], is_given=True))}"
+            things = [] if left else [each for each in self._named() if each not in {subject, token}]
+            return None if left else token if not things else things[0] if len(things) == 1 else None
         if re.fullmatch(r"[XPS]\d+", token):
             return token
         if token == "itself" or (token == "it" and self.mover not in {"", subject}):
@@ -324,36 +307,31 @@ class _Parser:
         named = [each for each in self.plain[:at] if _THING.fullmatch(each) and each != subject]
         return named[-1] if named and token in {"it", "that", "this"} else None
 
-    def _other(self, subject: str, token: str) -> str | None:
-        """The one thing, of those that are given or else named, that is not the subject; the word itself where the
-        picture must tell."""
-        own = plain(self._thing(subject).text) if subject else ""
-        if left := [name for name in self.tokens.names if plain(name) != own]:
-            phrase = replace(parse_noun_phrase(left[0]) or self._thing(token), text=left[0], is_given=True)
-            return f"X{self.tokens.number(phrase)}" if len(left) == 1 else None
-        things = [each for each in self._named() if each not in {subject, token}]
-        return token if not things else things[0] if len(things) == 1 else None
-
-    def _asked(
-        self, asking: _Piece, told: Sequence[_Piece], changes: Sequence[ChangeWords]
-    ) -> tuple[Asked | None, tuple[lex.ObjectPhrase, ...]]:
+    def _asked(self, asking: _Piece) -> tuple[Asked | None, tuple[lex.ObjectPhrase, ...]]:
         """What is asked, and among which things; None where that is not clear."""
-        if asking.form is None:
-            return None, ()
         form, relation, is_negated = asking.form.asks
         is_turned, counts = "n" in asking.roles or asking.said("q") == "NOOF", asking.said("q")
-        target = self._target(asking, told)
+        target = self._target(asking)
         unclear = is_turned and (is_negated or counts == "ALLOF")
         if target is None or unclear or (asking.said("o") == "EVERYTHING" and not is_negated):
             return None, ()
         subject = asking.thing("s") or self.mover
         relation, doer, target = self._turned(asking, relation, subject if subject != self.mover else "", target)
-        thing = self._thing(target) if target else None
-        found = self._settled(asking, relation, thing, changes)
-        if found is None:
-            return None, ()
-        relation, thing = found
-        crash = [each.thing("o") for each in told if each.thing("o")]
+        thing, words = self._thing(target) if target else None, self.plain[asking.start : asking.end]
+        if relation == "lands" and thing is not None:  # "off the table"
+            self.names_table = thing.head in lex.TABLES
+            if not self.names_table:
+                return None, ()
+            thing = None
+        if relation == "inside" and form == "whether":
+            puts = [each.targets[0] for each in self.changes if each.targets]
+            thing = thing or next(iter(puts), None)
+            if thing is None:
+                return None, ()
+            along = not {"roll", "slide", "move", "drive", "push"}.isdisjoint(words)
+            holds = thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
+            relation = "inside" if holds or "fit" in words or self.changes else "touches"
+        crash = [each.thing("o") for each in self.told if each.thing("o")]
         if (form == "which-to-remove" or asking.said("r")) and thing is None and crash:
             thing = self._thing(crash[-1])  # "It will collide with the lamp. Which object should be removed ..."
         lists = [each.said("l") for each in (asking, *self.pieces) if each.said("l")]
@@ -376,16 +354,16 @@ class _Parser:
         )
         return asked, tuple(listed or kinds) if form == "which-first" else ()
 
-    def _target(self, asking: _Piece, told: Sequence[_Piece]) -> str | None:
+    def _target(self, asking: _Piece) -> str | None:
         """The thing that is acted on; empty for any, None where it is not clear which."""
         said, subject = asking.said("o"), asking.thing("s") or self.mover
-        several = sum(each.what == "motion" and bool(each.thing("m")) for each in self.pieces) > 1
-        is_open = (told or several) and asking.said("s") == "it" and asking.asks_form != "which-to-remove"
-        elsewhere = asking.asks_form == "where" and subject != self.mover
+        moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
+        form = asking.form.asks[0]
+        is_open = (self.told or len(moved) > 1) and asking.said("s") == "it" and form != "which-to-remove"
+        elsewhere = form == "where" and subject != self.mover
         if (is_open and not asking.said("r")) or said == "OBJ" or elsewhere:
             return None  # the mover, or what it strikes
         if "both" in asking.roles:
-            moved = [each.thing("m") for each in self.pieces if each.what == "motion" and each.thing("m")]
             pairs = ([each for each in dict.fromkeys(names) if each != subject] for names in (moved, self._named()))
             pair = next((each for each in pairs if each), [])
             return pair[0] if len(pair) == 1 else None
@@ -406,77 +384,27 @@ class _Parser:
             return relation, "", doer  # "the vase hits it", "is it hit?"
         return relation, doer, target
 
-    def _settled(
-        self, asking: _Piece, relation: AskedRelation, thing: lex.ObjectPhrase | None, changes: Sequence[ChangeWords]
-    ) -> tuple[AskedRelation, lex.ObjectPhrase | None] | None:
-        """The relation that is meant to a thing of that kind, and the thing; None where there is none."""
-        words, is_table = self.plain[asking.start : asking.end], thing is not None and thing.head in lex.TABLES
-        if relation == "lands" and thing is not None:  # "off the table"
-            self.names_table = is_table
-            return (relation, None) if is_table else None
-        if (
-            relation == "touches"
-            and thing is not None
-            and is_table
-            and not thing.colour
-            and {"on", "onto"} & set(words)
-        ):
-            self.names_table = True
-            return "lands", None
-        if relation == "inside" and asking.asks_form == "whether":
-            puts = [each.targets[0] for each in changes if each.targets]
-            thing = thing or next(iter(puts), None)
-            along = {"roll", "slide", "move", "drive", "push"} & set(words)
-            holds = thing is not None and thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
-            relation = "inside" if holds or "fit" in words or changes else "touches"
-            return None if thing is None else (relation, thing)
-        return relation, thing
-
-    def _others(
-        self, mover: lex.ObjectPhrase | None, changes: Sequence[ChangeWords], asked: Asked | None
-    ) -> tuple[lex.ObjectPhrase, ...]:
-        """The further things that are named, each once."""
-        removed = [each.object for each in changes if each.kind == "remove"]
-        phrases = [self._thing(token) for token in self._named()]
-        if asked is not None and asked.form == "which-to-remove":
-            phrases += [each for each in map(parse_noun_phrase, asked.among) if each is not None]
-        named = {plain(each.text): each for each in reversed(phrases) if each.head != "container"}
-        return tuple(each for each in reversed(named.values()) if each not in (mover, *removed))
-
-    def _unread(
-        self, asking: _Piece | None, asks: Sequence[_Piece], told: Sequence[_Piece], moving: dict[str, MotionWords]
-    ) -> list[tuple[str, str]]:
-        """The words that no form covers, each run with the part of the question to which it belongs."""
-        form = "" if asking is None or asking.form is None else asking.form.asks[0]
+    def _unread(self, asking: _Piece | None, lost: list[_Piece]) -> list[tuple[str, str]]:
+        """The words that no form covers, or one of the lost pieces does, each run with the part it belongs to."""
+        form = "" if asking is None else asking.form.asks[0]
         names_crash = asking is not None and (form == "which-to-remove" or asking.said("r"))
         struck = "" if asking is None else asking.thing("s")
-        lost = [each for each in asks if each is not asking]
         lost += [each for each in self.pieces if each.said("m") == "OBJ"]
         lost += [each for each in self.pieces if each.what == "listed" and form != "which-first"]
         # What is told to be hit, and is not what the question then goes on about.
-        lost += [each for each in told if not names_crash and (each.said("o") != struck or not struck)]
-        read = {at for each in self.pieces if each not in lost for at in range(each.start, each.end)}
-        runs: list[list[int]] = [[]]
-        for at, token in enumerate(self.plain):
-            if at in read or token in {".", "?", "!", ";", ","}:
-                runs.append([])
-            else:
-                runs[-1].append(at)
-        found = list[tuple[str, str]]()
-        for run in runs:
-            words = [self.plain[at] for at in run]
-            limits = [
-                word for word in words if word[0] == "Q" and self.tokens.quantities[int(word[1:])].what == "within"
-            ]
-            if all(word in lex.CONNECTORS or word in limits for word in words):
+        lost += [each for each in self.told if not names_crash and (each.said("o") != struck or not struck)]
+        closed = {at for each in self.pieces if each not in lost for at in range(each.start, each.end)}
+        closed |= {at for at, token in enumerate(self.plain) if token in {".", "?", "!", ";", ","}}
+        found, ends = list[tuple[str, str]](), {each.end: each.what for each in self.pieces}
+        for is_closed, run in groupby(range(len(self.plain)), key=lambda at: at in closed):
+            at = list(run)
+            words = [self.plain[each] for each in at]
+            if is_closed or all(word in lex.CONNECTORS or re.fullmatch(r"W\d+", word) for word in words):
                 continue
-            ends = [
-                each
-                for each in self.pieces
-                if each.end <= run[0] and not {".", "?"} & set(self.plain[each.end : run[0]])
-            ]
-            what = "motion" if ends and ends[-1].what == "motion" else "asked"
-            found.append((what, " ".join(self.said[at] for at in run if self.said[at]) or " ".join(words)))
+            sentence = max((end for end in range(at[0]) if self.plain[end] in {".", "?"}), default=-1)
+            before = [ends[end] for end in range(sentence + 1, at[0] + 1) if end in ends]
+            what = "motion" if before[-1:] == ["motion"] else "asked"
+            found.append((what, " ".join(self.said[each] for each in at if self.said[each]) or " ".join(words)))
         return found
 
 
@@ -485,19 +413,16 @@ def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: 
     found = {name: [text for each, text in said if each == name] for name, _ in said}
     ways = [lex.WAYS[text.lower()] for text in found.get("way", ())]
     senses, ahead, depths = (set(found.get(name, ())) for name in ("sense", "ahead", "depth"))
-    x, y, depth = sum(way[0] for way in ways), sum(way[1] for way in ways), 0.0
-    up, falls = [way[1] for way in ways], verb in lex.SETS["fall"]
-    turned = (falls and min(up, default=0) < 0) or (verb in _RISING and max(up, default=0) > 0)
+    x, y, up = sum(way[0] for way in ways), sum(way[1] for way in ways), [way[1] for way in ways]
+    turned = min(up, default=0) < 0 if verb in lex.SETS["fall"] else verb in _RISING and max(up, default=0) > 0
     opposed = any(a[0] * b[0] < 0 or a[1] * b[1] < 0 for a in ways for b in ways)
     stays = "still" in found and bool(ways or depths or senses)
     if kind == "fall":
         y = 0.0  # down is what a fall does; only what leads away from it is a direction
     elif not ways:
         y = -1.0 if verb in _RISING else 1.0 if verb in _SINKING else 0.0
-    if depths:
-        depth = -1.0 if "NEAR" in depths else 1.0
-    length = math.hypot(x, y)
-    goal, near, side = (next(iter(found.get(name, ())), "") for name in ("goal", "near", "side"))
+    depth, length = -1.0 if "NEAR" in depths else 1.0 if depths else 0.0, math.hypot(x, y)
+    goal = next(iter(found.get("goal", ())), "")
     return MotionWords(
         kind=kind,
         along_arrow="ALONG" in senses if senses else None,
@@ -507,7 +432,7 @@ def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: 
         verb=verb,
         towards=tokens.things[int(goal[1:])] if goal else None,
         trail="trail" in found,
-        trail_end=tokens.things[int(near[1:])] if near else lex.SIDES.get(side),
+        trail_end=lex.SIDES.get(next(iter(found.get("side", ())), "")),
         quantities=tuple(tokens.quantities[int(text[1:])] for text in found.get("quantity", ())),
         is_contradictory=turned or opposed or stays or any(len(each) > 1 for each in (senses, ahead, depths)),
         topples=("over" in found and verb in _TOPPLING) or verb in {"tip", "topple"},
@@ -519,8 +444,8 @@ def joined(first: MotionWords, second: MotionWords) -> MotionWords:
     """A motion that is told in two places."""
     empty = vars(NOT_SAID)
     told = {name: value for name, value in vars(second).items() if value != empty[name]}
-    single = ("kind", "direction", "depth", "along_arrow", "forward")
-    clash = any(name in told and getattr(first, name) not in (empty[name], told[name]) for name in single)
     kept = {name: value for name, value in told.items() if getattr(first, name) == empty[name]}
+    single = {"kind", "direction", "depth", "along_arrow", "forward"} & (told.keys() - kept.keys())
+    clash = any(getattr(first, name) != told[name] for name in single)
     quantities = (*first.quantities, *second.quantities)
     return replace(first, **kept | {"quantities": quantities, "is_contradictory": clash or first.is_contradictory})
