@@ -286,10 +286,10 @@ TABLE: dict[str, list[tuple[Any, ...]]] = {
     "image-url-unreachable": [(unreachable,
          "The host name 'nosuch.invalid' is unknown. Check its spelling. Or send the image itself, as a data URL "
          "or as a file part.")],
-    "cannot-ground": [(simulated(grounding=None, question="If the pink car turns?"),
+    "cannot-ground": [(simulated(grounding=None, question="If the pink car moves to the left?"),
          "What moves is not clear: 'pink car' was not found, or not for certain. Seen: blue at (188, 79), red at "
          "(60, 80). Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the "
-         "request.")],
+         "request. Or click it on the page, or have a multimodal LLM read the image (COW_MLLM).")],
     "object-not-found": [(read_by_the_mllm(saying('{"reasoning": "", "object": null}'), "Describe the image."),
          "The multimodal LLM 'Qwen/Qwen3-VL-8B-Instruct' sees nothing in the image that the question could move. "
          "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request.")],

@@ -77,7 +77,7 @@ class EmbeddedReader:
         if mover is None or (given.motion_wanted and not question.says_motion):
             words = ("', '".join(unread) or given.question)[:MAX_UNREAD]
             like = " Or: ".join(rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",))
-            fault = f"The question does not say in words what moves and how: '{words}' was not understood."
+            fault = f"What moves and how is not said in words that the embedded reader knows: '{words}'; it reads English."
             raise CannotGround(f"{fault} Ask like: {like}", remedy=LOCATE_IT)
         _check_changes(question, changes)
         with given.cpu():
@@ -114,8 +114,6 @@ class EmbeddedReader:
             things = [(phrase, each.bbox) for phrase, each in others if each is not None and phrase in question.others]
             things += [] if mover.is_given else [(mover, bbox)]
             doubts, doubtful = matching.noun_doubts(scene, things)
-            if question.names_table and scene.side_view is not None:
-                asked = None  # seen from the side, a table is a thing, and the floor is another
         left = unread if given.asked_wanted or given.changes_wanted else ()
         doubts += [f"The words '{each}' were not understood, so no outcome is sure." for each in left]
         own = finder.known.get(mover.text)

@@ -67,7 +67,6 @@ class Question:
     asked: Asked | None = None
     others: tuple[lex.ObjectPhrase, ...] = ()
     alternatives: tuple[lex.ObjectPhrase, ...] = ()
-    names_table: bool = False  # something is asked to come down on it, or to stay there
     names_arrow: bool = False
     names_direction: bool = False  # some word says which way, whether or not it was understood
     unread: tuple[str, ...] = ()
@@ -85,9 +84,13 @@ def parse(question: str, names: tuple[str, ...] = ()) -> Question:
     return _Parser(tokens_of(text, names), options).question()
 
 
+MOST_OF_A_NAME = 5  # words: what is longer is no name, but words that were not understood
+
+
 def rewordings(question: Question) -> tuple[str, ...]:
     """Up to three questions in forms that are read, with the names of this one and about what it asks."""
     names = [each.text for each in (question.mover, *question.others) if each is not None]
+    names = [each for each in names if each.isascii() and len(each.split()) <= MOST_OF_A_NAME]
     motion, said = question.motion, " ".join(question.unread).lower()
     way = "opposite to the direction of the arrow" if motion.along_arrow is False else "in the direction of the arrow"
     way = next((f"to the {name}" for name in ("left", "right") if motion.direction == lex.WAYS[name]), way)
@@ -136,7 +139,7 @@ class _Parser:
     def __init__(self, tokens: Tokens, options: Sequence[str]) -> None:
         self.tokens, self.options, self.plain, self.said = tokens, options, tokens.plain, tokens.said
         self.text, self.starts = " ".join(self.plain), [0, *accumulate(len(token) + 1 for token in self.plain)]
-        self.mover, self.names_table = "", False
+        self.mover = ""
         self.told, self.changes = list[_Piece](), tuple[ChangeWords, ...]()
         self.place_of = {start: at for at, start in enumerate(self.starts)}
         at, self.pieces = 0, list[_Piece]()
@@ -224,7 +227,6 @@ class _Parser:
             asked=None if unread else asked,
             others=tuple(each for each in reversed(others.values()) if each not in (mover, *gone)),
             alternatives=alternatives,
-            names_table=self.names_table,
             names_arrow=any(word in {"ALONG", "AGAINST"} or "arrow" in word for word in (*self.plain, *self.said)),
             names_direction=not _DIRECTIONS.isdisjoint(self.plain),
             unread=tuple(dict.fromkeys(said for _, said in unread)),
@@ -319,10 +321,7 @@ class _Parser:
         relation, doer, target = self._turned(asking, relation, subject if subject != self.mover else "", target)
         thing, words = self._thing(target) if target else None, self.plain[asking.start : asking.end]
         if relation == "lands" and thing is not None:  # "off the table"
-            self.names_table = thing.head in lex.TABLES
-            if not self.names_table:
-                return None, ()
-            thing = None
+            thing = None if thing.head in lex.TABLES else thing
         if relation == "inside" and form == "whether":
             puts = [each.targets[0] for each in self.changes if each.targets]
             thing = thing or next(iter(puts), None)
