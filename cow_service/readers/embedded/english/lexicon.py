@@ -42,7 +42,6 @@ FUNCTION, DETERMINERS, PLACES, CAUSES = (SETS[name] for name in ("function", "de
 GENERIC, AGENTS, TOUCHING, FILLERS = (SETS[name] for name in ("generic", "agents", "touching", "fillers"))
 TABLES = words("table desk tabletop")
 CONTAINERS = SETS["hollow"] | (SETS["round"] | SETS["square"]) - {"vase", "can"}  # to fall into
-NOUNS = frozenset[str]().union(*(SETS[name] for name in ("sphere", "box", "vehicle", "cone", "cylinder")))
 _KINDS: tuple[MotionKind, ...] = ("linear", "projectile", "fall", "static")
 KINDS: dict[str, MotionKind] = {"let go": "fall", **{lemma: kind for kind in _KINDS for lemma in LISTS[kind]}}
 
