@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from cow_service.errors import CannotReadDirection
+from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.perception.facing import facing
 from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
@@ -18,6 +18,7 @@ from cow_service.vision.masks import is_same_object
 from cow_service.vision.scene import Scene, arrow_of
 from cow_service.vision.trails import trail_of
 
+NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
 _ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
 _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
@@ -97,6 +98,7 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     """The scene in which the trail that the question may be about ends where the question says, and a warning.
 
     If neither the image nor the words show the end, it is the one whose path leads on to the object in question.
+    Raises `CannotGround` if the thing that the words tell the end by was not found.
     """
     end, phrase = question.motion.trail_end, question.mover
     if phrase is None or phrase.is_given or not scene.trails:
@@ -106,11 +108,18 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     if len(trails) != 1:
         return scene, ()
     trail, warnings = trails[0], ()
-    if question.motion.trail:
+    beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
+    if isinstance(end, ObjectPhrase):
+        near = match_one(beside, end)
+        gaps = sorted(math.dist(trail.positions[at].centre, near.centre) for at in (0, -1)) if near else []
+        if near is None or gaps[0] > NEARER * gaps[1]:
+            told = f"'{end.text}', which was not found for certain, or is about as far from either end"
+            raise CannotGround(f"The question tells the end of the trail by {told}.", remedy=GIVE_PLACE)
+        trail = trail.ending(near.bbox)
+    elif question.motion.trail:
         trail = trail.ending(None, end or question.motion.direction)
     if not trail.end_known:
         # What may lie ahead: the first thing that is asked about, else the middle of the image.
-        beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
         asked = ((each.text, match_one(beside, each)) for each in question.others)
         x, y = scene.width / 2, scene.height / 2
         ahead = ((name, region.bbox) for name, region in asked if region is not None)

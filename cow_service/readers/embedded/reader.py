@@ -77,7 +77,9 @@ class EmbeddedReader:
         if mover is None or (given.motion_wanted and not question.says_motion):
             words = ("', '".join(unread) or given.question)[:MAX_UNREAD]
             like = " Or: ".join(rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",))
-            fault = f"What moves and how is not said in words that the embedded reader knows: '{words}'; it reads English."
+            fault = (
+                f"What moves and how is not said in words that the embedded reader knows: '{words}'; it reads English."
+            )
             raise CannotGround(f"{fault} Ask like: {like}", remedy=LOCATE_IT)
         _check_changes(question, changes)
         with given.cpu():

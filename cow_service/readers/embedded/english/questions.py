@@ -32,7 +32,9 @@ class MotionWords:
     verb: str = ""
     towards: lex.ObjectPhrase | None = None
     trail: bool = False  # on along it
-    trail_end: Vector | None = None  # the side on which its present position is
+    trail_end: lex.ObjectPhrase | Vector | None = (
+        None  # the thing, or the side, that its present position is nearest to
+    )
     quantities: tuple[lex.QuantityWords, ...] = ()
     steps: "tuple[MotionWords, ...]" = ()  # the legs behind the first
     others: "tuple[tuple[lex.ObjectPhrase, MotionWords], ...]" = ()  # what moves at the same time
@@ -321,7 +323,10 @@ class _Parser:
         relation, doer, target = self._turned(asking, relation, subject if subject != self.mover else "", target)
         thing, words = self._thing(target) if target else None, self.plain[asking.start : asking.end]
         if relation == "lands" and thing is not None:  # "off the table"
-            thing = None if thing.head in lex.TABLES else thing
+            if thing.head in lex.TABLES:
+                thing = None
+            elif {"off", "on"}.isdisjoint(words):
+                return None, ()
         if relation == "inside" and form == "whether":
             puts = [each.targets[0] for each in self.changes if each.targets]
             thing = thing or next(iter(puts), None)
@@ -421,7 +426,7 @@ def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: 
     elif not ways:
         y = -1.0 if verb in _RISING else 1.0 if verb in _SINKING else 0.0
     depth, length = -1.0 if "NEAR" in depths else 1.0 if depths else 0.0, math.hypot(x, y)
-    goal = next(iter(found.get("goal", ())), "")
+    goal, near = (next(iter(found.get(name, ())), "") for name in ("goal", "near"))
     return MotionWords(
         kind=kind,
         along_arrow="ALONG" in senses if senses else None,
@@ -431,7 +436,7 @@ def motion_of(verb: str, said: Sequence[tuple[str, str]], tokens: Tokens, kind: 
         verb=verb,
         towards=tokens.things[int(goal[1:])] if goal else None,
         trail="trail" in found,
-        trail_end=lex.SIDES.get(next(iter(found.get("side", ())), "")),
+        trail_end=tokens.things[int(near[1:])] if near else lex.SIDES.get(next(iter(found.get("side", ())), "")),
         quantities=tuple(tokens.quantities[int(text[1:])] for text in found.get("quantity", ())),
         is_contradictory=turned or opposed or stays or any(len(each) > 1 for each in (senses, ahead, depths)),
         topples=("over" in found and verb in _TOPPLING) or verb in {"tip", "topple"},
