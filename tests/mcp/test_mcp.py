@@ -162,7 +162,7 @@ def test_answer_over_stdio_and_the_same_image_again(here: tuple[Session, Path]) 
     [
         ({"question": "What if the purple cow jumps?"}, ("cannot-ground: ", "`bbox` [x0, y0, x1, y1]", "request id")),
         (
-            {"image": data_url(picture()), "question": "Where does the red ball go?"},
+            {"image": data_url(picture()), "question": "If the red ball moves forward, where does it stop?"},
             ("cannot-read-direction: ", "`direction` [dx, dy]"),
         ),
         ({"image": "https://example.org/a.png"}, ("image-url-not-allowed: ", "COW_ALLOW_IMAGE_URLS")),

@@ -123,6 +123,8 @@ def test_a_server_whose_database_is_away_says_so_from_its_start_on(tmp_path: Pat
         served = Served(tmp_path, COW_DATABASE_URL=url)
         stack.callback(served.kill)
         served.start("/livez")
+        # It answers probes while the reader is still being loaded.
+        eventually(lambda: served.http.get("/readyz").json()["type"].endswith("storage-unavailable"))
         problem(served.http.get("/readyz"), 503, "storage-unavailable")
         refused = served.http.post("/simulate", json=BODY)
         problem(refused, 503, "not-ready")
