@@ -215,7 +215,7 @@ def _is_about(box: BBox, region: BBox) -> bool:
 def _fault_of(thing: LocatedObject, region: Region | None, seen: SeenThings) -> str | None:
     if region is None and thing.bbox in seen.bare:
         return f"In the box of '{thing.object}' nothing stands."
-    named = set(thing.object.lower().split())
+    named = set(thing.object.lower().split(" with ")[0].split())  # "a truck with a red cab" need not be red
     region = region or next((each for each in seen.regions if is_same_object(each.bbox, thing.bbox)), None)
     if region is None or not named.isdisjoint((region.colour, *region.colours)):
         return None
