@@ -147,11 +147,6 @@ class WayReading:
     towards: str | None = None  # name of the thing that it moves towards
     forward: bool | None = None  # as it faces, else backward
 
-    @property
-    def speaks_of_arrow(self) -> bool:
-        """Whether a drawn arrow is to be followed."""
-        return self.along_arrow is not None
-
 
 @dataclass(frozen=True)
 class QuestionReading:

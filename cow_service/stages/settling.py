@@ -79,7 +79,7 @@ def settle_way(read: MotionReading, said: WayReading, seen: SeenWay, mover: BBox
 
 
 def _by_arrow(read: MotionReading, said: WayReading, arrow: Vector | None) -> MotionReading | None:
-    is_meant = said.speaks_of_arrow or read.cue == "arrow" or (read.direction is None and said == WayReading())
+    is_meant = said.along_arrow is not None or read.cue == "arrow" or (read.direction is None and said == WayReading())
     if arrow is None or not is_meant:
         return None
     along = read.along_arrow if said.along_arrow is None else said.along_arrow

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cow_service.narration.words import phrases_of
 from cow_service.readers.embedded.answers import answer_from, says_it_happens, span_of
-from cow_service.readers.embedded.english.questions import parse
+from cow_service.readers.embedded.english.questions import parse, rewordings
 from cow_service.readers.options import read_choices, without_reply_form
 from cow_service.records import Asked
 
@@ -329,3 +329,9 @@ def test_no_sense_is_made_of_what_has_none(word: str) -> None:
     assert question.mover is not None
     named = " ".join(question.unread).split()
     assert word in question.mover.text or word in named  # a noun nobody knows, or named as unread
+
+
+def test_words_that_were_not_read_are_no_names_in_the_questions_that_are_offered() -> None:
+    assert rewordings(parse("If the lorry zigzags to the right, will it frobnicate the mug?")) == ()
+    assert all("the dent" not in each for each in rewordings(parse("If the ball rolls left, will it dent the mug?")))
+    assert "hit the mug" in rewordings(parse("If the ball rolls left, will it dent the mug?"))[0]

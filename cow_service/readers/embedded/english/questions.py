@@ -92,8 +92,13 @@ MOST_OF_A_NAME = 5  # words: what is longer is no name, but words that were not 
 def rewordings(question: Question) -> tuple[str, ...]:
     """Up to three questions in forms that are read, with the names of this one and about what it asks."""
     names = [each.text for each in (question.mover, *question.others) if each is not None]
-    names = [each for each in names if each.isascii() and len(each.split()) <= MOST_OF_A_NAME]
     motion, said = question.motion, " ".join(question.unread).lower()
+    # Words that were not read are no name without a determiner: in "will it frobnicate the mug" only "mug" is one.
+    texts = [each.lower() for each in names]
+    clear = (n for n in texts if n not in said or re.search(rf"\b(the|an?|this|that) {re.escape(n)}\b", said))
+    names = [name for name in clear if name.isascii() and len(name.split()) <= MOST_OF_A_NAME]
+    if question.mover is None or question.mover.text.lower() not in names:
+        return ()
     way = "opposite to the direction of the arrow" if motion.along_arrow is False else "in the direction of the arrow"
     way = next((f"to the {name}" for name in ("left", "right") if motion.direction == lex.WAYS[name]), way)
     way, (mover, other) = "forward" if motion.forward else way, (*names, "", "")[:2]
