@@ -65,6 +65,7 @@ class CallLog:
 
     usage: records.Usage = field(default_factory=records.Usage)
     prompts: dict[str, int] = field(default_factory=dict[str, int])  # version by name
+    notes: dict[str, None] = field(default_factory=dict[str, None])  # what was sent otherwise than it is
 
 
 @dataclass(frozen=True)

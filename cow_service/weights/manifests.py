@@ -155,9 +155,6 @@ class Family(Record):
     also: tuple[str, ...] = Field(
         default=(), description="Served names of its models that have no manifest, in lower case, with * and ?."
     )
-    structured_output: Literal["native", "prompted"] = Field(
-        description="Whether its servers hold replies to a JSON schema, or the prompt has to ask for the shape."
-    )
 
 
 @cache

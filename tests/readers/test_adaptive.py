@@ -171,14 +171,14 @@ def test_calls_that_become_longer_for_good_are_made_as_many() -> None:
     assert server.limits[-1][1] == 64
 
 
-def test_an_mllm_is_called_more_often_at_once_as_it_accepts_more() -> None:
+def test_an_mllm_is_called_more_often_at_once_as_it_accepts_more(tmp_path) -> None:
     """Over sockets: calls that are refused are made again, and all places are free at the end."""
     from cow_service.readers.mllm.client import MllmClient, PromptCall
     from cow_service.readers.mllm.models import configure
 
     accepted, calls, begun, most, refused = 12, 80, 0, 0, 0
     with mllm_server() as mllm:
-        settings = Settings(mllm="generic", mllm_base_url=mllm.address)
+        settings = Settings(mllm="generic", mllm_base_url=mllm.address, data_dir=tmp_path)
         client = MllmClient(configure(settings), settings)
         limit = client.places.limit
 

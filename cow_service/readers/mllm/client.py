@@ -17,7 +17,7 @@ import anyio
 from pydantic_ai import Agent, BinaryContent, ModelRetry, TextOutput
 from pydantic_ai import exceptions as errors
 from pydantic_ai.direct import model_request
-from pydantic_ai.messages import ModelMessage, ModelResponse
+from pydantic_ai.messages import ModelMessage, ModelResponse, TextPart, ThinkingPart, ToolCallPart
 from pydantic_ai.models import Model, ModelRequestParameters
 from pydantic_ai.models.wrapper import WrapperModel
 from pydantic_ai.output import OutputObjectDefinition
@@ -29,10 +29,12 @@ from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable, shortened
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.chat import ChatTurn
+from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore, store_of
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
 from cow_service.readers.mllm.coordinates import MEDIA_TYPE
 from cow_service.readers.mllm.models import ConfiguredModel
 from cow_service.readers.mllm.replies import ReplyError, Schema
+from cow_service.readers.mllm.sheets import fit_images, images_in
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Usage
 from cow_service.settings import Settings
@@ -99,6 +101,7 @@ class MllmClient:
         own = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
         self._keys = {key for key in (own, model.upstream and model.upstream.key) if key}
         self.places = AdaptivePlaces(settings.mllm_concurrency)
+        self.capabilities = store_of(settings.data_dir, model.server, model.name, model.first)
         self._instructions = load_prompt(SYSTEM_PROMPT)
         self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
         self._thread = EventLoopThread(model.model)
@@ -144,7 +147,7 @@ class MllmClient:
     async def _chat(self, body: dict[str, Any]) -> ChatTurn:
         chat = prepare_chat(body, self.model.model)
         settings = self._supported(chat.settings | ModelSettings(timeout=self._timeout, max_retries=0))
-        once = RetryingModel(self.model.model, self.places, self._timeout, self._budget, None, retries=False)
+        once = RetryingModel(self.model.model, self.places, self._timeout, self._budget, retries=False)
         try:
             response = await model_request(
                 once, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
@@ -168,9 +171,16 @@ class MllmClient:
     async def _complete(self, call: PromptCall[T], given: ReaderInput) -> T | CowError:
         """The parsed reply, or the error that the call came to: one failed vote must not lose the others."""
         prompt, parser, used = load_prompt(call.prompt), _ReplyParser(call.parse), RunUsage()
-        schema = call.schema if self.model.supports_schema else None
         seconds = self._budget if given.until is None else min(self._budget, given.until - time.time())
-        model = RetryingModel(self.model.model, self.places, self._timeout, seconds, schema, place_seconds=self._budget)
+        model = LearningModel(
+            self.model,
+            self.capabilities,
+            call.schema,
+            self.places,
+            self._timeout,
+            seconds,
+            place_seconds=self._budget,
+        )
         images = [BinaryContent(image, media_type=MEDIA_TYPE) for image in call.images]
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
@@ -197,10 +207,12 @@ class MllmClient:
         except CowError as error:  # of a model that runs in this process
             return error
         except (errors.AgentRunError, errors.UserError, TimeoutError) as error:
+            self.capabilities.give_up()
             return self._error(call, parser, model, error)
         finally:  # in the one thread of the event loop, so that calls at the same time do not lose each other's usage
             tokens = {"input_tokens": used.input_tokens, "output_tokens": used.output_tokens}
             given.calls.usage += Usage(calls=model.calls, **tokens)
+            given.calls.notes |= dict.fromkeys(model.notes)
             given.calls.prompts |= {prompt.name: prompt.version, SYSTEM_PROMPT: self._instructions.version}
 
     def _supported(self, settings: ModelSettings) -> ModelSettings:
@@ -309,14 +321,13 @@ class RetryingModel(WrapperModel):
         places: AdaptivePlaces,
         timeout: float,
         seconds: float,
-        schema: Schema | None,
         *,
         retries: bool = True,
         place_seconds: float | None = None,
     ) -> None:
         """`place_seconds`: how long a place is waited for, where that is not `seconds`."""
         super().__init__(wrapped)
-        self._places, self._timeout, self._schema, self._retries = places, timeout, schema, retries
+        self._places, self._timeout, self._retries = places, timeout, retries
         self.seconds, self._ends = max(0.0, seconds), time.monotonic() + seconds
         self._place_ends = time.monotonic() + (seconds if place_seconds is None else place_seconds)
         self.calls = 0
@@ -334,12 +345,7 @@ class RetryingModel(WrapperModel):
         model_settings: ModelSettings | None,
         model_request_parameters: ModelRequestParameters,
     ) -> ModelResponse:
-        """A reply held to the schema where there is one. Raises `ModelAPIError`, `ContentFilterError`."""
-        parameters = model_request_parameters
-        if self._schema is not None:
-            # The text is read by our own tolerant rules all the same: a server may ignore the schema.
-            output = OutputObjectDefinition(self._schema, "reply")
-            parameters = replace(parameters, output_mode="native", output_object=output)
+        """The reply. Raises `ModelAPIError`, `ContentFilterError`."""
 
         def is_transient(error: BaseException) -> bool:
             if isinstance(error, errors.ModelHTTPError) and error.status_code < HTTPStatus.INTERNAL_SERVER_ERROR:
@@ -364,7 +370,12 @@ class RetryingModel(WrapperModel):
 
         retry = retry_if_exception(is_transient)
         retrying = AsyncRetrying(retry=retry, wait=seconds_to_wait, stop=is_over, reraise=True)
-        return await retrying(self._attempt, messages, model_settings, parameters)
+        return await retrying(self._attempt, messages, model_settings, model_request_parameters)
+
+    async def _send(
+        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ModelResponse:
+        return await super().request(messages, settings, parameters)
 
     async def _attempt(
         self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
@@ -386,7 +397,7 @@ class RetryingModel(WrapperModel):
             self.calls += 1
             try:
                 with anyio.fail_after(self._timeout):
-                    response = await super().request(messages, settings, parameters)
+                    response = await self._send(messages, settings, parameters)
                 call.succeeded = True
             except errors.ContentFilterError:
                 raise
@@ -409,6 +420,84 @@ class RetryingModel(WrapperModel):
         if isinstance(error, TimeoutError):
             return errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
         return errors.ModelAPIError(self.model_name, "the reply was no chat completion")
+
+
+class LearningModel(RetryingModel):
+    """Asks as the server takes it, which is learned from its refusals. `notes` say what was sent otherwise."""
+
+    def __init__(
+        self,
+        model: ConfiguredModel,
+        capabilities: CapabilityStore,
+        schema: Schema,
+        places: AdaptivePlaces,
+        timeout: float,
+        seconds: float,
+        *,
+        place_seconds: float,
+    ) -> None:
+        super().__init__(model.model, places, timeout, seconds, place_seconds=place_seconds)
+        self._variant, self._capabilities, self._schema = model.variant, capabilities, schema
+        self._takes, self._steps = capabilities.current, 0
+        self.notes: tuple[str, ...] = ()
+
+    async def _attempt(
+        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ModelResponse:
+        while True:
+            self._takes = self._capabilities.current
+            try:
+                response = await super()._attempt(messages, settings, parameters)
+            except errors.ModelAPIError as error:
+                self._steps += 1
+                # A first fault of a server may pass; a refusal of the call itself does not.
+                is_refusal = isinstance(error, errors.ModelHTTPError) and error.status_code in REFUSED
+                may_pass = not is_refusal and len(self.failures) == 1
+                if self._steps > MAX_STEPS or not self._capabilities.refuse(
+                    self._takes, error, images_in(messages), may_pass=may_pass
+                ):
+                    raise
+                self.failures.pop()
+            else:
+                self._capabilities.succeed(self._takes)
+                return with_text(response)
+
+    async def _send(
+        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ModelResponse:
+        takes = self._takes
+        messages, note = fit_images(messages, takes)
+        self.notes = (note,) if note else ()
+        refused = [name for name in ("temperature", "seed") if not getattr(takes, name)]
+        sent = cast("ModelSettings", {name: value for name, value in (settings or {}).items() if name not in refused})
+        if takes.output != "prompt":
+            # The text is read by our own tolerant rules all the same: a server may ignore the schema.
+            parameters = replace(
+                parameters,
+                output_mode="native" if takes.output == "json_schema" else "prompted",
+                output_object=OutputObjectDefinition(self._schema, "reply"),
+                prompted_output_template=False,  # the prompt shows the shape
+            )
+        model = self.wrapped if self._variant is None else self._variant(takes)
+        if takes.delivery == "declared":
+            sent |= ModelSettings(extra_body={"stream": True})
+        if takes.delivery != "streamed":
+            return await model.request(messages, sent, parameters)
+        async with model.request_stream(messages, sent, parameters) as stream:
+            async for _ in stream:
+                pass
+            return stream.get()
+
+
+def with_text(response: ModelResponse) -> ModelResponse:
+    """The reply as text: servers put it into a tool call or, with nothing else, at the end of what was thought."""
+    if any(isinstance(part, TextPart) and part.content.strip() for part in response.parts):
+        return response
+    called = [part.args_as_json_str() for part in response.parts if isinstance(part, ToolCallPart)]
+    thought = [part.content for part in response.parts if isinstance(part, ThinkingPart) if part.content]
+    ended = [text for text in thought if text.rstrip().endswith(("}", "]", "```"))]
+    said = called or (ended if response.finish_reason != "length" else [])
+    return replace(response, parts=[TextPart(said[-1])]) if said else response
 
 
 def is_busy(error: errors.ModelAPIError) -> bool:

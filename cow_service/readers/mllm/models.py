@@ -1,5 +1,6 @@
 """The multimodal LLM of the settings: its manifest and family, and a client model of pydantic-ai to call it with."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
@@ -15,6 +16,7 @@ from pydantic_ai.providers.openai_compatible import OpenAICompatibleProvider
 
 from cow_service.errors import ReaderUnavailable
 from cow_service.readers.chat import Upstream
+from cow_service.readers.mllm.capabilities import Capabilities
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
 
@@ -33,12 +35,14 @@ class ConfiguredModel:
     family: Family
     deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
     upstream: Upstream | None = None  # the OpenAI-compatible server; None for another protocol
+    variant: Callable[[Capabilities], Model] | None = None  # for what its server takes; None: pydantic-ai knows it
+    server: str = ""  # its address, or its provider's name
 
     @property
-    def supports_schema(self) -> bool:
-        """Whether a JSON schema can be sent along: the family's servers take one, and so does this model's client."""
-        native = self.family.structured_output == "native"
-        return native and bool(self.model.profile.get("supports_json_schema_output", False))
+    def first(self) -> Capabilities:
+        """What is taken for granted before the server has refused anything."""
+        has_schema = bool(self.model.profile.get("supports_json_schema_output", False))
+        return Capabilities(output="json_schema" if has_schema else "prompt")
 
 
 @dataclass(frozen=True)
@@ -101,15 +105,21 @@ def configure(settings: Settings) -> ConfiguredModel:
 
     # Any server of OpenAI's protocol.
     if base_url is not None and provider not in OWN_PROTOCOL:
-        profile = OpenAIModelProfile(
-            supports_json_schema_output=family.structured_output == "native",
-            # The older name is the one that every such server knows.
-            openai_chat_supports_max_completion_tokens=False,
-        )
         server = OpenAICompatibleProvider("mllm", base_url=base_url, api_key=key or NO_KEY)
-        model = OpenAIChatModel(name, provider=server, profile=profile)
-        upstream = Upstream(base_url.rstrip("/"), name, key)
-        return ConfiguredModel(model, name, manifest, family, upstream=upstream)
+
+        def variant(takes: Capabilities) -> Model:
+            profile = OpenAIModelProfile(
+                supports_json_schema_output=True,
+                supports_json_object_output=True,
+                openai_chat_supports_max_completion_tokens=takes.token_field == "max_completion_tokens",
+                openai_system_prompt_role="system" if takes.system_role else "user",
+            )
+            return OpenAIChatModel(name, provider=server, profile=profile)
+
+        upstream, model = Upstream(base_url.rstrip("/"), name, key), variant(Capabilities())
+        return ConfiguredModel(
+            model, name, manifest, family, upstream=upstream, variant=variant, server=upstream.base_url
+        )
 
     # A provider, of whatever protocol.
     if provider is None:
@@ -126,7 +136,7 @@ def configure(settings: Settings) -> ConfiguredModel:
     if isinstance(client, AsyncOpenAI) and not isinstance(client, AsyncAzureOpenAI):  # whose addresses are its own
         key = None if client.api_key in ("", NO_KEY) else client.api_key
         upstream = Upstream(str(client.base_url).rstrip("/"), name, key)
-    return ConfiguredModel(model, name, manifest, family, upstream=upstream)
+    return ConfiguredModel(model, name, manifest, family, upstream=upstream, server=provider)
 
 
 def _model_of(name: str, model: str, base_url: str | None, key: str | None) -> Model:

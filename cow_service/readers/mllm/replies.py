@@ -119,7 +119,11 @@ def schema_of(*kinds: type[Reply], reasoning_length: int, numbers: Schema | None
                 for name, each in schema["properties"].items()
                 for key in names[name]
             }
-            kept["required"] = [key for name in schema.get("required", ()) for key in names[name]]
+            optional = {key for name in names.keys() - set(schema.get("required", ())) for key in names[name]}
+            for key in optional:  # strict servers want every property
+                if kept["properties"][key].get("type") != "array" and "anyOf" not in kept["properties"][key]:
+                    kept["properties"][key] = nullable(kept["properties"][key])
+            kept["required"] = list(kept["properties"])
             kept["additionalProperties"] = False
         return kept
 

@@ -1,0 +1,175 @@
+"""What one server takes of a call: learned from what it refuses, and remembered per server and model.
+
+A refusal that names a field, or an unexplained one before any call has succeeded, moves one step down. A step that has
+worked is never tried again.
+"""
+
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import Literal
+
+from pydantic import ValidationError
+from pydantic_ai import exceptions as errors
+
+from cow_service.records import Record
+
+OutputMode = Literal["json_schema", "json_object", "prompt"]
+# `declared`: it wants `stream: true`, and replies in one piece all the same.
+Delivery = Literal["whole", "streamed", "declared"]
+_NEXT_DELIVERY: dict[Delivery, Delivery] = {"whole": "streamed", "streamed": "declared"}
+MAX_STEPS = 8  # that one call may teach
+MAX_AGE_SECONDS = 7 * 24 * 3600.0  # servers are updated: what is older is found out again
+MAX_REDUCTION = 3
+REFUSED = (HTTPStatus.BAD_REQUEST, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.NOT_IMPLEMENTED)
+_SIZE_STATUS = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+_IMAGES = re.compile(
+    r"(?:most|maximum(?: of)?|only|up to|limit\D{0,20}|than)\s+(\d+)\s+(?:image|picture)", re.IGNORECASE
+)
+_ONE_IMAGE = re.compile(r"\b(?:single|one) image\b|multiple images|more than one image", re.IGNORECASE)
+_TOO_LARGE = re.compile(
+    r"too large|too big|too long|maximum (?:context|size|allowed)|context (?:length|window)"
+    r"|exceeds? .{0,30}(?:size|limit|length)",
+    re.IGNORECASE,
+)  # fmt: skip
+_OUTPUT = re.compile(
+    r"response_?format|json_?(?:schema|object)|\bschema\b|grammar|guided|structured|extra", re.IGNORECASE
+)
+_SYSTEM = re.compile(
+    r"system[ _]?(?:role|message|prompt|instruction)|role\W{0,3}.{0,12}system|roles must", re.IGNORECASE
+)
+
+
+class Capabilities(Record):
+    """What a server takes of a call for one model."""
+
+    output: OutputMode = "json_schema"
+    token_field: Literal["max_tokens", "max_completion_tokens"] = "max_tokens"
+    temperature: bool = True
+    seed: bool = True
+    system_role: bool = True
+    delivery: Delivery = "whole"
+    images: int | None = None  # per call, at most; null where no limit is known
+    reduction: int = 0  # steps by which frames are made smaller, then fewer, to keep a call short enough
+
+
+@dataclass
+class CapabilityStore:
+    """What is known of one server and model, in memory and, once a call has succeeded, on disk.
+
+    Used from one event loop. `proven` is what calls have succeeded with.
+    """
+
+    path: Path | None
+    first: Capabilities  # before anything is known
+    proven: Capabilities | None = None
+
+    def __post_init__(self) -> None:
+        self.current = self.first
+        try:
+            stored = None if self.path is None else json.loads(self.path.read_text(encoding="utf-8"))
+            if stored is not None and time.time() - stored["learned_at"] < MAX_AGE_SECONDS:
+                self.current = self.proven = Capabilities.model_validate(stored["takes"])
+        except (OSError, ValueError, KeyError, TypeError, ValidationError):
+            return  # nothing is known, or what is stored is of another version: it is found out again
+
+    def succeed(self, used: Capabilities) -> None:
+        """A call has succeeded: what it was sent with is kept."""
+        if used == self.proven:
+            return
+        self.proven = used
+        if self.path is None:
+            return
+        part = self.path.with_suffix(f".{os.getpid()}")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_text(json.dumps({"learned_at": time.time(), "takes": used.model_dump()}), encoding="utf-8")
+            part.replace(self.path)
+        except OSError:
+            return  # it is found out again by the next process
+
+    def refuse(self, used: Capabilities, error: errors.ModelAPIError, images: int, *, may_pass: bool) -> bool:
+        """A call with that many images was refused: whether another one is worth trying, with what is known then.
+
+        `may_pass`: the refusal may be a passing fault, unless it says what it is about.
+        """
+        if used != self.current:
+            return True  # another call has learned meanwhile
+        lower = step_down(used, error, images, is_proven=may_pass or used == self.proven)
+        if lower is None:
+            return False
+        self.current = lower
+        return True
+
+    def give_up(self) -> None:
+        """No step helped: nothing was learned from these refusals."""
+        self.current = self.proven or self.first
+
+
+def store_of(data_dir: Path, server: str, model: str, first: Capabilities) -> CapabilityStore:
+    """What is known of a model on a server, by its address; without one nothing is kept."""
+    if not server:
+        return CapabilityStore(None, first)
+    name = hashlib.sha256(f"{server}\n{model}".encode()).hexdigest()[:16]
+    return CapabilityStore(data_dir / "mllm" / f"{name}.json", first)
+
+
+def step_down(used: Capabilities, error: errors.ModelAPIError, images: int, *, is_proven: bool) -> Capabilities | None:
+    """What to try after a refusal; None where nothing that is known of servers would help."""
+    if isinstance(error, errors.ModelHTTPError):
+        update = next(_named_steps(used, error, images), None)
+        may_learn = error.status_code in REFUSED or error.status_code == HTTPStatus.INTERNAL_SERVER_ERROR
+        if update is None and may_learn and not is_proven:  # else this call is at fault, not what every call has
+            update = next(_blind_steps(used), None)
+    else:  # no chat completion: it may be one in pieces
+        unreadable = type(error) is errors.ModelAPIError and not is_proven
+        delivery = _NEXT_DELIVERY.get(used.delivery) if unreadable else None
+        update = None if delivery is None else {"delivery": delivery}
+    return None if update is None else used.model_copy(update=update)
+
+
+def _named_steps(used: Capabilities, error: errors.ModelHTTPError, images: int) -> Iterator[dict[str, object]]:
+    """Steps for what a refusal names."""
+    status, said = error.status_code, str(error.body or "")
+    too_large = isinstance(error, errors.ModelContextWindowExceededError) or status == _SIZE_STATUS
+    if (too_large or (status in REFUSED and _TOO_LARGE.search(said))) and used.reduction < MAX_REDUCTION:
+        yield {"reduction": used.reduction + 1}
+    if status not in REFUSED and status != HTTPStatus.INTERNAL_SERVER_ERROR:
+        return
+    counted = _IMAGES.search(said)
+    most = int(counted[1]) if counted else 1 if _ONE_IMAGE.search(said) else images
+    if 0 < most < images:
+        yield {"images": most}
+    if "max_completion_tokens" in said:
+        had_new = used.token_field == "max_completion_tokens"
+        yield {"token_field": "max_tokens" if had_new else "max_completion_tokens"}
+    if used.temperature and "temperature" in said:
+        yield {"temperature": False}
+    if used.seed and re.search(r"\bseed\b", said):
+        yield {"seed": False}
+    if used.system_role and _SYSTEM.search(said):
+        yield {"system_role": False}
+    if used.delivery == "whole" and "stream" in said.lower():
+        yield {"delivery": "streamed"}
+    if used.output != "prompt" and _OUTPUT.search(said):
+        yield _lower_output(used)
+
+
+def _blind_steps(used: Capabilities) -> Iterator[dict[str, object]]:
+    """Steps after a refusal that names nothing, what is refused most often first."""
+    if used.output != "prompt":
+        yield _lower_output(used)
+    if used.temperature or used.seed:
+        yield {"temperature": False, "seed": False}
+    if used.system_role:
+        yield {"system_role": False}
+
+
+def _lower_output(used: Capabilities) -> dict[str, object]:
+    return {"output": "json_object" if used.output == "json_schema" else "prompt"}
