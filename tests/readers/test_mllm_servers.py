@@ -14,7 +14,6 @@ from drawn import ball, floor
 from hypothesis import given
 from hypothesis import strategies as st
 from mllm_server import MllmServer
-from pydantic_ai.exceptions import ModelHTTPError
 from waiting import TIME_LIMIT
 
 from cow_service.readers.base import ReaderInput
@@ -174,6 +173,8 @@ def test_what_a_dead_server_refuses_teaches_nothing(mllm: MllmServer, tmp_path: 
     images=st.integers(0, 6),
 )  # fmt: skip
 def test_steps_end(words: list[str], status: int, images: int) -> None:
+    from pydantic_ai.exceptions import ModelHTTPError
+
     from cow_service.readers.mllm.capabilities import Capabilities, step_down
 
     takes, seen = Capabilities(), list[Capabilities]()
