@@ -233,7 +233,7 @@ def test_nothing_that_is_not_asked_moves_the_box_or_the_line(fields: dict[str, A
         ({"sense": "toward the camera", "direction": [230, 500, 230, 900]}, None, "towards", None),
         ({"sense": "away", "direction": None}, None, "away", None),
         ({"cue": "arrow", "along_arrow": False, "camera": "neither"}, False, None, "arrow"),  # as it was asked before
-        ({"camera": "towards", "direction": None}, None, "towards", "orientation"),
+        ({"camera": "towards", "direction": None}, None, "towards", None),
     ],
 )
 def test_the_sense_is_a_word(said: dict[str, Any], along: bool | None, camera: str | None, cue: str | None) -> None:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 from cow_service import records
 from cow_service.narration.words import same_name
@@ -37,10 +37,6 @@ _HEADINGS = frozenset({
     *_LISTS, "object", "result", "results", "answer", "data", "detections", "detection", "location", "locations",
     "output", "response", "places", "items", "boxes", "bboxes", "final_result", "grounding",
 })  # fmt: skip
-_CUE_WORDS: dict[str, records.Cue] = {
-    "arrow": "arrow", "trail": "trail", "ghost": "trail", "orient": "orientation", "front": "orientation",
-    "facing": "orientation", "text": "text", "question": "text", "word": "text", "gravity": "gravity",
-}  # fmt: skip
 # The plane on which the things of a picture stand, be it that of a room, a street or a table.
 _FLOOR = frozenset({
     "floor", "ground", "surface", "table top", "tabletop", "table surface", "desk top", "countertop",
@@ -136,7 +132,7 @@ def locate_call(
         "wants_direction": wants_direction,
         "max_obstacles": MAX_OBSTACLES,
         "objections": tuple(" ".join(each.split()) for each in given.objections),
-        "example": json.dumps(example(frame, wants_box, wants_direction)),
+        "example": json.dumps(_example(frame, wants_box, wants_direction)),
     }
     schema = locate_schema(frame, wants_box, wants_direction, reasoning_length)
     read = partial(
@@ -145,19 +141,18 @@ def locate_call(
     return PromptCall("locate", inputs, (image.jpeg,), schema, read)
 
 
-def example(frame: CoordinateFrame, wants_box: bool, wants_direction: bool) -> dict[str, Any]:
-    """A reply as it is wanted, in the form in which families that find things are trained: lists of labelled boxes."""
-    width, height, key = frame.width, frame.height, frame.coordinates.box
-    objects = [("red ball", (0.2, 0.5, 0.3, 0.6)), ("vase", (0.7, 0.3, 0.8, 0.6))]
+def _example(frame: CoordinateFrame, wants_box: bool, wants_direction: bool) -> dict[str, Any]:
+    """A reply as it is wanted, in the form on which models that find things are trained: a list of labelled boxes."""
+
+    def at(*points: Point) -> list[float]:
+        return frame.write(*((x * frame.width, y * frame.height) for x, y in points))
+
+    boxes = {"red ball": at((0.2, 0.5), (0.3, 0.6)), "vase": at((0.7, 0.3), (0.8, 0.6))}
     reply: dict[str, Any] = {"reasoning": "..."}
     if wants_box:
-        reply["objects"] = [
-            {key: frame.write((x0 * width, y0 * height), (x1 * width, y1 * height)), "label": label}
-            for label, (x0, y0, x1, y1) in objects
-        ]
+        reply["objects"] = [{frame.coordinates.box: box, "label": label} for label, box in boxes.items()]
     if wants_direction:
-        start, end = (frame.write((x * width, 0.55 * height)) for x in (0.25, 0.9))
-        reply |= {"start": start, "end": end, "sense": "with"}
+        reply |= {"start": at((0.25, 0.55)), "end": at((0.9, 0.55)), "sense": "with"}
     return reply
 
 
@@ -217,10 +212,10 @@ def _read_objects(
     What cannot be read of the rest is a fault, and the list is not complete then.
     """
     fields = list(replies.objects_in(list(values), *_LISTS))
-    entries = [each for held in fields for key in _LISTS if key in held for each in _entries(held[key])]
+    entries = [each for held in fields for key in _LISTS for each in replies.listed(held.get(key))]
     is_whole = True
-    for name, entry in entries:
-        found = list(_places(entry, frame, name))
+    for entry in entries:
+        found = list(_places(entry, frame))
         is_usable = any(each == place or (each.label and not replies.is_none(each.box)) for each in found)
         is_whole = is_whole and is_usable
         if not is_usable and not replies.is_none(entry) and not any(each.is_unseen for each in found):
@@ -254,14 +249,6 @@ def _read_objects(
         others=tuple(objects),
         objects_complete=is_complete and is_whole and len(objects) == len(named),
     )
-
-
-def _entries(written: object) -> list[tuple[str, object]]:
-    """The entries of a list of things, or of an object with their boxes by name."""
-    fields = replies.fields_of(written)
-    if fields and fields.keys().isdisjoint((*BOX_KEYS, *_LABEL_KEYS)):
-        return [(str(name), box) for name, box in cast("dict[object, object]", written).items()]
-    return [("", each) for each in replies.listed(written)]
 
 
 def separate_objects(
@@ -414,21 +401,20 @@ def _line(fields: Mapping[str, Any], frame: CoordinateFrame, context: ReadingCon
             raise ReplyError(f"the direction is given in words ('{written[:40]}'); give the points `start` and `end`")
         # Some models that see no direction fill the field with zeros.
         ends = frame.ends(written) if any(replies.listed(written)) else None
-    told = {name: fields.get(name) for name in ("sense", "along_arrow", "camera")}
-    words = {word for each in told.values() for word in re.findall(r"[a-z]+", replies.text_of(each).lower())}
-    along_arrow = replies.truth_of(told["sense"] if told["along_arrow"] is None else told["along_arrow"])
-    words |= set() if along_arrow is None else {"with" if along_arrow else "against"}
-    senses = {sense for sense, synonyms in SENSES.items() if not words.isdisjoint(synonyms)}
-    if not senses and not replies.is_none(fields.get("sense")):
-        context.faults.append(f"`sense` is {replies.shown(fields['sense'])}, not one of {', '.join(SENSES)}")
-    along = {"with", "against"} & senses
-    camera = {"towards", "away"} & senses
-    cue = f"{replies.text_of(fields.get('cue'))} {'trail' if 'trail' in senses else 'arrow' if along else ''}".lower()
+    sense, along_arrow, camera, cue = (fields.get(name) for name in ("sense", "along_arrow", "camera", "cue"))
+    words = set(re.findall(r"[a-z]+", " ".join(map(replies.text_of, (sense, along_arrow, camera))).lower()))
+    is_along = replies.truth_of(sense if along_arrow is None else along_arrow)
+    words |= set() if is_along is None else {"with" if is_along else "against"}
+    senses = {each for each, synonyms in SENSES.items() if not words.isdisjoint(synonyms)}
+    if not senses and not replies.is_none(sense):
+        context.faults.append(f"`sense` is {replies.shown(sense)}, not one of {', '.join(SENSES)}")
+    along, towards = senses & {"with", "against"}, senses & {"towards", "away"}
+    told = f"{replies.text_of(cue).lower()} {'trail' if 'trail' in senses else 'arrow' if along else ''}"
     return Line(
-        ends,
-        "with" in along if len(along) == 1 else None,
-        ("away" if "away" in camera else "towards") if len(camera) == 1 else None,
-        next((known for word, known in _CUE_WORDS.items() if word in cue), None),
+        ends=ends,
+        along_arrow="with" in along if len(along) == 1 else None,
+        camera=("away" if "away" in towards else "towards") if len(towards) == 1 else None,
+        cue="trail" if "trail" in told else "arrow" if "arrow" in told else None,
     )
 
 
