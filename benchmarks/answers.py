@@ -98,14 +98,22 @@ def measure_scenes(service: Service, folders: list[Path]) -> tuple[list[dict[str
 def measure_overhead(folder: Path, runs: int) -> dict[str, float]:
     """Milliseconds of an answer whose every call of the MLLM is answered at once, and without a simulation."""
     meta = json.loads((folder / "meta.json").read_text())
-    x0, y0, x1, y1 = meta["bbox"]
     width, height = meta["image_size"]
-    box = [round(1000 * v / s) for v, s in zip((x0, y0, x1, y1), (width, height, width, height), strict=True)]
-    middle = [(box[0] + box[2]) // 2, (box[1] + box[3]) // 2]
-    line = [*middle, middle[0] + round(200 * meta["direction"][0]), middle[1] + round(200 * meta["direction"][1])]
+
+    def place(name: str) -> dict[str, Any]:
+        bbox = meta["bbox"] if name == meta["object"] else meta["boxes"][name][0]
+        return {
+            "bbox_2d": [round(1000 * v / s) for v, s in zip(bbox, (width, height) * 2, strict=True)],
+            "label": name,
+        }
+
+    names = [meta["object"], *(name for name in meta["boxes"] if name != meta["object"])]
+    x0, y0, x1, y1 = place(meta["object"])["bbox_2d"]
+    start = [(x0 + x1) // 2, (y0 + y1) // 2]
+    end = [at + round(200 * way) for at, way in zip(start, meta["direction"], strict=True)]
     Instant.replies = {
-        "kind": {"reasoning": "", "object": meta["object"], "others": [], "kind": "linear", "sentence": "It moves on."},
-        "bbox_2d": {"label": meta["object"], "bbox_2d": box, "cue": "orientation", "direction": line},
+        "kind": {"reasoning": "", "object": meta["object"], "others": [], "kind": "linear"},
+        "objects": {"reasoning": "", "objects": [*map(place, names)], "start": start, "end": end, "sense": None},
         "answer": {"reasoning": "", "answer": "A"},
     }
     with ThreadingHTTPServer(("127.0.0.1", 0), Instant) as server, tempfile.TemporaryDirectory() as data:

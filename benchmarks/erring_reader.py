@@ -91,8 +91,8 @@ class StandIn(BaseHTTPRequestHandler):
         fields = body["response_format"]["json_schema"]["schema"]["properties"]
         if "kind" in fields:
             reply = self.identified()
-        elif "reference" in fields:
-            reply = {"reasoning": "", "reference": None, "metres": None, "ends": None, "down": "bottom"}
+        elif "metres" in fields:
+            reply = {"metres": None, "down": "bottom"}
         else:
             reply = {name: value for name, value in self.located().items() if name in fields}
         message = {"role": "assistant", "content": json.dumps({"reasoning": ""} | reply)}
@@ -126,7 +126,7 @@ class StandIn(BaseHTTPRequestHandler):
         named = [name for name in (meta["target"], meta.get("via")) if name]
         return {
             "object": self.mover, "others": named, "asked": asked, "kind": kind_of(meta), "changes": changes,
-            "sentence": f"The {self.mover} moves on.", "language": "en",
+            "language": "en",
         }  # fmt: skip
 
     def located(self) -> dict[str, Any]:
@@ -160,13 +160,10 @@ class StandIn(BaseHTTPRequestHandler):
         start, end = ([round(1000 * a / width), round(1000 * b / height)] for a, b in points)
         has_arrow = "arrow" in meta["question"] and not level.get("no_cue")
         along = ("opposite" not in meta["question"]) != bool(level.get("other_sense"))
+        seen = [self.mover, *(name for name in others if name not in missing)]
         return {
-            "label": self.mover, "bbox_2d": told(self.mover),
-            "others": [{"label": name, "bbox_2d": told(name)} for name in others if name not in missing],
-            "complete": True, "cue": "arrow" if has_arrow else "orientation",
-            "along_arrow": along if has_arrow else None,
+            "objects": [{"bbox_2d": told(name), "label": name} for name in seen], "start": start, "end": end,
             "sense": ("with" if along else "against") if has_arrow else None,
-            "camera": None, "direction": [*start, *end], "start": start, "end": end,
         }  # fmt: skip
 
 

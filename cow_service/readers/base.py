@@ -90,6 +90,7 @@ class ReaderInput:
     changes_wanted: bool = True  # so with what is taken away or put somewhere
     known: tuple[LocatedObject, ...] = ()  # objects that the caller has located, by name: not to be searched
     sought: tuple[str, ...] = ()  # names of further objects that the caller wants located, besides the question's
+    words: "QuestionReading | None" = None  # what the words of the question say, where a reader may rely on it
     objections: tuple[str, ...] = ()  # what speaks against its last reading, in sentences: to be asked again with these
     until: float | None = None  # Unix time, s, after which an MLLM that refuses is not asked again; None: its own limit
     calls: CallLog = field(default_factory=CallLog)
@@ -111,11 +112,9 @@ class MotionHints(Record):
     """What a reader learned of the motion while it looked for the object, so that stage 2 needs no second look."""
 
     kind: MotionKind | None = None
-    sentence: str | None = None
     ends: tuple[Point, Point] | None = None  # of a line along the motion, px of the upright image
     camera: Literal["towards", "away"] | None = None  # the motion leads straight to the camera, or from it
-    depth_degrees: float | None = Field(default=None, ge=-90, le=90)  # out of the image plane, positive away
-    speed: SpeedWord | Quantity | None = None
+    speed: Quantity | None = None
     distance: Quantity | None = None
     duration: float | None = Field(default=None, gt=0)  # s
     until: records.Until | None = None
@@ -160,6 +159,10 @@ class QuestionReading:
     nouns: tuple[str, ...] = ()  # of the things that it names, each once
     drawings_named: frozenset[str] = frozenset()  # "arrow" and "box", where the question speaks of one
     way: WayReading = WayReading()
+    kind: MotionKind | None = (
+        None  # of the motion, where the words tell all of it but its direction, and name all things
+    )
+    others: tuple[str, ...] = ()  # the further things that it names, in its words
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,7 @@ class GroundingReading:
 
     object: str
     bbox: BBox  # px of the upright image
+    label: str = ""  # what the reader calls the thing in the box, if not by that name
     point: Point | None = None  # where the reader pointed, if it gave no box; by default the centre of the box
     others: tuple[LocatedObject, ...] = ()
     objects_complete: bool = False  # the others are all that could be hit or hide something

@@ -24,7 +24,7 @@ from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObj
 from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
-from cow_service.stages.settling import SeenThings, settle_places, settle_question, things_of
+from cow_service.stages.settling import SeenThings, settle_mover, settle_places, settle_question, things_of
 from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object, mask_iou
 from cow_service.vision.segmentation import mask_from_bbox
 from cow_service.vision.types import Mask
@@ -54,7 +54,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
         empty, changed = run.reader_input("grounding"), request.changed_names
         sought = tuple(name for name in changed if not any(same_name(name, each.object) for each in given))
         find = partial(_find, run) if "detector" in run.backends.perception.names else None
-        reading = _read_and_settle(run, replace(empty, known=given, sought=sought, find=find))
+        reading = _read_and_settle(run, replace(empty, known=given, sought=sought, find=find, words=question))
         if run.can_segment:
             with run.cpu():
                 reading = _outlined(run, reading)
@@ -127,24 +127,27 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
 def _read_and_settle(run: Run[SimulateRequest], given: ReaderInput) -> GroundingReading:
     """What the reader says of places and of what is asked, settled with the words and with what is seen.
 
-    A reader that may be wrong is asked once more with what speaks against its reading; a reply that cannot be used then
-    leaves the first. Raises what the reader raises.
+    A reader that may be wrong is asked once more with what speaks against its reading, and not to rely on the words
+    where that is what they say; a reply that cannot be used then leaves the first. Raises what the reader raises.
     """
     reading = run.reader.ground(given)
     if not run.reader.heeds_objections:
         return reading
-    settled, objections = _settled(run, reading, given.known)
+    settled, objections, misread = _settled(run, reading, given.known)
     if objections:
+        given = replace(given, objections=objections, words=None if misread else given.words)
         with suppress(CannotGround, MllmBadReply, MllmUnavailable):
-            again = run.reader.ground(replace(given, objections=objections))
-            settled, objections = _settled(run, again, given.known)
+            settled, objections, _ = _settled(run, run.reader.ground(given), given.known)
     return replace(settled, warnings=(*settled.warnings, *objections))
 
 
 def _settled(
     run: Run[SimulateRequest], reading: GroundingReading, known: Sequence[LocatedObject]
-) -> tuple[GroundingReading, tuple[str, ...]]:
-    """The reading without what the request says: the places of things that are `known`, what is asked and changed."""
+) -> tuple[GroundingReading, tuple[str, ...], bool]:
+    """The reading without what the request says: the places of things that are `known`, what is asked and changed.
+
+    With what speaks against it, and whether that is what the words say of what moves or is asked.
+    """
     words, question, request = run.backends.words(), run.question, run.request
     if request.interventions:
         question, reading = replace(question, changes=()), replace(reading, interventions=())
@@ -156,9 +159,10 @@ def _settled(
         scene = run.scene
         boxes = [reading.bbox, *(each.bbox for each in things_of(reading))]
         bare = frozenset(bbox for bbox in boxes if not scene.shows_thing(bbox))
-        placed, objections = settle_places(reading, question, SeenThings(scene.regions, bare), words)
-    asked, misread = settle_question(placed, question, words, is_given=request.asked is not None)
-    return asked, (*objections, *misread)
+        placed, objections = settle_places(reading, SeenThings(scene.regions, bare))
+    settled, misnamed = settle_mover(placed, question, words)
+    settled, misread = settle_question(settled, question, words, is_given=request.asked is not None)
+    return settled, (*objections, *misnamed, *misread), bool(misnamed or misread)
 
 
 def _is_mover(thing: LocatedObject, mask: Mask | None, mover: GroundingReading) -> bool:

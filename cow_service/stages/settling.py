@@ -138,13 +138,10 @@ class SeenThings:
     bare: frozenset[BBox] = frozenset()  # those of the boxes that were read in which nothing stands
 
 
-def settle_places(
-    read: GroundingReading, said: QuestionReading, seen: SeenThings, words: WordReader
-) -> tuple[GroundingReading, Objections]:
-    """The reading, its boxes moved onto the things that are seen there, and what speaks against its names and places.
+def settle_places(read: GroundingReading, seen: SeenThings) -> tuple[GroundingReading, Objections]:
+    """The reading, its boxes moved onto the things that are seen there, and what speaks against its places.
 
-    A box in which nothing stands, or something of another colour while the named one is elsewhere, is doubtful, and so
-    is a mover that is another one than the words say.
+    A box in which nothing stands, or something of another colour while the named one is elsewhere, is doubtful.
     """
     boxes = list(dict.fromkeys([read.bbox, *(each.bbox for each in things_of(read))]))
     moved, objections, doubtful = _onto_regions(boxes, seen.regions), list[str](), set[BBox]()
@@ -154,9 +151,6 @@ def settle_places(
         if fault is not None and thing.bbox not in doubtful:
             objections.append(fault)
             doubtful.add(thing.bbox)
-    if said.mover is not None and _is_other(read, said.mover, words):
-        objections.append(f"The question has '{said.mover}' move, and '{read.object}' was read.")
-        doubtful.add(read.bbox)
 
     def settled(thing: LocatedObject) -> LocatedObject:
         region = moved[thing.bbox]
@@ -229,12 +223,19 @@ def _fault_of(thing: LocatedObject, region: Region | None, seen: SeenThings) -> 
     )
 
 
-def _is_other(read: GroundingReading, mover: str, words: WordReader) -> bool:
-    """Whether what was read to move is another thing than the words say: one that they, or the reading, tell apart."""
-    likeness = words.likeness(mover, read.object)
-    return likeness == "other" or (
-        likeness == "unknown" and any(words.likeness(mover, each.object) == "same" for each in read.others)
-    )
+def settle_mover(
+    read: GroundingReading, said: QuestionReading, words: WordReader
+) -> tuple[GroundingReading, Objections]:
+    """The reading; in doubt where what was read to move, or what was found for it, is not what the words say."""
+    if said.mover is None:
+        return read, ()
+    for name in filter(None, (read.object, read.label)):
+        likeness = words.likeness(said.mover, name)
+        rivals = read.others if likeness == "unknown" else ()
+        if likeness == "other" or any(words.likeness(said.mover, each.object) == "same" for each in rivals):
+            told = f"The question has '{said.mover}' move, and '{name}' was read."
+            return replace(read, is_doubtful=True), (told,)
+    return read, ()
 
 
 # --- what is asked

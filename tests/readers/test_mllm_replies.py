@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.readers.options import read_choices
-from cow_service.records import Asked, Estimate, ObjectPrior
+from cow_service.records import Asked
 from cow_service.weights.manifests import load_families
 
 if TYPE_CHECKING:
@@ -27,8 +27,7 @@ CHOICES = read_choices("If the toy car moves forward, will it hit the vase? (A) 
 BALL = {"label": "red ball", "bbox_2d": [172, 400, 297, 600]}
 VASE = {"label": "vase", "bbox_2d": [700, 300, 800, 600]}
 LINE = {"cue": "orientation", "along_arrow": None, "camera": None, "direction": [230, 500, 600, 500]}
-NAMED = {"object": "red ball", "others": [], "kind": "linear", "sentence": "The red ball rolls."}
-OPTIONAL = ("size", "stands_on", "height_above", "shape", "depth_degrees", "speed")
+NAMED = {"object": "red ball", "others": [], "kind": "linear"}
 
 
 def frame_of(family: str, image: tuple[int, int] = (640, 400), sent: tuple[int, int] = (640, 400)) -> CoordinateFrame:
@@ -72,9 +71,9 @@ def told(case: dict[str, Any]) -> dict[str, Any]:
         return {"error": "object-not-found"}
     if found.line is None:
         return {"bbox": found.bbox, "point": found.point}
-    if found.line.direction is None:
+    if found.line.ends is None:
         return {"error": "cannot-read-direction"} if found.line.camera is None else {"camera": found.line.camera}
-    (x0, y0), (x1, y1) = found.line.direction
+    (x0, y0), (x1, y1) = found.line.ends
     length = math.hypot(x1 - x0, y1 - y0)
     return {"direction": ((x1 - x0) / length, (y1 - y0) / length), "cue": found.line.cue}
 
@@ -196,7 +195,7 @@ def test_what_the_caller_has_said_is_not_read() -> None:
     assert (found.asked, found.changes, found.then, found.kind, found.warnings) == (None, (), (), None, ())
 
 
-# What an object is like
+# Where things are, and which way
 
 
 def read(mover: dict[str, Any], others: object = (), targets: tuple[str, ...] = ("vase",), **motion: Any) -> Located:
@@ -205,71 +204,6 @@ def read(mover: dict[str, Any], others: object = (), targets: tuple[str, ...] = 
 
     reply = {"reasoning": "r", **mover, "others": others, **LINE, **motion}
     return usable(lambda: read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", targets, True, True))
-
-
-def test_priors_have_widths() -> None:
-    from cow_service.readers.mllm import estimates
-
-    said = {"size": 0.2, "stands_on": "floor", "height_above": 0.02, "shape": "sphere"}
-    found = read(BALL | said, [VASE | {"size": 0.4, "height_above": 1}])
-    assert found.prior == ObjectPrior(
-        shape="sphere",
-        size=Estimate(value=0.2, deviation=estimates.SIZE_DEVIATION * 0.2),
-        stands_on="floor",
-        height=Estimate(value=0.02, deviation=estimates.MIN_HEIGHT_DEVIATION),
-    )
-    (vase,) = found.others
-    assert vase.prior is not None
-    assert vase.prior.size == Estimate(value=0.4, deviation=estimates.SIZE_DEVIATION * 0.4)
-    assert vase.prior.height == Estimate(value=1, deviation=estimates.HEIGHT_DEVIATION)
-    assert (vase.role, vase.source, found.warnings) == ("target", "mllm", ())
-
-
-def test_who_says_nothing_is_not_warned_of() -> None:
-    for said in ({}, {"size": None, "stands_on": "unknown", "height_above": "n/a", "shape": ""}):
-        found = read(BALL | said, [VASE | said], depth_degrees=None, speed=None)
-        assert (found.prior, found.others[0].prior, found.warnings) == (None, None, ())
-        assert found.line is not None
-        assert (found.line.depth_degrees, found.line.speed) == (None, None)
-
-
-IMPOSSIBLE = {
-    "size": (3000, 0, 10**400, True, "3 km", [0.1, 0.2]), "height_above": (-1,), "stands_on": (7, "red ball"),
-    "shape": ("blob",), "depth_degrees": (120,), "speed": ("ludicrous",),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("field", "value"), [(field, each) for field, some in IMPOSSIBLE.items() for each in some])
-def test_what_cannot_be_is_left_out_with_a_warning(field: str, value: object) -> None:
-    """The warning names the field and the value."""
-    found = read(BALL | {field: value})
-    assert found.prior is None
-    assert found.line is not None
-    assert (found.line.depth_degrees, found.line.speed, found.line.camera) == (None, None, None)
-    (warning,) = found.warnings
-    assert f"`{field}`" in warning
-    assert str(value)[:4] in warning
-    assert found.bbox == pytest.approx((110.08, 160, 190.08, 240))
-
-
-def test_lengths() -> None:
-    for written, metres in (("0.3", 0.3), ("30 cm", 0.3), ("0.3 metres", 0.3), ("5mm", 0.005), (1, 1.0)):
-        prior = read(BALL | {"size": written}).prior
-        assert prior is not None
-        assert prior.size is not None
-        assert prior.size.value == pytest.approx(metres)
-
-
-def test_supports() -> None:
-    from cow_service.readers.mllm.estimates import support_named
-
-    named = {
-        "The ground": "floor", "table top": "floor", "地面": "floor", "mid-air": "air", "空中": "air",
-        "top of the blue crate": "blue crate", "a shelf": "a shelf", "the red ball": None, "": None,
-    }  # fmt: skip
-    assert {said: support_named(said, "red ball", ("vase", "blue crate")) for said in named} == named
-    assert support_named("table top", "ball", ("wooden table",)) == "wooden table", "before the floor"
-    assert support_named("box", "ball", ("red box", "blue box")) == "box"  # which of them it does not say
 
 
 VALUES = st.recursive(
@@ -281,37 +215,50 @@ VALUES = st.recursive(
 )
 
 
-@given(fields=st.dictionaries(st.sampled_from(OPTIONAL), VALUES))
-def test_no_optional_field_fails_or_moves_the_box(fields: dict[str, Any]) -> None:
+@given(fields=st.dictionaries(st.sampled_from(["size", "shape", "depth_degrees", "speed", "cue", "complete"]), VALUES))
+def test_nothing_that_is_not_asked_moves_the_box_or_the_line(fields: dict[str, Any]) -> None:
     found = read(BALL | fields, [VASE | fields])
-    assert found.bbox == read(BALL).bbox
-    assert len(found.others) == 1
-    for prior in (found.prior, found.others[0].prior):
-        for estimate in () if prior is None else (prior.size, prior.height):
-            assert estimate is None or (0 <= estimate.value <= 1000 and math.isfinite(estimate.deviation))
+    assert (found.bbox, len(found.others)) == (read(BALL).bbox, 1)
     assert found.line is not None
-    assert found.line.direction is not None or found.line.camera is not None
-    assert abs(found.line.depth_degrees or 0) <= 90
+    assert found.line.ends == (pytest.approx((147.2, 200)), (384, 200))
 
 
 @pytest.mark.parametrize(
-    ("said", "degrees", "camera"),
+    ("said", "along", "camera", "cue"),
     [
-        ({"depth_degrees": 30}, 30, None),
-        ({"depth_degrees": "30 degrees away"}, 30, None),
-        ({"depth_degrees": "slightly towards the camera"}, -20, None),
-        ({"depth_degrees": "across"}, 0, None),
-        ({"depth_degrees": 30, "camera": "towards"}, -30, None),  # its line leads to the right: no contradiction
-        ({"depth_degrees": 80, "direction": [230, 500, 230, 100]}, None, "away"),
-        ({"depth_degrees": -90, "direction": None}, None, "towards"),
-        ({"depth_degrees": 80}, 80, None),  # along a line to the right nothing moves straight away: no fault either
-        ({"camera": "away", "direction": None, "depth_degrees": 20}, None, "away"),
+        ({"sense": "with"}, True, None, "arrow"),
+        ({"sense": "against the arrow"}, False, None, "arrow"),
+        ({"sense": "trail"}, None, None, "trail"),
+        ({"sense": None}, None, None, None),
+        ({"sense": "toward the camera", "direction": [230, 500, 230, 900]}, None, "towards", None),
+        ({"sense": "away", "direction": None}, None, "away", None),
+        ({"cue": "arrow", "along_arrow": False, "camera": "neither"}, False, None, "arrow"),  # as it was asked before
+        ({"camera": "towards", "direction": None}, None, "towards", None),
     ],
 )
-def test_depth(said: dict[str, Any], degrees: float | None, camera: str | None) -> None:
-    line = read(BALL, **said).line
+def test_the_sense_is_a_word(said: dict[str, Any], along: bool | None, camera: str | None, cue: str | None) -> None:
+    line = read(BALL, **({"cue": None} if "sense" in said else {}), **said).line
     assert line is not None
-    assert (line.depth_degrees, line.camera) == (degrees, camera)
+    assert (line.along_arrow, line.camera, line.cue) == (along, camera, cue)
+
+
+@pytest.mark.parametrize(
+    ("written", "metres"), [("0.3", 0.3), ("30 cm", 0.3), ("0.3 metres", 0.3), ("5mm", 0.005), (1, 1.0), (None, None)]
+)
+def test_a_size_is_a_number_in_metres(written: object, metres: float | None) -> None:
+    from cow_service.readers.mllm.locate import read_scale
+
+    assert read_scale(json.dumps({"metres": written, "down": "Left"})).metres == metres
+    assert read_scale(json.dumps({"metres": written, "down": "Left"})).down == "left"
+
+
+@pytest.mark.parametrize("written", [3000, 0, -1, 10**400, True, "3 km", [0.1, 0.2], "large"])
+def test_a_size_that_cannot_be_is_asked_for_again(written: object) -> None:
+    from cow_service.readers.mllm.locate import read_scale
+    from cow_service.readers.mllm.replies import ReplyError
+
+    with pytest.raises(ReplyError, match="`metres`"):
+        read_scale(json.dumps({"metres": written, "down": "bottom"}))
 
 
 # What is around
@@ -325,16 +272,15 @@ def test_boxes_of_targets_and_obstacles_in_every_convention(family: str) -> None
     key = frame.coordinates.box
     boxes = {"red ball": (64, 160, 128, 240), "the blue mug": (320, 120, 384, 240), "box": (448, 80, 512, 240)}
     written = {name: frame.write((box[0], box[1]), (box[2], box[3])) for name, box in boxes.items()}
-    others = [{"label": name, key: written[name], "size": 0.1} for name in ("box", "the blue mug")]
-    reply = json.dumps({"label": "red ball", key: written["red ball"], "stands_on": "box", "others": others})
+    reply = json.dumps(
+        {"objects": [{key: written[name], "label": name} for name in ("red ball", "box", "the blue mug")]}
+    )
     found = read_located(reply, frame, "red ball", ("blue mug",), True, False)
     assert found is not None
     assert [(other.object, other.role) for other in found.others] == [("blue mug", "target"), ("box", "obstacle")]
     places = (found.bbox, *(other.bbox for other in found.others))
     for place, wanted in zip(places, ("red ball", "the blue mug", "box"), strict=True):
         assert place == pytest.approx(boxes[wanted], abs=2)
-    assert found.prior == ObjectPrior(stands_on="box")
-    assert all(other.prior is not None and other.prior.size is not None for other in found.others)
 
 
 def test_targets_are_known_by_their_words() -> None:
@@ -350,11 +296,10 @@ def test_what_is_no_object_is_left_out() -> None:
     bad = {"label": "lamp", "bbox_2d": [500, 400, 500, 400]}
     wall = {"label": "wall", "bbox_2d": [0, 0, 1000, 1000]}
     ground = {"label": "the floor", "bbox_2d": [0, 500, 1000, 1000]}
-    found = read(BALL | {"stands_on": "lamp"}, [bad, wall, ground, VASE, {"label": "cat", "bbox_2d": None}, 3, "cup"])
+    found = read(BALL, [bad, wall, ground, VASE, {"label": "cat", "bbox_2d": None}, 3, "cup"])
     assert [other.object for other in found.others] == ["vase"]
     assert all(sum(name in warning for warning in found.warnings) == 1 for name in ("'3'", "'cup'", "'lamp'", "'wall'"))
     assert len(found.warnings) == 4
-    assert found.prior == ObjectPrior(stands_on="lamp")  # in words: it was not located
 
 
 MUG = {"label": "mug", "bbox_2d": [400, 300, 450, 400]}
@@ -435,16 +380,51 @@ def test_nothing_is_read_with_the_wrong_box_of_what_moves(mover: dict[str, Any],
 
 
 @pytest.mark.parametrize("family", ["qwen3-vl", "gemini", "gpt"])
-def test_a_direction_is_two_named_points_and_its_sense_a_word(family: str) -> None:
+def test_a_direction_is_two_named_points(family: str) -> None:
     from cow_service.readers.mllm.locate import read_located
 
     frame = frame_of(family, sent=(320, 200))
-    for word, sense in (("with", True), ("against the arrow", False), (None, None)):
-        line = {"cue": "arrow", "sense": word, "start": frame.write((100, 300)), "end": frame.write((400, 100))}
-        found = read_located(json.dumps(line), frame, "red ball", (), False, True)
-        assert found is not None
-        assert found.line is not None
-        assert found.line.sense is sense
-        assert found.line.direction is not None
-        for point, wanted in zip(found.line.direction, ((100, 300), (400, 100)), strict=True):
-            assert point == pytest.approx(wanted, abs=2)
+    line = {"start": frame.write((100, 300)), "end": frame.write((400, 100)), "sense": None}
+    found = read_located(json.dumps(line), frame, "red ball", (), False, True)
+    assert found is not None
+    assert found.line is not None
+    assert found.line.ends is not None
+    for point, wanted in zip(found.line.ends, ((100, 300), (400, 100)), strict=True):
+        assert point == pytest.approx(wanted, abs=2)
+
+
+@pytest.mark.parametrize(
+    ("labels", "first"),
+    [
+        (("red ball", "vase"), 0),
+        (("vase", "red ball"), 1),  # its words tell it, wherever it stands
+        (("ball", "red vase"), 0),
+        (("toy", "vase"), 0),  # no words do: it was to come first
+        (("ball", "ball"), 0),
+    ],
+)
+def test_what_moves_is_known_by_its_words_else_it_comes_first(labels: tuple[str, str], first: int) -> None:
+    from cow_service.readers.mllm.locate import read_located
+
+    boxes = ([172, 400, 297, 600], [700, 300, 800, 600])
+    reply = {"objects": [{"bbox_2d": box, "label": label} for box, label in zip(boxes, labels, strict=True)]}
+    found = read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", (), True, False)
+    assert found is not None
+    assert found.bbox == frame_of("qwen3-vl").bbox(boxes[first])
+    assert [each.object for each in found.others] == [labels[1 - first]]
+
+
+def test_of_two_lists_neither_comes_first() -> None:
+    from cow_service.readers.mllm.locate import read_located
+    from cow_service.readers.mllm.replies import ReplyError
+
+    drafts = [json.dumps({"objects": [BALL | {"bbox_2d": [172 + off, 400, 297 + off, 600]}, VASE]}) for off in (30, 0)]
+    with pytest.raises(ReplyError, match="give one box"):
+        read_located("Corrected: ".join(drafts), frame_of("qwen3-vl"), "red ball", (), True, False)
+
+
+def test_an_empty_list_says_that_it_is_not_there() -> None:
+    from cow_service.readers.mllm.locate import read_located
+
+    for reply in ({"objects": []}, {"objects": None, "start": None}, {"objects": [], "start": [1, 1], "end": [9, 9]}):
+        assert read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", ("vase",), True, True) is None

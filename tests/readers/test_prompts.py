@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
+import json
+import re
+from typing import TYPE_CHECKING, Any
+
 import pytest
+from drawn import floor
 from jinja2.exceptions import SecurityError
 
+from cow_service.readers.base import Quantity, ReaderInput
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import Prompt, load_prompt, parse_prompt
+from cow_service.records import Asked
 from cow_service.stages.motion import motion_sentence
-from cow_service.weights.manifests import PROMPTS, Coordinates
+from cow_service.vision.scene import Scene
+from cow_service.weights.manifests import PROMPTS, load_families
+
+if TYPE_CHECKING:
+    from cow_service.readers.mllm.client import PromptCall
 
 HEAD = "---\nversion: 1\n---\n"
 SAMPLES: dict[str, object] = {  # of inputs that are no words
@@ -47,29 +59,74 @@ def test_every_shipped_prompt_renders_its_inputs_and_no_others(name: str) -> Non
             prompt.render(**{key: value for key, value in inputs.items() if key != each})
 
 
-def test_a_prompt_shows_the_fields_of_its_schema_in_their_order() -> None:
-    from cow_service.readers.mllm.answer import answer_schema
-    from cow_service.readers.mllm.coordinates import CoordinateFrame
-    from cow_service.readers.mllm.identify import Identified
-    from cow_service.readers.mllm.locate import Scale, locate_schema
-    from cow_service.readers.mllm.replies import schema_of
+def calls(family: str, question: str = "Does it go 3 cm?") -> dict[str, PromptCall[Any]]:
+    """What a model of that family is asked of an image of 640 x 480 px."""
+    from cow_service.readers.mllm.coordinates import CoordinateFrame, EncodedImage
+    from cow_service.readers.mllm.identify import identify_call
+    from cow_service.readers.mllm.locate import locate_call, scale_call
 
-    frame = CoordinateFrame(640, 480, (640, 480), Coordinates(units="thousandths"))
-    answer = answer_schema(read_choices("", ["Yes", "No"]), 100)
-    schemas = {
-        "identify": schema_of(Identified, reasoning_length=100),
-        "locate": locate_schema(frame, True, True, 100),
-        "scale": schema_of(Scale, reasoning_length=100, numbers=frame.numbers),
-        "answer-from-image": answer,
-        "answer-with-frames": answer,
-    }
-    for name, schema in schemas.items():
-        prompt = load_prompt(name)
-        shape = prompt.render(**inputs_of(prompt)).splitlines()[-1]
-        fields = list(schema["properties"])
-        places = [shape.index(f'"{field}"') for field in fields]
-        assert places == sorted(places), name
-        assert fields[0] == "reasoning"
+    given = ReaderInput(Scene(floor(640, 480)), question)
+    image = EncodedImage(b"", CoordinateFrame(640, 480, (640, 480), load_families()[family].coordinates))
+    made = (
+        identify_call(given, image, 100),
+        locate_call(given, image, "red ball", None, ("vase",), True, 100),
+        scale_call(image, "red ball", 100),
+    )
+    return {call.prompt: call for call in made}
+
+
+FAMILIES = ["qwen3-vl", "qwen2.5-vl", "gemini", "claude", "gpt"]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_prompt_asks_for_the_fields_of_its_schema_and_shows_a_reply_that_is_read_so(family: str) -> None:
+    made = calls(family)
+    for name, call in made.items():
+        text = load_prompt(name).render(**call.inputs)
+        asked, _, shown = text.rpartition("Such as: ")
+        fields = set(call.schema["properties"])
+        assert fields - {"reasoning"} <= set(re.findall(r"`(\w+)`", asked)), name
+        assert json.loads(shown).keys() <= fields, name
+        assert json.loads(shown).keys() | {"until", "then", "also_moving", "distance", "duration"} >= fields, name
+    shown = {name: load_prompt(name).render(**call.inputs).rpartition("Such as: ")[2] for name, call in made.items()}
+    named, found, scale = (made[name].parse(shown[name]) for name in ("identify", "locate", "scale"))
+    assert (named.object, named.others, named.kind) == ("red car", ("mug", "vase"), "linear")
+    assert (named.asked, named.speed) == (Asked(relation="touches", target="mug", negated=True), Quantity(20, "px/s"))
+    assert [(each.kind, each.object) for each in named.changes] == [("remove", "vase")]
+    assert found.bbox == pytest.approx((128, 240, 192, 288), abs=0.7)
+    assert [(each.object, each.bbox) for each in found.others] == [
+        ("vase", pytest.approx((448, 144, 512, 288), abs=0.7))
+    ]
+    assert [*itertools.chain(*found.line.ends)] == pytest.approx([160, 264, 576, 264], abs=0.7)
+    assert (found.line.along_arrow, scale.metres, scale.down) == (True, 0.067, "bottom")
+
+
+def test_only_a_question_with_a_number_is_searched_for_speeds_and_lengths() -> None:
+    numbers = {"speed", "distance", "duration"}
+    assert calls("gpt")["identify"].schema["properties"].keys() >= numbers
+    assert numbers.isdisjoint(calls("gpt", "Does it hit the vase?")["identify"].schema["properties"])
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_schemas_are_what_strict_servers_take(family: str) -> None:
+    """Every object requires all its properties and forbids others; limits are refused by some servers."""
+
+    def walk(schema: dict[str, Any], name: str) -> None:
+        if schema.get("type") == "object":
+            assert schema["required"] == list(schema["properties"]), name
+            assert schema["additionalProperties"] is False, name
+            for key, each in schema["properties"].items():
+                walk(each, key)
+        for each in (*schema.get("anyOf", ()), *([schema["items"]] if "items" in schema else ())):
+            walk(each, name)
+        limits = schema.keys() - {"type", "enum", "anyOf", "items", "properties", "required", "additionalProperties"}
+        is_point = schema.get("type") == "array" and schema["items"]["type"] in ("integer", "number")
+        assert limits <= ({"maxLength"} if name == "reasoning" else {"minItems", "maxItems"} if is_point else set()), (
+            name
+        )
+
+    for call in calls(family).values():
+        walk(call.schema, call.prompt)
 
 
 def test_values_are_data_and_blocks_leave_no_blank_lines() -> None:

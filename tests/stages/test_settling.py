@@ -34,6 +34,7 @@ from cow_service.stages.settling import (
     SeenThings,
     SeenWay,
     angle,
+    settle_mover,
     settle_places,
     settle_question,
     settle_way,
@@ -213,14 +214,14 @@ def test_estimated_boxes_are_moved_onto_the_things_that_are_seen(
         return x0, y0, x1, y1
 
     read = GroundingReading("red ball", estimated(RED, first), others=(named("blue box", estimated(BLUE, second)),))
-    settled, objections = settle_places(read, QuestionReading(), SeenThings(REGIONS), WORDS)
+    settled, objections = settle_places(read, SeenThings(REGIONS))
     assert (settled.bbox, settled.others[0].bbox, settled.bbox_deviation) == (RED, BLUE, 0.0)
     assert not objections
 
 
 def test_a_box_that_no_edges_tell_has_a_spread() -> None:
     half = (RED[0], RED[1], RED[0] + 20, RED[3])  # a part of what is seen, or what is seen a part of it
-    settled, objections = settle_places(GroundingReading("duck", half), QuestionReading(), SeenThings(REGIONS), WORDS)
+    settled, objections = settle_places(GroundingReading("duck", half), SeenThings(REGIONS))
     assert (settled.bbox, settled.bbox_deviation, settled.is_doubtful, objections) == (half, BBOX_DEVIATION, False, ())
 
 
@@ -230,6 +231,7 @@ PLACES: dict[str, tuple[GroundingReading, str | None, bool, bool]] = {
     "as the words say": (GroundingReading("red ball", RED), "the ball", False, False),
     "under another word": (GroundingReading("red toy", RED), "the vehicle", False, False),
     "another thing than they say": (GroundingReading("blue box", BLUE), "the red ball", True, False),
+    "another thing by its label": (GroundingReading("red ball", RED, label="red box"), "the red ball", True, False),
     "a thing that they tell apart": (
         GroundingReading("toy", BLUE, others=(named("duck", RED),)), "the duck", True, False
     ),
@@ -243,10 +245,11 @@ def test_what_speaks_against_a_name_or_a_place_is_a_doubt(
     read: GroundingReading, mover: str | None, is_doubtful: bool, is_other_doubtful: bool
 ) -> None:
     things = SeenThings(REGIONS, frozenset({ELSEWHERE}))
-    settled, objections = settle_places(read, QuestionReading(mover=mover), things, WORDS)
+    settled, misplaced = settle_places(read, things)
+    settled, misnamed = settle_mover(settled, QuestionReading(mover=mover), WORDS)
     assert settled.is_doubtful is is_doubtful
     assert any(each.is_doubtful for each in settled.others) is is_other_doubtful
-    assert bool(objections) is (is_doubtful or is_other_doubtful)
+    assert bool(misplaced or misnamed) is (is_doubtful or is_other_doubtful)
 
 
 class Estimating:

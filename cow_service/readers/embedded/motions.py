@@ -9,7 +9,7 @@ from cow_service.physics.camera import depth_motion, way_to
 from cow_service.physics.trail_fit import is_thrown
 from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
-from cow_service.readers.embedded.english.noun_phrases import prior_of
+from cow_service.readers.embedded.english.noun_phrases import kind_of, prior_of
 from cow_service.readers.embedded.english.questions import MotionWords, Question
 from cow_service.readers.embedded.matching import best_matches, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
@@ -21,11 +21,32 @@ from cow_service.vision.trails import trail_of
 NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
 AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
 _ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
+_ANY_THING = frozenset({"object", "thing", "item"})
 _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
 
 
 def _refused(fault: str) -> CannotReadDirection:
     return CannotReadDirection(fault, remedy=GIVE_DIRECTION)
+
+
+def settled_kind(question: Question) -> MotionKind | None:
+    """The kind of motion of a question whose words leave open only which way, and where the things are; else None.
+
+    Open is also how fast, how far and along which trail something moves, whether what falls stands, and what is meant
+    by words for several things, for any of some, or for none in particular.
+    """
+    words, asked = question.motion, question.asked
+    changed = (each for change in question.changes for each in (change.object, *change.targets))
+    is_named = all(
+        each is not None and not each.is_other and each.head not in _ANY_THING and kind_of(each.text) is None
+        for each in (question.mover, *question.others, *changed)
+    )
+    is_open = words.quantities or words.steps or words.others or words.trail or words.topples or words.is_contradictory
+    is_open = is_open or (words.kind == "fall" and not words.in_air)
+    is_open = is_open or any(change.kind == "place" and not change.targets for change in question.changes)
+    if asked is None or asked.among or asked.form.startswith("which") or is_open or not is_named:
+        return None
+    return words.kind
 
 
 def quantities(

@@ -51,7 +51,8 @@ class EmbeddedReader:
         way = base.WayReading(said.along_arrow, said.direction, said.depth, towards, said.forward)
         way = base.WayReading() if read.unread_motion or said.is_contradictory else way
         nouns, mover = matching.nouns_of(read), None if read.asked is None or read.mover is None else read.mover.text
-        return base.QuestionReading(read.asked, mover, changes, said.trail, nouns, drawings, way)
+        kind, others = motions.settled_kind(read), tuple(each.text for each in read.others)
+        return base.QuestionReading(read.asked, mover, changes, said.trail, nouns, drawings, way, kind, others)
 
     def read_name(self, name: str) -> records.ObjectPrior:
         """By its noun."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InternalError, InvalidRequest
-from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number, listed, number
+from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number, listed
 from cow_service.records import BBox, Point
 from cow_service.weights.manifests import Coordinates, Family, ImageSize
 
@@ -85,8 +85,8 @@ class CoordinateFrame:
         """What the numbers count, in words for a prompt."""
         width, height = self.seen
         return {
-            "thousandths": "integers from 0 to 1000, thousandths of the image's width and height",
-            "fractions": "fractions from 0 to 1 of the image's width and height, with three decimals",
+            "thousandths": "thousandths of the image's width and height, 0 to 1000",
+            "fractions": "fractions of the image's width and height, 0 to 1, with three decimals",
             "pixels": f"pixels of the image, which is {width} wide and {height} high, from its top left corner",
         }[self.coordinates.units]
 
@@ -100,16 +100,10 @@ class CoordinateFrame:
         """The order of a point's numbers, in words for a prompt."""
         return "[x, y]" if self.coordinates.axes == "xy" else "[y, x]"
 
-    @property
-    def line_order(self) -> str:
-        """The order of the numbers of a line from one point to another, in words for a prompt."""
-        return "[x0, y0, x1, y1]" if self.coordinates.axes == "xy" else "[y0, x0, y1, x1]"
-
-    @property
-    def numbers(self) -> Schema:
-        """The JSON schema of one coordinate."""
-        kind = "number" if self.coordinates.units == "fractions" else "integer"
-        return number(0, int(max(self._full)), kind)
+    def schema(self, count: int) -> Schema:
+        """The JSON schema of so many coordinates."""
+        number = {"type": "number" if self.coordinates.units == "fractions" else "integer"}
+        return {"type": "array", "items": number, "minItems": count, "maxItems": count}
 
     def point(self, written: object) -> Point:
         """A point in pixels. Raises `ReplyError` if two numbers inside the image are not what was written."""

@@ -1,5 +1,6 @@
 """First prompt: what the question asks, which object it sets in motion, and how that moves, in words."""
 
+import json
 import re
 from collections.abc import Collection, Iterator
 from functools import partial
@@ -23,13 +24,20 @@ from cow_service.readers.base import OtherMotionHint, ReaderInput, StepReading
 from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage
-from cow_service.readers.mllm.estimates import Distance, ReadingContext, Seconds, Speed, context_of, seconds_of
+from cow_service.readers.mllm.quantities import Distance, ReadingContext, Seconds, Speed, context_of, positive
 from cow_service.readers.mllm.replies import Reply, ReplyError
 from cow_service.readers.options import plain
 
 MAX_NAMED = 12  # other objects that the question names
-MIN_SENTENCE, MAX_SENTENCE = 8, 240  # characters
-_SAID_ALIKE = ("sentence", "speed", "distance", "duration", "until")  # fields of a reply and of `MotionHints`
+_NUMBERS = ("speed", "distance", "duration")  # which only a question with a number can say
+_SAID_ALIKE = (*_NUMBERS, "until")  # fields of a reply and of `MotionHints`
+_MOTION = ("kind", *_SAID_ALIKE, "then", "also_moving")
+# The reply to "With the vase gone, will the red car that drives left at 20 px/s miss the mug?"
+_EXAMPLE: dict[str, Any] = {
+    "object": "red car", "others": ["mug", "vase"],
+    "asked": {"form": "whether", "relation": "touches", "target": "mug", "negated": True}, "kind": "linear",
+    "changes": [{"kind": "remove", "object": "vase"}], "speed": "20 px/s", "language": "en",
+}  # fmt: skip
 _NAMES = ("object", "moving_object", "mover", "object_name", "final_result", "result")
 _INNER = ("name", "label", "object", "description")  # of an object that is an object itself
 _ANSWERS = frozenset({"yes", "no", "not sure", "unsure", "true", "false", "unknown", "maybe"})
@@ -128,7 +136,7 @@ Name = Annotated[str, Field(min_length=1), BeforeValidator(replies.name_of)]
 _PLACE_RELATION = BeforeValidator(lambda said: RELATION_WORDS.get(replies.text_of(said).lower().replace("_", "-")))
 _LANGUAGES = get_args(records.Language)
 _LANGUAGE = BeforeValidator(lambda said: code if (code := replies.text_of(said)[:2].lower()) in _LANGUAGES else None)
-_WAY = BeforeValidator(_way), WithJsonSchema(replies.one_of(*WAYS))
+_WAY = BeforeValidator(_way), WithJsonSchema(replies.nullable(replies.one_of(*WAYS)))
 
 
 class Change(Reply):
@@ -181,11 +189,10 @@ class Identified(Reply):
     """What is asked and what moves, in words; nothing about where it is. Null is what the reply does not say."""
 
     other_names: ClassVar = {"object": _NAMES}
-    object: Annotated[str, WithJsonSchema(replies.nullable(replies.words(replies.MAX_NAME)))]
+    object: Annotated[str, WithJsonSchema(replies.nullable({"type": "string"}))]
     others: Annotated[tuple[str, ...], *_names(MAX_NAMED)]
     asked: records.Asked | None
     kind: Annotated[records.MotionKind | None, _known(records.MotionKind, _KINDS)]
-    sentence: Annotated[str | None, WithJsonSchema(replies.words(MAX_SENTENCE))]
     changes: Annotated[tuple[Change, ...], replies.all_of(Change)] = ()
     speed: Speed = None
     distance: Distance = None
@@ -237,19 +244,13 @@ class Identified(Reply):
             ((fields["relation"], denied),) = told
             fields |= {"negated": True} if denied else {}
         if "within" in fields:
-            fields["within"] = seconds_of(fields["within"]) or fields["within"]
+            fields["within"] = positive(fields["within"], "s") or fields["within"]
         try:
             return records.Asked.model_validate(fields)
         except ValidationError as error:
             fault = ".".join(map(str, error.errors()[0]["loc"]))
             context_of(info).faults.append(f"`asked` is {replies.shown(written)}, of which `{fault}` cannot be read")
             return None
-
-    @field_validator("sentence", mode="before")
-    @classmethod
-    def _read_sentence(cls, written: Any) -> str | None:
-        sentence = replies.text_of(written)
-        return sentence if MIN_SENTENCE <= len(sentence) <= MAX_SENTENCE else None
 
     @property
     def must_be_found(self) -> tuple[str, ...]:
@@ -264,36 +265,58 @@ class Identified(Reply):
     def hints(self) -> dict[str, Any]:
         """Fields of `MotionHints`, as far as the reply says them."""
         return {
+            "kind": self.kind or "linear",
             **{name: value for name in _SAID_ALIKE if (value := getattr(self, name)) is not None},
             "then": tuple(StepReading(*each.way, each.distance, each.duration) for each in self.then),
             "also": tuple(each.hint for each in self.also_moving),
         }
 
 
+def identified_by_words(given: ReaderInput) -> Identified | None:
+    """What the words of a question say of all that is asked here; None where they leave something open."""
+    words = given.words
+    if words is None or words.kind is None or words.mover is None:
+        return None
+    return Identified.model_construct(
+        object=words.mover,
+        others=words.others,
+        asked=words.asked if given.asked_wanted else None,
+        kind=words.kind,
+        changes=words.changes if given.changes_wanted else (),
+    )
+
+
 def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
-    """The call that asks which object moves, in words, and of the rest what the caller has not said."""
-    schema = replies.schema_of(Identified, reasoning_length=reasoning_length)
+    """The call that asks which object moves, in words, and of the rest what neither the caller nor the words say."""
+    has_numbers = any(map(str.isdigit, given.question))
+    asked = None if given.words is None or not given.asked_wanted else given.words.asked
+    if asked is not None and (asked.among or asked.form.startswith("which")):
+        asked = None  # the words do not say which things these are
     said = frozenset((
-        *(() if given.asked_wanted else ("asked",)),
+        *(() if given.asked_wanted and asked is None else ("asked",)),
         *(() if given.changes_wanted else ("changes",)),
-        *(() if given.motion_wanted else ("kind", "sentence", *_SAID_ALIKE, "then", "also_moving")),
+        *(() if given.motion_wanted else _MOTION),
+        *(() if has_numbers else _NUMBERS),
     ))  # fmt: skip
-    schema["properties"] = {name: each for name, each in schema["properties"].items() if name not in said}
-    schema["required"] = [name for name in schema["required"] if name not in said]
+    fields = {name: each for name, each in replies.fields_schema(Identified).items() if name not in said}
+    example = {"reasoning": "...", **{name: _EXAMPLE[name] for name in fields if name in _EXAMPLE}}
     inputs: dict[str, object] = {
         "question": given.question,
-        "wants_asked": given.asked_wanted,
-        "wants_changes": given.changes_wanted,
-        "wants_motion": given.motion_wanted,
+        "wants_asked": "asked" in fields,
+        "wants_changes": "changes" in fields,
+        "wants_motion": "kind" in fields,
+        "wants_numbers": "speed" in fields,
         "objections": tuple(" ".join(each.split()) for each in given.objections),
+        "example": json.dumps(example),
     }
-    return PromptCall("identify", inputs, (image.jpeg,), schema, partial(read_identified, said=said))
+    schema = replies.schema_of(fields, reasoning_length=reasoning_length)
+    return PromptCall("identify", inputs, (image.jpeg,), schema, partial(read_identified, said=said, asked=asked))
 
 
-def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None:
+def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked | None = None) -> Identified | None:
     """The object that a reply names; None where it says that there is none. Raises `ReplyError`.
 
-    Fields that the caller has `said` are not read.
+    Fields that are `said` elsewhere are not read; `asked` is what the question's words ask.
     """
     text = replies.without_thinking(reply)
     values = replies.values_in(text)
@@ -321,7 +344,7 @@ def read_identified(reply: str, said: Collection[str] = ()) -> Identified | None
     context = ReadingContext(faults=[] if objects else ["it is no JSON object, so that fields are missing"])
     fields = {name: held for name, held in written[-1].items() if name not in said}
     found = Identified.model_validate(fields, context=context)
-    mover, asked = replies.name_words(found.object), found.asked
+    mover, asked = replies.name_words(found.object), asked or found.asked
     others = tuple(name for name in found.others if replies.name_words(name) != mover)
     if asked is not None:
         one = partial(replies.named_among, known=(found.object, *others))

@@ -1,7 +1,6 @@
-"""The reader that asks a multimodal LLM. A simulation takes two calls one after the other, an answer one more."""
+"""The reader that asks a multimodal LLM. A simulation takes two calls, or one; an answer takes one more."""
 
 import hashlib
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -16,10 +15,9 @@ from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
-from cow_service.readers.mllm.estimates import HEADING_DEVIATION, SPEED_DEVIATION
 from cow_service.readers.mllm.hypothesis import pictures
-from cow_service.readers.mllm.identify import Identified, identify_call
-from cow_service.readers.mllm.locate import DOWN, Located, Scale, locate_call, scale_call, separate_objects
+from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
+from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import UNKNOWN, configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
@@ -27,6 +25,7 @@ from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
+HEADING_DEVIATION = 20.0  # degrees of a direction that an MLLM points at, where its manifest says nothing else
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_KIND: records.MotionKind = "linear"
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
@@ -80,7 +79,7 @@ class MllmReader:
         return await self._client.chat(body)
 
     def ground(self, given: ReaderInput) -> GroundingReading:
-        """Two calls: what moves, in words; then where it is and, in the same call, which way it moves.
+        """Two calls: what moves, unless the question's words say it; then where it is and which way it moves.
 
         Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
         """
@@ -90,12 +89,12 @@ class MllmReader:
                 f"{self._subject} sees nothing in the image that the question could move.",
                 remedy=GIVE_PLACE,
             )
-        located, hints = self._locate(given, image, identified, identified.object)
+        located, scale = self._locate(given, image, identified, identified.object)
         if located is None:
             raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image.", remedy=GIVE_PLACE)
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
-        mover = LocatedObject(object=identified.object, bbox=bbox, prior=located.prior, source="mllm")
+        mover = LocatedObject(object=identified.object, bbox=bbox, source="mllm")
         others, doubles = separate_objects(mover, located.others)
         known = {name_words(each.object): each for each in (mover, *others)}
 
@@ -124,6 +123,7 @@ class MllmReader:
         return GroundingReading(
             object=identified.object,
             bbox=bbox,
+            label=located.label,
             point=located.point,
             others=tuple(other for other in others if other.bbox not in removed),
             objects_complete=located.objects_complete and not doubles,
@@ -132,8 +132,7 @@ class MllmReader:
             place_doubts=self._family_warnings,
             is_doubtful=is_other,
             asked_is_doubtful=bool(identified.warnings),
-            hints=hints if given.motion_wanted else None,
-            prior=located.prior,
+            hints=_hints(identified, located, scale, bbox) if given.motion_wanted else None,
             asked=identified.asked,
             language=identified.language,
         )
@@ -147,7 +146,8 @@ class MllmReader:
         others_sought = hints is not None  # with the mover
         if hints is None:
             image, identified = self._identify(replace(given, asked_wanted=False, changes_wanted=False))
-            located, hints = self._locate(given, image, identified, grounding.object, grounding.bbox)
+            located, scale = self._locate(given, image, identified, grounding.object, grounding.bbox)
+            hints = _hints(identified, located, scale, grounding.bbox)
             warnings += () if identified is None else identified.warnings
             warnings += () if located is None else located.warnings
         elif given.objections and hints.kind in records.DIRECTED_KINDS:
@@ -156,7 +156,7 @@ class MllmReader:
             call = locate_call(given, image, grounding.object, grounding.bbox, (), True, self._reasoning)
             if (located := self._client.complete(call, given)) is not None:
                 warnings += located.warnings
-                hints = hints.model_copy(update=located.line_hints | {"speed": hints.speed})
+                hints = hints.model_copy(update=vars(located.line or Line()))
         places = {name_words(each.object): each for each in grounding.others}
         others: list[base.OtherMotionReading] = []
         for hint in hints.also:
@@ -169,7 +169,7 @@ class MllmReader:
             else:
                 warnings.append(f"'{hint.object}' moves, too, and was left out: it has no place. {GIVE_OBJECT}")
         kind = hints.kind or DEFAULT_KIND
-        reading = MotionReading(kind, None, "text", sentence=hints.sentence, others=tuple(others))
+        reading = MotionReading(kind, None, "text", others=tuple(others))
         if kind in records.FALLING_KINDS:
             reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
             if hints.scale_error:
@@ -201,10 +201,11 @@ class MllmReader:
         return tuple(replace(each, notes=(*each.notes, *notes)) for each in readings)
 
     def _identify(self, given: ReaderInput) -> tuple[EncodedImage, Identified | None]:
-        """The image as it is sent, and the question about it."""
+        """The image as it is sent, and the question about it; of several arrows the MLLM says which one is meant."""
         with given.cpu():
             image = encode(given.scene.image, self._model.family)
-        return image, self._client.complete(identify_call(given, image, self._reasoning), given)
+            said = identified_by_words(given) if given.words and len(given.scene.arrows) <= 1 else None
+        return image, said or self._client.complete(identify_call(given, image, self._reasoning), given)
 
     def _locate(
         self,
@@ -213,10 +214,10 @@ class MllmReader:
         identified: Identified | None,
         name: str,
         bbox: BBox | None = None,
-    ) -> tuple[Located | None, MotionHints]:
+    ) -> tuple[Located | None, Scale | CowError | None]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
-        None if the place was not asked for, or the object not seen. Raises `MllmBadReply`, `MllmUnavailable`.
+        None for what was not asked for, or not seen. Raises `MllmBadReply`, `MllmUnavailable`.
         """
         kind = (identified.kind if identified else None) or DEFAULT_KIND
         others: tuple[str, ...] = ()
@@ -231,43 +232,45 @@ class MllmReader:
             calls["scale"] = scale_call(image, name, self._reasoning)
         results = dict(zip(calls, self._client.complete_all(list(calls.values()), given), strict=True))
         located: Located | CowError | None = results.get("place")
-        scaled: Scale | CowError | None = results.get("scale")
         if isinstance(located, CowError):
             raise located
-        hints: dict[str, Any] = {"kind": kind}
-        if located is not None:
-            hints |= located.line_hints
-        if identified is not None:
-            hints |= identified.hints
-        if isinstance(scaled, Scale):
-            hints |= {"metres_per_pixel": scaled.metres_per_pixel, "down": DOWN[scaled.down or "bottom"]}
-        elif isinstance(scaled, CowError):
-            hints["scale_error"] = scaled.code
-        return located, MotionHints(**hints)
+        return located, results.get("scale")
 
     def _directed(self, reading: MotionReading, hints: MotionHints) -> MotionReading:
         """The reading with its direction."""
-        deviation = SPEED_DEVIATION if isinstance(hints.speed, str) else None
-        ends = {"distance": hints.distance, "duration": hints.duration, "until": hints.until, "steps": hints.then}
         reading = replace(
             reading,
             speed=hints.speed,
-            speed_deviation=deviation,
+            distance=hints.distance,
+            duration=hints.duration,
+            until=hints.until,
+            steps=hints.then,
             cue=hints.cue or "orientation",
             direction_deviation=self._direction_deviation,
             along_arrow=hints.along_arrow,
-            **ends,
         )
         if hints.camera is not None:
             direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
             return replace(reading, direction=direction, depth=depth, depth_deviation=HEADING_DEVIATION)
         if hints.ends is None:
             return reading
-        if hints.depth_degrees is not None:
-            depth = math.sin(math.radians(hints.depth_degrees))
-            reading = replace(reading, depth=depth, depth_deviation=HEADING_DEVIATION)
         (x0, y0), (x1, y1) = hints.ends
         return replace(reading, direction=(x1 - x0, y1 - y0))
+
+
+def _hints(
+    identified: Identified | None, located: Located | None, scale: Scale | CowError | None, bbox: BBox
+) -> MotionHints:
+    """What was read of the motion of the object in the box."""
+    hints: dict[str, Any] = {"kind": DEFAULT_KIND} if identified is None else identified.hints
+    if located is not None and located.line is not None:
+        hints |= vars(located.line)
+    if isinstance(scale, Scale):
+        name = "" if identified is None else identified.object
+        hints |= {"metres_per_pixel": scale.metres_per_pixel(name, bbox), "down": DOWN[scale.down]}
+    elif isinstance(scale, CowError):
+        hints["scale_error"] = scale.code
+    return MotionHints(**hints)
 
 
 def create(settings: Settings) -> MllmReader:

@@ -6,7 +6,7 @@ repaired by a library, but only where its brackets close: a reply that was cut s
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar, TypeGuard, TypeVar, cast
 
@@ -17,8 +17,6 @@ Schema = dict[str, Any]
 MAX_LENGTH = 20_000  # characters behind the thinking; a longer reply is not looked through
 MAX_NAME = 120  # characters of an object's name, and of any text without another limit
 MAX_LISTED = 8  # entries of a list without another limit
-COORDINATES = "coordinates"  # key of a schema that stands for so many numbers as the model's family writes them
-POINTS = "points"  # key of a schema that stands for points under these names instead of the field
 _FENCE = re.compile(r"```[\w+-]*[ \t]*\n?(.*?)```", re.DOTALL)
 _THOUGHT = re.compile(r"</(?:think|thinking|thought|reasoning|seed:think)>|◁/think▷|<\|channel\|>final<\|message\|>")
 _THINKING = re.compile(r"<(?:think|thinking|thought|seed:think)>|◁think▷|<\|channel\|>analysis")
@@ -27,7 +25,6 @@ _NOTHING = frozenset({"", "none", "null", "n/a", "not found", "nothing", "...", 
 _NO_JSON = object()
 _DETERMINERS = frozenset({"the", "a", "an", "this", "that"})
 _BEFORE_STRING, _AFTER_STRING = frozenset("{[,:("), frozenset("}],:)")
-_SCHEMA_KEYS = ("type", "enum", "minimum", "maximum", "minItems", "maxItems", "maxLength")
 
 
 class ReplyError(Exception):
@@ -43,7 +40,7 @@ class ReplyError(Exception):
 
 
 class Reply(BaseModel):
-    """An object that a prompt asks for. Its JSON schema goes to the server, which must give fields without a default.
+    """An object that a prompt asks for. Its JSON schema, which goes to the server, requires every field.
 
     Reading is more tolerant: names of fields may be spelled and capitalised differently, and a missing field is null.
     """
@@ -90,50 +87,31 @@ def all_of(kind: type[R]) -> BeforeValidator:
     return BeforeValidator(read)
 
 
-def schema_of(*kinds: type[Reply], reasoning_length: int, numbers: Schema | None = None, box_key: str = "") -> Schema:
-    """The JSON schema of a reply with the fields of these models, in the few forms that every server takes.
+def schema_of(fields: Mapping[str, Schema] | None = None, *, reasoning_length: int) -> Schema:
+    """The JSON schema of a reply with `reasoning` and these fields, in the few forms that strict servers take."""
+    return closed({"reasoning": words(reasoning_length), **(fields or {})})
 
-    `reasoning` comes first. `numbers` is the schema of coordinates, and `box_key` what the model's family calls a box.
-    """
 
-    def adapted(schema: Schema, definitions: Schema) -> Schema:
+def closed(fields: Mapping[str, Schema]) -> Schema:
+    """The schema of an object with all of these fields and no others."""
+    return {"type": "object", "properties": dict(fields), "required": [*fields], "additionalProperties": False}
+
+
+def fields_schema(kind: type[Reply]) -> dict[str, Schema]:
+    """The schemas of a model's fields, none of them optional, and without limits, which some servers refuse."""
+    whole = kind.model_json_schema()
+
+    def strict(schema: Schema) -> Schema:
         if "$ref" in schema:
-            schema = definitions[schema["$ref"].rpartition("/")[2]]
-        if COORDINATES in schema:
-            count = schema[COORDINATES]
-            return nullable({"type": "array", "items": numbers, "minItems": count, "maxItems": count})
+            schema = whole["$defs"][schema["$ref"].rpartition("/")[2]]
         if "anyOf" in schema:
-            return {"anyOf": [adapted(each, definitions) for each in schema["anyOf"]]}
-        kept = {key: schema[key] for key in _SCHEMA_KEYS if key in schema}
-        if kept.get("type") == "string" and "enum" not in kept:
-            kept.setdefault("maxLength", MAX_NAME)
-        if kept.get("type") == "array":
-            kept |= {"items": adapted(schema["items"], definitions), "maxItems": kept.get("maxItems", MAX_LISTED)}
+            return {"anyOf": [strict(each) for each in schema["anyOf"]]}
         if "properties" in schema:
-            names = {
-                name: each.get(POINTS, [box_key if name == "bbox" else name])
-                for name, each in schema["properties"].items()
-            }
-            kept["properties"] = {
-                key: adapted({COORDINATES: 2} if POINTS in each else each, definitions)
-                for name, each in schema["properties"].items()
-                for key in names[name]
-            }
-            optional = {key for name in names.keys() - set(schema.get("required", ())) for key in names[name]}
-            for key in optional:  # strict servers want every property
-                if kept["properties"][key].get("type") != "array" and "anyOf" not in kept["properties"][key]:
-                    kept["properties"][key] = nullable(kept["properties"][key])
-            kept["required"] = list(kept["properties"])
-            kept["additionalProperties"] = False
-        return kept
+            return closed({name: strict(each) for name, each in schema["properties"].items()})
+        kept = {key: schema[key] for key in ("type", "enum") if key in schema}
+        return kept | ({"items": strict(schema["items"])} if "items" in schema else {})
 
-    whole: Schema = {"type": "object", "properties": {"reasoning": words(reasoning_length)}, "required": ["reasoning"]}
-    for kind in kinds:
-        schema = kind.model_json_schema()
-        part = adapted(schema, schema.get("$defs", {}))
-        whole["properties"] |= part["properties"]
-        whole["required"] += part["required"]
-    return whole | {"additionalProperties": False}
+    return strict(whole)["properties"]
 
 
 def words(longest: int) -> Schema:
@@ -144,11 +122,6 @@ def words(longest: int) -> Schema:
 def one_of(*values: str) -> Schema:
     """The schema of one of some words."""
     return {"type": "string", "enum": list(values)}
-
-
-def number(least: float, most: float, kind: str = "number") -> Schema:
-    """The schema of a number between two limits."""
-    return {"type": kind, "minimum": least, "maximum": most}
 
 
 def nullable(schema: Schema) -> Schema:
