@@ -59,7 +59,7 @@ class ChatProblem(Problem):
 
 
 def openai_error(error: errors.CowError) -> dict[str, Any]:
-    """An error as OpenAI's clients read it: a `ChatError`. Where the MLLM refused a call, in the MLLM's words."""
+    """An error as OpenAI's clients read it: a `ChatError`. Where the MLLM refused a call, as it did."""
     status = openai_status(error)
     other = "server_error" if status >= HTTPStatus.INTERNAL_SERVER_ERROR else "invalid_request_error"
     param = None

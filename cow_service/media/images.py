@@ -170,7 +170,7 @@ def _check_frames(kind: str, frames: int) -> None:
 
 
 def decode_own(data: bytes) -> NDArray[np.uint8]:
-    """Upright RGB pixels [H, W, 3] of a PNG that this service wrote. Raises `InternalError` if it is damaged."""
+    """Upright RGB pixels [H, W, 3] of a picture that this service wrote. Raises `InternalError` if it is damaged."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if pixels is None:
         raise errors.InternalError("A stored picture can no longer be read.")
@@ -206,10 +206,10 @@ def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.bool_
     return _encoded(".png", cast(NDArray[np.uint8], pixels), options)
 
 
-def encode_jpeg(pixels: NDArray[np.uint8]) -> bytes:
+def encode_jpeg(pixels: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
     """Encode [H, W, 3] RGB as JPEG without subsampling of colours: lines that are drawn stay sharp."""
     sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    return _encoded(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, *sampling])
+    return _encoded(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling])
 
 
 def _encoded(extension: str, pixels: NDArray[np.uint8], options: list[int]) -> bytes:

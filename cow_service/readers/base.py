@@ -65,7 +65,7 @@ class CallLog:
 
     usage: records.Usage = field(default_factory=records.Usage)
     prompts: dict[str, int] = field(default_factory=dict[str, int])  # version by name
-    notes: dict[str, None] = field(default_factory=dict[str, None])  # what was sent otherwise than it is
+    notes: dict[str, None] = field(default_factory=dict[str, None])  # warnings of what was sent in another form
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,6 @@ class MotionReading:
     steps: tuple[StepReading, ...] = ()
     trail: tuple[Point, ...] = ()  # earlier positions that are shown, oldest first, px
     others: tuple[OtherMotionReading, ...] = ()
-    speed_deviation: float | None = None  # of ln speed; null if the reader says nothing of the speed
     metres_per_pixel: records.MetresPerPixel | None = None  # null if the reader cannot tell
     down: Vector = (0.0, 1.0)  # unit vector: which way things fall in the image
     sentence: str | None = None

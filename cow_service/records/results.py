@@ -170,7 +170,7 @@ class MllmRefusal(BaseModel):
     """How the server of a multimodal LLM refused a call."""
 
     status: int = Field(description="HTTP status of its response.")
-    message: str = Field(description="Its own message.")
+    message: str = Field(description="What was wrong, without its own words.")
     retry_after: float | None = Field(default=None, ge=0, description="Seconds to wait before the next call.")
 
 

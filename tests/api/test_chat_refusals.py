@@ -34,25 +34,28 @@ def proven(served: Served) -> None:
     post(served)
 
 
-def test_what_the_mllm_does_not_take_stays_what_it_said(served: Served, mllm: RandomMllm) -> None:
+def test_what_the_mllm_does_not_take_is_told_with_its_status_alone(served: Served, mllm: RandomMllm) -> None:
     status = 413
     mllm.next_replies = [refusing(status, f"the image is too small for the patches of {KEY}")] * ALWAYS
     response = post(served, Prefer="wait=0")  # it is asked once all the same
     said = response.json()["error"]
     assert (response.status_code, response.json()["status"], said["code"]) == (status, status, "mllm-refused")
-    assert (said["message"], said["type"]) == ("the image is too small for the patches of ***", "invalid_request_error")
+    assert said["type"] == "invalid_request_error"
+    assert "413" in said["message"]
+    assert "patches" not in said["message"], "what a provider says may name its account: it stays in the log"
     assert "retry-after" not in response.headers
     *_, last = [block for block in post(served, body={**CHAT, "stream": True}).text.split("\n\n") if block.strip()]
     assert json.loads(last.removeprefix("data: "))["error"]["message"] == said["message"]
-    assert len(mllm.received) == 2 * (1 + 3)  # each asked again with smaller pictures alone
+    assert len(mllm.received) == 2 * (1 + 2)  # each was asked again with smaller pictures, and no more
 
 
 @pytest.mark.parametrize("path", ["/simulate", "/answer"])
 def test_other_operations_tell_that_it_is_final(served: Served, mllm: RandomMllm, path: str) -> None:
     mllm.next_replies = [refusing(400, "the image is too small")] * ALWAYS
     told = problem(post(served, path, SIMULATE), 422, "mllm-refused")
-    refusal = {"status": 400, "message": "the image is too small", "retry_after": None}
-    assert told["refusal"] == refusal
+    refusal = told["refusal"]
+    assert (refusal["status"], refusal["retry_after"]) == (400, None)
+    assert "too small" not in refusal["message"]
     assert told["usage"]["calls"] == 1
     job = served.ended(served.submit(SIMULATE, path, **{"Cache-Control": "no-cache"})["id"])
     assert job["problem"]["refusal"] == refusal  # stored
@@ -63,12 +66,12 @@ def test_other_operations_tell_that_it_is_final(served: Served, mllm: RandomMllm
 
 def test_a_chat_asks_again_within_the_patience_of_its_caller(served: Served, mllm: RandomMllm) -> None:
     mllm.next_replies = [refusing(429, retry_after="1"), refusing(400, "too small")]
-    assert post(served).json()["error"]["message"] == "too small"
+    assert "400" in post(served).json()["error"]["message"]
     assert len(mllm.received) == 2
     mllm.next_replies = [refusing(429, "slow down", retry_after="90")]  # more than 60 s, within COW_MLLM_BUDGET
     response = post(served)
     assert (response.status_code, response.headers["retry-after"], len(mllm.received)) == (429, "90", 3)
-    assert (response.json()["error"]["message"], response.json()["error"]["type"]) == ("slow down", "rate_limit_error")
+    assert response.json()["error"]["type"] == "rate_limit_error"
     mllm.next_replies = [refusing(429, retry_after="5")]
     assert post(served, Prefer="wait=2").headers["retry-after"] == "5"
     mllm.next_replies = [refusing(429, retry_after="500")]

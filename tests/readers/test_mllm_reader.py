@@ -245,7 +245,7 @@ def test_guesses_are_neither_asked_for_nor_read(mllm, reader, scene) -> None:
     guesses = {"size": 0.2, "shape": "ball", "depth_degrees": 30, "speed": "slowly", "others": [VASE]}
     reading, motion = placed(mllm, reader, scene, guesses)
     assert (reading.prior, reading.others[0].prior, reading.warnings) == (None, None, ())
-    assert (motion.depth, motion.depth_deviation, motion.speed, motion.speed_deviation) == (0.0, None, None, None)
+    assert (motion.depth, motion.depth_deviation, motion.speed) == (0.0, None, None)
     assert motion.direction == pytest.approx((0.37 * 640, 0))
     assert motion.direction_deviation == 20
 

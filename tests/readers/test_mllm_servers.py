@@ -175,9 +175,9 @@ def test_what_a_dead_server_refuses_teaches_nothing(mllm: MllmServer, tmp_path: 
 def test_steps_end(words: list[str], status: int, images: int) -> None:
     from pydantic_ai.exceptions import ModelHTTPError
 
-    from cow_service.readers.mllm.capabilities import Capabilities, step_down
+    from cow_service.readers.mllm.capabilities import ServerCapabilities, step_down
 
-    takes, seen = Capabilities(), list[Capabilities]()
+    takes, seen = ServerCapabilities(), list[ServerCapabilities]()
     error = ModelHTTPError(status, "m", {"message": " ".join(words)})
     while (lower := step_down(takes, error, images, is_proven=False)) is not None and lower not in seen:
         seen.append(lower)

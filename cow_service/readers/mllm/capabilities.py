@@ -5,7 +5,6 @@ worked is never tried again.
 """
 
 import hashlib
-import json
 import os
 import re
 import time
@@ -15,7 +14,6 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ValidationError
 from pydantic_ai import exceptions as errors
 
 from cow_service.records import Record
@@ -26,7 +24,8 @@ Delivery = Literal["whole", "streamed", "declared"]
 _NEXT_DELIVERY: dict[Delivery, Delivery] = {"whole": "streamed", "streamed": "declared"}
 MAX_STEPS = 8  # that one call may teach
 MAX_AGE_SECONDS = 7 * 24 * 3600.0  # servers are updated: what is older is found out again
-MAX_REDUCTION = 3
+FEWER_FRAMES = 3  # reductions from which only the first, middle and last frame are sent
+MAX_REDUCTION = FEWER_FRAMES + 2
 REFUSED = (HTTPStatus.BAD_REQUEST, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.NOT_IMPLEMENTED)
 _SIZE_STATUS = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
 _IMAGES = re.compile(
@@ -46,7 +45,7 @@ _SYSTEM = re.compile(
 )
 
 
-class Capabilities(Record):
+class ServerCapabilities(Record):
     """What a server takes of a call for one model."""
 
     output: OutputMode = "json_schema"
@@ -56,7 +55,7 @@ class Capabilities(Record):
     system_role: bool = True
     delivery: Delivery = "whole"
     images: int | None = None  # per call, at most; null where no limit is known
-    reduction: int = 0  # steps by which frames are made smaller, then fewer, to keep a call short enough
+    reduction: int = 0  # steps by which images are made smaller, so that a call is short enough: see `sheets.py`
 
 
 @dataclass
@@ -67,19 +66,20 @@ class CapabilityStore:
     """
 
     path: Path | None
-    first: Capabilities  # before anything is known
-    proven: Capabilities | None = None
+    first: ServerCapabilities  # before anything is known
+    proven: ServerCapabilities | None = None
 
     def __post_init__(self) -> None:
         self.current = self.first
         try:
-            stored = None if self.path is None else json.loads(self.path.read_text(encoding="utf-8"))
-            if stored is not None and time.time() - stored["learned_at"] < MAX_AGE_SECONDS:
-                self.current = self.proven = Capabilities.model_validate(stored["takes"])
-        except (OSError, ValueError, KeyError, TypeError, ValidationError):
+            if self.path is not None and time.time() - self.path.stat().st_mtime < MAX_AGE_SECONDS:
+                self.current = self.proven = ServerCapabilities.model_validate_json(
+                    self.path.read_text(encoding="utf-8")
+                )
+        except (OSError, ValueError):
             return  # nothing is known, or what is stored is of another version: it is found out again
 
-    def succeed(self, used: Capabilities) -> None:
+    def succeed(self, used: ServerCapabilities) -> None:
         """A call has succeeded: what it was sent with is kept."""
         if used == self.proven:
             return
@@ -89,12 +89,12 @@ class CapabilityStore:
         part = self.path.with_suffix(f".{os.getpid()}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(json.dumps({"learned_at": time.time(), "takes": used.model_dump()}), encoding="utf-8")
+            part.write_text(used.model_dump_json(), encoding="utf-8")
             part.replace(self.path)
         except OSError:
             return  # it is found out again by the next process
 
-    def refuse(self, used: Capabilities, error: errors.ModelAPIError, images: int, *, may_pass: bool) -> bool:
+    def refuse(self, used: ServerCapabilities, error: errors.ModelAPIError, images: int, *, may_pass: bool) -> bool:
         """A call with that many images was refused: whether another one is worth trying, with what is known then.
 
         `may_pass`: the refusal may be a passing fault, unless it says what it is about.
@@ -112,7 +112,7 @@ class CapabilityStore:
         self.current = self.proven or self.first
 
 
-def store_of(data_dir: Path, server: str, model: str, first: Capabilities) -> CapabilityStore:
+def store_of(data_dir: Path, server: str, model: str, first: ServerCapabilities) -> CapabilityStore:
     """What is known of a model on a server, by its address; without one nothing is kept."""
     if not server:
         return CapabilityStore(None, first)
@@ -120,7 +120,9 @@ def store_of(data_dir: Path, server: str, model: str, first: Capabilities) -> Ca
     return CapabilityStore(data_dir / "mllm" / f"{name}.json", first)
 
 
-def step_down(used: Capabilities, error: errors.ModelAPIError, images: int, *, is_proven: bool) -> Capabilities | None:
+def step_down(
+    used: ServerCapabilities, error: errors.ModelAPIError, images: int, *, is_proven: bool
+) -> ServerCapabilities | None:
     """What to try after a refusal; None where nothing that is known of servers would help."""
     if isinstance(error, errors.ModelHTTPError):
         update = next(_named_steps(used, error, images), None)
@@ -134,12 +136,13 @@ def step_down(used: Capabilities, error: errors.ModelAPIError, images: int, *, i
     return None if update is None else used.model_copy(update=update)
 
 
-def _named_steps(used: Capabilities, error: errors.ModelHTTPError, images: int) -> Iterator[dict[str, object]]:
+def _named_steps(used: ServerCapabilities, error: errors.ModelHTTPError, images: int) -> Iterator[dict[str, object]]:
     """Steps for what a refusal names."""
     status, said = error.status_code, str(error.body or "")
     too_large = isinstance(error, errors.ModelContextWindowExceededError) or status == _SIZE_STATUS
     if (too_large or (status in REFUSED and _TOO_LARGE.search(said))) and used.reduction < MAX_REDUCTION:
-        yield {"reduction": used.reduction + 1}
+        only_first = images == 1  # what is done to frames does not help
+        yield {"reduction": max(used.reduction, FEWER_FRAMES if only_first else 0) + 1}
     if status not in REFUSED and status != HTTPStatus.INTERNAL_SERVER_ERROR:
         return
     counted = _IMAGES.search(said)
@@ -161,7 +164,7 @@ def _named_steps(used: Capabilities, error: errors.ModelHTTPError, images: int) 
         yield _lower_output(used)
 
 
-def _blind_steps(used: Capabilities) -> Iterator[dict[str, object]]:
+def _blind_steps(used: ServerCapabilities) -> Iterator[dict[str, object]]:
     """Steps after a refusal that names nothing, what is refused most often first."""
     if used.output != "prompt":
         yield _lower_output(used)
@@ -171,5 +174,5 @@ def _blind_steps(used: Capabilities) -> Iterator[dict[str, object]]:
         yield {"system_role": False}
 
 
-def _lower_output(used: Capabilities) -> dict[str, object]:
+def _lower_output(used: ServerCapabilities) -> dict[str, object]:
     return {"output": "json_object" if used.output == "json_schema" else "prompt"}

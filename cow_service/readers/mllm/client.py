@@ -17,7 +17,15 @@ import anyio
 from pydantic_ai import Agent, BinaryContent, ModelRetry, TextOutput
 from pydantic_ai import exceptions as errors
 from pydantic_ai.direct import model_request
-from pydantic_ai.messages import ModelMessage, ModelResponse, TextPart, ThinkingPart, ToolCallPart
+from pydantic_ai.messages import (
+    ModelMessage,
+    ModelRequest,
+    ModelResponse,
+    TextPart,
+    ThinkingPart,
+    ToolCallPart,
+    UserPromptPart,
+)
 from pydantic_ai.models import Model, ModelRequestParameters
 from pydantic_ai.models.wrapper import WrapperModel
 from pydantic_ai.output import OutputObjectDefinition
@@ -34,7 +42,7 @@ from cow_service.readers.mllm.chat import completion_of, prepare_chat
 from cow_service.readers.mllm.coordinates import MEDIA_TYPE
 from cow_service.readers.mllm.models import ConfiguredModel
 from cow_service.readers.mllm.replies import ReplyError, Schema
-from cow_service.readers.mllm.sheets import fit_images, images_in
+from cow_service.readers.mllm.sheets import fit_images
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Usage
 from cow_service.settings import Settings
@@ -98,8 +106,6 @@ class MllmClient:
         self.model = model
         self._name = f"The multimodal LLM '{model.name}'"
         self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
-        own = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
-        self._keys = {key for key in (own, model.upstream and model.upstream.key) if key}
         self.places = AdaptivePlaces(settings.mllm_concurrency)
         self.capabilities = store_of(settings.data_dir, model.server, model.name, model.first)
         self._instructions = load_prompt(SYSTEM_PROMPT)
@@ -173,15 +179,8 @@ class MllmClient:
         prompt, parser, used = load_prompt(call.prompt), _ReplyParser(call.parse), RunUsage()
         seconds = self._budget if given.until is None else min(self._budget, given.until - time.time())
         model = LearningModel(
-            self.model,
-            self.capabilities,
-            call.schema,
-            self.places,
-            self._timeout,
-            seconds,
-            place_seconds=self._budget,
+            self.model, self.capabilities, call, self.places, self._timeout, seconds, place_seconds=self._budget
         )
-        images = [BinaryContent(image, media_type=MEDIA_TYPE) for image in call.images]
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
             max_tokens=int(defaults.get("max_tokens", 4096)),
@@ -197,7 +196,7 @@ class MllmClient:
         try:
             with anyio.fail_after(self._budget):
                 run = await self._agent.run(
-                    [*images, prompt.render(**call.inputs)],
+                    prompt.render(**call.inputs),
                     output_type=TextOutput(parser.read),
                     model=model,
                     model_settings=self._supported(settings),
@@ -212,7 +211,8 @@ class MllmClient:
         finally:  # in the one thread of the event loop, so that calls at the same time do not lose each other's usage
             tokens = {"input_tokens": used.input_tokens, "output_tokens": used.output_tokens}
             given.calls.usage += Usage(calls=model.calls, **tokens)
-            given.calls.notes |= dict.fromkeys(model.notes)
+            if model.note:
+                given.calls.notes[model.note] = None
             given.calls.prompts |= {prompt.name: prompt.version, SYSTEM_PROMPT: self._instructions.version}
 
     def _supported(self, settings: ModelSettings) -> ModelSettings:
@@ -256,14 +256,7 @@ class MllmClient:
         is_own = isinstance(error, errors.ModelQuotaExceededError)
         if is_own or not isinstance(error, errors.ModelHTTPError) or error.status_code not in _CALLERS_STATUS:
             return None
-        message = reason_of(error)
-        match error.body:
-            case {"error": {"message": str(said)}} | {"message": str(said)} | {"detail": str(said)}:
-                message = shortened(said, MAX_REFUSAL)
-            case _:
-                pass
-        for key in self._keys:
-            message = message.replace(key, "***")
+        message = f"{self._name} refused the call: {reason_of(error)}."
         return {"status": error.status_code, "message": message, "retry_after": error.retry_after}
 
     def _closed(self) -> MllmUnavailable:
@@ -291,7 +284,7 @@ _CALLERS_STATUS = (
     HTTPStatus.BAD_REQUEST, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.UNPROCESSABLE_ENTITY,
     HTTPStatus.TOO_MANY_REQUESTS,
 )  # fmt: skip
-MAX_REFUSAL = 2000  # characters of a server's own words
+MAX_LOGGED = 2000  # characters of a server's own words
 _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     (errors.ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
     (
@@ -423,13 +416,13 @@ class RetryingModel(WrapperModel):
 
 
 class LearningModel(RetryingModel):
-    """Asks as the server takes it, which is learned from its refusals. `notes` say what was sent otherwise."""
+    """Asks in the way that the server takes, which its refusals teach. `note` says what was changed for that."""
 
     def __init__(
         self,
         model: ConfiguredModel,
         capabilities: CapabilityStore,
-        schema: Schema,
+        call: PromptCall[Any],
         places: AdaptivePlaces,
         timeout: float,
         seconds: float,
@@ -437,9 +430,10 @@ class LearningModel(RetryingModel):
         place_seconds: float,
     ) -> None:
         super().__init__(model.model, places, timeout, seconds, place_seconds=place_seconds)
-        self._variant, self._capabilities, self._schema = model.variant, capabilities, schema
+        self._variant, self._capabilities, self._call = model.variant, capabilities, call
         self._takes, self._steps = capabilities.current, 0
-        self.notes: tuple[str, ...] = ()
+        self._key = model.upstream and model.upstream.key
+        self.note = ""
 
     async def _attempt(
         self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
@@ -450,11 +444,14 @@ class LearningModel(RetryingModel):
                 response = await super()._attempt(messages, settings, parameters)
             except errors.ModelAPIError as error:
                 self._steps += 1
+                if isinstance(error, errors.ModelHTTPError):
+                    said = shortened(str(error), MAX_LOGGED)
+                    log.debug("an MLLM refused a call: %s", said.replace(self._key, "***") if self._key else said)
                 # A first fault of a server may pass; a refusal of the call itself does not.
                 is_refusal = isinstance(error, errors.ModelHTTPError) and error.status_code in REFUSED
                 may_pass = not is_refusal and len(self.failures) == 1
                 if self._steps > MAX_STEPS or not self._capabilities.refuse(
-                    self._takes, error, images_in(messages), may_pass=may_pass
+                    self._takes, error, len(self._call.images), may_pass=may_pass
                 ):
                     raise
                 self.failures.pop()
@@ -466,8 +463,16 @@ class LearningModel(RetryingModel):
         self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
     ) -> ModelResponse:
         takes = self._takes
-        messages, note = fit_images(messages, takes)
-        self.notes = (note,) if note else ()
+        fitted = await anyio.to_thread.run_sync(fit_images, self._call.images, takes)
+        self.note = fitted.note
+        shown = [BinaryContent(each, media_type=MEDIA_TYPE) for each in fitted.jpegs]
+        shown += [fitted.caption] if fitted.caption else []
+        first = cast("ModelRequest", messages[0])
+        parts = [
+            replace(part, content=[*shown, cast("str", part.content)]) if isinstance(part, UserPromptPart) else part
+            for part in first.parts
+        ]
+        messages = [replace(first, parts=parts), *messages[1:]]
         refused = [name for name in ("temperature", "seed") if not getattr(takes, name)]
         sent = cast("ModelSettings", {name: value for name, value in (settings or {}).items() if name not in refused})
         if takes.output != "prompt":
@@ -475,7 +480,7 @@ class LearningModel(RetryingModel):
             parameters = replace(
                 parameters,
                 output_mode="native" if takes.output == "json_schema" else "prompted",
-                output_object=OutputObjectDefinition(self._schema, "reply"),
+                output_object=OutputObjectDefinition(self._call.schema, "reply"),
                 prompted_output_template=False,  # the prompt shows the shape
             )
         model = self.wrapped if self._variant is None else self._variant(takes)
@@ -513,7 +518,7 @@ def reason_of(error: errors.ModelAPIError) -> str:
         if isinstance(error, kind):
             return words
     if isinstance(error, errors.ModelHTTPError):
-        return f"it answered with status {error.status_code}"
+        return f"it answered with status {error.status_code} (COW_LOG_LEVEL=debug logs its own words)"
     return "its reply could not be read; check that COW_MLLM_BASE_URL is that of an OpenAI-compatible server"
 
 

@@ -15,15 +15,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.errors import InternalError, InvalidRequest
+from cow_service.errors import InvalidRequest
+from cow_service.media.images import encode_jpeg
 from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number, listed
 from cow_service.records import BBox, Point
 from cow_service.weights.manifests import Coordinates, Family, ImageSize
 
 MEDIA_TYPE = "image/jpeg"
 QUALITY = 95  # percent; fine lines such as drawn arrows stay clean
-# Each colour channel keeps its full resolution: a red arrow on green would smear else.
-_ENCODING = (cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 OVERSHOOT = 0.02  # of the image's side: so far outside a place is cut off at the edge, further out it is refused
 LEAST_SIDE = 1.0  # px of the upright image: a narrower box has no area
 LEAST_LENGTH = 2.0  # px of the upright image between the ends of a direction
@@ -175,10 +174,7 @@ def encode(pixels: NDArray[np.uint8], family: Family) -> EncodedImage:
         smaller = size[0] * size[1] < width * height
         resized = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
         pixels = np.asarray(resized, np.uint8)
-    done, data = cv2.imencode(".jpg", pixels[..., ::-1], _ENCODING)
-    if not done:
-        raise InternalError("The image could not be encoded for the multimodal LLM.")
-    return EncodedImage(data.tobytes(), CoordinateFrame(width, height, size, family.coordinates))
+    return EncodedImage(encode_jpeg(pixels, QUALITY), CoordinateFrame(width, height, size, family.coordinates))
 
 
 def _numbers(written: object) -> list[float]:

@@ -16,7 +16,7 @@ from pydantic_ai.providers.openai_compatible import OpenAICompatibleProvider
 
 from cow_service.errors import ReaderUnavailable
 from cow_service.readers.chat import Upstream
-from cow_service.readers.mllm.capabilities import Capabilities
+from cow_service.readers.mllm.capabilities import ServerCapabilities
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
 
@@ -35,14 +35,16 @@ class ConfiguredModel:
     family: Family
     deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
     upstream: Upstream | None = None  # the OpenAI-compatible server; None for another protocol
-    variant: Callable[[Capabilities], Model] | None = None  # for what its server takes; None: pydantic-ai knows it
+    variant: Callable[[ServerCapabilities], Model] | None = (
+        None  # for what its server takes; None: pydantic-ai knows it
+    )
     server: str = ""  # its address, or its provider's name
 
     @property
-    def first(self) -> Capabilities:
+    def first(self) -> ServerCapabilities:
         """What is taken for granted before the server has refused anything."""
         has_schema = bool(self.model.profile.get("supports_json_schema_output", False))
-        return Capabilities(output="json_schema" if has_schema else "prompt")
+        return ServerCapabilities(output="json_schema" if has_schema else "prompt")
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def configure(settings: Settings) -> ConfiguredModel:
     if base_url is not None and provider not in OWN_PROTOCOL:
         server = OpenAICompatibleProvider("mllm", base_url=base_url, api_key=key or NO_KEY)
 
-        def variant(takes: Capabilities) -> Model:
+        def variant(takes: ServerCapabilities) -> Model:
             profile = OpenAIModelProfile(
                 supports_json_schema_output=True,
                 supports_json_object_output=True,
@@ -116,7 +118,7 @@ def configure(settings: Settings) -> ConfiguredModel:
             )
             return OpenAIChatModel(name, provider=server, profile=profile)
 
-        upstream, model = Upstream(base_url.rstrip("/"), name, key), variant(Capabilities())
+        upstream, model = Upstream(base_url.rstrip("/"), name, key), variant(ServerCapabilities())
         return ConfiguredModel(
             model, name, manifest, family, upstream=upstream, variant=variant, server=upstream.base_url
         )

@@ -195,10 +195,7 @@ class MllmReader:
         readings = tuple(each for each in results if not isinstance(each, CowError))
         if not readings:
             raise next(each for each in results if isinstance(each, CowError))
-        notes = tuple(
-            f"The multimodal LLM's server takes less than was to be sent. {note}" for note in given.calls.notes
-        )
-        return tuple(replace(each, notes=(*each.notes, *notes)) for each in readings)
+        return tuple(replace(each, notes=(*each.notes, *given.calls.notes)) for each in readings)
 
     def _identify(self, given: ReaderInput) -> tuple[EncodedImage, Identified | None]:
         """The image as it is sent, and the question about it; of several arrows the MLLM says which one is meant."""
