@@ -183,3 +183,10 @@ def test_steps_end(words: list[str], status: int, images: int) -> None:
         seen.append(lower)
         takes = lower
     assert len(seen) <= 12  # each step leaves something out
+
+
+def test_a_picture_that_is_too_large_alone_is_not_sent_in_other_forms(mllm: MllmServer, tmp_path: Path) -> None:
+    mllm.say(refusing(lambda _: True, 400, "This model's maximum context length is 400 tokens."))
+    with pytest.raises(Exception, match="smaller image"):
+        asked_with_frames(mllm, tmp_path)
+    assert all("json_schema" in json.dumps(call["response_format"]) for call in mllm.asked)

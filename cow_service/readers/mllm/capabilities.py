@@ -127,7 +127,8 @@ def step_down(
     if isinstance(error, errors.ModelHTTPError):
         update = next(_named_steps(used, error, images), None)
         may_learn = error.status_code in REFUSED or error.status_code == HTTPStatus.INTERNAL_SERVER_ERROR
-        if update is None and may_learn and not is_proven:  # else this call is at fault, not what every call has
+        # Else this call is at fault, not what every call is sent with.
+        if update is None and may_learn and not is_proven and not _is_too_large(error):
             update = next(_blind_steps(used), None)
     else:  # no chat completion: it may be one in pieces
         unreadable = type(error) is errors.ModelAPIError and not is_proven
@@ -136,19 +137,24 @@ def step_down(
     return None if update is None else used.model_copy(update=update)
 
 
+def _is_too_large(error: errors.ModelHTTPError) -> bool:
+    if isinstance(error, errors.ModelContextWindowExceededError) or error.status_code == _SIZE_STATUS:
+        return True
+    return error.status_code in REFUSED and _TOO_LARGE.search(str(error.body or "")) is not None
+
+
 def _named_steps(used: ServerCapabilities, error: errors.ModelHTTPError, images: int) -> Iterator[dict[str, object]]:
     """Steps for what a refusal names."""
     status, said = error.status_code, str(error.body or "")
-    too_large = isinstance(error, errors.ModelContextWindowExceededError) or status == _SIZE_STATUS
-    if (too_large or (status in REFUSED and _TOO_LARGE.search(said))) and used.reduction < MAX_REDUCTION:
-        only_first = images == 1  # what is done to frames does not help
-        yield {"reduction": max(used.reduction, FEWER_FRAMES if only_first else 0) + 1}
-    if status not in REFUSED and status != HTTPStatus.INTERNAL_SERVER_ERROR:
-        return
     counted = _IMAGES.search(said)
     most = int(counted[1]) if counted else 1 if _ONE_IMAGE.search(said) else images
-    if 0 < most < images:
+    if status in REFUSED and 0 < most < images:
         yield {"images": most}
+    if _is_too_large(error) and used.reduction < MAX_REDUCTION:
+        only_first = images == 1  # what is done to frames does not help
+        yield {"reduction": max(used.reduction, FEWER_FRAMES if only_first else 0) + 1}
+    if _is_too_large(error) or status not in (*REFUSED, HTTPStatus.INTERNAL_SERVER_ERROR):
+        return
     if "max_completion_tokens" in said:
         had_new = used.token_field == "max_completion_tokens"
         yield {"token_field": "max_tokens" if had_new else "max_completion_tokens"}

@@ -16,16 +16,8 @@ from typing import Any, Generic, TypeVar, cast
 import anyio
 from pydantic_ai import Agent, BinaryContent, ModelRetry, TextOutput
 from pydantic_ai import exceptions as errors
+from pydantic_ai import messages as ai
 from pydantic_ai.direct import model_request
-from pydantic_ai.messages import (
-    ModelMessage,
-    ModelRequest,
-    ModelResponse,
-    TextPart,
-    ThinkingPart,
-    ToolCallPart,
-    UserPromptPart,
-)
 from pydantic_ai.models import Model, ModelRequestParameters
 from pydantic_ai.models.wrapper import WrapperModel
 from pydantic_ai.output import OutputObjectDefinition
@@ -291,7 +283,10 @@ _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
         errors.ModelNotFoundError,
         "there is no model of that name; COW_MLLM_MODEL says under which name it is served there",
     ),
-    (errors.ModelContextWindowExceededError, "the images and the question are more than it takes; send fewer frames"),
+    (
+        errors.ModelContextWindowExceededError,
+        "the images and the question are more than it takes; send a smaller image",
+    ),
     (errors.ModelQuotaExceededError, "the account's quota is used up"),
     (errors.ModelRateLimitError, "it takes no more requests for now (429); try later"),
     (errors.ModelTimeoutError, "it did not reply in time; COW_MLLM_TIMEOUT says how long to wait"),
@@ -334,10 +329,10 @@ class RetryingModel(WrapperModel):
 
     async def request(
         self,
-        messages: list[ModelMessage],
+        messages: list[ai.ModelMessage],
         model_settings: ModelSettings | None,
         model_request_parameters: ModelRequestParameters,
-    ) -> ModelResponse:
+    ) -> ai.ModelResponse:
         """The reply. Raises `ModelAPIError`, `ContentFilterError`."""
 
         def is_transient(error: BaseException) -> bool:
@@ -366,13 +361,13 @@ class RetryingModel(WrapperModel):
         return await retrying(self._attempt, messages, model_settings, model_request_parameters)
 
     async def _send(
-        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
-    ) -> ModelResponse:
+        self, messages: list[ai.ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ai.ModelResponse:
         return await super().request(messages, settings, parameters)
 
     async def _attempt(
-        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
-    ) -> ModelResponse:
+        self, messages: list[ai.ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ai.ModelResponse:
         async with AsyncExitStack() as stack:
             now = time.monotonic()
             # Where the server has asked for a longer pause than there is time, no place comes free in time.
@@ -436,8 +431,8 @@ class LearningModel(RetryingModel):
         self.note = ""
 
     async def _attempt(
-        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
-    ) -> ModelResponse:
+        self, messages: list[ai.ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ai.ModelResponse:
         while True:
             self._takes = self._capabilities.current
             try:
@@ -460,16 +455,16 @@ class LearningModel(RetryingModel):
                 return with_text(response)
 
     async def _send(
-        self, messages: list[ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
-    ) -> ModelResponse:
+        self, messages: list[ai.ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
+    ) -> ai.ModelResponse:
         takes = self._takes
         fitted = await anyio.to_thread.run_sync(fit_images, self._call.images, takes)
         self.note = fitted.note
         shown = [BinaryContent(each, media_type=MEDIA_TYPE) for each in fitted.jpegs]
         shown += [fitted.caption] if fitted.caption else []
-        first = cast("ModelRequest", messages[0])
+        first = cast("ai.ModelRequest", messages[0])
         parts = [
-            replace(part, content=[*shown, cast("str", part.content)]) if isinstance(part, UserPromptPart) else part
+            replace(part, content=[*shown, cast("str", part.content)]) if isinstance(part, ai.UserPromptPart) else part
             for part in first.parts
         ]
         messages = [replace(first, parts=parts), *messages[1:]]
@@ -494,15 +489,15 @@ class LearningModel(RetryingModel):
             return stream.get()
 
 
-def with_text(response: ModelResponse) -> ModelResponse:
+def with_text(response: ai.ModelResponse) -> ai.ModelResponse:
     """The reply as text: servers put it into a tool call or, with nothing else, at the end of what was thought."""
-    if any(isinstance(part, TextPart) and part.content.strip() for part in response.parts):
+    if any(isinstance(part, ai.TextPart) and part.content.strip() for part in response.parts):
         return response
-    called = [part.args_as_json_str() for part in response.parts if isinstance(part, ToolCallPart)]
-    thought = [part.content for part in response.parts if isinstance(part, ThinkingPart) if part.content]
+    called = [part.args_as_json_str() for part in response.parts if isinstance(part, ai.ToolCallPart)]
+    thought = [part.content for part in response.parts if isinstance(part, ai.ThinkingPart) if part.content]
     ended = [text for text in thought if text.rstrip().endswith(("}", "]", "```"))]
     said = called or (ended if response.finish_reason != "length" else [])
-    return replace(response, parts=[TextPart(said[-1])]) if said else response
+    return replace(response, parts=[ai.TextPart(said[-1])]) if said else response
 
 
 def is_busy(error: errors.ModelAPIError) -> bool:
