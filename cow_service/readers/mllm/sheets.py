@@ -50,9 +50,7 @@ def fit_images(jpegs: Sequence[bytes], takes: ServerCapabilities) -> FittedImage
         first, frames = (sheet, []) if most == 1 else (first, [sheet])
         which = "All images" if most == 1 else "All images after the first"
         caption += f"{which} are on one sheet, from left to right and row by row."
-        note = (
-            f"The multimodal LLM's server takes {most} images a call, so frames were sent on one sheet. {note}".strip()
-        )
+        note = f"The multimodal LLM's server takes fewer images a call: frames were sent on one sheet. {note}".strip()
     quality = QUALITIES.get(takes.reduction)
     encoded = encode_jpeg(first) if quality is None else encode_jpeg(first, quality)
     return FittedImages((encoded, *map(encode_jpeg, frames)), caption.strip(), note)
