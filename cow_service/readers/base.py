@@ -210,6 +210,7 @@ class MotionReading:
     steps: tuple[StepReading, ...] = ()
     trail: tuple[Point, ...] = ()  # earlier positions that are shown, oldest first, px
     others: tuple[OtherMotionReading, ...] = ()
+    speed_deviation: float | None = None  # of ln speed; null if nothing is said of the speed
     metres_per_pixel: records.MetresPerPixel | None = None  # null if the reader cannot tell
     down: Vector = (0.0, 1.0)  # unit vector: which way things fall in the image
     sentence: str | None = None

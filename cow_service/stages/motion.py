@@ -317,8 +317,11 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
     thing = LocatedObject(object=grounding.object, bbox=grounding.bbox)
     mover = _moving(thing, reading, scale, law, image_width, DIRECTION_DEVIATIONS[reading.cue])
     depth_deviation = THROW_DEPTH_DEVIATION if reading.kind == "projectile" else 0.0
+    speed_deviation = mover.speed_deviation if moves else 0.0
     if moves and reading.depth_deviation is not None:
         depth_deviation = reading.depth_deviation
+    if moves and reading.speed_deviation is not None:
+        speed_deviation = reading.speed_deviation
     steps = tuple(
         records.MotionStep(
             direction=_unit(step.direction),
@@ -347,7 +350,7 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
         cue=reading.cue,
         along_arrow=reading.along_arrow,
         speed=mover.speed,
-        speed_deviation=mover.speed_deviation if moves else 0.0,
+        speed_deviation=speed_deviation,
         distance=None if reading.distance is None else _pixels(reading.distance, scale, image_width),
         duration=reading.duration,
         until=reading.until,

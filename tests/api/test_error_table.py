@@ -107,9 +107,11 @@ def canceled(doors: Doors) -> httpx.Response:
 
 def read_by_the_mllm(reply: Any, question: str) -> Provoke:
     def provoke(doors: Doors) -> httpx.Response:
-        doors("mllm").next_replies = [reply]
+        doors("mllm").next_replies = [reply] * 40  # in whichever form the call is sent
         body = {"image": BODY["image"], "question": question}
-        return doors("served").http.post("/simulate", json=body, headers={"Cache-Control": "no-cache"})
+        response = doors("served").http.post("/simulate", json=body, headers={"Cache-Control": "no-cache"})
+        doors("mllm").next_replies = []
+        return response
 
     return provoke
 
@@ -306,8 +308,8 @@ TABLE: dict[str, list[tuple[Any, ...]]] = {
     "mllm-bad-reply": [(chatted(failing(200, b"<html>")),
          "The server of the multimodal LLM replied with something other than a JSON object.")],
     "mllm-refused": [(read_by_the_mllm(failing(400, {}), QUESTION),
-         "The multimodal LLM 'Qwen/Qwen3-VL-8B-Instruct' rejected the call (identify): it answered with status "
-         "400.")],
+         "The multimodal LLM 'Qwen/Qwen3-VL-8B-Instruct' rejected the call (locate): it answered with status "
+         "400 (COW_LOG_LEVEL=debug logs its own words).")],
     "mllm-unavailable": [(chatted(failing(401, {})),
          "The server of the multimodal LLM answered with status 401: its address or this server's own key for it "
          "is wrong (COW_MLLM_BASE_URL, COW_MLLM_API_KEY).")],
