@@ -1,15 +1,16 @@
 """The pipeline: what happens to a request, stage by stage. The only file that names the stages in order."""
 
+from contextlib import nullcontext
+
 from cow_service import errors
 from cow_service.narration.summary import narrate
 from cow_service.readers.options import choices_source, read_choices
 from cow_service.records import Answer, Problem, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
-from cow_service.stages.answering import answer_question, ask_first, gate_of
+from cow_service.stages.answering import answer_question, ask_baseline, ask_first, gate_of
 from cow_service.stages.depth import estimate_depth
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
-from cow_service.stages.keys import Verdicts
 from cow_service.stages.motion import read_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
@@ -49,7 +50,8 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
 def answer(run: Run[AnswerRequest]) -> Answer:
     """Imagines, unless the request says never or the gate sees no need, then answers.
 
-    A simulation that fails does not lose the answer: it is then given from the image alone, with a warning.
+    The baseline, which needs only the image, is asked for meanwhile. A simulation that fails does not lose the answer:
+    it is then given from the image alone, with a warning.
     Raises `InvalidRequest`, `Canceled`, `ReaderUnavailable`, `MllmBadReply`, `MllmRefused`,
     `MllmUnavailable`.
     """
@@ -57,21 +59,27 @@ def answer(run: Run[AnswerRequest]) -> Answer:
     first = run.stage("gating", ask_first) if request.imagine == "auto" else None
     gate = None if first is None else gate_of(first, request.imagine_threshold)
     wanted = request.imagine == "always" if gate is None else gate.imagined
-    simulation, failure = _imagine(run) if wanted else (None, None)
-    if simulation is None and first is not None and first.verdict is not None:
-        # Where there is nothing to look at, the answer is that of the gate: asked once is enough.
-        verdicts = Verdicts(verdict=first.verdict, baseline=first.verdict if request.baseline else None)
-        warnings = run.warnings("gating")
+    is_asked = wanted and request.baseline and (first is None or first.verdict is None)
+    if is_asked:
+        run.check_request()
+    with run.beside("baseline", ask_baseline) if is_asked else nullcontext() as baseline:
+        simulation, failure = _imagine(run) if wanted else (None, None)
+        verdict = None if simulation is None else run.stage("answering", answer_question, run.grounding, simulation)
+        first = first if baseline is None else baseline()
+    alone = None if first is None else first.verdict
+    if simulation is not None and verdict is not None:  # whoever reads only the answer must see what it rests on
+        missing = run.warnings("baseline") if alone is None else ()
+        warnings = tuple(dict.fromkeys((*simulation.warnings, *missing, *run.warnings("answering"))))
+    elif alone is not None:  # asked once is enough
+        verdict, warnings = alone, run.warnings("baseline" if is_asked else "gating")
     else:
-        verdicts = run.stage("answering", answer_question, run.grounding, simulation, first)
+        verdict = alone = run.stage("answering", answer_question, run.grounding, None)
         warnings = run.warnings("answering")
-    if simulation is not None:  # whoever reads only the answer must see what it rests on
-        warnings = tuple(dict.fromkeys((*simulation.warnings, *warnings)))
     if failure is not None:
         why = f"{failure.code}: {failure}"
         warnings = (f"Nothing was imagined, the answer is from the image alone. {why}", *warnings)
     return Answer(
-        **dict(verdicts.verdict),
+        **dict(verdict),
         id=run.id,
         created_at=run.created_at,
         question=run.request.question,
@@ -81,9 +89,9 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         simulation=simulation,
         simulation_problem=None if failure is None else Problem(**failure.as_problem()),
         gate=gate,
-        baseline=verdicts.baseline,
-        reader=run.reader_info("gating", "grounding", "motion", "answering"),
-        **run.accounts("gating", *SIMULATION_STAGES, "answering"),
+        baseline=alone if request.baseline else None,
+        reader=run.reader_info("gating", "baseline", "grounding", "motion", "answering"),
+        **run.accounts("gating", "baseline", *SIMULATION_STAGES, "answering"),
         warnings=warnings,
     )
 

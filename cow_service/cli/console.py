@@ -87,7 +87,7 @@ def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], 
     columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
     with Progress(*columns, console=console, transient=True) as bars:
         bar = bars.add_task("loading", total=1.0)  # loading a model takes a while before the first stage
-        yield lambda stage, done: bars.update(bar, description=stage or "loading", completed=done)
+        yield lambda stage, done: bars.update(bar, description=stage, completed=stage and done)
 
 
 def print_stages(console: Console, simulation: Simulation) -> None:

@@ -8,7 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 from weakref import WeakValueDictionary
@@ -39,6 +39,8 @@ SHARE_WAITING = 0.5  # of the memory, that such jobs may take all together if th
 
 # Stages that take less than their transactions would: behind one that was computed they are not looked for, either.
 QUICK: tuple[Stage, ...] = ("grounding", "depth", "motion", "trajectory")
+# Stages that run beside others. Two jobs that each held a key and waited for the other's would wait for ever.
+UNLOCKED: tuple[Stage, ...] = ("baseline",)
 
 Value = TypeVar("Value")
 HoldKey = Callable[[str, Callable[[], None]], AbstractContextManager[None]]
@@ -97,7 +99,7 @@ class KeyLocks:
 
 @dataclass
 class StoredStep:
-    """The `Step` of one job: stored results are not computed again.
+    """The `Step` of one job: stored results are not computed again. Its stages may run in several threads.
 
     Results of quick stages are stored together, before the next one that may take long, or by `flush`: a transaction
     costs more than they do. One that waits for that is computed again by a job that wants the same at this moment. What
@@ -115,6 +117,7 @@ class StoredStep:
     trajectory_key: str | None = None  # of this job's trajectory, where it computed one
     stages: set[str] = field(default_factory=set[str])  # whose results are stored, or wait for that
     waiting: list[StoredResult] = field(default_factory=list[StoredResult])  # to be stored
+    guard: threading.Lock = field(default_factory=threading.Lock)  # of `waiting`
 
     def __call__(
         self, stage: Stage, key: StageKey, compute: Callable[[], StageResult[Any]]
@@ -129,21 +132,23 @@ class StoredStep:
         elif self.owner is not None:
             scope = {"owner": self.owner}
         digest, *also = (digest_of({**scope, "key": each}) if scope else each for each in (key.digest, *key.also))
-        with self.hold_key(digest, self.outages.check_canceled):
+        with nullcontext() if stage in UNLOCKED else self.hold_key(digest, self.outages.check_canceled):
             found = None
-            if stage not in QUICK or not self.waiting:
-                found = self.outages.wait_through(
-                    lambda: next((each for key in (digest, *also) if (each := self._find(stage, key))), None)
-                )
+            with self.guard:
+                if stage not in QUICK or not self.waiting:
+                    found = self.outages.wait_through(
+                        lambda: next((each for key in (digest, *also) if (each := self._find(stage, key))), None)
+                    )
             self.looked_for(stage, found is not None and found[1])
             if found is None:
                 found = result, _ = self.outages.wait_through(compute), False
                 text, trajectory = result.model_dump_json(exclude={"value"} if stage == "trajectory" else None), None
                 if stage == "trajectory":
                     trajectory, self.trajectory_key = result.value.model_dump_json(), digest
-                self.waiting.append(StoredResult(digest, stage, text, result.artifacts, trajectory))
-                if result.usage.calls or stage not in QUICK:
-                    self.flush()
+                with self.guard:
+                    self.waiting.append(StoredResult(digest, stage, text, result.artifacts, trajectory))
+                    if result.usage.calls or stage not in QUICK:
+                        self.flush()
             self.stages.add(stage)
             return found
 

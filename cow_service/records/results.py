@@ -41,7 +41,7 @@ class ReaderInfo(Record):
     model: str | None = Field(default=None, description="Name under which the multimodal LLM is served.")
     revision: str | None = None
     prompts: dict[str, int] = Field(default_factory=dict, description="Version of each prompt sent.")
-    stages: tuple[Literal["gating", "grounding", "motion", "answering"], ...] = Field(
+    stages: tuple[Literal["gating", "baseline", "grounding", "motion", "answering"], ...] = Field(
         default=(), description="The stages that used the reader; the request gave the others."
     )
 

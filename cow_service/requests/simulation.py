@@ -576,4 +576,4 @@ class AnswerRequest(SimulateRequest):
     votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer wins.")
 
 
-Stage = Literal["gating", "grounding", "depth", "motion", "trajectory", "generation", "answering"]
+Stage = Literal["gating", "baseline", "grounding", "depth", "motion", "trajectory", "generation", "answering"]

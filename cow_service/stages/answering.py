@@ -2,28 +2,24 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
+from dataclasses import replace
 
 from cow_service.errors import MllmBadReply
 from cow_service.media.images import decode_own
 from cow_service.readers.base import AnswerReading, Imagined, Reader, ReaderInput
 from cow_service.readers.options import read_choices
 from cow_service.records import AnswerOption, Gate, GateReason, Grounding, Simulation, Verdict
-from cow_service.requests import AnswerRequest
-from cow_service.stages.keys import FirstAnswers, StageResult, Verdicts
+from cow_service.requests import AnswerRequest, Stage
+from cow_service.stages.keys import FirstAnswers, StageResult
 from cow_service.stages.run import Run
 
 NOT_SURE = "not sure"  # the name of that vote where no option says so
 
 
 def answer_question(
-    run: Run[AnswerRequest], grounding: Grounding | None, simulation: Simulation | None, first: FirstAnswers | None
-) -> StageResult[Verdicts]:
-    """The answer after looking at a simulation, or from the image alone; and the baseline where it is wanted.
-
-    `first` are the answers of the gate: where it has any, they are the baseline. Raises what the reader raises where it
-    gives no answer at all.
-    """
+    run: Run[AnswerRequest], grounding: Grounding | None, simulation: Simulation | None
+) -> StageResult[Verdict]:
+    """The answer after looking at a simulation, or from the image alone. Raises what the reader raises."""
     request = run.request
     options = read_choices(request.question, request.options)
     given = run.reader_input("answering")
@@ -35,17 +31,8 @@ def answer_question(
                 for chosen in (simulation.frames, simulation.factual_frames)
             )
             imagined = Imagined(simulation, frames, factual)
-    answer = partial(ask, run.reader, given, options, grounding, votes=request.votes)
-    verdict, warnings = answer(imagined)
-    baseline = None if first is None or not request.baseline else first.verdict
-    if request.baseline and imagined is None:
-        baseline = verdict
-    elif request.baseline and baseline is None:
-        try:
-            baseline, _ = answer(None)
-        except MllmBadReply as error:
-            warnings = (f"There is no baseline answer: {error.detail}", *warnings)
-    return StageResult(value=Verdicts(verdict=verdict, baseline=baseline), warnings=warnings)
+    verdict, warnings = ask(run.reader, given, options, grounding, imagined, request.votes)
+    return StageResult(value=verdict, warnings=warnings)
 
 
 def ask(
@@ -82,17 +69,27 @@ def _named(reading: AnswerReading) -> str:
 
 
 def ask_first(run: Run[AnswerRequest]) -> StageResult[FirstAnswers]:
-    """The answers from the image alone. A reader that gives the same each time is asked once: more votes say no more.
+    """The answers of the gate. A reader that gives the same each time is asked once: more votes say no more."""
+    votes = run.request.imagine_votes
+    return _ask_alone(run, "gating", 1 if run.repeats_answers(votes) else votes)
 
-    Raises what the reader raises where it gives no answer, but for a reply that cannot be used: then looking may help.
-    """
+
+def ask_baseline(run: Run[AnswerRequest]) -> StageResult[FirstAnswers]:
+    """The answer to compare with the one after looking."""
+    return _ask_alone(run, "baseline", run.request.votes)
+
+
+def _ask_alone(run: Run[AnswerRequest], stage: Stage, votes: int) -> StageResult[FirstAnswers]:
+    """The answers from the image alone; no verdict where no reply can be used. Raises what else the reader raises."""
     request = run.request
     options = read_choices(request.question, request.options)
-    votes = 1 if run.repeats_answers(request.imagine_votes) else request.imagine_votes
+    # Not the language that the grounding finds: it may be at work meanwhile.
+    given = replace(run.reader_input(stage), language=request.language or "en")
     try:
-        verdict, warnings = ask(run.reader, run.reader_input("gating"), options, None, None, votes)
-    except MllmBadReply:
-        return StageResult(value=FirstAnswers(verdict=None, asked=votes))
+        verdict, warnings = ask(run.reader, given, options, None, None, votes)
+    except MllmBadReply as error:
+        warning = f"There is no baseline answer: {error.detail}"
+        return StageResult(value=FirstAnswers(verdict=None, asked=votes), warnings=(warning,))
     return StageResult(value=FirstAnswers(verdict=verdict, asked=votes), warnings=warnings)
 
 

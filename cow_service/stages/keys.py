@@ -34,13 +34,6 @@ class StageResult(Record, Generic[Value]):
     hints: MotionHints | None = None  # of stage 1 for stage 2
 
 
-class Verdicts(Record):
-    """The value of stage 5: the answer, and the one from the image alone where the request wants it for comparison."""
-
-    verdict: Verdict
-    baseline: Verdict | None = None
-
-
 class EstimatedDepth(Record):
     """The value of the stage `depth`: what a depth model makes of the image, as a caller would give it."""
 
@@ -48,7 +41,7 @@ class EstimatedDepth(Record):
 
 
 class FirstAnswers(Record):
-    """The value of the gate: the answer from the image alone, and how many votes it was asked for with."""
+    """The value of the gate and of the baseline: the answer from the image alone, and how many votes were asked for."""
 
     verdict: Verdict | None  # null where no vote could be read
     asked: int
@@ -56,12 +49,13 @@ class FirstAnswers(Record):
 
 RESULT_TYPES: dict[Stage, type[StageResult[Any]]] = {
     "gating": StageResult[FirstAnswers],
+    "baseline": StageResult[FirstAnswers],
     "grounding": StageResult[Grounding],
     "depth": StageResult[EstimatedDepth],
     "motion": StageResult[Motion],
     "trajectory": StageResult[Trajectory],
     "generation": StageResult[Clip],
-    "answering": StageResult[Verdicts],
+    "answering": StageResult[Verdict],
 }
 
 
@@ -103,6 +97,7 @@ TRAJECTORY_FIELDS = (
 )
 KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "language", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
+    "baseline": KeyFields(("question", "language", "seed", "options", "votes"), "reader", votes="votes"),
     "grounding": KeyFields(
         ("seed", "left_to_reader"),
         "reader",
@@ -122,9 +117,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
     "depth": KeyFields((), perception=("depth",)),
     "trajectory": KeyFields(TRAJECTORY_FIELDS),
     "generation": KeyFields(("clip_seed", "frames", "video"), "generator", perception=("inpainter",)),
-    "answering": KeyFields(
-        ("question", "language", "seed", "options", "votes", "baseline", "imagine"), "reader", votes="votes"
-    ),
+    "answering": KeyFields(("question", "language", "seed", "options", "votes"), "reader", votes="votes"),
 }
 # Of a simulation its id and times do not decide an answer.
 _SIMULATION_FIELDS = {"grounding", "motion", "trajectory", "frames", "factual_frames"}

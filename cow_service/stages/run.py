@@ -1,11 +1,14 @@
 """One request being worked on: its inputs and backends, and how each stage is timed, stored and accounted for."""
 
+import threading
 import time
 import uuid
 from collections import abc
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from contextvars import copy_context
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, Generic, Self, TypeVar
 
@@ -308,8 +311,7 @@ class Run(Generic[Request_co]):
         try:
             result, reused = self.step(name, key, compute)
         except CowError as error:
-            spent = self.usage(stage for stage in (*self.results, name) if stage not in self.reused)
-            error.usage = spent.model_dump() if spent.calls else None
+            error.usage = self._spent()
             raise
         self.results[name] = result
         if reused:
@@ -317,6 +319,31 @@ class Run(Generic[Request_co]):
         self.timings[name] = round(time.perf_counter() - started, 4)
         self.report(name, 1.0)
         return result.value
+
+    @contextmanager
+    def beside(self, name: Stage, function: Callable[..., StageResult[Value]]) -> abc.Generator[Callable[[], Value]]:
+        """Runs a stage without inputs in a thread of its own; yields the function that waits for its value.
+
+        The stage reports no progress. Where the block ends without having waited for it, it is canceled.
+        """
+        left = threading.Event()
+
+        def check(_stage: Stage | None, _done: float) -> None:
+            if left.is_set():
+                raise errors.Canceled("The run has ended without this stage.")
+            self.progress(None, 0.0)
+
+        side = replace(self, progress=check)  # with the same results, times and calls
+        try:
+            with ThreadPoolExecutor(1, thread_name_prefix=name) as thread:
+                outcome = thread.submit(copy_context().run, side.stage, name, function)
+                try:
+                    yield outcome.result
+                finally:
+                    left.set()
+        except CowError as error:
+            error.usage = self._spent()
+            raise
 
     def report(self, name: Stage | None, done: float) -> None:
         """Says how far a stage is, 0 to 1. Raises `Canceled` where nobody wants the result any more."""
@@ -390,6 +417,11 @@ class Run(Generic[Request_co]):
         asked = (self._calls.get(stage) or self.results.get(stage) for stage in stages)
         return sum((each.usage for each in asked if each is not None), Usage())
 
+    def _spent(self) -> dict[str, int] | None:
+        """The usage for an error: what this run has asked so far; None if nothing."""
+        spent = self.usage((self.results.keys() | self._calls.keys()).difference(self.reused))
+        return spent.model_dump() if spent.calls else None
+
     def accounts(self, *stages: Stage) -> dict[str, Any]:
         """What some stages cost and took, and which of them were reused: fields of a result.
 
@@ -398,8 +430,8 @@ class Run(Generic[Request_co]):
         return {
             "usage": self.usage(stage for stage in stages if stage not in self.reused),
             "usage_total": self.usage(stages),
-            "timings": {stage: seconds for stage, seconds in self.timings.items() if stage in stages},
-            "reused": tuple(stage for stage in self.reused if stage in stages),
+            "timings": {stage: self.timings[stage] for stage in stages if stage in self.timings},
+            "reused": tuple(stage for stage in stages if stage in self.reused),
         }
 
     def reader_info(self, *stages: Stage) -> ReaderInfo:

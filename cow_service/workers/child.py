@@ -71,7 +71,7 @@ class _Job:
 
     def _progress(self, stage: Stage | None, done: float) -> None:
         self.active.check()
-        if stage != self.active.at[0] or done >= min(1.0, self.active.at[1] + MIN_PROGRESS):
+        if stage is not None and (stage != self.active.at[0] or done >= min(1.0, self.active.at[1] + MIN_PROGRESS)):
             self.active.at = stage, done
             self._send(messages.Progressed(self.job.id, stage, done))
 

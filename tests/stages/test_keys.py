@@ -9,13 +9,21 @@ import pytest
 from cow_service.requests import AnswerRequest
 from cow_service.stages.keys import KEY_FIELDS, StageKey, key_of
 
-READ = ("gating", "grounding", "motion", "answering")
+READ = ("gating", "baseline", "grounding", "motion", "answering")
 GIVEN = {"grounding": {"point": (200, 200)}, "motion": {"kind": "fall"}}
 PATH = {"trajectory": {"points": [(200, 200), (300, 200)]}}
 # A change of a request, and the stages that it decides where all is left to the reader, and where all is given.
 DECIDE: dict[str, tuple[dict[str, Any], str, str]] = {
-    "question": ({"question": "b"}, "gating grounding motion answering", "gating grounding answering"),
-    "seed": ({"seed": 1}, "gating grounding motion generation answering", "gating generation answering"),
+    "question": (
+        {"question": "b"},
+        "gating baseline grounding motion answering",
+        "gating baseline grounding answering",
+    ),
+    "seed": (
+        {"seed": 1},
+        "gating baseline grounding motion generation answering",
+        "gating baseline generation answering",
+    ),
     "asked": ({"asked": {"relation": "touches", "target": "cube"}}, "grounding", "grounding"),
     "objects": ({"objects": [{"object": "mug", "bbox": [0, 0, 90, 90]}]}, "grounding", "grounding"),
     "objects_complete": ({"objects_complete": True}, "grounding trajectory", "grounding trajectory"),
@@ -27,8 +35,8 @@ DECIDE: dict[str, tuple[dict[str, Any], str, str]] = {
     "num_frames": ({"num_frames": 9}, "trajectory", "trajectory"),
     "live": ({"live": True}, "trajectory", "trajectory"),
     "frames": ({"frames": {"count": 2}}, "generation", "generation"),
-    "votes": ({"votes": 3, "baseline": True}, "answering", "answering"),
-    "options": ({"options": ["a", "b"], "language": "de"}, "gating answering", "gating answering"),
+    "votes": ({"votes": 3, "baseline": True}, "baseline answering", "baseline answering"),
+    "options": ({"options": ["a", "b"], "language": "de"}, "gating baseline answering", "gating baseline answering"),
 }
 
 
@@ -58,7 +66,9 @@ def test_what_came_before_and_the_reader_decide_where_the_request_does_not_say_i
         assert (key(stage, reader="2") != key(stage)) == is_read
         assert (key(stage, reader="2", **GIVEN) != key(stage, **GIVEN)) == (is_read and stage not in GIVEN)
         assert (key(stage, reader=None).shareable, key(stage).shareable) == (not is_read, True)
-        assert key(stage, repeats=False).shareable == (stage not in ("gating", "answering")), "sampled answers are not"
+        assert key(stage, repeats=False).shareable == (stage not in ("gating", "baseline", "answering")), (
+            "sampled answers are not"
+        )
 
 
 def test_the_seed_decides_where_the_reader_heeds_it() -> None:

@@ -27,7 +27,7 @@ from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, wait_ran
 
 from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable, shortened
-from cow_service.readers.base import ReaderInput
+from cow_service.readers.base import CallLog, ReaderInput
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore, store_of
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
@@ -171,7 +171,7 @@ class MllmClient:
         prompt, parser, used = load_prompt(call.prompt), _ReplyParser(call.parse), RunUsage()
         seconds = self._budget if given.until is None else min(self._budget, given.until - time.time())
         model = LearningModel(
-            self.model, self.capabilities, call, self.places, self._timeout, seconds, place_seconds=self._budget
+            self.model, self.capabilities, call, self.places, self._timeout, seconds, given.calls, self._budget
         )
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
@@ -202,9 +202,7 @@ class MllmClient:
             return self._error(call, parser, model, error)
         finally:  # in the one thread of the event loop, so that calls at the same time do not lose each other's usage
             tokens = {"input_tokens": used.input_tokens, "output_tokens": used.output_tokens}
-            given.calls.usage += Usage(calls=model.calls, **tokens)
-            if model.note:
-                given.calls.notes[model.note] = None
+            given.calls.usage += Usage(**tokens)
             given.calls.prompts |= {prompt.name: prompt.version, SYSTEM_PROMPT: self._instructions.version}
 
     def _supported(self, settings: ModelSettings) -> ModelSettings:
@@ -309,16 +307,17 @@ class RetryingModel(WrapperModel):
         places: AdaptivePlaces,
         timeout: float,
         seconds: float,
+        log: CallLog | None = None,
+        place_seconds: float | None = None,
         *,
         retries: bool = True,
-        place_seconds: float | None = None,
     ) -> None:
-        """`place_seconds`: how long a place is waited for, where that is not `seconds`."""
+        """`log` counts the calls. `place_seconds`: how long a place is waited for, where that is not `seconds`."""
         super().__init__(wrapped)
         self._places, self._timeout, self._retries = places, timeout, retries
         self.seconds, self._ends = max(0.0, seconds), time.monotonic() + seconds
         self._place_ends = time.monotonic() + (seconds if place_seconds is None else place_seconds)
-        self.calls = 0
+        self.calls, self._log = 0, log or CallLog()
         self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens
 
@@ -383,6 +382,7 @@ class RetryingModel(WrapperModel):
                     self.failures.append(told)
                 raise (self.failures[-1] if self.failures else error) from None
             self.calls += 1
+            self._log.usage += Usage(calls=1)  # at once: a call that is canceled has been made, too
             try:
                 with anyio.fail_after(self._timeout):
                     response = await self._send(messages, settings, parameters)
@@ -411,7 +411,7 @@ class RetryingModel(WrapperModel):
 
 
 class LearningModel(RetryingModel):
-    """Asks in the way that the server takes, which its refusals teach. `note` says what was changed for that."""
+    """Asks in the way that the server takes, which its refusals teach."""
 
     def __init__(
         self,
@@ -421,14 +421,14 @@ class LearningModel(RetryingModel):
         places: AdaptivePlaces,
         timeout: float,
         seconds: float,
-        *,
+        calls: CallLog,
         place_seconds: float,
     ) -> None:
-        super().__init__(model.model, places, timeout, seconds, place_seconds=place_seconds)
+        super().__init__(model.model, places, timeout, seconds, calls, place_seconds)
         self._variant, self._capabilities, self._call = model.variant, capabilities, call
         self._takes, self._steps = capabilities.current, 0
         self._key = model.upstream and model.upstream.key
-        self.note = ""
+        self._note = ""
 
     async def _attempt(
         self, messages: list[ai.ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
@@ -452,6 +452,8 @@ class LearningModel(RetryingModel):
                 self.failures.pop()
             else:
                 self._capabilities.succeed(self._takes)
+                if self._note:
+                    self._log.notes[self._note] = None
                 return with_text(response)
 
     async def _send(
@@ -459,7 +461,7 @@ class LearningModel(RetryingModel):
     ) -> ai.ModelResponse:
         takes = self._takes
         fitted = await anyio.to_thread.run_sync(fit_images, self._call.images, takes)
-        self.note = fitted.note
+        self._note = fitted.note
         shown = [BinaryContent(each, media_type=MEDIA_TYPE) for each in fitted.jpegs]
         shown += [fitted.caption] if fitted.caption else []
         first = cast("ai.ModelRequest", messages[0])
