@@ -23,6 +23,7 @@ from mllm_server import MllmServer
 from refusals import refused
 from rich.console import Console
 from servers import data_url
+from waiting import eventually
 
 from cow_service.cli.batch import print_summary
 from cow_service.cli.console import answer_table
@@ -284,3 +285,28 @@ def test_a_job_that_goes_on_after_a_crash_draws_nothing_again(
         answers(mllm, list("AAA"))
         others = answer(service.prepare(request, step=replace(step, job_id="two"), run_id="two"))
         assert (others.answer, others.gate and others.gate.votes, others.reused) == ("A", {"A": 3}, ())
+
+
+def test_a_baseline_that_came_before_a_crash_is_not_asked_for_again(
+    service: Service, mllm: MllmServer, tmp_path: Path
+) -> None:
+    answers(mllm, ["A"], looking="B")
+    request = AnswerRequest.model_validate(BODY | GIVEN | {"baseline": True})
+    with closing(open_database(tmp_path)) as database:
+        add_job(database, "one")
+        looked_for, locks, outages = service.metrics.stage_cache, KeyLocks(), Outages(0, lambda: None)
+        step = StoredStep("one", None, False, database, service.artifacts, looked_for, locks.held, outages)
+
+        def crash(stage: Stage | None, _done: float) -> None:
+            if stage == "generation":
+                eventually(lambda: "baseline" in step.stages)
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            answer(service.prepare(request, crash, step=step, run_id="one"))
+        assert len(mllm.asked) == 1
+        for _ in range(2):
+            found = answer(service.prepare(request, step=step, run_id="one"))
+            assert (found.answer, found.baseline and found.baseline.answer, found.reused) == ("B", "A", ())
+            assert found.usage == found.usage_total == COST + COST
+            assert len(mllm.asked) == 2

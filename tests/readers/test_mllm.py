@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import httpx
@@ -67,6 +68,12 @@ def blank(width: int = 64, height: int = 64) -> bytes:
     return encode_png(floor(width, height))
 
 
+@cache
+def with_car() -> bytes:
+    """A toy car where `PLACE` says."""
+    return encode_png(np.ascontiguousarray(block(floor(320, 240), (128, 96, 192, 144), (40, 60, 200))))
+
+
 def body_of(service: Service, image: bytes, body: dict[str, Any]) -> dict[str, Any]:
     return QUICK | {"image": {"artifact": service.keep_image(image).sha256}, "question": OPTIONS} | body
 
@@ -78,8 +85,7 @@ def answered(service: Service, image: bytes | None = None, **body: Any) -> Answe
 
 
 def simulated(service: Service, **body: Any) -> Simulation:
-    image = encode_png(np.ascontiguousarray(block(floor(320, 240), (128, 96, 192, 144), (40, 60, 200))))
-    return service.simulate(SimulateRequest.model_validate(body_of(service, image, body)))
+    return service.simulate(SimulateRequest.model_validate(body_of(service, with_car(), body)))
 
 
 def replying(mllm: MllmServer, reply: Callable[[str], object]) -> None:
@@ -253,6 +259,90 @@ def test_the_baseline_is_asked_without_frames(mllm, make) -> None:
     assert (told.answer, told.not_sure) == ("A", False)
     assert told.baseline is not None
     assert (told.baseline.answer, told.baseline.not_sure) == ("C", True)
+
+
+def test_the_baseline_is_asked_beside_the_simulation(mllm, make) -> None:
+    """Nothing is said of what moves before the baseline was asked for, and nothing of that before it was looked at."""
+    asked, looked = Event(), Event()
+
+    def reply(handler) -> None:
+        prompt, pictures = say.text_of(handler.body), len(say.images_of(handler.body))
+        said: Any = IDENTIFIED if "sets in motion" in prompt else PLACE | LINE
+        if "`answer`" not in prompt:
+            assert asked.wait(TIME_LIMIT)
+        elif pictures == 1:
+            asked.set()
+            assert looked.wait(TIME_LIMIT)
+            said = {"answer": "B"}
+        else:
+            looked.set()
+            said = {"answer": "A"}
+        handler.send(200, say.completion(json.dumps(said)))
+
+    mllm.say(reply)
+    told = answered(make(), with_car(), baseline=True)
+    assert (told.answer, told.baseline and told.baseline.answer) == ("A", "B")
+    assert told.usage.calls == len(mllm.asked) == 4
+    assert told.reader.stages == ("baseline", "grounding", "answering")
+    assert list(told.timings) == ["baseline", "grounding", "motion", "trajectory", "generation", "answering"]
+
+
+def test_a_run_that_fails_does_not_wait_for_its_baseline(mllm, make) -> None:
+    asked, over = Event(), Event()
+
+    def reply(handler) -> None:
+        if "`answer`" in say.text_of(handler.body):
+            asked.set()
+            assert over.wait(TIME_LIMIT)
+        assert asked.wait(TIME_LIMIT)
+        say.status(400)(handler)
+
+    mllm.say(reply)
+    with refused("mllm-refused") as caught:
+        answered(make(), blank(), baseline=True)
+    over.set()
+    assert len(mllm.asked) == 2
+    assert caught.value.usage == {"calls": 2, "input_tokens": 0, "output_tokens": 0}, "both were made"
+
+
+@pytest.mark.parametrize(
+    ("alone", "looking", "code"),
+    [("?", "A", None), (404, "A", "mllm-unavailable"), (400, "A", "mllm-refused"), ("B", "?", "mllm-bad-reply")],
+)
+def test_a_baseline_that_fails(alone: str | int, looking: str, code: str | None, mllm, make) -> None:
+    """One that cannot be read is missing; all else is an error, as it is for the answer."""
+
+    def reply(handler) -> None:
+        said = alone if len(say.images_of(handler.body)) == 1 else looking
+        say.status(said)(handler) if isinstance(said, int) else handler.send(200, say.completion(said))
+
+    mllm.say(reply)
+    given = {"grounding": {"bbox": [20, 20, 40, 40], "object": "toy car"}, "motion": HEADING, "baseline": True}
+    if code is not None:
+        with refused(code) as caught:
+            answered(make(), blank(), **given)
+        assert caught.value.usage is not None
+        assert caught.value.usage["calls"] == len(mllm.asked)
+        return
+    told = answered(make(), blank(), **given)
+    assert (told.answer, told.baseline, told.usage.calls) == ("A", None, 4)
+    assert [warning for warning in told.warnings if "no baseline answer" in warning]
+
+
+def test_what_the_generator_cannot_do_is_refused_before_a_baseline_is_asked_for(mllm, make) -> None:
+    mllm.say("A")
+    with refused("invalid-request"):
+        answered(make(), blank(), baseline=True, generator_options={"nonsense": 1})
+    assert mllm.asked == []
+
+
+def test_where_imagining_fails_the_baseline_is_the_answer(mllm, make) -> None:
+    replying(mllm, lambda prompt: '{"answer": "B"}' if "`answer`" in prompt else "[]")
+    told = answered(make(), blank(), baseline=True, votes=2)
+    assert (told.answer, told.simulation, told.votes) == ("B", None, {"B": 2})
+    assert told.baseline is not None
+    assert told.baseline.votes == told.votes
+    assert sum("`answer`" in say.text_of(call) for call in mllm.asked) == 2
 
 
 @pytest.mark.parametrize("failure", ["[]", "no idea"])
