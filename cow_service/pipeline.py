@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from cow_service import errors
 from cow_service.narration.summary import narrate
 from cow_service.readers.options import choices_source, read_choices
-from cow_service.records import Answer, Problem, Simulation
+from cow_service.records import Answer, Problem, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question, ask_baseline, ask_first, gate_of
 from cow_service.stages.depth import estimate_depth
@@ -50,28 +50,20 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
 def answer(run: Run[AnswerRequest]) -> Answer:
     """Imagines, unless the request says never or the gate sees no need, then answers.
 
-    The baseline, which needs only the image, is asked for meanwhile. A simulation that fails does not lose the answer:
-    it is then given from the image alone, with a warning.
-    Raises `InvalidRequest`, `Canceled`, `ReaderUnavailable`, `MllmBadReply`, `MllmRefused`,
-    `MllmUnavailable`.
+    A simulation that fails does not lose the answer: it is then given from the image alone, with a warning.
+    Raises `InvalidRequest`, `Canceled`, `ReaderUnavailable`, `MllmBadReply`, `MllmRefused`, `MllmUnavailable`.
     """
     request = run.request
     first = run.stage("gating", ask_first) if request.imagine == "auto" else None
     gate = None if first is None else gate_of(first, request.imagine_threshold)
     wanted = request.imagine == "always" if gate is None else gate.imagined
-    is_asked = wanted and request.baseline and (first is None or first.verdict is None)
-    if is_asked:
-        run.check_request()
-    with run.beside("baseline", ask_baseline) if is_asked else nullcontext() as baseline:
-        simulation, failure = _imagine(run) if wanted else (None, None)
-        verdict = None if simulation is None else run.stage("answering", answer_question, run.grounding, simulation)
-        first = first if baseline is None else baseline()
     alone = None if first is None else first.verdict
-    if simulation is not None and verdict is not None:  # whoever reads only the answer must see what it rests on
-        missing = run.warnings("baseline") if alone is None else ()
-        warnings = tuple(dict.fromkeys((*simulation.warnings, *missing, *run.warnings("answering"))))
+    simulation, failure, verdict, alone = _look(run, alone) if wanted else (None, None, None, alone)
+    if verdict is not None:  # whoever reads only the answer must see what it rests on
+        missing: tuple[Stage, ...] = ("baseline",) if alone is None else ()
+        warnings = run.warnings(*SIMULATION_STAGES, *missing, "answering")
     elif alone is not None:  # asked once is enough
-        verdict, warnings = alone, run.warnings("baseline" if is_asked else "gating")
+        verdict, warnings = alone, run.warnings("baseline" if "baseline" in run.results else "gating")
     else:
         verdict = alone = run.stage("answering", answer_question, run.grounding, None)
         warnings = run.warnings("answering")
@@ -92,8 +84,22 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         baseline=alone if request.baseline else None,
         reader=run.reader_info("gating", "baseline", "grounding", "motion", "answering"),
         **run.accounts("gating", "baseline", *SIMULATION_STAGES, "answering"),
-        warnings=warnings,
+        warnings=tuple(dict.fromkeys(warnings)),
     )
+
+
+def _look(
+    run: Run[AnswerRequest], alone: Verdict | None
+) -> tuple[Simulation | None, errors.CowError | None, Verdict | None, Verdict | None]:
+    """The simulation, or the error for which there is none; the answer after looking at it, and the one from the image
+    alone, which is asked for meanwhile where the request wants it and it is not known.
+    """
+    is_asked = run.request.baseline and alone is None
+    run.check_request()
+    with run.beside("baseline", ask_baseline) if is_asked else nullcontext() as baseline:
+        simulation, failure = _imagine(run)
+        verdict = None if simulation is None else run.stage("answering", answer_question, run.grounding, simulation)
+        return simulation, failure, verdict, alone if baseline is None else baseline().verdict
 
 
 def _imagine(run: Run[AnswerRequest]) -> tuple[Simulation | None, errors.CowError | None]:

@@ -71,18 +71,15 @@ def _named(reading: AnswerReading) -> str:
 def ask_first(run: Run[AnswerRequest]) -> StageResult[FirstAnswers]:
     """The answers of the gate. A reader that gives the same each time is asked once: more votes say no more."""
     votes = run.request.imagine_votes
-    return _ask_alone(run, "gating", 1 if run.repeats_answers(votes) else votes)
+    return ask_baseline(run, "gating", 1 if run.repeats_answers(votes) else votes)
 
 
-def ask_baseline(run: Run[AnswerRequest]) -> StageResult[FirstAnswers]:
-    """The answer to compare with the one after looking."""
-    return _ask_alone(run, "baseline", run.request.votes)
-
-
-def _ask_alone(run: Run[AnswerRequest], stage: Stage, votes: int) -> StageResult[FirstAnswers]:
+def ask_baseline(
+    run: Run[AnswerRequest], stage: Stage = "baseline", votes: int | None = None
+) -> StageResult[FirstAnswers]:
     """The answers from the image alone; no verdict where no reply can be used. Raises what else the reader raises."""
     request = run.request
-    options = read_choices(request.question, request.options)
+    options, votes = read_choices(request.question, request.options), votes or request.votes
     # Not the language that the grounding finds: it may be at work meanwhile.
     given = replace(run.reader_input(stage), language=request.language or "en")
     try:

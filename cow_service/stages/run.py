@@ -6,7 +6,7 @@ import uuid
 from collections import abc
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -335,12 +335,9 @@ class Run(Generic[Request_co]):
 
         side = replace(self, progress=check)  # with the same results, times and calls
         try:
-            with ThreadPoolExecutor(1, thread_name_prefix=name) as thread:
-                outcome = thread.submit(copy_context().run, side.stage, name, function)
-                try:
-                    yield outcome.result
-                finally:
-                    left.set()
+            with ThreadPoolExecutor(1, thread_name_prefix=name) as thread, ExitStack() as leaving:
+                leaving.callback(left.set)
+                yield thread.submit(copy_context().run, side.stage, name, function).result
         except CowError as error:
             error.usage = self._spent()
             raise

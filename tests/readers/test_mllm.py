@@ -283,7 +283,7 @@ def test_the_baseline_is_asked_beside_the_simulation(mllm, make) -> None:
     told = answered(make(), with_car(), baseline=True)
     assert (told.answer, told.baseline and told.baseline.answer) == ("A", "B")
     assert told.usage.calls == len(mllm.asked) == 4
-    assert told.reader.stages == ("baseline", "grounding", "answering")
+    assert told.reader.stages == ("baseline", "grounding", "motion", "answering")
     assert list(told.timings) == ["baseline", "grounding", "motion", "trajectory", "generation", "answering"]
 
 
