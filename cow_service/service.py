@@ -22,6 +22,7 @@ from cow_service.perception.base import Perception
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
 from cow_service.readers.chat import CallsMllm, ChatReader
+from cow_service.readers.mllm.known import status_of
 from cow_service.records import Answer, Artifact, BackendInfo, BackendKind, Look, Models, Simulation, WorkerLoad
 from cow_service.registry import Registry
 from cow_service.requests import (
@@ -249,6 +250,7 @@ class Service:
             generators=tuple(self._describe("generator", name) for name in self.generators.names()),
             perception=tuple(self._describe(kind, name) for kind, name in self.perception.installed()),
             mllms=tuple(name for name, manifest in load_manifests().items() if manifest.role == "mllm"),
+            mllm=status_of(self.settings),
         )
 
     def chat_reader(self, name: str) -> ChatReader | None:

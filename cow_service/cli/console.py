@@ -1,5 +1,7 @@
 """The output of `simulate`, `answer`, `models` and `doctor`: progress, results in a folder, tables."""
 
+from __future__ import annotations
+
 import hashlib
 import platform
 import shutil
@@ -8,7 +10,7 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 from rich.console import Console
@@ -25,6 +27,9 @@ from cow_service.records import Answer, Simulation, Unserved, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.requests.values import field_errors
 from cow_service.service import Service
+
+if TYPE_CHECKING:
+    from cow_service.readers.mllm.check import MllmCheck
 
 
 def run_request(
@@ -172,6 +177,47 @@ def print_models(models: records.Models, *, as_json: bool) -> None:
     console = Console()
     console.print(table)
     console.print(f"\nValues of COW_MLLM: provider:model, or one of: {', '.join(models.mllms)}", highlight=False)
+    if models.mllm is not None:
+        console.print(escape(_mllm_words(models.mllm)), highlight=False, soft_wrap=True)
+
+
+def _mllm_words(mllm: records.MllmStatus) -> str:
+    takes = "not called in the last week" if mllm.takes is None else f"its server takes {_taken(mllm.takes)}"
+    off = "not checked (`cow models check --save`)" if mllm.measured is None else _spreads(mllm.measured)
+    return f"COW_MLLM: {mllm.name} (family {mllm.family}); {takes}; {off}"
+
+
+def _taken(takes: records.ServerCapabilities) -> str:
+    """What a server takes of a call, in words."""
+    refused = [name.replace("_", " ") for name in ("temperature", "seed", "system_role") if not getattr(takes, name)]
+    return ", ".join((
+        f"{takes.output}, {takes.token_field}",
+        *(f"no {name}" for name in refused),
+        *(() if takes.images is None else (f"{takes.images} image{'s' * (takes.images > 1)} a call",)),
+        *(("smaller images",) if takes.reduction else ()),
+        *(() if takes.delivery == "whole" else (f"replies that are {takes.delivery}",)),
+    ))  # fmt: skip
+
+
+def _spreads(measured: records.MllmMeasurement) -> str:
+    return f"boxes {measured.bbox_deviation:.0%} of a side off, directions {measured.direction_deviation:.0f} degrees"
+
+
+def print_check(check: MllmCheck, mllm: records.MllmStatus | None) -> None:
+    """How a multimodal LLM answered the questions of a check, and what is known of it now."""
+    console = Console(highlight=False, soft_wrap=True)
+    table = Table("asked for", "", "", box=None, pad_edge=False)
+    for finding in check.findings:
+        mark = "[green]good[/]" if finding.usable else "[yellow]not good[/]"
+        table.add_row(finding.question, mark, escape(finding.result))
+    console.print(table)
+    for note in check.notes:
+        console.print(escape(note))
+    console.print(f"{check.usage.calls} calls; the longest question took {check.seconds:.1f} s.")
+    if check.measured is not None:
+        console.print(f"Measured: {_spreads(check.measured)}.")
+    if mllm is not None:
+        console.print(escape(_mllm_words(mllm)))
 
 
 def _readiness(backend: records.BackendInfo) -> str:
@@ -223,6 +269,7 @@ class Report(BaseModel):
     free_disk_gb: float
     problem: str | None
     backends: list[records.BackendInfo]
+    mllm: records.MllmStatus | None
     unserved: list[Unserved]  # jobs that wait, and that no process takes
     jobs_problem: str | None  # why the job database cannot be read
 
@@ -261,6 +308,7 @@ def examine(service: Service) -> Report:
         free_disk_gb=round(shutil.disk_usage(folder).free / 1e9, 1),
         problem=problem,
         backends=[*models.readers, *models.generators, *models.perception],
+        mllm=models.mllm,
         unserved=list(unserved),
         jobs_problem=jobs_problem,
     )
@@ -281,6 +329,8 @@ def print_report(report: Report, *, as_json: bool) -> None:
     console.print(table)
     installed = ", ".join(f"{name} {found}" for name, found in report.packages.items() if found)
     console.print(f"installed: {installed}", highlight=False)
+    if report.mllm is not None:
+        console.print(escape(_mllm_words(report.mllm)), highlight=False, soft_wrap=True)
     if report.problem:
         console.print(f"[red]{report.problem}[/]", highlight=False)
     else:

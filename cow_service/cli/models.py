@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cow_service.cli.options import EXISTING, AsJson, Texts, argument, option, writable
+from cow_service.cli.options import EXISTING, AsJson, FolderNotWritable, Texts, argument, option, writable
 from cow_service.errors import InvalidRequest
 
 if TYPE_CHECKING:
@@ -87,9 +87,20 @@ def _pull(name: str, revision: list[str] | None) -> None:
     _fetch_kernels(manifest, console)
 
 
-@app.command(epilog="Example: cow models check ati")
-def check(name: Name, as_json: AsJson = False) -> None:
-    """Check that a model's weights are complete; exit code 1 if not."""
+@app.command(epilog="Example: cow models check --save")
+def check(
+    name: Annotated[str | None, argument("Model whose weights are checked; without one, COW_MLLM is.", "NAME")] = None,
+    save: Annotated[bool, option("Keep what was measured: readings then count as that exact.", "--save")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Check that a model's weights are complete or, without a name, what the multimodal LLM can do.
+
+    That is asked for boxes, directions and senses in pictures whose answers are known, for JSON, and about several
+    images. Exit code 1 if anything is missing or not good.
+    """
+    if name is None:
+        _check_mllm(save=save, as_json=as_json)
+        return
     import json  # noqa: PLC0415
 
     from cow_service.weights import repositories as weights  # noqa: PLC0415
@@ -110,6 +121,32 @@ def check(name: Name, as_json: AsJson = False) -> None:
                 typer.echo(f"  {finding.message}")
     if not complete:
         typer.echo(f"Run `cow models pull {name}`.", err=True)
+        raise typer.Exit(1)
+
+
+def _check_mllm(*, save: bool, as_json: bool) -> None:
+    """Raises `ReaderUnavailable` where none is set up."""
+    from cow_service.cli.console import print_check  # noqa: PLC0415
+    from cow_service.readers.mllm.reader import MllmReader  # noqa: PLC0415
+    from cow_service.service import Service  # noqa: PLC0415
+    from cow_service.settings import load_settings  # noqa: PLC0415
+
+    with Service(load_settings()) as service:
+        reader = service.chat_reader("local" if service.settings.reader == "local" else "mllm")
+        if not isinstance(reader, MllmReader):
+            raise InvalidRequest("The configured reader is not one of COW's own: only those can be checked.")
+        found = reader.check()
+        if saved := found.measured if save else None:
+            try:
+                reader.keep(saved)
+            except OSError as error:
+                detail = f"Cannot write to COW_DATA_DIR, '{service.settings.data_dir}': {error.strerror}."
+                raise FolderNotWritable(detail) from error
+    if as_json:
+        typer.echo(found.model_dump_json(indent=2))
+    else:
+        print_check(found, service.models().mllm)
+    if not all(finding.usable for finding in found.findings):
         raise typer.Exit(1)
 
 

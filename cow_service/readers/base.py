@@ -185,7 +185,7 @@ class GroundingReading:
     changes: tuple[NamedChange, ...] = ()  # as `interventions`, of things that the request locates
     is_doubtful: bool = False  # the object in the box may not be the named one
     asked_is_doubtful: bool = False  # the words say otherwise than what is asked was read
-    bbox_deviation: float = 0.0  # see `LocatedObject.bbox_deviation`
+    bbox_deviation: float = 0.0  # of all its boxes, where nothing that is seen tells their edges, in their sides
     language: Language | None = None  # of the question, as far as the reader can say
 
 

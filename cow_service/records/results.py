@@ -321,6 +321,61 @@ class BackendInfo(Record):
     defaults: dict[str, bool | int | float | str] = Field(default_factory=dict)
 
 
+OutputMode = Literal["json_schema", "json_object", "prompt"]
+Delivery = Literal["whole", "streamed", "declared"]
+
+
+class Coordinates(Record):
+    """How a family of MLLMs writes places. Nothing infers it from the size of the numbers."""
+
+    units: Literal["thousandths", "fractions", "pixels"] = Field(
+        description="Of width and height, or absolute pixels of the image as the model sees it."
+    )
+    axes: Literal["xy", "yx"] = Field(default="xy", description="Which of a pair of numbers comes first.")
+    box_form: Literal["corners", "size"] = Field(
+        default="corners", description="Whether a box is two corners, or a corner and the width and height."
+    )
+    box: str = Field(default="bbox_2d", description="The key under which it writes a box.")
+    point: str = Field(default="point_2d", description="The key under which it writes a point.")
+
+
+class ServerCapabilities(Record):
+    """What a server takes of a call for one model."""
+
+    output: OutputMode = Field(
+        default="json_schema", description="How a reply is held to its form; `prompt`: by the prompt alone."
+    )
+    token_field: Literal["max_tokens", "max_completion_tokens"] = "max_tokens"
+    temperature: bool = True
+    seed: bool = True
+    system_role: bool = True
+    delivery: Delivery = Field(
+        default="whole",
+        description="How it replies. `declared`: it wants `stream: true`, and replies in one piece all the same.",
+    )
+    images: int | None = Field(default=None, description="Per call, at most; null where no limit is known.")
+    reduction: int = Field(default=0, description="Steps by which images are made smaller, so that a call is accepted.")
+
+
+class MllmMeasurement(Record):
+    """What `cow models check --save` has measured of a model: the readers then go by it."""
+
+    coordinates: Coordinates | None = Field(default=None, description="Where they are not those of its family.")
+    bbox_deviation: float = Field(ge=0, le=1, description="Of the edges of its boxes, one standard deviation in sides.")
+    direction_deviation: float = Field(ge=0, le=180, description="Of its directions, one standard deviation, degrees.")
+
+
+class MllmStatus(Record):
+    """The multimodal LLM of `COW_MLLM`, as far as it is known without calling it."""
+
+    name: str = Field(description="As it is served.")
+    family: str = Field(description="Which says how it writes places.")
+    takes: ServerCapabilities | None = Field(
+        default=None, description="What its server takes, learned from calls in the last week; null before the first."
+    )
+    measured: MllmMeasurement | None = Field(default=None, description="Null before `cow models check --save`.")
+
+
 class Models(Record):
     """What `GET /models` returns."""
 
@@ -328,6 +383,7 @@ class Models(Record):
     generators: tuple[BackendInfo, ...]
     perception: tuple[BackendInfo, ...] = Field(default=(), description="Vision models.")
     mllms: tuple[str, ...] = Field(default=(), description="Multimodal LLMs that `COW_MLLM` may name.")
+    mllm: MllmStatus | None = Field(default=None, description="The one that it names; null without one.")
 
 
 class SeenObject(Record):

@@ -127,7 +127,6 @@ def _taken(
 # --- what stands where
 
 EDGE_OFF = 0.25  # of the sides of a thing that is seen: an estimated edge this far off is still its own
-BBOX_DEVIATION = 0.1  # of its sides: how exact an estimated box is where nothing that is seen tells its edges
 
 
 @dataclass(frozen=True)
@@ -156,7 +155,7 @@ def settle_places(read: GroundingReading, seen: SeenThings) -> tuple[GroundingRe
         region = moved[thing.bbox]
         return thing.model_copy(update={
             "bbox": thing.bbox if region is None else region.bbox,
-            "bbox_deviation": BBOX_DEVIATION if region is None else 0.0,
+            "bbox_deviation": read.bbox_deviation if region is None else 0.0,
             "is_doubtful": thing.is_doubtful or thing.bbox in doubtful,
         })  # fmt: skip
 

@@ -12,7 +12,7 @@ import yaml
 from pydantic import Field, JsonValue
 
 from cow_service.errors import CowError, install_line
-from cow_service.records import Record
+from cow_service.records import Coordinates, Record
 
 
 @dataclass(frozen=True)
@@ -124,17 +124,6 @@ def check_modules(name: str, unavailable: type[CowError]) -> None:
         raise unavailable(
             f"'{name}' needs {', '.join(missing)}, not installed on this server: {manifest.install_line()}"
         )
-
-
-class Coordinates(Record):
-    """How a family of MLLMs writes places. Nothing infers it from the size of the numbers."""
-
-    units: Literal["thousandths", "fractions", "pixels"] = Field(
-        description="Of width and height, or absolute pixels of the image as the model sees it."
-    )
-    axes: Literal["xy", "yx"] = Field(default="xy", description="Which of a pair of numbers comes first.")
-    box: str = Field(default="bbox_2d", description="The key under which it writes a box.")
-    point: str = Field(default="point_2d", description="The key under which it writes a point.")
 
 
 class ImageSize(Record):

@@ -144,7 +144,8 @@ def test_what_a_model_in_the_process_does_not_take() -> None:
 
     from cow_service.readers.mllm.chat import prepare_chat
     from cow_service.readers.mllm.client import MllmClient
-    from cow_service.readers.mllm.models import ConfiguredModel, mllm_manifests
+    from cow_service.readers.mllm.known import mllm_manifests
+    from cow_service.readers.mllm.models import ConfiguredModel
 
     class Refusing(TestModel):
         """As a model in the process, which takes fewer settings, and no tools."""

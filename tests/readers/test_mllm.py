@@ -102,7 +102,7 @@ def replying(mllm: MllmServer, reply: Callable[[str], object]) -> None:
 
 
 def test_a_name_finds_its_manifest_and_provider() -> None:
-    from cow_service.readers.mllm.models import ResolvedModel, manifest_for, mllm_manifests, resolve_model
+    from cow_service.readers.mllm.known import ResolvedModel, manifest_for, mllm_manifests, resolve_model
 
     for served, manifest in (
         ("Qwen/Qwen3-VL-8B-Instruct", "qwen3-vl-8b"),
@@ -118,7 +118,7 @@ def test_a_name_finds_its_manifest_and_provider() -> None:
         (f"anthropic:{claude}", "http://127.0.0.1:8001", "anthropic"),
     ):
         resolved = resolve_model(Settings(mllm=name, mllm_base_url=base_url))
-        assert resolved == ResolvedModel(mllm_manifests()[claude], provider, claude)
+        assert resolved == ResolvedModel(mllm_manifests()[claude], provider, claude, base_url)
 
 
 @pytest.mark.parametrize(

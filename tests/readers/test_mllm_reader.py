@@ -277,21 +277,6 @@ def test_a_part_that_cannot_be_used_is_asked_for_once_more_then_left_out_aloud(m
         assert len(reading.warnings) == warned
 
 
-def test_a_manifest_says_how_exact_its_model_points(mllm, scene, tmp_path) -> None:
-    from cow_service.readers.mllm.client import MllmClient
-    from cow_service.readers.mllm.models import configure
-    from cow_service.readers.mllm.reader import MllmReader
-
-    settings = Settings(mllm="qwen3-vl-8b", mllm_base_url=mllm.address, data_dir=tmp_path)
-    model = configure(settings)
-    manifest = model.manifest.model_copy(update={"defaults": {"direction_deviation": 8}})
-    client = MllmClient(replace(model, manifest=manifest), settings)
-    mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    motion = MllmReader("mllm", client).read_motion(ReaderInput(scene, QUESTION), grounding("mllm"), None)
-    assert motion.direction_deviation == 8
-    client.close()
-
-
 def test_objections_to_a_reading_are_put_to_the_model(mllm, reader, scene) -> None:
     objection = "The box of 'red ball' lies\nwhere nothing stands."
     mllm.say(json.dumps(BALL), json.dumps(PLACE))

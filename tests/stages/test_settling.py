@@ -30,7 +30,6 @@ from cow_service.records import Asked, BBox, Cue, Intervention, LocatedObject, V
 from cow_service.stages.grounding import ground
 from cow_service.stages.settling import (
     APART,
-    BBOX_DEVIATION,
     SeenThings,
     SeenWay,
     angle,
@@ -221,8 +220,8 @@ def test_estimated_boxes_are_moved_onto_the_things_that_are_seen(
 
 def test_a_box_that_no_edges_tell_has_a_spread() -> None:
     half = (RED[0], RED[1], RED[0] + 20, RED[3])  # a part of what is seen, or what is seen a part of it
-    settled, objections = settle_places(GroundingReading("duck", half), SeenThings(REGIONS))
-    assert (settled.bbox, settled.bbox_deviation, settled.is_doubtful, objections) == (half, BBOX_DEVIATION, False, ())
+    settled, objections = settle_places(GroundingReading("duck", half, bbox_deviation=0.1), SeenThings(REGIONS))
+    assert (settled.bbox, settled.bbox_deviation, settled.is_doubtful, objections) == (half, 0.1, False, ())
 
 
 ELSEWHERE = (450.0, 300.0, 500.0, 350.0)

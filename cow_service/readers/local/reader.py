@@ -21,7 +21,8 @@ from cow_service.readers.local.generation import BatchGenerator
 from cow_service.readers.local.model import LocalModel, LocalOptions
 from cow_service.readers.local.tiny import make_tiny, still
 from cow_service.readers.mllm.client import MllmClient
-from cow_service.readers.mllm.models import ConfiguredModel, mllm_manifests, resolve_model
+from cow_service.readers.mllm.known import mllm_manifests, resolve_model
+from cow_service.readers.mllm.models import ConfiguredModel
 from cow_service.readers.mllm.reader import MllmReader
 from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed, reason_of

@@ -4,26 +4,19 @@ A refusal that names a field, or an unexplained one before any call has succeede
 worked is never tried again.
 """
 
-import hashlib
-import os
 import re
-import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
-from pathlib import Path
-from typing import Literal
 
 from pydantic_ai import exceptions as errors
 
-from cow_service.records import Record
+from cow_service.readers.mllm.known import MllmNotes
+from cow_service.records import Delivery, ServerCapabilities
 
-OutputMode = Literal["json_schema", "json_object", "prompt"]
-# `declared`: it wants `stream: true`, and replies in one piece all the same.
-Delivery = Literal["whole", "streamed", "declared"]
 _NEXT_DELIVERY: dict[Delivery, Delivery] = {"whole": "streamed", "streamed": "declared"}
 MAX_STEPS = 8  # that one call may teach
-MAX_AGE_SECONDS = 7 * 24 * 3600.0  # servers are updated: what is older is found out again
 FEWER_FRAMES = 3  # reductions from which only the first, middle and last frame are sent
 MAX_REDUCTION = FEWER_FRAMES + 2
 REFUSED = (HTTPStatus.BAD_REQUEST, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.NOT_IMPLEMENTED)
@@ -45,19 +38,6 @@ _SYSTEM = re.compile(
 )
 
 
-class ServerCapabilities(Record):
-    """What a server takes of a call for one model."""
-
-    output: OutputMode = "json_schema"
-    token_field: Literal["max_tokens", "max_completion_tokens"] = "max_tokens"
-    temperature: bool = True
-    seed: bool = True
-    system_role: bool = True
-    delivery: Delivery = "whole"
-    images: int | None = None  # per call, at most; null where no limit is known
-    reduction: int = 0  # steps by which images are made smaller, so that a call is short enough: see `sheets.py`
-
-
 @dataclass
 class CapabilityStore:
     """What is known of one server and model, in memory and, once a call has succeeded, on disk.
@@ -65,34 +45,21 @@ class CapabilityStore:
     Used from one event loop. `proven` is what calls have succeeded with.
     """
 
-    path: Path | None
+    notes: MllmNotes
     first: ServerCapabilities  # before anything is known
     proven: ServerCapabilities | None = None
 
     def __post_init__(self) -> None:
-        self.current = self.first
-        try:
-            if self.path is not None and time.time() - self.path.stat().st_mtime < MAX_AGE_SECONDS:
-                self.current = self.proven = ServerCapabilities.model_validate_json(
-                    self.path.read_text(encoding="utf-8")
-                )
-        except (OSError, ValueError):
-            return  # nothing is known, or what is stored is of another version: it is found out again
+        self.proven = self.notes.takes
+        self.current = self.proven or self.first
 
     def succeed(self, used: ServerCapabilities) -> None:
         """A call has succeeded: what it was sent with is kept."""
         if used == self.proven:
             return
         self.proven = used
-        if self.path is None:
-            return
-        part = self.path.with_suffix(f".{os.getpid()}")
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(used.model_dump_json(), encoding="utf-8")
-            part.replace(self.path)
-        except OSError:
-            return  # it is found out again by the next process
+        with suppress(OSError):  # it is found out again by the next process
+            self.notes.keep(used)
 
     def refuse(self, used: ServerCapabilities, error: errors.ModelAPIError, images: int, *, may_pass: bool) -> bool:
         """A call with that many images was refused: whether another one is worth trying, with what is known then.
@@ -110,14 +77,6 @@ class CapabilityStore:
     def give_up(self) -> None:
         """No step helped: nothing was learned from these refusals."""
         self.current = self.proven or self.first
-
-
-def store_of(data_dir: Path, server: str, model: str, first: ServerCapabilities) -> CapabilityStore:
-    """What is known of a model on a server, by its address; without one nothing is kept."""
-    if not server:
-        return CapabilityStore(None, first)
-    name = hashlib.sha256(f"{server}\n{model}".encode()).hexdigest()[:16]
-    return CapabilityStore(data_dir / "mllm" / f"{name}.json", first)
 
 
 def step_down(

@@ -29,9 +29,10 @@ from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable, shortened
 from cow_service.readers.base import CallLog, ReaderInput
 from cow_service.readers.chat import ChatTurn
-from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore, store_of
+from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
 from cow_service.readers.mllm.coordinates import MEDIA_TYPE
+from cow_service.readers.mllm.known import MllmNotes
 from cow_service.readers.mllm.models import ConfiguredModel
 from cow_service.readers.mllm.replies import ReplyError, Schema
 from cow_service.readers.mllm.sheets import fit_images
@@ -99,7 +100,12 @@ class MllmClient:
         self._name = f"The multimodal LLM '{model.name}'"
         self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
         self.places = AdaptivePlaces(settings.mllm_concurrency)
-        self.capabilities = store_of(settings.data_dir, model.server, model.name, model.first)
+        self.notes = MllmNotes(settings.data_dir, model.server, model.name)
+        self.capabilities = CapabilityStore(self.notes, model.first)
+        self.measured = self.notes.measured
+        coordinates = self.measured and self.measured.coordinates
+        family = model.family if coordinates is None else model.family.model_copy(update={"coordinates": coordinates})
+        self.family = family
         self._instructions = load_prompt(SYSTEM_PROMPT)
         self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
         self._thread = EventLoopThread(model.model)

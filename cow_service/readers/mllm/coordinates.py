@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from cow_service.errors import InvalidRequest
 from cow_service.media.images import encode_jpeg
 from cow_service.readers.mllm.replies import ReplyError, Schema, fields_of, is_number, listed
-from cow_service.records import BBox, Point
-from cow_service.weights.manifests import Coordinates, Family, ImageSize
+from cow_service.records import BBox, Coordinates, Point
+from cow_service.weights.manifests import Family, ImageSize
 
 MEDIA_TYPE = "image/jpeg"
 QUALITY = 95  # percent; fine lines such as drawn arrows stay clean
@@ -92,6 +92,8 @@ class CoordinateFrame:
     @property
     def box_order(self) -> str:
         """The order of a box's numbers, in words for a prompt."""
+        if self.coordinates.box_form == "size":
+            return "[x, y, width, height]" if self.coordinates.axes == "xy" else "[y, x, height, width]"
         return "[x0, y0, x1, y1]" if self.coordinates.axes == "xy" else "[ymin, xmin, ymax, xmax]"
 
     @property
@@ -110,7 +112,10 @@ class CoordinateFrame:
 
     def bbox(self, written: object) -> BBox:
         """A box [x0, y0, x1, y1] in pixels, its corners sorted. Raises `ReplyError` for one outside or without area."""
-        (ax, ay), (bx, by) = (self._inside(*pair) for pair in self._pairs(written, 2, "a box is 4 numbers"))
+        corner, (right, lower) = self._pairs(written, 2, "a box is 4 numbers")
+        if self.coordinates.box_form == "size" and not fields_of(written):  # names say which numbers they are
+            right, lower = corner[0] + right, corner[1] + lower
+        (ax, ay), (bx, by) = self._inside(*corner), self._inside(right, lower)
         x0, y0, x1, y1 = min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
         if x1 - x0 < LEAST_SIDE or y1 - y0 < LEAST_SIDE:
             raise ReplyError(f"the box {_shown(written)} has no area; give two opposite corners of the object")
@@ -122,6 +127,11 @@ class CoordinateFrame:
         if math.dist(start, end) < LEAST_LENGTH:
             raise ReplyError(f"the direction {_shown(written)} has no length; give two different points")
         return start, end
+
+    def write_box(self, bbox: BBox) -> list[float]:
+        """A box in pixels as the family writes it."""
+        x0, y0, x1, y1 = bbox
+        return self.write((x0, y0), (x1 - x0, y1 - y0) if self.coordinates.box_form == "size" else (x1, y1))
 
     def write(self, *points: Point) -> list[float]:
         """Points as the family writes them, one after the other."""

@@ -123,7 +123,7 @@ def locate_call(
         "question": given.question,
         "object": " ".join(name.split()),
         "others": tuple(others),
-        "bbox": "" if bbox is None else str(frame.write((bbox[0], bbox[1]), (bbox[2], bbox[3]))),
+        "bbox": "" if bbox is None else str(frame.write_box(bbox)),
         "units": frame.units,
         "box_key": frame.coordinates.box,
         "box_order": frame.box_order,
@@ -144,15 +144,19 @@ def locate_call(
 def _example(frame: CoordinateFrame, wants_box: bool, wants_direction: bool) -> dict[str, Any]:
     """A reply as it is wanted, in the form on which models that find things are trained: a list of labelled boxes."""
 
-    def at(*points: Point) -> list[float]:
-        return frame.write(*((x * frame.width, y * frame.height) for x, y in points))
-
-    boxes = {"red ball": at((0.2, 0.5), (0.3, 0.6)), "vase": at((0.7, 0.3), (0.8, 0.6))}
+    wide, high = frame.width, frame.height
+    boxes = {
+        "red ball": (0.2 * wide, 0.5 * high, 0.3 * wide, 0.6 * high),
+        "vase": (0.7 * wide, 0.3 * high, 0.8 * wide, 0.6 * high),
+    }
     reply: dict[str, Any] = {"reasoning": "..."}
     if wants_box:
-        reply["objects"] = [{frame.coordinates.box: box, "label": label} for label, box in boxes.items()]
+        reply["objects"] = [
+            {frame.coordinates.box: frame.write_box(box), "label": label} for label, box in boxes.items()
+        ]
     if wants_direction:
-        reply |= {"start": at((0.25, 0.55)), "end": at((0.9, 0.55)), "sense": "with"}
+        start, end = (0.25 * wide, 0.55 * high), (0.9 * wide, 0.55 * high)
+        reply |= {"start": frame.write(start), "end": frame.write(end), "sense": "with"}
     return reply
 
 

@@ -2,8 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from difflib import get_close_matches
-from fnmatch import fnmatchcase
 from typing import Any
 
 from openai import AsyncAzureOpenAI, AsyncOpenAI
@@ -16,11 +14,11 @@ from pydantic_ai.providers.openai_compatible import OpenAICompatibleProvider
 
 from cow_service.errors import ReaderUnavailable
 from cow_service.readers.chat import Upstream
-from cow_service.readers.mllm.capabilities import ServerCapabilities
+from cow_service.readers.mllm.known import resolve_model
+from cow_service.records import ServerCapabilities
 from cow_service.settings import Settings
-from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
+from cow_service.weights.manifests import Family, Manifest
 
-UNKNOWN = "generic"  # the manifest, and the family, for models that no other one describes
 NO_KEY = "none"  # what stands for a key where a client library wants one
 OWN_PROTOCOL = ("anthropic", "google", "google-gla")  # these speak their own protocol at a base URL, too
 
@@ -35,10 +33,9 @@ class ConfiguredModel:
     family: Family
     deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
     upstream: Upstream | None = None  # the OpenAI-compatible server; None for another protocol
-    variant: Callable[[ServerCapabilities], Model] | None = (
-        None  # for what its server takes; None: pydantic-ai knows it
-    )
-    server: str = ""  # its address, or its provider's name
+    server: str = "local"  # its address, its provider's name, or that it runs in this process
+    # The model for what its server takes; None: pydantic-ai knows that.
+    variant: Callable[[ServerCapabilities], Model] | None = None
 
     @property
     def first(self) -> ServerCapabilities:
@@ -47,62 +44,10 @@ class ConfiguredModel:
         return ServerCapabilities(output="json_schema" if has_schema else "prompt")
 
 
-@dataclass(frozen=True)
-class ResolvedModel:
-    """What COW_MLLM means."""
-
-    manifest: Manifest
-    provider: str | None  # null if one runs one's own server
-    name: str  # as it is served
-
-
-def resolve_model(settings: Settings) -> ResolvedModel:
-    """The manifest, provider and served name of the settings. A manifest with a base URL is on one's own server.
-
-    Raises `ReaderUnavailable` if COW_MLLM is not set or names nothing.
-    """
-    name, manifests = settings.mllm, mllm_manifests()
-    if name is None:
-        raise ReaderUnavailable(
-            "Reader 'mllm' needs COW_MLLM, which is not set: a manifest's name such as qwen3-vl-8b with "
-            "COW_MLLM_BASE_URL, or provider:model such as openai:gpt-5."
-        )
-    if name in manifests:
-        manifest = manifests[name]
-        provider = manifest.provider if settings.mllm_base_url is None else None
-        return ResolvedModel(manifest, provider, settings.mllm_model or manifest.model or name)
-    provider, _, model = name.partition(":")
-    if not (provider and model):
-        close = get_close_matches(name, manifests, n=3, cutoff=0.5)
-        names = f"Did you mean {' or '.join(close)}?" if close else f"Manifests: {', '.join(manifests)}."
-        raise ReaderUnavailable(f"COW_MLLM={name!r} is no manifest and not provider:model. {names}")
-    return ResolvedModel(manifest_for(model), provider, settings.mllm_model or model)
-
-
-def mllm_manifests() -> dict[str, Manifest]:
-    """The manifests of multimodal LLMs by name."""
-    return {name: manifest for name, manifest in load_manifests().items() if manifest.role == "mllm"}
-
-
-def manifest_for(model: str) -> Manifest:
-    """The manifest of a model by the name under which it is served; the generic one where none describes it."""
-    manifests = mllm_manifests()
-    for manifest in manifests.values():
-        patterns = (manifest.model or manifest.name, *manifest.also)
-        if any(fnmatchcase(model.lower(), pattern.lower()) for pattern in patterns):
-            return manifest
-    return manifests[UNKNOWN]
-
-
 def configure(settings: Settings) -> ConfiguredModel:
     """The model of the settings, ready to be called; nothing is sent. Raises `ReaderUnavailable`."""
-    resolved = resolve_model(settings)
-    manifest, provider, name = resolved.manifest, resolved.provider, resolved.name
-    base_url, families = settings.mllm_base_url, load_families()
-    family = families[manifest.family or UNKNOWN]
-    if manifest.name == UNKNOWN:  # its served name may tell more
-        matching = (f for f in families.values() if any(fnmatchcase(name.lower(), pattern) for pattern in f.also))
-        family = next(matching, families[UNKNOWN])
+    resolved, base_url = resolve_model(settings), settings.mllm_base_url
+    manifest, family, provider, name = resolved.manifest, resolved.family, resolved.provider, resolved.name
     key = None if settings.mllm_api_key is None else settings.mllm_api_key.get_secret_value()
 
     # Any server of OpenAI's protocol.
@@ -120,7 +65,7 @@ def configure(settings: Settings) -> ConfiguredModel:
 
         upstream, model = Upstream(base_url.rstrip("/"), name, key), variant(ServerCapabilities())
         return ConfiguredModel(
-            model, name, manifest, family, upstream=upstream, variant=variant, server=upstream.base_url
+            model, name, manifest, family, upstream=upstream, variant=variant, server=resolved.server
         )
 
     # A provider, of whatever protocol.
@@ -138,7 +83,7 @@ def configure(settings: Settings) -> ConfiguredModel:
     if isinstance(client, AsyncOpenAI) and not isinstance(client, AsyncAzureOpenAI):  # whose addresses are its own
         key = None if client.api_key in ("", NO_KEY) else client.api_key
         upstream = Upstream(str(client.base_url).rstrip("/"), name, key)
-    return ConfiguredModel(model, name, manifest, family, upstream=upstream, server=provider)
+    return ConfiguredModel(model, name, manifest, family, upstream=upstream, server=resolved.server)
 
 
 def _model_of(name: str, model: str, base_url: str | None, key: str | None) -> Model:

@@ -13,19 +13,21 @@ from cow_service.readers import base
 from cow_service.readers.base import GroundingReading, MotionHints, MotionReading, ReaderInput
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
+from cow_service.readers.mllm.check import MllmCheck, check_model
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
 from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
+from cow_service.readers.mllm.known import UNKNOWN
 from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
-from cow_service.readers.mllm.models import UNKNOWN, configure
+from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import BBox, Grounding, LocatedObject
+from cow_service.records import BBox, Grounding, LocatedObject, MllmMeasurement
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
-HEADING_DEVIATION = 20.0  # degrees of a direction that an MLLM points at, where its manifest says nothing else
+USUAL = MllmMeasurement(bbox_deviation=0.1, direction_deviation=20.0)  # where nothing was measured
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_KIND: records.MotionKind = "linear"
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
@@ -45,7 +47,7 @@ class MllmReader:
         self._subject = f"The multimodal LLM '{self._model.name}'"
         defaults = self._model.manifest.defaults
         self._reasoning = int(defaults.get("max_reasoning", DEFAULT_REASONING_LENGTH))
-        self._direction_deviation = float(defaults.get("direction_deviation", HEADING_DEVIATION))
+        self._measured = client.measured or USUAL
         self.info = records.ReaderInfo(name=name, model=self._model.name)
         taken = f"by its name it was taken for one of the family '{self._model.family.name}'"
         if self._model.family.name == UNKNOWN:
@@ -58,7 +60,8 @@ class MllmReader:
         """The model, where it is served from, how its family is asked, and the words of all prompts."""
         parts = (
             __version__, self.info.name, self._model.name, self._origin, self._model.manifest.model_dump_json(),
-            self._model.family.model_dump_json(), *map(PROMPTS.read, PROMPTS.names()),
+            self._client.family.model_dump_json(), self._measured.model_dump_json(),
+            *map(PROMPTS.read, PROMPTS.names()),
         )  # fmt: skip
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
@@ -69,6 +72,14 @@ class MllmReader:
         """True only for a model that is deterministic at temperature 0, if it is asked with that."""
         temperature = VOTING_TEMPERATURE if votes > 1 else self._model.manifest.defaults.get("temperature")
         return self._model.deterministic and temperature == 0
+
+    def check(self) -> MllmCheck:
+        """Asks small questions about pictures whose answers are known. Raises `MllmUnavailable`."""
+        return check_model(self._client, USUAL, self._reasoning)
+
+    def keep(self, measured: MllmMeasurement) -> None:
+        """Keeps what a check has measured, for readers that are made from now on. Raises `OSError`."""
+        self._client.notes.keep(measured)
 
     def close(self) -> None:
         """Closes its connections."""
@@ -123,6 +134,7 @@ class MllmReader:
         return GroundingReading(
             object=identified.object,
             bbox=bbox,
+            bbox_deviation=self._measured.bbox_deviation,
             label=located.label,
             point=located.point,
             others=tuple(other for other in others if other.bbox not in removed),
@@ -152,7 +164,7 @@ class MllmReader:
             warnings += () if located is None else located.warnings
         elif given.objections and hints.kind in records.DIRECTED_KINDS:
             with given.cpu():
-                image = encode(given.scene.image, self._model.family)
+                image = encode(given.scene.image, self._client.family)
             call = locate_call(given, image, grounding.object, grounding.bbox, (), True, self._reasoning)
             if (located := self._client.complete(call, given)) is not None:
                 warnings += located.warnings
@@ -162,7 +174,7 @@ class MllmReader:
         for hint in hints.also:
             place = places.get(name_words(hint.object))
             if place is not None:
-                width = self._direction_deviation
+                width = self._measured.direction_deviation
                 others.append(base.OtherMotionReading(place, hint.kind, hint.direction, width, hint.depth))
             elif others_sought:
                 raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
@@ -189,7 +201,7 @@ class MllmReader:
         """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` if all of them fail."""
         with given.cpu():
             pixels = (given.scene.image, *(() if imagined is None else pictures(imagined)))
-            jpegs = tuple(encode(each, self._model.family).jpeg for each in pixels)
+            jpegs = tuple(encode(each, self._client.family).jpeg for each in pixels)
         calls = answer_calls(given.question, options, jpegs, imagined, votes, self._reasoning)
         results = self._client.complete_all(calls, given)
         readings = tuple(each for each in results if not isinstance(each, CowError))
@@ -200,7 +212,7 @@ class MllmReader:
     def _identify(self, given: ReaderInput) -> tuple[EncodedImage, Identified | None]:
         """The image as it is sent, and the question about it; of several arrows the MLLM says which one is meant."""
         with given.cpu():
-            image = encode(given.scene.image, self._model.family)
+            image = encode(given.scene.image, self._client.family)
             said = identified_by_words(given) if given.words and len(given.scene.arrows) <= 1 else None
         return image, said or self._client.complete(identify_call(given, image, self._reasoning), given)
 
@@ -235,6 +247,7 @@ class MllmReader:
 
     def _directed(self, reading: MotionReading, hints: MotionHints) -> MotionReading:
         """The reading with its direction."""
+        deviation = self._measured.direction_deviation
         reading = replace(
             reading,
             speed=hints.speed,
@@ -243,12 +256,12 @@ class MllmReader:
             until=hints.until,
             steps=hints.then,
             cue=hints.cue or "orientation",
-            direction_deviation=self._direction_deviation,
+            direction_deviation=deviation,
             along_arrow=hints.along_arrow,
         )
         if hints.camera is not None:
             direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
-            return replace(reading, direction=direction, depth=depth, depth_deviation=HEADING_DEVIATION)
+            return replace(reading, direction=direction, depth=depth, depth_deviation=deviation)
         if hints.ends is None:
             return reading
         (x0, y0), (x1, y1) = hints.ends

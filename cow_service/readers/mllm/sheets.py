@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from cow_service.media.images import decode_own, encode_jpeg
 from cow_service.media.overlay import named_strip
-from cow_service.readers.mllm.capabilities import FEWER_FRAMES, ServerCapabilities
+from cow_service.readers.mllm.capabilities import FEWER_FRAMES
+from cow_service.records import ServerCapabilities
 
 QUALITIES = {FEWER_FRAMES + 1: 80, FEWER_FRAMES + 2: 60}  # JPEG, percent, of the first image by reduction
 
