@@ -21,20 +21,12 @@ BUSY = frozenset({
 NEAR = 0.9  # share of the refused level up to which the limit doubles
 HOLD_ROUNDS, HOLD_CALLS = 8, 64  # both pass at the refused level before one more is tried
 MAX_PAUSE_SECONDS = 60.0  # a server that asks for a longer pause is asked again after this time
-LATENCY_FACTOR = 2.0  # rise of the typical latency that halves the limit
-LATENCY_GAIN = 0.75  # a halving helped if the latency fell to this share: calls did wait for each other
-MIN_WINDOW = 32  # calls whose latencies are compared: enough for a stable mix of short and long ones
-BASELINE_WEIGHT = 1 / 8  # of the last window in the long-run latency
 
 
 class AdaptiveLimit:
     """How many calls may be in flight, at least 1 and at most `most`. Thread-safe; it makes no calls and never waits.
 
     It grows only while calls wait for a place. Calls that were in flight when it was halved do not halve it again.
-    Growth is spread over a round trip, so that few calls are refused before the first refusal comes back.
-
-    Latencies are compared by their geometric mean over a window. A rise halves the limit on trial: where that does not
-    bring the latency down, the calls are simply longer now, and the limit returns.
     """
 
     def __init__(self, most: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -42,14 +34,8 @@ class AdaptiveLimit:
         self._limit = float(min(FIRST, most))
         self._clock, self._lock = clock, threading.Lock()
         self._ceiling = math.inf  # calls in flight that were accepted when one more was refused
-        self._credit = 0.0  # growth that successes have earned
-        self._latency = 0.0  # of the last successes, seconds
-        self._full_at = self._grown_at = self._cut_at = self._resumes_at = -math.inf
+        self._full_at = self._cut_at = self._resumes_at = -math.inf
         self._succeeded = True  # since the last halving
-        self._window_from, self._window_logs, self._window_calls = clock(), 0.0, 0
-        self._baseline: float | None = None  # long-run mean of the logarithm of the latency
-        self._trial: tuple[float, float, float] | None = None  # mean, limit and ceiling before a halving for latency
-        self._skipped, self._skip = 0, 1  # windows not judged after a trial that did not help; doubled each time
 
     @property
     def limit(self) -> int:
@@ -67,14 +53,9 @@ class AdaptiveLimit:
             now = self._clock()
             if self.in_flight >= self.limit:
                 self._full_at = now
-            seconds_to_grow = self._grown_at + self._latency / (2 * self._limit) - now
-            if self._credit >= 1 and seconds_to_grow <= 0:
-                self._limit, self._credit, self._grown_at = min(self.most, self._limit + 1), self._credit - 1, now
             if now < self._resumes_at:
                 return self._resumes_at - now
-            if self.in_flight < self.limit:
-                return 0.0
-            return max(seconds_to_grow, 0.001) if self._credit >= 1 and self.limit < self.most else math.inf
+            return 0.0 if self.in_flight < self.limit else math.inf
 
     def begin(self) -> float:
         """A call begins, once `seconds_to_wait` is 0. Returns the time, by which `end` and `refuse` know the call."""
@@ -83,22 +64,14 @@ class AdaptiveLimit:
             return self._clock()
 
     def end(self, began: float, *, succeeded: bool) -> None:
-        """A call has ended. Only successes count for growth and latency."""
+        """A call has ended. Only successes count for growth."""
         with self._lock:
-            now = self._clock()
             self.in_flight -= 1
             if not succeeded or began <= self._cut_at:
                 return
             self._succeeded = True
-            seconds = max(now - began, 1e-6)
-            self._latency += (seconds - self._latency) / 4 if self._latency else seconds
             if began <= self._full_at:  # a call waited for a place meanwhile
-                self._credit = min(self._credit + self._growth(), self._limit)
-            if began > self._window_from:
-                self._window_logs += math.log(seconds)
-                self._window_calls += 1
-                if self._window_calls >= max(MIN_WINDOW, self._limit):
-                    self._judge(self._window_logs / self._window_calls, now)
+                self._limit = min(self._limit + self._growth(), self.most)
 
     def refuse(self, began: float, retry_after: float | None = None) -> None:
         """The other side was too busy for a call, and maybe said after how many seconds to call again. Still `end` it.
@@ -112,8 +85,8 @@ class AdaptiveLimit:
                 return
             if self._succeeded:  # else nothing works, at whatever level
                 self._ceiling = max(1, self.in_flight - 1)
-            self._trial = None
-            self._cut(now)
+            self._limit = max(1.0, min(self._limit, self.in_flight) / 2)
+            self._cut_at, self._succeeded = now, False
 
     def _growth(self) -> float:
         """By how much one success raises the limit; there are `limit` of them in a round trip."""
@@ -124,31 +97,6 @@ class AdaptiveLimit:
         if self._limit < self._ceiling + 1:
             return 1 / max(HOLD_ROUNDS * self._limit, HOLD_CALLS)
         return (self._limit - self._ceiling) / self._limit  # more is accepted than before: faster and faster
-
-    def _cut(self, now: float) -> None:
-        self._limit = max(1.0, min(self._limit, self.in_flight) / 2)
-        self._credit, self._cut_at, self._succeeded = 0.0, now, False
-        self._window_from, self._window_logs, self._window_calls = now, 0.0, 0
-
-    def _judge(self, mean: float, now: float) -> None:
-        """Compares the latency of a full window with the long-run one, and begins the next window."""
-        self._window_from, self._window_logs, self._window_calls = now, 0.0, 0
-        if self._trial is not None:
-            before, limit, ceiling = self._trial
-            self._trial = None
-            if mean > before + math.log(LATENCY_GAIN):
-                self._limit, self._ceiling, self._baseline = max(self._limit, limit), ceiling, mean
-                self._skipped, self._skip = self._skip, min(2 * self._skip, 64)
-            return
-        if self._baseline is None:
-            self._baseline = mean
-        elif self._skipped == 0 and mean > self._baseline + math.log(LATENCY_FACTOR) and self._limit > 1:
-            self._trial = mean, self._limit, self._ceiling
-            self._ceiling = self._limit
-            self._cut(now)
-        else:
-            self._skipped = max(0, self._skipped - 1)
-            self._baseline += BASELINE_WEIGHT * (mean - self._baseline)
 
 
 @dataclass

@@ -88,7 +88,7 @@ class Settings(BaseSettings):
     mllm_budget: float = Field(default=180, gt=0, le=7200)
     """Longest wait for the multimodal LLM including retries, seconds."""
     mllm_concurrency: int = Field(default=64, ge=1, le=1024)
-    """Most simultaneous calls of the multimodal LLM; lowered while it refuses calls or slows down."""
+    """Most simultaneous calls of the multimodal LLM; lowered while it refuses calls."""
     reader: str = Field(default_factory=lambda values: "mllm" if values.get("mllm") else "embedded")
     """Default reader, the part that understands the question; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"

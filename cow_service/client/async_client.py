@@ -176,7 +176,7 @@ class AsyncClient:
         that do not have them; `timeout`, `fresh` and `minimal` are those of `simulate`, for each question. One that
         fails yields a result with an `error`; an error is raised where no question would get through, and when the
         server has accepted none for five minutes. As many are asked at the same time as the server takes without
-        refusals and longer waits, `concurrency` at most (64). `progress` shows a bar, and what limits the batch.
+        refusals, `concurrency` at most (64). `progress` shows a bar, and what limits the batch.
 
         With `out` every result is a line of `results.jsonl` in that folder, and the same call resumes a batch that was
         killed: nothing is asked twice. Earlier results come last, or not at all with `only_new`. `retry_failed` asks

@@ -69,7 +69,7 @@ class Simulation:
 
 
 @given(
-    accepted=st.integers(16, 200), most=st.integers(1, 300), jitter=st.sampled_from([0.0, 0.3]), seed=st.integers(0, 9)
+    accepted=st.integers(16, 200), most=st.integers(1, 300), jitter=st.sampled_from([0.1, 0.3]), seed=st.integers(0, 9)
 )
 def test_it_finds_what_is_accepted_with_few_refusals(accepted: int, most: int, jitter: float, seed: int) -> None:
     draws = random.Random(seed)
@@ -82,10 +82,11 @@ def test_it_finds_what_is_accepted_with_few_refusals(accepted: int, most: int, j
 
 
 def test_sixty_four_places_are_reached_in_a_few_round_trips_and_used() -> None:
-    server = Simulation(256, lambda _: 64)
+    draws = random.Random(0)
+    server = Simulation(256, lambda _: 64, lambda *_: draws.uniform(1.8, 2.2))
     assert server.run(1320) < 1.3 * 1320 * 2 / 64
     assert server.refused <= 0.02 * 1320
-    assert next(now for now, limit in server.limits if limit >= 64) <= 5 * 2.0
+    assert next(now for now, limit in server.limits if limit >= 64) <= 5 * 2.2
 
 
 @pytest.mark.parametrize("accepted", [1, 3])
@@ -147,18 +148,8 @@ def test_a_retry_after_holds_all_calls_back(asked: float, kept: float) -> None:
     assert limit.seconds_to_wait() == limit.seconds_paused == 0
 
 
-def test_it_halves_when_latency_rises_with_the_load() -> None:
-    """A server that computes 8 at a time, and queues all others: more calls only wait longer."""
-    draws = random.Random(0)
-    server = Simulation(64, seconds=lambda _, flying: max(1.0, flying / 8) * draws.uniform(0.8, 1.2))
-    assert server.run(2000) < 1.05 * 2000 / 8
-    tail = [limit for now, limit in server.limits if now > 50]
-    assert max(tail) < 64
-    assert min(tail) >= 4
-
-
 @pytest.mark.parametrize("share", [0.05, 0.5])
-def test_calls_of_very_different_lengths_do_not_misfire(share: float) -> None:
+def test_calls_of_very_different_lengths_are_made_as_many(share: float) -> None:
     draws = random.Random(1)
     server = Simulation(64, seconds=lambda *_: 0.005 if draws.random() < share else draws.uniform(1, 3))
     assert server.run(3000) < 1.2 * 3000 * 2 * (1 - share) / 64
