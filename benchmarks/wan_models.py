@@ -146,10 +146,6 @@ class Passes:
             self.computed.append(1)
 
         transformer.register_forward_pre_hook(passed)
-        if getattr(transformer, "_is_cached", False):  # by cache-dit, which calls the layers that it does not skip
-            last = cast(Any, transformer).blocks[-1]
-            last.forward = self._counting(last.forward)
-            return
         # A cache is a hook of diffusers' own, which calls the layer's original forward unless it skips it.
         registry = getattr(cast(Any, transformer).blocks[-1], "_diffusers_hook", None)
         references = [hook.fn_ref for hook in registry.hooks.values()] if registry else []

@@ -52,7 +52,6 @@ from wan_rows import build_seconds, measure_rows, reckoned, refused, rows, total
 from wan_table import PARTS, table
 
 from cow_service.errors import CowError, GeneratorUnavailable
-from cow_service.generators.wan.acceleration import FIRST_LAYERS
 from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
 from cow_service.generators.wan.capabilities import backends_for_auto, detect_capabilities, refusals
 from cow_service.generators.wan.pipeline import image_token_count
@@ -151,8 +150,7 @@ def _seconds(timings: list[Timing], steps_of_profile: int) -> dict[str, Any]:
 def _flops(profile: Profile, case: Case, timing: Timing, image_tokens: int) -> int:
     """Of one clip's denoising; of a pass that the cache skipped, only what is computed before it decides."""
     size = case.manifest.architecture, case.num_frames, case.width, case.height, image_tokens
-    layers = int(case.manifest.architecture["num_layers"])
-    looked_at = {"first-block": 1, "dbcache": max(1, layers // FIRST_LAYERS)}.get(profile.acceleration.cache, 0)
+    looked_at = 1 if profile.acceleration.cache == "first-block" else 0
     skipped = timing.passes - timing.computed
     return timing.computed * pass_flops(*size) + skipped * pass_flops(*size, layers=looked_at)
 

@@ -132,7 +132,7 @@ def counted(pipeline: WanImageToVideoPipeline) -> list[int]:
     counts = [0] * LAYERS
     for index, block in enumerate(pipeline.transformer.blocks):
 
-        @wraps(block.forward)  # cache-dit reads its signature
+        @wraps(block.forward)
         def computed(*args: Any, _index: int = index, _forward: Any = block.forward, **kwargs: Any) -> Any:
             counts[_index] += 1
             return _forward(*args, **kwargs)

@@ -97,8 +97,6 @@ UNAVOIDABLE = {
     "_abort_process_group": "torch: ends the waits of all subgroups when a rank is lost",
     "_reset_stateful_cache": "diffusers: nothing of one clip stays in a cache for the next",
     "_keep_in_fp32_modules": "diffusers: the layers that a checkpoint must keep in float32",
-    "_context_manager": "cache-dit: nothing of one clip stays in a cache for the next",
-    "_context_names": "cache-dit: as `_context_manager`",
 }
 
 

@@ -5,9 +5,7 @@ that skips blocks, memory, and last, in `ranks`, context parallelism around the 
 its cache hooks breaks its graph; a cache around context parallelism would compare a whole tensor with a shard.
 """
 
-import os
 import re
-import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any, cast
@@ -19,9 +17,8 @@ from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.capabilities import AUTO, detect_capabilities, refusals
 from cow_service.generators.wan.profiles import Acceleration
 
-WARM_UP_SHARE = 5  # dbcache never skips in the first fifth of the steps
-MAX_SKIPPED = 3  # steps in a row that dbcache skips
-FIRST_LAYERS = 5  # dbcache computes a fifth of the layers in every step, and decides by them
+WARM_UP_SHARE = 5  # magcache never skips in the first fifth of the steps
+MAX_SKIPPED = 3  # steps in a row that magcache skips
 
 
 def check_device(acceleration: Acceleration, device: torch.device) -> None:
@@ -106,20 +103,6 @@ def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
         from diffusers.hooks.first_block_cache import FirstBlockCacheConfig  # noqa: PLC0415
 
         transformer.enable_cache(FirstBlockCacheConfig(threshold=wanted.cache_threshold))
-    elif wanted.cache == "dbcache":
-        os.environ.setdefault("CACHE_DIT_LOG_LEVEL", "WARNING")
-        import cache_dit  # noqa: PLC0415
-
-        dbcache = cache_dit.DBCacheConfig(
-            Fn_compute_blocks=max(1, len(transformer.blocks) // FIRST_LAYERS),
-            residual_diff_threshold=wanted.cache_threshold,
-            max_continuous_cached_steps=MAX_SKIPPED,
-            enable_separate_cfg=True,
-        )
-        order = wanted.cache_taylor_order
-        # Without the encoder's: the text is the same in every step.
-        taylor = cache_dit.TaylorSeerCalibratorConfig(taylorseer_order=order, enable_encoder_calibrator=False)
-        cache_dit.enable_cache(transformer, cache_config=dbcache, calibrator_config=taylor if order else None)
     elif wanted.cache == "magcache":
         from diffusers.hooks.mag_cache import MagCacheConfig  # noqa: PLC0415
 
@@ -139,11 +122,10 @@ def cached_pass(transformer: Any, branch: str) -> Generator[None]:
         yield
 
 
-def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2, first: int = 0) -> None:
+def reset_cache(transformer: Any, steps: int | None = None, first: int = 0) -> None:
     """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next.
 
-    `steps`: denoising steps of the coming clip; those before `first` are skipped. `branches`: passes of each
-    step here, which are run in `cached_pass`.
+    `steps`: denoising steps of the coming clip; those before `first` are skipped. Passes are run in `cached_pass`.
     """
     config = getattr(transformer, "mag_cache", None)
     if steps is not None and config is not None:  # the nearest ratio of each step
@@ -152,19 +134,6 @@ def reset_cache(transformer: Any, steps: int | None = None, branches: int = 2, f
             branch: [known[round(step * (len(known) - 1) / max(1, steps - 1))] for step in range(first, steps)]
             for branch, known in config.of_passes.items()
         }
-    steps = None if steps is None else steps - first
-    if "cache_dit" in sys.modules and getattr(transformer, "_is_cached", False):  # by dbcache
-        import cache_dit  # noqa: PLC0415
-
-        changed = cache_dit.DBCacheConfig().reset(
-            num_inference_steps=steps,
-            max_warmup_steps=None if steps is None else -(-steps // WARM_UP_SHARE),
-            enable_separate_cfg=branches == 2,
-        )
-        cache_dit.refresh_context(transformer, cache_config=changed)
-        for name in transformer._context_names:  # else the old one would be held until the next pass
-            transformer._context_manager.set_context(name)
-        return
     transformer._reset_stateful_cache()  # removing and adding them again would change the order of the hooks
 
 

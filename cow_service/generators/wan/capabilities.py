@@ -43,7 +43,7 @@ EXACT_BACKENDS: Mapping[str, AttentionBackend] = {
     "xformers": AttentionBackend(VOLTA),
 }
 # Distributions and the minimum versions that diffusers accepts.
-MINIMUM_VERSIONS: Mapping[str, str] = {"cache-dit": "1.5.0", "torchao": "0.15.0", "triton": "3.0.0"}
+MINIMUM_VERSIONS: Mapping[str, str] = {"torchao": "0.15.0", "triton": "3.0.0"}
 
 
 class Capabilities(Record):
@@ -109,8 +109,6 @@ def _find_refusals(wanted: Acceleration, available: Capabilities) -> Iterator[st
         yield f"compile: regional needs {_package('triton')}; install it, or choose none."
     if wanted.compile != "none" and not available.compiler:
         yield "compile: regional needs a C++ compiler and Python's headers; install them, or choose none."
-    if wanted.cache == "dbcache" and "cache-dit" not in has:
-        yield f"cache: dbcache needs {_package('cache-dit')}; install it, or choose first-block."
     if wanted.cache == "first-block" and wanted.context_parallel > 1:
         # Each GPU measures the change of its own shard; if only some skip, the others wait for their tensors forever.
         yield "cache: GPUs that share a video would not skip the same steps with first-block; choose none."

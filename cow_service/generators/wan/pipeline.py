@@ -258,9 +258,8 @@ def denoise(
 
         return share(branch, compute, latents)
 
-    branches = 1 if negative is None else 2
     total = sampling.steps - first
-    reset_cache(transformer, sampling.steps, branches, first)
+    reset_cache(transformer, sampling.steps, first)
     try:
         for step, time in enumerate(schedule.timesteps[first:], first):
             velocity = velocity_of("cond", guided, time, prompt)
@@ -273,7 +272,7 @@ def denoise(
             wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
             on_step(step + 1 - first, total)
     finally:  # what was kept for the next step would lie in memory while the clip is decoded
-        reset_cache(transformer, sampling.steps, branches, first)
+        reset_cache(transformer, sampling.steps, first)
     return torch.cat([guided, latents[:, :, 1:]], dim=2) if _is_first_frame(guided, latents) else latents
 
 

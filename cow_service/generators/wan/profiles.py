@@ -79,15 +79,13 @@ class Acceleration(Record):
         description="regional compiles the transformer's block once for all of its layers; the same to rounding. The "
         "first clips of new shapes wait for the compiler.",
     )
-    cache: Literal["none", "first-block", "dbcache", "magcache"] = Field(
+    cache: Literal["none", "first-block", "magcache"] = Field(
         default="none",
         description="Skips the transformer in steps that would change little, and so changes the frames. first-block "
-        "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`. "
-        "dbcache (the package cache-dit, for one GPU) decides as first-block by a fifth of the layers, never skips in "
-        "the first fifth of the steps or more than 3 in a row, and can extrapolate what it skips "
-        "(`cache_taylor_order`). Both keep one to three copies of the hidden states per guidance branch, dbcache as "
-        "many more as its order. magcache knows beforehand how much each step changes (`mag_ratios`), skips as seldom "
-        "as dbcache, and keeps one copy. Of no use with few, distilled steps.",
+        "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`; "
+        "it keeps one to three copies of the hidden states per guidance branch. magcache knows beforehand how much "
+        "each step changes (`mag_ratios`), never skips in the first fifth of the steps or more than 3 in a row, and "
+        "keeps one copy. Of no use with few, distilled steps.",
     )
     mag_ratios: tuple[float, ...] = Field(
         default=(),
@@ -97,15 +95,8 @@ class Acceleration(Record):
     cache_threshold: float = Field(
         default=0.05,
         ge=0,
-        description="Relative change of the first layers, or of magcache the error that adds up. 0 skips nothing; the "
+        description="Relative change of the first layer, or of magcache the error that adds up. 0 skips nothing; the "
         "larger, the faster and the worse.",
-    )
-    cache_taylor_order: int = Field(
-        default=0,
-        ge=0,
-        le=2,
-        description="For dbcache: 0 takes what was computed last for what is skipped, 1 and 2 extrapolate it from its "
-        "last values (TaylorSeer).",
     )
     fp8: Literal["none", "stored", "stored-dynamic", "weights", "dynamic"] = Field(
         default="none",
