@@ -27,7 +27,6 @@ from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModel, 
 
 from cow_service.generators.wan import conditioning
 from cow_service.generators.wan.acceleration import accelerate
-from cow_service.generators.wan.attention import with_attention
 from cow_service.generators.wan.checkpoints import diffusers_config
 from cow_service.generators.wan.pipeline import Conditioning, WanTrackPipeline, latent_shape, token_count
 from cow_service.generators.wan.profiles import Profile, Sampling
@@ -186,7 +185,6 @@ class Studio:
             self.pipeline = build_plain(case)
             self._film = film_plain
         else:
-            profile = with_attention(profile, case.manifest.architecture, case.width, case.height, case.device)
             self.pipeline = build(case, profile)
             accelerate(self.pipeline, profile.acceleration, case.device)
             self._film = film_tracks

@@ -43,6 +43,7 @@ import transformers
 # On a bare GPU machine the package is not installed.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from wan_attention import BACKENDS, AttentionShape, TimedBackend, fastest, shape_of, time_backends
 from wan_flops import pass_flops
 from wan_golden import distances
 from wan_models import Case, Clock, Studio, Timing, do_without_ftfy
@@ -52,10 +53,9 @@ from wan_rows import build_seconds, measure_rows, reckoned, refused, rows, total
 from wan_table import PARTS, table
 
 from cow_service.errors import CowError, GeneratorUnavailable
-from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
-from cow_service.generators.wan.capabilities import backends_for_auto, detect_capabilities, refusals
+from cow_service.generators.wan.capabilities import detect_capabilities, refusals
 from cow_service.generators.wan.pipeline import image_token_count
-from cow_service.generators.wan.profiles import Acceleration, Profile, profile_of
+from cow_service.generators.wan.profiles import Profile, profile_of
 from cow_service.generators.wan.tracks import MAX_FRAMES, STRIDE
 from cow_service.weights.device import choose_device
 from cow_service.weights.manifests import load_manifests
@@ -202,9 +202,8 @@ def survey(case: Case, names: Iterable[str], file: Path | None, budget: Budget |
 
 def time_attention(case: Case) -> tuple[TimedBackend, ...]:
     """Each attention backend that this machine has, by itself, at the shape of the clip."""
-    names = backends_for_auto(Acceleration(), detect_capabilities(case.device))
-    if case.device.type == "cpu":  # on a GPU, its matrix of tokens x tokens would not fit
-        names += ("_native_math",)
+    # On a GPU, the matrix of tokens x tokens of `_native_math` would not fit.
+    names = BACKENDS if case.device.type == "cuda" else ("native", "_native_math")
     dtype = torch.bfloat16 if case.device.type == "cuda" else torch.float32
     return time_backends(names, _attention_shape(case), dtype, case.device)
 

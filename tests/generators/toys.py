@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from diffusers import AutoencoderKLWan, FlowMatchEulerDiscreteScheduler, WanImageToVideoPipeline, WanTransformer3DModel
 from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffusers
-from diffusers.models.attention_dispatch import AttentionBackendName, attention_backend
+from diffusers.models.attention_dispatch import attention_backend
 from golden import figures, image_embeds, original_folder, original_weights, tensors
 from safetensors.torch import load_file, save, save_file
 from torch import Tensor
@@ -26,12 +26,9 @@ from torch.profiler import profile
 
 from cow_service.generators.wan import acceleration, attention, generator, loading, memory, ranks
 from cow_service.generators.wan.acceleration import accelerate, cached_pass, pin, reset_cache
-from cow_service.generators.wan.attention import AttentionShape, TimedBackend, fastest, shape_of, time_backends
 from cow_service.generators.wan.capabilities import (
-    EXACT_BACKENDS,
     MINIMUM_VERSIONS,
     Capabilities,
-    backends_for_auto,
     detect_capabilities,
     refusals,
 )

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from cow_service.errors import CowError, GeneratorUnavailable
-from cow_service.generators.wan.capabilities import AUTO, detect_capabilities, refusals
+from cow_service.generators.wan.capabilities import detect_capabilities, refusals
 from cow_service.generators.wan.profiles import Acceleration
 
 WARM_UP_SHARE = 5  # magcache never skips in the first fifth of the steps
@@ -27,11 +27,10 @@ def check_device(acceleration: Acceleration, device: torch.device) -> None:
         machine = detect_capabilities(device)
     if sentences := refusals(acceleration, machine):
         raise GeneratorUnavailable(f"{' '.join(sentences)} Another profile may work (COW_PROFILE).")
-    if acceleration.attention != AUTO:
-        from diffusers.models.attention_dispatch import attention_backend  # noqa: PLC0415
+    from diffusers.models.attention_dispatch import attention_backend  # noqa: PLC0415
 
-        with naming_option(f"attention: {acceleration.attention}"), attention_backend(acceleration.attention):
-            pass  # diffusers has looked for what the backend needs, and fetched its kernel
+    with naming_option(f"attention: {acceleration.attention}"), attention_backend(acceleration.attention):
+        pass  # diffusers has looked for what the backend needs, and fetched its kernel
 
 
 def accelerate(pipeline: Any, wanted: Acceleration, device: torch.device) -> None:

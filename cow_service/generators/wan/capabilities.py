@@ -8,7 +8,6 @@ import sysconfig
 from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from pydantic import Field
@@ -16,32 +15,8 @@ from pydantic import Field
 from cow_service.generators.wan.profiles import Acceleration
 from cow_service.records import Record
 
-AUTO = "auto"  # in place of a backend's name
 ComputeCapability = tuple[int, int]
-HOPPER, ADA, AMPERE, VOLTA = (9, 0), (8, 9), (8, 0), (7, 0)
-
-
-class AttentionBackend(NamedTuple):
-    """What one of diffusers' attention backends needs of a GPU. Without `at_least` it runs on any device."""
-
-    at_least: ComputeCapability | None = None
-    at_most: ComputeCapability | None = None
-    context_parallel: bool = False  # whether several GPUs can share one clip
-
-
-# Those that compute the same as native to rounding: `auto` chooses among them. diffusers knows what packages they need.
-EXACT_BACKENDS: Mapping[str, AttentionBackend] = {
-    "native": AttentionBackend(context_parallel=True),
-    "_native_flash": AttentionBackend(AMPERE, context_parallel=True),
-    "_native_cudnn": AttentionBackend(AMPERE, context_parallel=True),
-    "_native_efficient": AttentionBackend(VOLTA),
-    "flash": AttentionBackend(AMPERE, context_parallel=True),
-    "flash_hub": AttentionBackend(AMPERE, context_parallel=True),
-    "_flash_3": AttentionBackend(HOPPER, HOPPER),
-    "_flash_3_hub": AttentionBackend(HOPPER, HOPPER, context_parallel=True),
-    "flash_4_hub": AttentionBackend(HOPPER),
-    "xformers": AttentionBackend(VOLTA),
-}
+ADA = (8, 9)
 # Distributions and the minimum versions that diffusers accepts.
 MINIMUM_VERSIONS: Mapping[str, str] = {"torchao": "0.15.0", "triton": "3.0.0"}
 
@@ -82,17 +57,6 @@ def detect_capabilities(device: torch.device) -> Capabilities:
     )
 
 
-def backends_for_auto(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
-    """The attention backends that a GPU supports and `attention: auto` may choose; native is one of them."""
-    own = available.compute_capability
-    return tuple(
-        name
-        for name, (least, most, splits) in EXACT_BACKENDS.items()
-        if (splits or acceleration.context_parallel == 1)
-        and (least is None or (own is not None and least <= own <= (most or own)))
-    )
-
-
 def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
     """One sentence, with reason and remedy, for each option that is not supported; empty if all are."""
     return tuple(_find_refusals(acceleration, available))
@@ -101,10 +65,6 @@ def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, 
 def _find_refusals(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     has, own, here = available.packages, available.compute_capability, available.description
     on_gpu = available.device == "cuda"
-    if wanted.attention == AUTO and not on_gpu:
-        yield f"attention: auto needs a GPU, whose backends it times, and {here}; choose native."
-    if wanted.attention in EXACT_BACKENDS and wanted.attention not in backends_for_auto(wanted, available):
-        yield f"attention: '{wanted.attention}' needs another GPU, or only one, and {here}; choose native."
     if wanted.compile != "none" and on_gpu and "triton" not in has:
         yield f"compile: regional needs {_package('triton')}; install it, or choose none."
     if wanted.compile != "none" and not available.compiler:

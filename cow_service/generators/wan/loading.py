@@ -7,7 +7,7 @@ nothing; it is for tests, and to try a deployment out.
 
 import logging
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -20,8 +20,7 @@ from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT
 
 from cow_service.errors import CheckpointInvalid, GeneratorOutOfMemory, GeneratorUnavailable
 from cow_service.generators.wan import acceleration, checkpoints, conditioning
-from cow_service.generators.wan.attention import with_attention
-from cow_service.generators.wan.generator import USUAL_SIDES, WanGenerator, clip_size
+from cow_service.generators.wan.generator import WanGenerator
 from cow_service.generators.wan.memory import check_machine, within_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
@@ -55,13 +54,7 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning | None, s
     check_machine(manifest, settings.profile, folders, device)
     acceleration.check_device(profile.acceleration, device)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
-    cell = int(manifest.defaults.get("vae_stride", conditioning.CELL))
-    size = clip_size(int(manifest.defaults["max_area"]), *USUAL_SIDES, cell)
     with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
-        kept = settings.data_dir / "attention.json"
-        longest = int(manifest.defaults["num_frames"])
-        profile = with_attention(profile, manifest.architecture, *size, device, kept, longest, cell)
-        weights = replace(weights, profile=profile)
         pipeline, group = weights.load_pipeline(device)
     generator = WanGenerator(
         manifest, settings, weights.revisions(), identity, pipeline, group, device, profile, track_conditioning

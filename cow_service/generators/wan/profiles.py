@@ -69,10 +69,9 @@ class Acceleration(Record):
     attention: str = Field(
         default="native",
         description="Attention backend, by its name in diffusers. native is PyTorch's own and needs nothing. flash and "
-        "_flash_3 (Hopper GPUs only) are exact to rounding and faster; sage computes in 8 bits, faster still, with "
-        "small visible differences. Names that end in _hub download their kernel from the Hugging Face hub at start, "
-        "with the package kernels. auto times those of the machine that are exact to rounding, at the shape of a clip "
-        "when the model is loaded, and takes the fastest.",
+        "_flash_3 (Hopper GPUs only) are exact to rounding, and may be faster; sage computes in 8 bits, faster still, "
+        "with small visible differences. Names that end in _hub download their kernel from the Hugging Face hub at "
+        "start, with the package kernels.",
     )
     compile: Literal["none", "regional"] = Field(
         default="none",
