@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision import masks
 from cow_service.vision.completion import (
+    WEAK_EDGES,
     as_disc,
     black_faces,
+    enclosed,
     is_top,
     is_underside,
     neck_between,
@@ -442,3 +444,62 @@ def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
     sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
     lightness, a, b = np.median(sample, axis=0).tolist()
     return colour_name(lightness, a, b), colour_names(lightness, a, b)
+
+
+FAINT_AREA = 0.0008  # of the image
+COVERED = 0.25  # of a patch, by things that were found: it is a part of one
+SOLID = 0.8  # of its convex hull that a patch fills
+PALER, TINTED = 1.2, 3.0  # Lab lightness above the floor on every side of it, and Lab units from its hue
+FAINT_TEXTURE = 2.0  # of the spread in lightness of the floor around it: less is texture
+NEAR, BEYOND = 5, 12  # px at the working size: the floor around it, and that beyond the joint beside a tile
+DARKEST = -5.0  # Lab lightness against the floor on any side: what is darker is a shadow or a gap
+
+
+def find_faint(view: View, size: tuple[int, int], regions: Sequence[Region]) -> tuple[BBox, ...]:
+    """Boxes [x0, y0, x1, y1] (px) of what may be a thing of an image (width, height) although it hardly stands out.
+
+    Such as a white cone on a pale floor: a patch that a closed weak edge surrounds, paler than the floor on every side
+    of it or of another hue. What is darker and of the floor's hue may as well be a shadow. Such a patch is too faint to
+    be simulated, and too clear to be denied.
+    """
+    taken, found = np.zeros(size[::-1], bool), list[BBox]()
+    for region in regions:
+        region.mask.add_to(taken)
+    taken = masks.dilated(masks.resized_mask(taken, (view.lab.shape[1], view.lab.shape[0])), 7)
+    across, down = size[0] / taken.shape[1], size[1] / taken.shape[0]
+    for near, patch, (x, y, w, h) in enclosed(view, *WEAK_EDGES):
+        area = np.count_nonzero(patch)
+        if area < FAINT_AREA * taken.size or np.count_nonzero(taken[near] & patch) > COVERED * area:
+            continue
+        y0, x0 = max(0, near[0].start - BEYOND), max(0, near[1].start - BEYOND)
+        wide = slice(y0, near[0].stop + BEYOND), slice(x0, near[1].stop + BEYOND)
+        whole = np.zeros(taken.shape, bool)
+        whole[near] = patch
+        steps = _steps_around(view.lab[wide], whole[wide], taken[wide])
+        if steps is None:
+            continue
+        paler, tinted = steps
+        texture = FAINT_TEXTURE * float(np.median(view.spread[near]))
+        if paler > max(PALER, texture) or (tinted > TINTED and paler > max(DARKEST, texture - tinted)):
+            found.append((x * across, y * down, (x + w) * across, (y + h) * down))
+    return tuple(found)
+
+
+def _steps_around(lab: Floats32, patch: Mask, taken: Mask) -> tuple[float, float] | None:
+    """How much paler a patch [h, w] is than each quarter of the floor around it, and how far from its hue, at least.
+
+    None for a patch that is ragged, or beside which some quarter is not seen. `taken` [h, w] are things.
+    """
+    whole = masks.without_holes(masks.dilated(patch))
+    if np.count_nonzero(whole) < SOLID * np.count_nonzero(masks.hull(whole)):
+        return None
+    own, steps = np.median(lab[patch], axis=0), list[Floats32]()
+    for around in (masks.dilated(whole, 2 * NEAR + 1), masks.dilated(whole, 2 * BEYOND + 1) & ~taken):
+        rows, columns = np.nonzero(around & ~masks.dilated(whole, 5))
+        quarter = 2 * (rows > rows.mean()) + (columns > columns.mean()) if len(rows) else rows
+        sides = [lab[rows[quarter == i], columns[quarter == i]] for i in range(4)]
+        if min(len(side) for side in sides) == 0:
+            return None
+        steps += [own - np.median(side, axis=0) for side in sides]
+    lightness, *hue = np.array(steps).T
+    return float(lightness.min()), float(np.hypot(*hue).min())

@@ -16,7 +16,6 @@ from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.contrast import View
 from cow_service.vision.edges import find_segments
-from cow_service.vision.faint import find_faint
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, dilated, is_among, is_same_object, without_holes
 from cow_service.vision.regions import (
@@ -24,6 +23,7 @@ from cow_service.vision.regions import (
     Region,
     disc_region,
     drawn_region,
+    find_faint,
     find_regions,
     found_region,
     measure,
