@@ -68,7 +68,10 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
     parameters, has_float8 = _read_headers(folders, tuple(manifest.parameters))
 
     def lacking(profile: Profile) -> str:
-        if sentences := refusals(profile.acceleration, machine):
+        sentences = refusals(profile.acceleration, machine)
+        if device.type == "cpu" and manifest.sources and profile.acceleration.compile != "none":
+            sentences += (f"It is meant for GPUs, and {machine.description}.",)
+        if sentences:
             return " ".join(sentences)
         if profile.acceleration.keeps_float8 and not has_float8:
             fp8 = profile.acceleration.fp8
