@@ -20,6 +20,7 @@ from conftest import ROOT
 from drawn import ball, block, floor
 from mllm_server import MllmServer
 from outcomes import YES, simulated
+from refusals import refused
 from waiting import TIME_LIMIT
 
 from cow_service.readers.base import Imagined, ReaderInput
@@ -357,6 +358,51 @@ def test_a_question_is_answered_as_the_page_sets_it_up(
     assert kept == model.first.model_dump() | habit.learned
     if habit.page not in ADDRESSES:  # one's own server: it serves the model under that name
         assert model.name in BLOCK.findall(PAGES[habit.page])[0]
+
+
+def failed(page: str, status: int, body: object, code: str, reason: str) -> Any:
+    return pytest.param(page, status, body, code, reason, id=f"{page}: {reason}")
+
+
+NO_MODEL, NO_KEY, NO_CREDIT = "there is no model of that name", "it refused the key", "the account's quota is used up"
+INVALID_KEY = [{"@type": "type.googleapis.com/google.rpc.ErrorInfo", "reason": "API_KEY_INVALID"}]
+
+
+@pytest.mark.parametrize(
+    ("page", "status", "body", "code", "reason"),
+    [
+        failed("vllm", 404, vllm("The model `x` does not exist."), "mllm-unavailable", NO_MODEL),
+        failed("sglang", 404, sglang("The model `x` does not exist."), "mllm-unavailable", NO_MODEL),
+        failed("ollama", 404, openai("model 'x' not found"), "mllm-unavailable", NO_MODEL),
+        failed("ollama", 200, say.completion('{"reas', "length"), "mllm-bad-reply", "it was cut off"),
+        failed("lm-studio", 200, say.completion(""), "mllm-bad-reply", "it was empty"),
+        failed("lm-studio", 200, {"error": "no"}, "mllm-unavailable", "its reply could not be read"),
+        failed("lm-studio", 400, {"error": "no"}, "mllm-refused", "it answered with status 400"),
+        failed(
+            "llama-cpp", 500, llama("image input is not supported - hint: provide the mmproj", 500, "server_error"),
+            "mllm-unavailable", "it answered with status 500",
+        ),
+        failed("openai", 401, openai("Incorrect API key provided"), "mllm-unavailable", NO_KEY),
+        failed("openai", 429, {"error": {"code": "insufficient_quota"}}, "mllm-unavailable", NO_CREDIT),
+        failed("anthropic", 401, anthropic("invalid x-api-key", "authentication_error"), "mllm-unavailable", NO_KEY),
+        failed("anthropic", 400, anthropic("Your credit balance is too low"), "mllm-unavailable", NO_CREDIT),
+        failed("google", 400, {"error": {"code": 400, "details": INVALID_KEY}}, "mllm-refused", NO_KEY),
+    ],
+)  # fmt: skip
+def test_a_failure_is_told_in_the_words_of_the_page(
+    page: str, status: int, body: object, code: str, reason: str, mllm: MllmServer, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    from cow_service.readers.mllm.reader import create
+
+    settings = settings_of(page, 0, mllm, tmp_path, monkeypatch)
+    reader = create(settings.model_copy(update={"mllm_budget": 0.5}))  # which is what repeats would take
+    mllm.say(lambda handler: handler.send(status, body))
+    with refused(code) as caught:
+        reader.ground(ReaderInput(scene=SCENE, question=QUESTION))
+    reader.close()
+    assert reason in caught.value.detail
+    assert f"| `{code}`: {reason}" in PAGES[page]
 
 
 def test_every_page_has_a_stand_in_and_stands_in_the_table() -> None:
