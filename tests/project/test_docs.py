@@ -34,6 +34,8 @@ LONG_PAGES = tuple(
     f"docs/{name}.md" for name in ("agents", "benchmark", "extending", "mllm", "photographs", "sdk", "video")
 )  # the command of photographs.md is run by service/test_photographs.py, too
 PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
+# Their commands need an MLLM: readers/test_server_pages.py sets a stand-in up as they say.
+SERVER_PAGES = tuple(sorted(f"docs/servers/{path.name}" for path in (ROOT / "docs" / "servers").glob("*.md")))
 LANGUAGES = {"sh", "python", "toml", "yaml", "json", "text"}
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SERVE = re.compile(r"(^|\s)(cow serve|make serve|cow mcp --transport)\b")
@@ -195,7 +197,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Checkout]:
 
 def test_every_block_has_a_language_that_is_known() -> None:
     assert len(PAGES) == 24
-    found = {block.language for page in PAGES for block in blocks(page)}
+    found = {block.language for page in PAGES + SERVER_PAGES for block in blocks(page)}
     assert found <= LANGUAGES
     # What stands outside of a block would not be run.
     outside = "".join(BLOCK.sub("", (ROOT / page).read_text()) for page in PAGES)
@@ -207,7 +209,7 @@ def test_links_lead_somewhere() -> None:
         headings = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE)
         return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
-    for page in PAGES:
+    for page in PAGES + SERVER_PAGES:
         path = ROOT / page
         for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
             if not target.startswith("http"):

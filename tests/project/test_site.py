@@ -82,8 +82,8 @@ def test_nothing_is_loaded_from_elsewhere_and_links_lead_somewhere(site: Path, p
                 assert not anchor or unquote(anchor) in pages[led].anchors, f"{path.name}: {target}"
     for path in site.rglob("*.css"):
         assert not re.search(r"url\(['\"]?(https?:)?//|@import", path.read_text()), path
-    for path in (ROOT / "docs").glob("*.md"):
-        page = (site / f"{path.stem}.html").read_text()
+    for path in (ROOT / "docs").rglob("*.md"):
+        page = (site / path.relative_to(ROOT / "docs")).with_suffix(".html").read_text()
         assert not re.search(r"<p>[^<]*\n([-*]|\d+\.) ", page), f"{path.name}: a list needs an empty line"
 
 

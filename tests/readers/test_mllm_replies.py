@@ -30,6 +30,16 @@ LINE = {"cue": "orientation", "along_arrow": None, "camera": None, "direction": 
 NAMED = {"object": "red ball", "others": [], "kind": "linear"}
 
 
+def test_no_schema_stands_at_two_places() -> None:
+    """pydantic-ai would empty the second."""
+    from cow_service.readers.mllm.replies import closed, nullable, words
+
+    point = nullable(words(9))
+    start, end = closed({"start": point, "end": point})["properties"].values()
+    assert start == end
+    assert start["anyOf"][0] is not end["anyOf"][0]
+
+
 def frame_of(family: str, image: tuple[int, int] = (640, 400), sent: tuple[int, int] = (640, 400)) -> CoordinateFrame:
     from cow_service.readers.mllm.coordinates import CoordinateFrame
 

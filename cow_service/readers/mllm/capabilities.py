@@ -22,17 +22,15 @@ MAX_REDUCTION = FEWER_FRAMES + 2
 REFUSED = (HTTPStatus.BAD_REQUEST, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.NOT_IMPLEMENTED)
 _SIZE_STATUS = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
 _IMAGES = re.compile(
-    r"(?:most|maximum(?: of)?|only|up to|limit\D{0,20}|than)\s+(\d+)\s+(?:image|picture)", re.IGNORECASE
+    r"(?i)(?:most|maximum(?: of)?|only|up to|limit\D{0,20}|than)\s+(\d+)\s+(?:image|picture)"
+    r"|image count \d+ exceeds limit (\d+)|\bimage=(\d+)"  # of SGLang, and of older vLLM
 )
 _ONE_IMAGE = re.compile(r"\b(?:single|one) image\b|multiple images|more than one image", re.IGNORECASE)
 _TOO_LARGE = re.compile(
-    r"too large|too big|too long|maximum (?:context|size|allowed)|context (?:length|window)"
-    r"|exceeds? .{0,30}(?:size|limit|length)",
-    re.IGNORECASE,
-)  # fmt: skip
-_OUTPUT = re.compile(
-    r"response_?format|json_?(?:schema|object)|\bschema\b|grammar|guided|structured|extra", re.IGNORECASE
+    r"(?i)too (?:large|big|long)|maximum (?:context|model|size|allowed)|context (?:length|window|size)"
+    r"|exceeds? .{0,30}(?:size|limit|length|tokens)"
 )
+_OUTPUT = re.compile(r"(?i)response_?format|json_?(?:schema|object)|\bschema\b|grammar|guided|structured|extra")
 _SYSTEM = re.compile(
     r"system[ _]?(?:role|message|prompt|instruction)|role\W{0,3}.{0,12}system|roles must", re.IGNORECASE
 )
@@ -106,7 +104,7 @@ def _named_steps(used: ServerCapabilities, error: errors.ModelHTTPError, images:
     """Steps for what a refusal names."""
     status, said = error.status_code, str(error.body or "")
     counted = _IMAGES.search(said)
-    most = int(counted[1]) if counted else 1 if _ONE_IMAGE.search(said) else images
+    most = int(counted[counted.lastindex or 1]) if counted else 1 if _ONE_IMAGE.search(said) else images
     if status in REFUSED and 0 < most < images:
         yield {"images": most}
     if _is_too_large(error) and used.reduction < MAX_REDUCTION:

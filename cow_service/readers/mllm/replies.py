@@ -94,7 +94,8 @@ def schema_of(fields: Mapping[str, Schema] | None = None, *, reasoning_length: i
 
 def closed(fields: Mapping[str, Schema]) -> Schema:
     """The schema of an object with all of these fields and no others."""
-    return {"type": "object", "properties": dict(fields), "required": [*fields], "additionalProperties": False}
+    properties = json.loads(json.dumps(dict(fields)))  # copies: pydantic-ai empties a schema that stands at two places
+    return {"type": "object", "properties": properties, "required": [*fields], "additionalProperties": False}
 
 
 def fields_schema(kind: type[Reply]) -> dict[str, Schema]:
