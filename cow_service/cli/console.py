@@ -1,7 +1,5 @@
 """The output of `simulate`, `answer`, `models` and `doctor`: progress, results in a folder, tables."""
 
-from __future__ import annotations
-
 import hashlib
 import platform
 import shutil
@@ -203,7 +201,7 @@ def _spreads(measured: records.MllmMeasurement) -> str:
     return f"boxes {measured.bbox_deviation:.0%} of a side off, directions {measured.direction_deviation:.0f} degrees"
 
 
-def print_check(check: MllmCheck, mllm: records.MllmStatus | None) -> None:
+def print_check(check: "MllmCheck", mllm: records.MllmStatus | None) -> None:
     """How a multimodal LLM answered the questions of a check, and what is known of it now."""
     console = Console(highlight=False, soft_wrap=True)
     table = Table("asked for", "", "", box=None, pad_edge=False)

@@ -1,6 +1,5 @@
 """A check of a multimodal LLM: five small questions about pictures that ship with COW, whose answers are known."""
 
-import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -148,8 +147,12 @@ def _of_places(
     written: Sequence[Reply], own: Coordinates, usual: MllmMeasurement
 ) -> tuple[list[Finding], MllmMeasurement | None]:
     """The findings on boxes, directions and senses, and what they come to."""
-    ways = itertools.product(("thousandths", "fractions", "pixels"), ("xy", "yx"), ("corners", "size"))
-    others = [own.model_copy(update=dict(zip(("units", "axes", "box_form"), way, strict=True))) for way in ways]
+    others = [
+        own.model_copy(update={"units": units, "axes": axes, "box_form": form})
+        for units in ("thousandths", "fractions", "pixels")
+        for axes in ("xy", "yx")
+        for form in ("corners", "size")
+    ]
 
     def fit(coordinates: Coordinates) -> float:
         return sum(iou(*pair) for reply in written for pair in reply.pairs(coordinates))
