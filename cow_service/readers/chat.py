@@ -5,6 +5,7 @@ from http import HTTPStatus
 from typing import Any, Protocol, runtime_checkable
 
 from cow_service.adaptive import AdaptivePlaces
+from cow_service.records import ServerCapabilities
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,30 @@ class ChatReader(Protocol):
         """Where chats can be sent on as they are; None if its MLLM does not speak OpenAI's protocol."""
         ...
 
+    @property
+    def takes(self) -> ServerCapabilities | None:
+        """What was learned of that server; None: nothing yet."""
+        ...
+
     async def chat(self, body: dict[str, Any]) -> ChatTurn:
         """The reply to a chat (the JSON object of OpenAI's chat completions), as far as it can be sent.
 
         Raises `InvalidRequest` for what can neither be sent nor left out, and `MllmUnavailable`.
         """
         ...
+
+
+def adapted(body: dict[str, Any], takes: ServerCapabilities | None) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """A chat as its server takes it, and what of it could not be sent. What the server takes stays as it is."""
+    if takes is None:
+        return body, ()
+    refused = [name for name in ("temperature", "seed") if body.get(name) is not None and not getattr(takes, name)]
+    sent = {name: value for name, value in body.items() if name not in refused}
+    if takes.token_field == "max_completion_tokens" and "max_tokens" in sent:
+        sent.setdefault(takes.token_field, sent.pop("max_tokens"))
+    if not takes.system_role and isinstance(sent.get("messages"), list):
+        sent["messages"] = [
+            each | {"role": "user"} if isinstance(each, dict) and each.get("role") == "system" else each
+            for each in sent["messages"]
+        ]
+    return sent, tuple(f"Not sent: `{name}`. The MLLM's server does not take it." for name in refused)

@@ -27,7 +27,7 @@ from cow_service.api.openai.forwarding import Events, Forwarder
 from cow_service.api.openai.imagining import EnrichedChat, WhatIf, find_what_if
 from cow_service.api.openai.records import Answerer
 from cow_service.jobs.engine import new_job_id
-from cow_service.readers.chat import ChatReader, ChatTurn
+from cow_service.readers.chat import ChatReader, ChatTurn, adapted
 from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.options import read_choices
 from cow_service.records import AnswerOption, Job
@@ -92,7 +92,7 @@ class Completer:
                 result = await submitter.result(request, submission, wanted)
                 assert result is not None, "this request waits without a limit"
                 wanted = await to_thread.run_sync(what_if.take, result, self.service.artifacts)
-            enriched = await to_thread.run_sync(what_if.enriched, self.service.artifacts)
+            enriched = await to_thread.run_sync(what_if.enriched, self.service.artifacts, reader.takes)
         except errors.CowError as error:
             enriched = what_if.without(error)
         return await self._forward(request, enriched, reader)
@@ -144,7 +144,7 @@ class Completer:
                     if wanted is not None:
                         following = replace(submission, job_id=new_job_id(submission.owner, None))
                         running = following, await self._submitter.submit(following, wanted)
-                enriched = await to_thread.run_sync(what_if.enriched, self.service.artifacts)
+                enriched = await to_thread.run_sync(what_if.enriched, self.service.artifacts, reader.takes)
             except errors.CowError as error:
                 enriched = what_if.without(error)
             async for event in _events_of(await self._ask(enriched, reader, stack), enriched):
@@ -181,9 +181,9 @@ class Completer:
     async def _send(self, body: dict[str, Any], reader: ChatReader, stack: AsyncExitStack) -> ChatTurn | Events:
         if reader.upstream is None:
             return await reader.chat(body)
-        return await stack.enter_async_context(
-            self._forwarder.send(reader.upstream, body | {"model": reader.upstream.model})
-        )
+        body, left_out = adapted(body | {"model": reader.upstream.model}, reader.takes)
+        reply = await stack.enter_async_context(self._forwarder.send(reader.upstream, body))
+        return replace(reply, warnings=left_out) if isinstance(reply, ChatTurn) else reply
 
     async def _vote(self, body: dict[str, Any], enriched: EnrichedChat, reader: ChatReader) -> ChatTurn:
         """The reply of most votes, all asked at the same time. A vote that fails fails the chat."""

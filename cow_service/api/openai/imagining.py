@@ -15,12 +15,13 @@ from cow_service.api.openai.records import WITHOUT, Answerer, ChatImagination
 from cow_service.api.problems import invalid
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode, decode_own, encode_png, fit_within
+from cow_service.media.overlay import named_strip
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion, other_item
 from cow_service.readers.mllm.hypothesis import hypothesis, pictures
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt
-from cow_service.records import Frame, Simulation, Usage
+from cow_service.records import Frame, ServerCapabilities, Simulation, Usage
 from cow_service.requests import ImageArtifact, MotionRequest, SimulateRequest
 
 NOTE, FACTS_NOTE = "imagined-frames", "imagined-facts"  # names in prompts/
@@ -105,10 +106,11 @@ class WhatIf:
             **{name: getattr(self.request, name) for name in OF_CLIP},
         )
 
-    def enriched(self, artifacts: ArtifactStore) -> EnrichedChat:
+    def enriched(self, artifacts: ArtifactStore, takes: ServerCapabilities | None) -> EnrichedChat:
         """The chat with a note and pictures after its question; for two worlds, a named strip of each.
 
-        All images are seen in the `detail` of the caller's own. CPU work. Raises `ArtifactNotFound`.
+        Where the MLLM's server takes fewer images a call, they share one strip. All images are seen in the `detail` of
+        the caller's own. CPU work. Raises `ArtifactNotFound`.
         """
         simulation, content = self.results[0], self.answerer.content
         factual = tuple(decode_own(artifacts.read(frame.sha256)) for frame in simulation.factual_frames)
@@ -116,7 +118,13 @@ class WhatIf:
         prompt = load_prompt(FACTS_NOTE if content == "text" else NOTE)
         detail = {} if self.image.detail is None else {"detail": self.image.detail}
         parts: list[Any] = [{"type": "text", "text": prompt.render(**{name: told[name] for name in prompt.inputs})}]
-        for png in () if content == "text" else self._pngs(artifacts):
+        pngs, warnings = [] if content == "text" else self._pngs(artifacts), list(simulation.warnings)
+        own = sum(1 for _ in images_of(self.chat.messages))
+        if takes is not None and takes.images is not None and own < takes.images < own + len(pngs):
+            strip = named_strip([decode_own(png) for png in pngs], f"Frames 1 to {len(pngs)}, row by row")
+            pngs = [encode_png(strip)]
+            warnings.append("The MLLM's server takes fewer images a call: frames were sent on one sheet.")
+        for png in pngs:
             url = "data:image/png;base64," + base64.b64encode(png).decode()
             parts.append({"type": "image_url", "image_url": {"url": url, **detail}})
         shown = () if content in ("text", "still") else (self.results[-1],)
@@ -128,7 +136,7 @@ class WhatIf:
             usage=sum((each.usage for each in self.results), Usage()),
             usage_total=sum((each.usage_total for each in self.results), Usage()),
             reused=simulation.reused,
-            warnings=simulation.warnings,
+            warnings=tuple(warnings),
         )
         messages = list(self.chat.messages)
         content = messages[self.message].get("content")

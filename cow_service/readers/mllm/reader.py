@@ -23,7 +23,7 @@ from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_c
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import BBox, Grounding, LocatedObject, MllmMeasurement
+from cow_service.records import BBox, Grounding, LocatedObject, MllmMeasurement, ServerCapabilities
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
@@ -84,6 +84,11 @@ class MllmReader:
     def close(self) -> None:
         """Closes its connections."""
         self._client.close()
+
+    @property
+    def takes(self) -> ServerCapabilities | None:
+        """What was learned of its server, by this process or another."""
+        return self._client.notes.takes
 
     async def chat(self, body: dict[str, Any]) -> ChatTurn:
         """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""
