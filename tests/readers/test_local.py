@@ -162,6 +162,9 @@ def test_a_model_that_thinks_first(toy: Toy) -> None:
         assert fits(BOX, json.loads(reply.content))
         assert found.finish_reason == "stop"
         assert found.usage.output_tokens > len(reply.content)
+    (endless,) = toy.now(toy.ask(thinker, "?", schema=BOX, temperature=0.0, max_tokens=400))
+    assert fits(BOX, json.loads(endless.text or "")), "a thought leaves room for the reply"
+    assert endless.usage.output_tokens > 200
     (cut,) = toy.now(toy.ask(thinker, "?", schema=BOX, temperature=9.0, seed=1, max_tokens=2))
     assert (cut.finish_reason, cut.usage.output_tokens, cut.text) == ("length", 2, "")
 

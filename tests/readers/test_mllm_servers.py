@@ -150,6 +150,22 @@ def test_frames_share_a_sheet_where_a_call_takes_fewer_images(mllm: MllmServer, 
     assert "All images after the first are on one sheet" in mllm.text(-1)
 
 
+@pytest.mark.parametrize("thought", [{"reasoning_content": "I look"}, {"content": "<think>I look"}])
+def test_a_thought_that_leaves_no_room_is_given_more(thought: dict[str, str], mllm: MllmServer, tmp_path: Path) -> None:
+    def reply(handler: Any) -> None:
+        body = say.completion(REPLY)
+        if handler.body["max_tokens"] <= mllm.asked[0]["max_tokens"]:
+            body["choices"][0] |= {
+                "message": {"role": "assistant", "content": None} | thought,
+                "finish_reason": "length",
+            }
+        handler.send(200, body)
+
+    mllm.say(reply)
+    calls, _ = asked_with_frames(mllm, tmp_path)
+    assert calls == 2
+
+
 def test_what_a_dead_server_refuses_teaches_nothing(mllm: MllmServer, tmp_path: Path) -> None:
     mllm.say(say.status(500), say.status(500), say.status(400), REPLY)
     asked_with_frames(mllm, tmp_path)

@@ -35,6 +35,7 @@ _BY_NAME = ("properties", "$defs", "definitions")  # they hold schemas under arb
 _AS_IT_IS = ("allOf", "enum", "const", "default", "examples")  # parts of one object, and values
 # With the one, the chat templates of models that think open a reply; the other is the token that ends the thought.
 _THOUGHT_START, _THOUGHT_END = "<think>", "</think>"
+ANSWER_TOKENS = 1024  # that a thought leaves for the reply, or half of all where those are fewer
 Finish = Literal["stop", "length"]
 Turn = dict[str, Any]  # as chat templates take it: {"role": ..., "content": [{"type": "text", "text": ...}, ...]}
 
@@ -153,6 +154,9 @@ class BatchRow:
     def choose(self, logits: Tensor) -> Tensor:
         """The id, [], of a valid next token of the reply, from logits, [vocabulary]."""
         if self.matcher is not None and self.thought_end is not None:
+            room = self.pending.limit - len(self.thought)
+            if room <= min(ANSWER_TOKENS, self.pending.limit // 2):  # else nothing would be left of it but the thought
+                return torch.tensor(self.thought_end, device=logits.device)
             logits = logits.index_fill(0, torch.tensor(list(self.ends), device=logits.device), -torch.inf)  # too early
         elif self.matcher is not None:
             # llguidance's own function for tensors needs a C++ compiler at run time.

@@ -434,7 +434,7 @@ class LearningModel(RetryingModel):
         self._variant, self._capabilities, self._call = model.variant, capabilities, call
         self._takes, self._steps = capabilities.current, 0
         self._key = model.upstream and model.upstream.key
-        self._note = ""
+        self._note, self._is_longer = "", False
 
     async def _attempt(
         self, messages: list[ai.ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
@@ -460,7 +460,10 @@ class LearningModel(RetryingModel):
                 self._capabilities.succeed(self._takes)
                 if self._note:
                     self._log.notes[self._note] = None
-                return with_text(response)
+                response, was_longer = with_text(response), self._is_longer
+                self._is_longer = was_longer or self.truncated
+                if response.text or was_longer or not self.truncated:
+                    return response  # else it was still thinking: once more, with more room
 
     async def _send(
         self, messages: list[ai.ModelMessage], settings: ModelSettings | None, parameters: ModelRequestParameters
@@ -478,6 +481,8 @@ class LearningModel(RetryingModel):
         messages = [replace(first, parts=parts), *messages[1:]]
         refused = [name for name in ("temperature", "seed") if not getattr(takes, name)]
         sent = cast("ModelSettings", {name: value for name, value in (settings or {}).items() if name not in refused})
+        if self._is_longer and (most := sent.get("max_tokens")):
+            sent |= ModelSettings(max_tokens=2 * most)
         if takes.output != "prompt":
             # The text is read by our own tolerant rules all the same: a server may ignore the schema.
             parameters = replace(
