@@ -27,6 +27,7 @@ class AdaptiveLimit:
     """How many calls may be in flight, at least 1 and at most `most`. Thread-safe; it makes no calls and never waits.
 
     It grows only while calls wait for a place. Calls that were in flight when it was halved do not halve it again.
+    Growth is spread over a round trip, so that few calls are refused before the first refusal comes back.
     """
 
     def __init__(self, most: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -34,7 +35,9 @@ class AdaptiveLimit:
         self._limit = float(min(FIRST, most))
         self._clock, self._lock = clock, threading.Lock()
         self._ceiling = math.inf  # calls in flight that were accepted when one more was refused
-        self._full_at = self._cut_at = self._resumes_at = -math.inf
+        self._credit = 0.0  # growth that successes have earned
+        self._latency = 0.0  # of the last successes, seconds
+        self._full_at = self._grown_at = self._cut_at = self._resumes_at = -math.inf
         self._succeeded = True  # since the last halving
 
     @property
@@ -53,9 +56,14 @@ class AdaptiveLimit:
             now = self._clock()
             if self.in_flight >= self.limit:
                 self._full_at = now
+            seconds_to_grow = self._grown_at + self._latency / (2 * self._limit) - now
+            if self._credit >= 1 and seconds_to_grow <= 0:
+                self._limit, self._credit, self._grown_at = min(self.most, self._limit + 1), self._credit - 1, now
             if now < self._resumes_at:
                 return self._resumes_at - now
-            return 0.0 if self.in_flight < self.limit else math.inf
+            if self.in_flight < self.limit:
+                return 0.0
+            return max(seconds_to_grow, 0.001) if self._credit >= 1 and self.limit < self.most else math.inf
 
     def begin(self) -> float:
         """A call begins, once `seconds_to_wait` is 0. Returns the time, by which `end` and `refuse` know the call."""
@@ -70,8 +78,10 @@ class AdaptiveLimit:
             if not succeeded or began <= self._cut_at:
                 return
             self._succeeded = True
+            seconds = max(self._clock() - began, 1e-6)
+            self._latency += (seconds - self._latency) / 4 if self._latency else seconds
             if began <= self._full_at:  # a call waited for a place meanwhile
-                self._limit = min(self._limit + self._growth(), self.most)
+                self._credit = min(self._credit + self._growth(), self._limit)
 
     def refuse(self, began: float, retry_after: float | None = None) -> None:
         """The other side was too busy for a call, and maybe said after how many seconds to call again. Still `end` it.
@@ -86,7 +96,7 @@ class AdaptiveLimit:
             if self._succeeded:  # else nothing works, at whatever level
                 self._ceiling = max(1, self.in_flight - 1)
             self._limit = max(1.0, min(self._limit, self.in_flight) / 2)
-            self._cut_at, self._succeeded = now, False
+            self._credit, self._cut_at, self._succeeded = 0.0, now, False
 
     def _growth(self) -> float:
         """By how much one success raises the limit; there are `limit` of them in a round trip."""

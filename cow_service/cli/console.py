@@ -180,9 +180,9 @@ def print_models(models: records.Models, *, as_json: bool) -> None:
 
 
 def _mllm_words(mllm: records.MllmStatus) -> str:
-    takes = "not called in the last week" if mllm.takes is None else f"its server takes {_taken(mllm.takes)}"
-    off = "not checked (`cow models check --save`)" if mllm.measured is None else _spreads(mllm.measured)
-    return f"COW_MLLM: {mllm.name} (family {mllm.family}); {takes}; {off}"
+    takes = "no call has succeeded in the last week" if mllm.takes is None else f"its server takes {_taken(mllm.takes)}"
+    exact = "not checked (`cow models check --save`)" if mllm.measured is None else _spreads(mllm.measured)
+    return f"COW_MLLM: {mllm.name} (family {mllm.family}); {takes}; {exact}"
 
 
 def _taken(takes: records.ServerCapabilities) -> str:
@@ -193,15 +193,18 @@ def _taken(takes: records.ServerCapabilities) -> str:
         *(f"no {name}" for name in refused),
         *(() if takes.images is None else (f"{takes.images} image{'s' * (takes.images > 1)} a call",)),
         *(("smaller images",) if takes.reduction else ()),
-        *(() if takes.delivery == "whole" else (f"replies that are {takes.delivery}",)),
+        *(() if takes.delivery == "whole" else ("`stream: true`",)),
     ))  # fmt: skip
 
 
 def _spreads(measured: records.MllmMeasurement) -> str:
-    return f"boxes {measured.bbox_deviation:.0%} of a side off, directions {measured.direction_deviation:.0f} degrees"
+    """How exact readings count as being."""
+    spreads = f"boxes count as exact to {measured.bbox_deviation:.0%} of a side, directions to "
+    spreads += f"{measured.direction_deviation:.0f} degrees"
+    return spreads if measured.coordinates is None else f"{spreads}; places are {measured.coordinates.words}"
 
 
-def print_check(check: "MllmCheck", mllm: records.MllmStatus | None) -> None:
+def print_check(check: "MllmCheck", mllm: records.MllmStatus | None, *, is_kept: bool) -> None:
     """How a multimodal LLM answered the questions of a check, and what is known of it now."""
     console = Console(highlight=False, soft_wrap=True)
     table = Table("asked for", "", "", box=None, pad_edge=False)
@@ -212,10 +215,14 @@ def print_check(check: "MllmCheck", mllm: records.MllmStatus | None) -> None:
     for note in check.notes:
         console.print(escape(note))
     console.print(f"{check.usage.calls} calls; the longest question took {check.seconds:.1f} s.")
-    if check.measured is not None:
-        console.print(f"Measured: {_spreads(check.measured)}.")
     if mllm is not None:
         console.print(escape(_mllm_words(mllm)))
+    if check.measured is None:
+        console.print("Nothing to keep: most boxes were not found, or no direction was given.")
+    elif is_kept:
+        console.print("Kept. A server that runs goes by it when it is started again.")
+    else:
+        console.print(f"Not kept (--save does that): {_spreads(check.measured)}.")
 
 
 def _readiness(backend: records.BackendInfo) -> str:

@@ -101,6 +101,8 @@ def check(
     if name is None:
         _check_mllm(save=save, as_json=as_json)
         return
+    if save:
+        raise InvalidRequest("--save is for the check of COW_MLLM: leave the name out.")
     import json  # noqa: PLC0415
 
     from cow_service.weights import repositories as weights  # noqa: PLC0415
@@ -121,6 +123,8 @@ def check(
                 typer.echo(f"  {finding.message}")
     if not complete:
         typer.echo(f"Run `cow models pull {name}`.", err=True)
+        if manifest.role == "mllm":
+            typer.echo("To check the MLLM of COW_MLLM, wherever it is served, leave the name out.", err=True)
         raise typer.Exit(1)
 
 
@@ -135,17 +139,18 @@ def _check_mllm(*, save: bool, as_json: bool) -> None:
         reader = service.chat_reader("local" if service.settings.reader == "local" else "mllm")
         if not isinstance(reader, MllmReader):
             raise InvalidRequest("The configured reader is not one of COW's own: only those can be checked.")
-        found = reader.check()
-        if saved := found.measured if save else None:
+        found, problem = reader.check(), None
+        if kept := found.measured if save else None:
             try:
-                reader.keep(saved)
+                reader.keep(kept)
             except OSError as error:
-                detail = f"Cannot write to COW_DATA_DIR, '{service.settings.data_dir}': {error.strerror}."
-                raise FolderNotWritable(detail) from error
-    if as_json:
-        typer.echo(found.model_dump_json(indent=2))
-    else:
-        print_check(found, service.models().mllm)
+                problem = FolderNotWritable(f"Cannot write to COW_DATA_DIR, '{service.settings.data_dir}': {error}.")
+        if as_json:
+            typer.echo(found.model_dump_json(indent=2))
+        else:
+            print_check(found, service.models().mllm, is_kept=kept is not None and problem is None)
+    if problem is not None:
+        raise problem
     if not all(finding.usable for finding in found.findings):
         raise typer.Exit(1)
 

@@ -39,7 +39,7 @@ SHARE_WAITING = 0.5  # of the memory, that such jobs may take all together if th
 
 # Stages that take less than their transactions would: behind one that was computed they are not looked for, either.
 QUICK: tuple[Stage, ...] = ("grounding", "depth", "motion", "trajectory")
-# Stages that run beside others. Two jobs that each held a key and waited for the other's would wait for ever.
+# Stages that run beside others. A job holds one key at a time: its process hears of one that was granted to the job.
 UNLOCKED: tuple[Stage, ...] = ("baseline",)
 
 Value = TypeVar("Value")

@@ -64,17 +64,18 @@ class ChatReader(Protocol):
         ...
 
 
-def adapted(body: dict[str, Any], takes: ServerCapabilities | None) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """A chat as its server takes it, and what of it could not be sent. What the server takes stays as it is."""
-    if takes is None:
-        return body, ()
-    refused = [name for name in ("temperature", "seed") if body.get(name) is not None and not getattr(takes, name)]
-    sent = {name: value for name, value in body.items() if name not in refused}
+def adapted(
+    fields: dict[str, Any], messages: list[Any], takes: ServerCapabilities
+) -> tuple[dict[str, Any], list[Any], list[str]]:
+    """The fields and messages of a chat as its server takes them, and warnings of what could not be sent."""
+    refused = [name for name in ("temperature", "seed") if fields.get(name) is not None and not getattr(takes, name)]
+    warnings = [f"Not sent: `{name}`. The MLLM's server does not take it." for name in refused]
+    sent = {name: value for name, value in fields.items() if name not in refused}
     if takes.token_field == "max_completion_tokens" and "max_tokens" in sent:
         sent.setdefault(takes.token_field, sent.pop("max_tokens"))
-    if not takes.system_role and isinstance(sent.get("messages"), list):
-        sent["messages"] = [
-            each | {"role": "user"} if isinstance(each, dict) and each.get("role") == "system" else each
-            for each in sent["messages"]
-        ]
-    return sent, tuple(f"Not sent: `{name}`. The MLLM's server does not take it." for name in refused)
+    roles = () if takes.system_role else ("system", "developer")
+    moved = [isinstance(each, dict) and each.get("role") in roles for each in messages]
+    if any(moved):
+        messages = [{**each, "role": "user"} if one else each for each, one in zip(messages, moved, strict=True)]
+        warnings.append("Sent as messages of the user: those of the system, which the MLLM's server does not take.")
+    return sent, messages, warnings

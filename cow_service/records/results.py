@@ -338,6 +338,12 @@ class Coordinates(Record):
     box: str = Field(default="bbox_2d", description="The key under which it writes a box.")
     point: str = Field(default="point_2d", description="The key under which it writes a point.")
 
+    @property
+    def words(self) -> str:
+        """Such as "pixels, x first, two corners"."""
+        form = "two corners" if self.box_form == "corners" else "a corner, width and height"
+        return f"{self.units}, {self.axes[0]} first, {form}"
+
 
 class ServerCapabilities(Record):
     """What a server takes of a call for one model."""
@@ -362,7 +368,7 @@ class MllmMeasurement(Record):
 
     coordinates: Coordinates | None = Field(default=None, description="Where they are not those of its family.")
     bbox_deviation: float = Field(ge=0, le=1, description="Of the edges of its boxes, one standard deviation in sides.")
-    direction_deviation: float = Field(ge=0, le=180, description="Of its directions, one standard deviation, degrees.")
+    direction_deviation: float = Field(ge=0, le=90, description="Of its directions, one standard deviation, degrees.")
 
 
 class MllmStatus(Record):
@@ -371,7 +377,8 @@ class MllmStatus(Record):
     name: str = Field(description="As it is served.")
     family: str = Field(description="Which says how it writes places.")
     takes: ServerCapabilities | None = Field(
-        default=None, description="What its server takes, learned from calls in the last week; null before the first."
+        default=None,
+        description="What its server takes, learned in the last week; null before a call has succeeded.",
     )
     measured: MllmMeasurement | None = Field(default=None, description="Null before `cow models check --save`.")
 

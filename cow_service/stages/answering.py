@@ -86,7 +86,8 @@ def ask_baseline(
         verdict, warnings = ask(run.reader, given, options, None, None, votes)
     except MllmBadReply as error:
         warning = f"There is no baseline answer: {error.detail}"
-        return StageResult(value=FirstAnswers(verdict=None, asked=votes), warnings=(warning,))
+        warnings = (warning,) if stage == "baseline" else ()
+        return StageResult(value=FirstAnswers(verdict=None, asked=votes), warnings=warnings)
     return StageResult(value=FirstAnswers(verdict=verdict, asked=votes), warnings=warnings)
 
 

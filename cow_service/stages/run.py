@@ -5,7 +5,7 @@ import time
 import uuid
 from collections import abc
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
@@ -76,7 +76,8 @@ ALMOST_DONE = 0.999  # of a stage whose end has not been reported
 
 Request_co = TypeVar("Request_co", bound=SimulateRequest, covariant=True)
 Progress = Callable[[Stage | None, float], None]
-"""Hears how far a stage is, 0 to 1; the stage is None while the run waits to begin. What it raises ends the run."""
+"""Hears how far a stage is, 0 to 1; the stage is None where none is told: while the run waits to begin, and of a stage
+beside others, from another thread. What it raises ends the run."""
 
 
 Compute = Callable[[], StageResult[Any]]
@@ -152,6 +153,7 @@ class Run(Generic[Request_co]):
     reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
     _calls: dict[Stage, CallLog] = field(default_factory=dict[Stage, CallLog])  # of the stages that asked the reader
     _current: tuple[Stage | None, float] = (None, 0.0)
+    _beside: Future[Any] | None = None
 
     @cached_property
     def scene(self) -> Scene:
@@ -324,7 +326,8 @@ class Run(Generic[Request_co]):
     def beside(self, name: Stage, function: Callable[..., StageResult[Value]]) -> abc.Generator[Callable[[], Value]]:
         """Runs a stage without inputs in a thread of its own; yields the function that waits for its value.
 
-        The stage reports no progress. Where the block ends without having waited for it, it is canceled.
+        The stage reports no progress. Where the block ends without having waited for it, it is canceled; where it
+        fails, the stages in the block end with its error, too, as soon as they report.
         """
         left = threading.Event()
 
@@ -337,15 +340,20 @@ class Run(Generic[Request_co]):
         try:
             with ThreadPoolExecutor(1, thread_name_prefix=name) as thread, ExitStack() as leaving:
                 leaving.callback(left.set)
-                yield thread.submit(copy_context().run, side.stage, name, function).result
+                self._beside = thread.submit(copy_context().run, side.stage, name, function)
+                yield self._beside.result
         except CowError as error:
             error.usage = self._spent()
             raise
+        finally:
+            self._beside = None
 
     def report(self, name: Stage | None, done: float) -> None:
-        """Says how far a stage is, 0 to 1. Raises `Canceled` where nobody wants the result any more."""
+        """Says how far a stage is, 0 to 1. Raises `Canceled` if nobody wants the result, and what one beside raised."""
         self._current = name, done
         self.progress(name, done)
+        if self._beside is not None and self._beside.done():
+            self._beside.result()
 
     def report_share(self, done: float) -> None:
         """As `report`, of the current stage before its end."""
@@ -433,12 +441,13 @@ class Run(Generic[Request_co]):
 
     def reader_info(self, *stages: Stage) -> ReaderInfo:
         """Who read for some stages; a reader that none of them needed is named but was never loaded."""
-        infos = [result.reader for result in self.results.values() if result.reader is not None]
+        done = {stage: self.results[stage].reader for stage in stages if stage in self.results}
+        infos = {stage: info for stage, info in done.items() if info is not None}
         if not infos:
             return ReaderInfo(name=self.backends.reader_name)
-        prompts = {name: version for info in infos for name, version in info.prompts.items()}
-        read = tuple(stage for stage in stages if stage in self.results and self.results[stage].reader is not None)
-        return infos[-1].model_copy(update={"prompts": dict(sorted(prompts.items())), "stages": read})
+        prompts = {name: version for info in infos.values() for name, version in info.prompts.items()}
+        told = {"prompts": dict(sorted(prompts.items())), "stages": tuple(infos)}
+        return next(iter(infos.values())).model_copy(update=told)
 
     def warnings(self, *stages: Stage) -> tuple[str, ...]:
         """The warnings of some stages."""

@@ -104,25 +104,28 @@ def test_frames_are_added_behind_the_last_user_message_and_nothing_else(served: 
     assert told(post(served, body, **{"Cache-Control": "no-cache"}))["cow"]["reused"] == []
 
 
-def test_a_server_is_sent_what_it_is_known_to_take(served: Served, mllm: RandomMllm) -> None:
+@pytest.mark.parametrize("stream", [False, True])
+def test_a_server_is_sent_what_it_is_known_to_take(stream: bool, served: Served, mllm: RandomMllm) -> None:
     notes = MllmNotes(served.data, mllm.address, SERVED_NAME)
     before = notes.takes or ServerCapabilities()
     known: dict[str, Any] = {"token_field": "max_completion_tokens", "temperature": False, "seed": False}
     notes.keep(ServerCapabilities(**known, system_role=False, images=2))
-    turns = [{"role": "system", "content": "You are terse."}, *what_if(1)]
-    frames = {**COW, "frames": {"count": 3}}
-    body = {"model": NAME, "messages": turns, "cow": frames, "temperature": 0, "seed": 3, "max_tokens": 90, "top_p": 1}
+    turns = [{"role": "developer", "content": "You are terse."}, *what_if(1)]
+    options = {**COW, "frames": {"count": 3}}
+    body = {"model": NAME, "messages": turns, "cow": options, "temperature": 0, "seed": 3, "max_tokens": 90, "top_p": 1}
     try:
-        told_of = told(post(served, body))["cow"]
+        response = post(served, {**body, "stream": stream})
+        found = chunks_of(response) if stream else [told(response)]
     finally:
         notes.keep(before)
     received = mllm.last()
-    assert received.keys() == {"model", "messages", "max_completion_tokens", "top_p"}
+    assert received.keys() - {"stream"} == {"model", "messages", "max_completion_tokens", "top_p"}
     assert [each["role"] for each in received["messages"]] == ["user", "user"]
     assert [part["type"] for part in received["messages"][1]["content"]].count("image_url") == 2, "its own and a sheet"
-    assert len(told_of["frames"]) == 3
-    for left_out in ("`temperature`", "`seed`", "frames were sent on one sheet"):
-        assert any(left_out in warning for warning in told_of["warnings"])
+    shown = next(each["cow"] for each in found if "frames" in each.get("cow", {}))
+    assert len(shown["frames"]) == 3
+    for left_out in ("`temperature`", "`seed`", "messages of the user", "frames were sent on one sheet"):
+        assert any(left_out in warning for warning in shown["warnings"])
 
 
 def test_an_earlier_image_and_a_text_alone(served: Served, mllm: RandomMllm) -> None:

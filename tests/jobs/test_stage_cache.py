@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,7 @@ from cow_service.jobs.job_table import JobTable
 from cow_service.media.artifacts import DiskArtifacts
 from cow_service.observability.metrics import Metrics
 from cow_service.records import MetresPerPixel, Motion
-from cow_service.stages.keys import StageKey, StageResult
+from cow_service.stages.keys import FirstAnswers, StageKey, StageResult
 
 SHARED, OWN = StageKey("a" * 64), StageKey("b" * 64, shareable=False)
 
@@ -67,6 +70,29 @@ def test_nobody_finds_what_another_key_asked(database: Database) -> None:
     owners = ["alice", "bob", None, "alice", None]
     found = [speed_of(database, str(n), SHARED, n, owner=owner) for n, owner in enumerate(owners)]
     assert found == [(0, False), (1, False), (2, False), (0, True), (2, True)]
+
+
+def test_a_stage_beside_others_holds_no_key_and_is_stored(database: Database) -> None:
+    """A job holds one key at a time, so what is computed beside has none: neither waits for the other."""
+    at_once, locks = threading.Barrier(2), KeyLocks()
+    alone = StageResult(value=FirstAnswers(verdict=None, asked=1))
+
+    def held(key: str, check: Callable[[], None]) -> AbstractContextManager[None]:
+        return locks.held("any key of this job", check)
+
+    def computed(found: StageResult[Any]) -> StageResult[Any]:
+        at_once.wait(TIME_LIMIT)
+        return found
+
+    one = replace(step(database, "one"), hold_key=held)
+    with ThreadPoolExecutor() as threads:
+        beside = threads.submit(one, "baseline", OWN, lambda: computed(alone))
+        one("motion", SHARED, lambda: computed(result(1)))
+        beside.result()
+    one.flush()
+    again = replace(one, waiting=[])
+    assert again("baseline", OWN, lambda: pytest.fail("asked again")) == (alone, False)
+    assert stored(again, SHARED, lambda: pytest.fail("computed again")) == (1, False)
 
 
 def test_a_result_is_found_by_other_jobs_only_where_it_may_be(database: Database) -> None:

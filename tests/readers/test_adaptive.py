@@ -69,7 +69,7 @@ class Simulation:
 
 
 @given(
-    accepted=st.integers(16, 200), most=st.integers(1, 300), jitter=st.sampled_from([0.1, 0.3]), seed=st.integers(0, 9)
+    accepted=st.integers(16, 200), most=st.integers(1, 300), jitter=st.sampled_from([0.0, 0.3]), seed=st.integers(0, 9)
 )
 def test_it_finds_what_is_accepted_with_few_refusals(accepted: int, most: int, jitter: float, seed: int) -> None:
     draws = random.Random(seed)
@@ -82,11 +82,10 @@ def test_it_finds_what_is_accepted_with_few_refusals(accepted: int, most: int, j
 
 
 def test_sixty_four_places_are_reached_in_a_few_round_trips_and_used() -> None:
-    draws = random.Random(0)
-    server = Simulation(256, lambda _: 64, lambda *_: draws.uniform(1.8, 2.2))
+    server = Simulation(256, lambda _: 64)
     assert server.run(1320) < 1.3 * 1320 * 2 / 64
     assert server.refused <= 0.02 * 1320
-    assert next(now for now, limit in server.limits if limit >= 64) <= 5 * 2.2
+    assert next(now for now, limit in server.limits if limit >= 64) <= 5 * 2.0
 
 
 @pytest.mark.parametrize("accepted", [1, 3])

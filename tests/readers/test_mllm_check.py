@@ -140,7 +140,7 @@ def test_other_coordinates_are_noticed_and_kept(
     check = checked(mllm, tmp_path, model(**written))
     box = check.findings[0]
     assert f"6 of 6 found, read as {said};" in box.result
-    assert not box.usable, "they are not those of its family"
+    assert not box.usable, "they are not those that were asked for"
     assert usable(check)["direction"], "read in the same way"
     first = reader_of(mllm, tmp_path)
     first.keep(measured(check))
@@ -150,6 +150,9 @@ def test_other_coordinates_are_noticed_and_kept(
     pixels = decode((EXAMPLES / "ball-and-mug" / "image.jpg").read_bytes()).pixels
     found = reader.ground(ReaderInput(Scene(pixels), true["question"]))
     reader.close()
+    again = checked(mllm, tmp_path, model(**written))
+    assert usable(again)["box"], "they are asked for now"
+    assert measured(again) == measured(check), "and stay"
     assert found.bbox == pytest.approx(true["bbox"], abs=2)
     assert found.bbox_deviation == measured(check).bbox_deviation
 
@@ -162,7 +165,17 @@ def test_errors_become_spreads(mllm: MllmServer, tmp_path: Path) -> None:
     assert measured(check).bbox_deviation == pytest.approx(math.sqrt((0.1**2 + 6 * edges**2) / 7), rel=0.1)
 
 
+def test_a_model_that_points_the_wrong_way_is_as_unsure_as_can_be(mllm: MllmServer, tmp_path: Path) -> None:
+    check = checked(mllm, tmp_path, model(turned=180))
+    assert not usable(check)["direction"]
+    assert measured(check).direction_deviation == 90, "the most that the simulation takes"
+
+
 def test_what_cannot_be_used_is_a_finding(mllm: MllmServer, tmp_path: Path) -> None:
+    always = json.dumps(
+        {"objects": [{"bbox_2d": [10, 20, 300, 400], "label": "thing"}], "start": [1, 2], "end": [90, 2]}
+    )
+    assert checked(mllm, tmp_path, always).measured is None, "whatever some coordinates would make of it"
     check = checked(mllm, tmp_path, "I would rather not.")
     assert not any(usable(check).values())
     assert check.measured is None
@@ -177,8 +190,8 @@ def test_the_command_keeps_what_it_measured(mllm: MllmServer, tmp_path: Path) ->
     settings = {"COW_MLLM": "qwen3-vl-8b", "COW_MLLM_BASE_URL": mllm.address}
     shown = cow_from_nothing(tmp_path, "models", "check", "--save", **settings)
     assert shown.returncode == 0, shown.stdout + shown.stderr
-    assert "Measured: boxes 4% of a side off" in shown.stdout
-    assert "its server takes json_schema, max_tokens; boxes 4% of a side off" in shown.stdout
+    assert "its server takes json_schema, max_tokens; boxes count as exact to 4% of a side" in shown.stdout
+    assert "Kept." in shown.stdout
     told = json.loads(cow_from_nothing(tmp_path, "doctor", "--json", **settings).stdout)["mllm"]
     assert told["measured"]["direction_deviation"] < 20
     assert told["takes"]["output"] == "json_schema"

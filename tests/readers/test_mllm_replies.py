@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cow_service.readers.options import read_choices
-from cow_service.records import Asked
+from cow_service.records import Asked, Coordinates
 from cow_service.weights.manifests import load_families
 
 if TYPE_CHECKING:
@@ -44,6 +44,24 @@ def frame_of(family: str, image: tuple[int, int] = (640, 400), sent: tuple[int, 
     from cow_service.readers.mllm.coordinates import CoordinateFrame
 
     return CoordinateFrame(*image, sent, load_families()[family].coordinates)
+
+
+@given(
+    units=st.sampled_from(["thousandths", "fractions", "pixels"]),
+    axes=st.sampled_from(["xy", "yx"]),
+    form=st.sampled_from(["corners", "size"]),
+    corner=st.tuples(st.integers(0, 300), st.integers(0, 200)),
+    sides=st.tuples(st.integers(20, 300), st.integers(20, 180)),
+)
+def test_a_box_is_read_as_it_is_written(
+    units: Any, axes: Any, form: Any, corner: tuple[int, int], sides: tuple[int, int]
+) -> None:
+    from cow_service.readers.mllm.coordinates import CoordinateFrame
+
+    frame = CoordinateFrame(640, 400, (640, 400), Coordinates(units=units, axes=axes, box_form=form))
+    box = (*corner, corner[0] + sides[0], corner[1] + sides[1])
+    assert frame.bbox(frame.write_box(box)) == pytest.approx(box, abs=1.0)
+    assert ("width" in frame.box_order) is (form == "size")
 
 
 def usable(read: Callable[[], Any]) -> Any:

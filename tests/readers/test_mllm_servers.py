@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -164,6 +166,16 @@ def test_a_thought_that_leaves_no_room_is_given_more(thought: dict[str, str], ml
     mllm.say(reply)
     calls, _ = asked_with_frames(mllm, tmp_path)
     assert calls == 2
+
+
+def test_what_was_learned_is_found_out_again_after_a_week(mllm: MllmServer, tmp_path: Path) -> None:
+    mllm.say(SERVERS["no seed"])
+    asked_with_frames(mllm, tmp_path)
+    (kept,) = (tmp_path / "mllm").iterdir()
+    for days, calls in ((6, 1), (8, 2)):
+        then = time.time() - days * 24 * 3600
+        os.utime(kept, (then, then))
+        assert asked_with_frames(mllm, tmp_path)[0] == calls
 
 
 def test_what_a_dead_server_refuses_teaches_nothing(mllm: MllmServer, tmp_path: Path) -> None:

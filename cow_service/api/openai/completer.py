@@ -27,7 +27,7 @@ from cow_service.api.openai.forwarding import Events, Forwarder
 from cow_service.api.openai.imagining import EnrichedChat, WhatIf, find_what_if
 from cow_service.api.openai.records import Answerer
 from cow_service.jobs.engine import new_job_id
-from cow_service.readers.chat import ChatReader, ChatTurn, adapted
+from cow_service.readers.chat import ChatReader, ChatTurn
 from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.options import read_choices
 from cow_service.records import AnswerOption, Job
@@ -147,6 +147,7 @@ class Completer:
                 enriched = await to_thread.run_sync(what_if.enriched, self.service.artifacts, reader.takes)
             except errors.CowError as error:
                 enriched = what_if.without(error)
+            enriched = enriched.adapted(reader)
             async for event in _events_of(await self._ask(enriched, reader, stack), enriched):
                 yield event
 
@@ -159,6 +160,7 @@ class Completer:
         self, request: Request, enriched: EnrichedChat, reader: ChatReader
     ) -> ChatTurn | stream.Streamed:
         """The reply of the MLLM. It is given up where the caller goes away before it has begun."""
+        enriched = enriched.adapted(reader)
         async with AsyncExitStack() as stack:
             reply = await submitting.unless_disconnected(request, self._ask(enriched, reader, stack))
             refused = isinstance(reply, ChatTurn) and not reply.succeeded
@@ -181,9 +183,9 @@ class Completer:
     async def _send(self, body: dict[str, Any], reader: ChatReader, stack: AsyncExitStack) -> ChatTurn | Events:
         if reader.upstream is None:
             return await reader.chat(body)
-        body, left_out = adapted(body | {"model": reader.upstream.model}, reader.takes)
-        reply = await stack.enter_async_context(self._forwarder.send(reader.upstream, body))
-        return replace(reply, warnings=left_out) if isinstance(reply, ChatTurn) else reply
+        return await stack.enter_async_context(
+            self._forwarder.send(reader.upstream, body | {"model": reader.upstream.model})
+        )
 
     async def _vote(self, body: dict[str, Any], enriched: EnrichedChat, reader: ChatReader) -> ChatTurn:
         """The reply of most votes, all asked at the same time. A vote that fails fails the chat."""

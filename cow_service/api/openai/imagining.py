@@ -3,7 +3,7 @@
 import base64
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -15,10 +15,11 @@ from cow_service.api.openai.records import WITHOUT, Answerer, ChatImagination
 from cow_service.api.problems import invalid
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode, decode_own, encode_png, fit_within
-from cow_service.media.overlay import named_strip
 from cow_service.readers.base import Imagined
+from cow_service.readers.chat import ChatReader, adapted
 from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion, other_item
 from cow_service.readers.mllm.hypothesis import hypothesis, pictures
+from cow_service.readers.mllm.sheets import AFTER_FIRST, SHEET_NOTE, sheet_of
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Frame, ServerCapabilities, Simulation, Usage
@@ -51,6 +52,14 @@ class EnrichedChat:
     answerer: Answerer
     messages: list[Any]
     cow: ChatImagination
+
+    def adapted(self, reader: ChatReader) -> "EnrichedChat":
+        """As the server of that reader takes it; warnings tell what of the chat could not be sent."""
+        if reader.upstream is None or (takes := reader.takes) is None:
+            return self
+        fields, messages, warnings = adapted(self.chat.fields, self.messages, takes)
+        cow = self.cow.model_copy(update={"warnings": (*self.cow.warnings, *warnings)})
+        return replace(self, chat=replace(self.chat, fields=fields), messages=messages, cow=cow)
 
     def extension(self, *warnings: str, **others: Any) -> dict[str, Any]:
         """`cow` of the reply."""
@@ -121,9 +130,10 @@ class WhatIf:
         pngs, warnings = [] if content == "text" else self._pngs(artifacts), list(simulation.warnings)
         own = sum(1 for _ in images_of(self.chat.messages))
         if takes is not None and takes.images is not None and own < takes.images < own + len(pngs):
-            strip = named_strip([decode_own(png) for png in pngs], f"Frames 1 to {len(pngs)}, row by row")
-            pngs = [encode_png(strip)]
-            warnings.append("The MLLM's server takes fewer images a call: frames were sent on one sheet.")
+            sheet = sheet_of([decode_own(png) for png in pngs], own + 1)
+            pngs = [encode_png(sheet)]
+            parts.append({"type": "text", "text": AFTER_FIRST})
+            warnings.append(SHEET_NOTE)
         for png in pngs:
             url = "data:image/png;base64," + base64.b64encode(png).decode()
             parts.append({"type": "image_url", "image_url": {"url": url, **detail}})

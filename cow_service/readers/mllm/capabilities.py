@@ -72,6 +72,10 @@ class CapabilityStore:
         self.current = lower
         return True
 
+    def forget(self) -> None:
+        """All is found out again from the next call on."""
+        self.proven, self.current = None, self.first
+
     def give_up(self) -> None:
         """No step helped: nothing was learned from these refusals."""
         self.current = self.proven or self.first

@@ -11,10 +11,11 @@ from cow_service.media.images import decode
 from cow_service.narration.words import same_name
 from cow_service.readers.base import CallLog, ReaderInput
 from cow_service.readers.mllm.answer import answer_calls
-from cow_service.readers.mllm.client import MllmClient, PromptCall
+from cow_service.readers.mllm.client import PARSER_BUGS, MllmClient, PromptCall
 from cow_service.readers.mllm.contents import QUESTIONS
 from cow_service.readers.mllm.coordinates import CoordinateFrame, encode
 from cow_service.readers.mllm.identify import identify_call
+from cow_service.readers.mllm.known import USUAL
 from cow_service.readers.mllm.locate import Line, Located, locate_call, read_located
 from cow_service.readers.mllm.replies import ReplyError
 from cow_service.records import AnswerOption, BBox, Coordinates, MllmMeasurement, Record, Usage, Vector
@@ -61,7 +62,7 @@ class Finding(Record):
 
 
 class MllmCheck(Record):
-    """What a check has found. `measured` is null where no box could be read."""
+    """What a check has found. `measured` is null where most boxes were not found, or no direction was given."""
 
     findings: tuple[Finding, ...]
     measured: MllmMeasurement | None
@@ -71,8 +72,8 @@ class MllmCheck(Record):
 
 
 @dataclass(frozen=True)
-class Reply:
-    """What was written about one picture."""
+class WrittenPlaces:
+    """What was written about one picture; nothing where the call failed."""
 
     truth: Truth
     frame: CoordinateFrame
@@ -85,6 +86,8 @@ class Reply:
             located = read_located(self.text, frame, mover, others, wants_box=True, wants_direction=True)
         except ReplyError as error:
             located = cast("Located | None", error.usable)
+        except PARSER_BUGS:
+            located = None
         return located or Located()
 
     def pairs(self, coordinates: Coordinates) -> list[tuple[BBox, BBox]]:
@@ -95,13 +98,14 @@ class Reply:
         return [(self.truth.boxes[name], box) for name, box in written.items() if box is not None]
 
 
-def check_model(client: MllmClient, usual: MllmMeasurement, reasoning_length: int) -> MllmCheck:
+def check_model(client: MllmClient, reasoning_length: int) -> MllmCheck:
     """Asks for boxes, directions and senses in three pictures, for a JSON object, and about four pictures at once.
 
-    `usual` are the spreads where nothing was measured. A reply that cannot be used, and a refusal, become findings.
-    Raises `MllmUnavailable`.
+    What the server takes is found out anew. A reply that cannot be used, and a refusal, become findings. Raises
+    `MllmUnavailable`.
     """
-    log, seconds, family = CallLog(), list[float](), client.model.family
+    client.capabilities.forget()
+    log, seconds, family = CallLog(), list[float](), client.family
     pictures = {name: decode(EXAMPLES[name].file("image").read_bytes()).pixels for name in QUESTIONS}
     images = {name: encode(pixels, family) for name, pixels in pictures.items()}
     inputs = {name: ReaderInput(Scene(pixels), QUESTIONS[name], calls=log) for name, pixels in pictures.items()}
@@ -114,13 +118,14 @@ def check_model(client: MllmClient, usual: MllmMeasurement, reasoning_length: in
             raise result
         return result
 
-    written = list[Reply]()
+    written, failed = list[WrittenPlaces](), None
     for name, truth in TRUTHS.items():
         mover, *others = truth.boxes
         call = locate_call(inputs[name], images[name], mover, None, others, True, reasoning_length)
         text = ask(name, cast("PromptCall[str]", replace(call, parse=str)))  # whatever it says
-        written.append(Reply(truth, images[name].coordinate_frame, "" if isinstance(text, CowError) else text))
-    findings, measured = _of_places(written, family.coordinates, usual)
+        failed = text if isinstance(text, CowError) else failed
+        written.append(WrittenPlaces(truth, images[name].coordinate_frame, "" if text is failed else cast("str", text)))
+    findings, measured = _of_places(written, client.model.family.coordinates, family.coordinates, failed)
 
     name = "ball-and-mug"
     identified = ask(name, identify_call(inputs[name], images[name], reasoning_length))
@@ -144,11 +149,15 @@ def _finding(question: Literal["JSON", "images"], said: object, usable: bool, re
 
 
 def _of_places(
-    written: Sequence[Reply], own: Coordinates, usual: MllmMeasurement
+    written: Sequence[WrittenPlaces], usual: Coordinates, used: Coordinates, failed: CowError | None
 ) -> tuple[list[Finding], MllmMeasurement | None]:
-    """The findings on boxes, directions and senses, and what they come to."""
+    """The findings on boxes, directions and senses, and what they come to.
+
+    `usual` are the coordinates of the family, and `used` those that were asked for; others are taken where most boxes
+    are found in them. `failed` is what a call came to.
+    """
     others = [
-        own.model_copy(update={"units": units, "axes": axes, "box_form": form})
+        used.model_copy(update={"units": units, "axes": axes, "box_form": form})
         for units in ("thousandths", "fractions", "pixels")
         for axes in ("xy", "yx")
         for form in ("corners", "size")
@@ -157,13 +166,19 @@ def _of_places(
     def fit(coordinates: Coordinates) -> float:
         return sum(iou(*pair) for reply in written for pair in reply.pairs(coordinates))
 
-    best = max((own, *others), key=fit)  # of equal ones its own
+    def found(coordinates: Coordinates) -> int:
+        return sum(iou(*pair) >= FOUND for reply in written for pair in reply.pairs(coordinates))
+
+    count, best = sum(len(reply.truth.boxes) for reply in written), max((used, *others), key=fit)
+    if found(best) * 2 <= count:
+        best = used
     pairs = [pair for reply in written for pair in reply.pairs(best)]
-    count, found = sum(len(reply.truth.boxes) for reply in written), sum(iou(*pair) >= FOUND for pair in pairs)
-    result = f"{found} of {count} found"
-    if best != own:
-        result += f", read as {described(best)}; its family writes {described(own)}"
-    findings = [Finding(question="box", usable=found == count and best == own, result=result)]
+    result = f"{found(best)} of {count} found"
+    if best != used:
+        result += f", read as {best.words}; asked for were {used.words}"
+    if failed is not None:
+        result += f"; {failed.code}: {failed}"
+    findings = [Finding(question="box", usable=found(best) == count and best == used, result=result)]
     lines = [(reply.truth, reply.read(best).line or Line()) for reply in written]
     off = [_degrees(truth.way, line.ends) for truth, line in lines if line.ends is not None]
     result = f"{len(off)} of {len(lines)} given"
@@ -174,20 +189,13 @@ def _of_places(
     senses = sum(line.along_arrow == truth.along_arrow for truth, line in lines)
     result = f"{senses} of {len(lines)} right, along or against an arrow"
     findings.append(Finding(question="sense", usable=senses == len(lines), result=result))
-    if not pairs:
+    if found(best) * 2 <= count or not off:
         return findings, None
     return findings, MllmMeasurement(
-        coordinates=None if best == own else best,
-        bbox_deviation=min(1.0, _spread(usual.bbox_deviation, [_edges_off(*pair) for pair in pairs])),
-        direction_deviation=_spread(usual.direction_deviation, off),
+        coordinates=None if best == usual else best,
+        bbox_deviation=min(1.0, _spread(USUAL.bbox_deviation, [_edges_off(*pair) for pair in pairs])),
+        direction_deviation=min(90.0, _spread(USUAL.direction_deviation, off)),
     )
-
-
-def described(coordinates: Coordinates) -> str:
-    """A convention in words."""
-    first = "x first" if coordinates.axes == "xy" else "y first"
-    form = "two corners" if coordinates.box_form == "corners" else "a corner, width and height"
-    return f"{coordinates.units}, {first}, {form}"
 
 
 def _spread(usual: float, off: Sequence[float]) -> float:

@@ -45,7 +45,7 @@ CANCEL_POLL_SECONDS = 0.2
 MAX_SEED = 2**31  # what every provider takes is below
 SYSTEM_PROMPT = "looking"
 
-_PARSER_BUGS = (ArithmeticError, LookupError, TypeError, ValueError, RecursionError)
+PARSER_BUGS = (ArithmeticError, LookupError, TypeError, ValueError, RecursionError)
 log = logging.getLogger("cow_service")
 
 T = TypeVar("T")
@@ -86,7 +86,7 @@ class _ReplyParser(Generic[T]):
                 return self.usable if error.usable is None else cast("T", error.usable)
             self.fault, self.usable = str(error), cast("T | None", error.usable)
             raise ModelRetry(f"That cannot be used: {error}.") from error
-        except _PARSER_BUGS as error:  # on an unforeseen reply; the other votes must not be lost
+        except PARSER_BUGS as error:  # on an unforeseen reply; the other votes must not be lost
             log.warning("a reply could not be parsed", exc_info=error)
             self.fault = "it could not be read"
             raise ModelRetry("That cannot be read. Reply with the JSON object alone.") from error
@@ -289,7 +289,7 @@ _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     ),
     (
         errors.ModelContextWindowExceededError,
-        "the images and the question are more than it takes; send a smaller image",
+        "the images and the question are more than it takes; start it with a larger context, or send a smaller image",
     ),
     (errors.ModelQuotaExceededError, "the account's quota is used up"),
     (errors.ModelRateLimitError, "it takes no more requests for now (429); try later"),

@@ -118,7 +118,7 @@ class CoordinateFrame:
         (ax, ay), (bx, by) = self._inside(*corner), self._inside(right, lower)
         x0, y0, x1, y1 = min(ax, bx), min(ay, by), max(ax, bx), max(ay, by)
         if x1 - x0 < LEAST_SIDE or y1 - y0 < LEAST_SIDE:
-            raise ReplyError(f"the box {_shown(written)} has no area; give two opposite corners of the object")
+            raise ReplyError(f"the box {_shown(written)} has no area; give {self.box_order} of the object")
         return x0, y0, x1, y1
 
     def ends(self, written: object) -> tuple[Point, Point]:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import tempfile
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from cow_service.settings import Settings
 from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
 
 UNKNOWN = "generic"  # the manifest, and the family, for models that no other one describes
+USUAL = MllmMeasurement(bbox_deviation=0.1, direction_deviation=20.0)  # where nothing was measured
 MAX_AGE_SECONDS = 7 * 24 * 3600.0  # servers are updated: what is older is found out again
 
 Kept = TypeVar("Kept", bound=Record)
@@ -107,10 +109,10 @@ class MllmNotes:
     def keep(self, note: ServerCapabilities | MllmMeasurement) -> None:
         """Replaces what was known. Raises `OSError`."""
         path = self._takes if isinstance(note, ServerCapabilities) else self._measured
-        part = path.with_suffix(f".{os.getpid()}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(note.model_dump_json(), encoding="utf-8")
-        part.replace(path)
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, encoding="utf-8", delete=False) as part:
+            part.write(note.model_dump_json())
+        os.replace(part.name, path)
 
 
 def _read(path: Path, kind: type[Kept]) -> Kept | None:

@@ -18,7 +18,7 @@ from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
 from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
-from cow_service.readers.mllm.known import UNKNOWN
+from cow_service.readers.mllm.known import UNKNOWN, USUAL
 from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
@@ -27,7 +27,6 @@ from cow_service.records import BBox, Grounding, LocatedObject, MllmMeasurement,
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
-USUAL = MllmMeasurement(bbox_deviation=0.1, direction_deviation=20.0)  # where nothing was measured
 CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_KIND: records.MotionKind = "linear"
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
@@ -53,7 +52,8 @@ class MllmReader:
         if self._model.family.name == UNKNOWN:
             taken = "coordinates were asked for as fractions, and a model that is used to others may have given those"
         warning = f"No manifest describes '{self._model.name}': {taken}."
-        self._family_warnings = (warning,) if self._model.manifest.name == UNKNOWN else ()
+        is_known = self._model.manifest.name != UNKNOWN or client.measured is not None
+        self._family_warnings = () if is_known else (warning,)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -75,7 +75,7 @@ class MllmReader:
 
     def check(self) -> MllmCheck:
         """Asks small questions about pictures whose answers are known. Raises `MllmUnavailable`."""
-        return check_model(self._client, USUAL, self._reasoning)
+        return check_model(self._client, self._reasoning)
 
     def keep(self, measured: MllmMeasurement) -> None:
         """Keeps what a check has measured, for readers that are made from now on. Raises `OSError`."""
@@ -88,7 +88,7 @@ class MllmReader:
     @property
     def takes(self) -> ServerCapabilities | None:
         """What was learned of its server, by this process or another."""
-        return self._client.notes.takes
+        return self._client.notes.takes or self._client.capabilities.proven
 
     async def chat(self, body: dict[str, Any]) -> ChatTurn:
         """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""

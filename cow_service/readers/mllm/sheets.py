@@ -16,6 +16,8 @@ from cow_service.media.overlay import named_strip
 from cow_service.readers.mllm.capabilities import FEWER_FRAMES
 from cow_service.records import ServerCapabilities
 
+AFTER_FIRST = "All images after the first are on one sheet, from left to right and row by row."
+SHEET_NOTE = "The multimodal LLM's server takes fewer images a call: frames were sent on one sheet."
 QUALITIES = {FEWER_FRAMES + 1: 80, FEWER_FRAMES + 2: 60}  # JPEG, percent, of the first image by reduction
 
 
@@ -46,19 +48,19 @@ def fit_images(jpegs: Sequence[bytes], takes: ServerCapabilities) -> FittedImage
         frames = [_resized(each, round(scale * each.shape[1]), round(scale * each.shape[0])) for each in frames]
     if len(frames) >= most:
         shared = [first, *frames] if most == 1 else frames
-        begin = 1 + len(frames) + 1 - len(shared)
-        sheet = _sheet(shared, f"Images {begin} to {len(frames) + 1}, row by row")
+        sheet = sheet_of(shared, 1 + len(frames) + 1 - len(shared))
         first, frames = (sheet, []) if most == 1 else (first, [sheet])
-        which = "All images" if most == 1 else "All images after the first"
-        caption += f"{which} are on one sheet, from left to right and row by row."
-        note = f"The multimodal LLM's server takes fewer images a call: frames were sent on one sheet. {note}".strip()
+        caption += AFTER_FIRST.replace(" after the first", "") if most == 1 else AFTER_FIRST
+        note = f"{SHEET_NOTE} {note}".strip()
     quality = QUALITIES.get(takes.reduction)
     encoded = encode_jpeg(first) if quality is None else encode_jpeg(first, quality)
     return FittedImages((encoded, *map(encode_jpeg, frames)), caption.strip(), note)
 
 
-def _sheet(images: Sequence[NDArray[np.uint8]], name: str) -> NDArray[np.uint8]:
+def sheet_of(images: Sequence[NDArray[np.uint8]], begin: int) -> NDArray[np.uint8]:
+    """Images [h, w, 3] in rows, each at the size of the smallest; the first has the number `begin`."""
     height, width = min((each.shape[:2] for each in images), key=lambda size: size[0] * size[1])
+    name = f"Images {begin} to {begin + len(images) - 1}, row by row"
     return named_strip([_resized(each, width, height) for each in images], name)
 
 
