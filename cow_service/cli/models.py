@@ -11,8 +11,6 @@ from cow_service.cli.options import EXISTING, AsJson, FolderNotWritable, Texts, 
 from cow_service.errors import InvalidRequest
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from cow_service.weights.manifests import Manifest, Source
     from cow_service.weights.repositories import Download
 
@@ -84,7 +82,6 @@ def _pull(name: str, revision: list[str] | None) -> None:
     for each in downloads:
         folder = folder_of(weights_dir, each.lock.repository)
         console.print(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
-    _fetch_kernels(manifest, console)
 
 
 @app.command(epilog="Example: cow models check --save")
@@ -153,25 +150,6 @@ def _check_mllm(*, save: bool, as_json: bool) -> None:
         raise problem
     if not all(finding.usable for finding in found.findings):
         raise typer.Exit(1)
-
-
-def _fetch_kernels(manifest: Manifest, console: Console) -> None:
-    """Fetches the attention kernels that a video model may use on this machine's GPU, and prints each outcome."""
-    from importlib.util import find_spec  # noqa: PLC0415
-
-    if not manifest.architecture or manifest.missing_modules() or find_spec("kernels") is None:
-        return
-    from cow_service.errors import GeneratorUnavailable  # noqa: PLC0415
-    from cow_service.generators.wan.attention import fetch_kernels  # noqa: PLC0415
-    from cow_service.generators.wan.profiles import profile_of  # noqa: PLC0415
-    from cow_service.settings import load_settings  # noqa: PLC0415
-    from cow_service.weights.device import choose_device  # noqa: PLC0415
-
-    device = choose_device(load_settings().device, GeneratorUnavailable)
-    fetched = fetch_kernels((profile_of(manifest, name).acceleration for name in manifest.profiles), device)
-    for name, problem in fetched.items():
-        outcome = "fetched" if problem is None else f"not fetched, and not needed ({problem})"
-        console.print(f"Attention kernel {name}: {outcome}")
 
 
 def _weights_dir() -> Path:

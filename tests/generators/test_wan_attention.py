@@ -1,4 +1,4 @@
-"""Attention backends: the benchmark that times them, on the CPU, and kernels that are fetched beforehand."""
+"""The benchmark that times attention backends, on the CPU."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import pytest
 from conftest import ROOT
 from hypothesis import given
 from hypothesis import strategies as st
-
-from cow_service.generators.wan.profiles import Acceleration
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -97,22 +95,3 @@ def test_the_fastest_that_computes_the_same_is_chosen(bench, others: list[tuple[
     best = min(one.seconds or 0 for one in exact)
     assert bench.fastest(some) == next(one.name for one in exact if (one.seconds or 0) <= 1.05 * best)
     assert bench.fastest([bench.TimedBackend("native", None, None, "memory")]) == "native"
-
-
-def test_kernels_of_the_hub_are_fetched_beforehand(toys, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What diffusers does to fetch them is a fake."""
-    asked: list[str] = []
-
-    @contextmanager
-    def fetch(name: str) -> Generator[None]:
-        asked.append(name)
-        if name == "flash_hub":
-            raise OSError("no build of it for this version of torch\nat some length")
-        yield
-
-    monkeypatch.setattr(toys.attention, "attention_backend", fetch)
-    wanted = [Acceleration(attention=name) for name in ("native", "flash_hub", "sage_hub", "sage_hub")]
-    fetched = toys.attention.fetch_kernels(wanted, toys.torch.device("cuda"))
-    assert fetched == {"flash_hub": "OSError: no build of it for this version of torch", "sage_hub": None}
-    assert sorted(asked) == sorted(fetched), "each once"
-    assert toys.attention.fetch_kernels(wanted, toys.CPU) == {}

@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save, save_file
 from torch import Tensor
 from torch.profiler import profile
 
-from cow_service.generators.wan import acceleration, attention, generator, loading, memory, ranks
+from cow_service.generators.wan import acceleration, generator, loading, memory, ranks
 from cow_service.generators.wan.acceleration import accelerate, cached_pass, pin, reset_cache
 from cow_service.generators.wan.capabilities import (
     MINIMUM_VERSIONS,

@@ -13,11 +13,11 @@ from http import HTTPStatus
 from pydantic_ai import exceptions as errors
 
 from cow_service.readers.mllm.known import MllmNotes
+from cow_service.readers.mllm.sheets import FEWER_FRAMES
 from cow_service.records import Delivery, ServerCapabilities
 
 _NEXT_DELIVERY: dict[Delivery, Delivery] = {"whole": "streamed", "streamed": "declared"}
 MAX_STEPS = 8  # that one call may teach
-FEWER_FRAMES = 3  # reductions from which only the first, middle and last frame are sent
 MAX_REDUCTION = FEWER_FRAMES + 2
 REFUSED = (HTTPStatus.BAD_REQUEST, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.NOT_IMPLEMENTED)
 _SIZE_STATUS = HTTPStatus.REQUEST_ENTITY_TOO_LARGE

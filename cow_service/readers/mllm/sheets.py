@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from cow_service.media.images import decode_own, encode_jpeg
 from cow_service.media.overlay import named_strip
-from cow_service.readers.mllm.capabilities import FEWER_FRAMES
 from cow_service.records import ServerCapabilities
 
+FEWER_FRAMES = 3  # reductions from which only the first, middle and last frame are sent
 AFTER_FIRST = "All images after the first are on one sheet, from left to right and row by row."
 SHEET_NOTE = "The multimodal LLM's server takes fewer images a call: frames were sent on one sheet."
 QUALITIES = {FEWER_FRAMES + 1: 80, FEWER_FRAMES + 2: 60}  # JPEG, percent, of the first image by reduction
