@@ -107,8 +107,8 @@ def mllm() -> Iterator[MllmServer]:
         yield server
 
 
-def asked_with_frames(mllm: MllmServer, data_dir: Path) -> tuple[int, tuple[str, ...]]:
-    """How many calls an answer with four frames took, which is A; and its notes."""
+def asked_with_frames(mllm: MllmServer, data_dir: Path, images: int = 5) -> tuple[int, tuple[str, ...]]:
+    """How many calls an answer with so many images took, which is A; and its notes."""
     from cow_service.readers.mllm.answer import answer_calls
     from cow_service.readers.mllm.client import MllmClient
     from cow_service.readers.mllm.coordinates import encode
@@ -124,7 +124,7 @@ def asked_with_frames(mllm: MllmServer, data_dir: Path) -> tuple[int, tuple[str,
     model = configure(settings)
     pixels = np.ascontiguousarray(ball(floor(320, 240), (160, 120), 30, (200, 40, 40)))
     asked = ReaderInput(scene=Scene(pixels), question="Will it hit the mug?", seed=3)
-    (call,) = answer_calls(asked.question, OPTIONS, (encode(pixels, model.family).jpeg,) * 5, None, 1, 100)
+    (call,) = answer_calls(asked.question, OPTIONS, (encode(pixels, model.family).jpeg,) * images, None, 1, 100)
     client, before = MllmClient(model, settings), len(mllm.asked)
     try:
         assert client.complete(call, asked).answer == "A"
@@ -141,6 +141,19 @@ def test_a_server_that_takes_less_is_found_out_once(kind: str, mllm: MllmServer,
     again, notes = asked_with_frames(mllm, tmp_path)
     assert again == 1, "what was learned is on disk, for another process as well"
     assert bool(notes) is (kind in ("one image", "small body"))
+
+
+def test_more_images_than_were_ever_taken_may_be_what_is_refused(mllm: MllmServer, tmp_path: Path) -> None:
+    mllm.say(refusing(lambda body: images(body) > 1, 400, "bad request"))
+    assert asked_with_frames(mllm, tmp_path, images=1)[0] == 1
+    calls, notes = asked_with_frames(mllm, tmp_path)
+    assert calls == 2
+    assert notes
+    assert asked_with_frames(mllm, tmp_path)[0] == 1
+    mllm.say(refusing(lambda _: True, 400, "bad request"))
+    with pytest.raises(Exception, match="status 400"):
+        asked_with_frames(mllm, tmp_path, images=1)
+    assert len(mllm.asked) == 1, "one image was taken before: it is the call that is at fault"
 
 
 def test_frames_share_a_sheet_where_a_call_takes_fewer_images(mllm: MllmServer, tmp_path: Path) -> None:

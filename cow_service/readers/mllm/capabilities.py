@@ -40,19 +40,20 @@ _SYSTEM = re.compile(
 class CapabilityStore:
     """What is known of one server and model, in memory and, once a call has succeeded, on disk.
 
-    Used from one event loop. `proven` is what calls have succeeded with.
+    Used from one event loop. `proven` is what calls have succeeded with, and `shown` the most images of one.
     """
 
     notes: MllmNotes
     first: ServerCapabilities  # before anything is known
-    proven: ServerCapabilities | None = None
+    shown: int = 0
 
     def __post_init__(self) -> None:
         self.proven = self.notes.takes
         self.current = self.proven or self.first
 
-    def succeed(self, used: ServerCapabilities) -> None:
-        """A call has succeeded: what it was sent with is kept."""
+    def succeed(self, used: ServerCapabilities, images: int) -> None:
+        """A call with that many images has succeeded: what it was sent with is kept."""
+        self.shown = max(self.shown, min(images, used.images or images))
         if used == self.proven:
             return
         self.proven = used
@@ -66,7 +67,7 @@ class CapabilityStore:
         """
         if used != self.current:
             return True  # another call has learned meanwhile
-        lower = step_down(used, error, images, is_proven=may_pass or used == self.proven)
+        lower = step_down(used, error, images, self.shown, is_proven=may_pass or used == self.proven)
         if lower is None:
             return False
         self.current = lower
@@ -82,15 +83,21 @@ class CapabilityStore:
 
 
 def step_down(
-    used: ServerCapabilities, error: errors.ModelAPIError, images: int, *, is_proven: bool
+    used: ServerCapabilities, error: errors.ModelAPIError, images: int, shown: int = 0, *, is_proven: bool
 ) -> ServerCapabilities | None:
-    """What to try after a refusal; None where nothing that is known of servers would help."""
+    """What to try after a refusal; None where nothing that is known of servers would help.
+
+    `images` were sent, and `shown` is the most that were ever taken.
+    """
     if isinstance(error, errors.ModelHTTPError):
         update = next(_named_steps(used, error, images), None)
         may_learn = error.status_code in REFUSED or error.status_code == HTTPStatus.INTERNAL_SERVER_ERROR
         # Else this call is at fault, not what every call is sent with.
         if update is None and may_learn and not is_proven and not _is_too_large(error):
             update = next(_blind_steps(used), None)
+        may_be_many = images > max(1, shown) and used.images is None and error.status_code in REFUSED
+        if update is None and may_be_many and not _is_too_large(error):
+            update = {"images": 1}
     else:  # no chat completion: it may be one in pieces
         unreadable = type(error) is errors.ModelAPIError and not is_proven
         delivery = _NEXT_DELIVERY.get(used.delivery) if unreadable else None

@@ -457,7 +457,7 @@ class LearningModel(RetryingModel):
                     raise
                 self.failures.pop()
             else:
-                self._capabilities.succeed(self._takes)
+                self._capabilities.succeed(self._takes, len(self._call.images))
                 if self._note:
                     self._log.notes[self._note] = None
                 response, was_longer = with_text(response), self._is_longer
