@@ -180,7 +180,7 @@ def print_models(models: records.Models, *, as_json: bool) -> None:
 
 
 def _mllm_words(mllm: records.MllmStatus) -> str:
-    takes = "no call has succeeded in the last week" if mllm.takes is None else f"its server takes {_taken(mllm.takes)}"
+    takes = "nothing is known of its server" if mllm.takes is None else f"its server takes {_taken(mllm.takes)}"
     exact = "not checked (`cow models check --save`)" if mllm.measured is None else _spreads(mllm.measured)
     return f"COW_MLLM: {mllm.name} (family {mllm.family}); {takes}; {exact}"
 
@@ -212,15 +212,13 @@ def print_check(check: "MllmCheck", mllm: records.MllmStatus | None, *, is_kept:
         mark = "[green]good[/]" if finding.usable else "[yellow]not good[/]"
         table.add_row(finding.question, mark, escape(finding.result))
     console.print(table)
-    for note in check.notes:
-        console.print(escape(note))
     console.print(f"{check.usage.calls} calls; the longest question took {check.seconds:.1f} s.")
-    if mllm is not None:
-        console.print(escape(_mllm_words(mllm)))
+    if mllm is not None and mllm.takes is not None:
+        console.print(f"Its server takes {_taken(mllm.takes)}.")
     if check.measured is None:
-        console.print("Nothing to keep: most boxes were not found, or no direction was given.")
+        console.print("Nothing was measured: most boxes were not found, or no direction was given.")
     elif is_kept:
-        console.print("Kept. A server that runs goes by it when it is started again.")
+        console.print(f"Kept: {_spreads(check.measured)}. A running COW goes by it once it is started again.")
     else:
         console.print(f"Not kept (--save does that): {_spreads(check.measured)}.")
 

@@ -378,7 +378,7 @@ class MllmStatus(Record):
     family: str = Field(description="Which says how it writes places.")
     takes: ServerCapabilities | None = Field(
         default=None,
-        description="What its server takes, learned in the last week; null before a call has succeeded.",
+        description="What its server takes; null where nothing was learned of that in the last week.",
     )
     measured: MllmMeasurement | None = Field(default=None, description="Null before `cow models check --save`.")
 

@@ -190,8 +190,8 @@ def test_the_command_keeps_what_it_measured(mllm: MllmServer, tmp_path: Path) ->
     settings = {"COW_MLLM": "qwen3-vl-8b", "COW_MLLM_BASE_URL": mllm.address}
     shown = cow_from_nothing(tmp_path, "models", "check", "--save", **settings)
     assert shown.returncode == 0, shown.stdout + shown.stderr
-    assert "its server takes json_schema, max_tokens; boxes count as exact to 4% of a side" in shown.stdout
-    assert "Kept." in shown.stdout
+    assert "Its server takes json_schema, max_tokens." in shown.stdout
+    assert "Kept: boxes count as exact to 4% of a side" in shown.stdout
     told = json.loads(cow_from_nothing(tmp_path, "doctor", "--json", **settings).stdout)["mllm"]
     assert told["measured"]["direction_deviation"] < 20
     assert told["takes"]["output"] == "json_schema"

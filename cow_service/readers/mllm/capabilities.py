@@ -1,7 +1,7 @@
 """What one server takes of a call: learned from what it refuses, and remembered per server and model.
 
-A refusal that names a field, or an unexplained one before any call has succeeded, moves one step down. A step that has
-worked is never tried again.
+A refusal that names a field moves one step down, and so does an unexplained one, before any call has succeeded or of
+more images than any call had. What has worked is not given up again without a reason.
 """
 
 import re

@@ -66,7 +66,6 @@ class MllmCheck(Record):
 
     findings: tuple[Finding, ...]
     measured: MllmMeasurement | None
-    notes: tuple[str, ...]  # of what was sent in another form
     usage: Usage
     seconds: float  # of the longest question, with its repeats
 
@@ -136,11 +135,9 @@ def check_model(client: MllmClient, reasoning_length: int) -> MllmCheck:
     jpegs = tuple(image.jpeg for image in images.values())
     chosen = ask(name, answer_calls(WHICH, options, jpegs, None, 1, reasoning_length)[0])
     is_right = getattr(chosen, "answer", None) == options[list(QUESTIONS).index("bottle-passes-cylinder")].letter
-    told = f"{len(jpegs)} in one call, {'told apart' if is_right else 'not told apart'}"
+    told = f"{len(jpegs)} pictures at once, {'told apart' if is_right else 'not told apart'}"
     findings.append(_finding("images", chosen, is_right, told))
-    return MllmCheck(
-        findings=tuple(findings), measured=measured, notes=tuple(log.notes), usage=log.usage, seconds=max(seconds)
-    )
+    return MllmCheck(findings=tuple(findings), measured=measured, usage=log.usage, seconds=max(seconds))
 
 
 def _finding(question: Literal["JSON", "images"], said: object, usable: bool, result: str) -> Finding:

@@ -32,7 +32,7 @@ from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
 from cow_service.readers.mllm.coordinates import MEDIA_TYPE
-from cow_service.readers.mllm.known import MllmNotes
+from cow_service.readers.mllm.known import UNKNOWN, MllmNotes
 from cow_service.readers.mllm.models import ConfiguredModel
 from cow_service.readers.mllm.replies import ReplyError, Schema
 from cow_service.readers.mllm.sheets import fit_images
@@ -103,9 +103,8 @@ class MllmClient:
         self.notes = MllmNotes(settings.data_dir, model.server, model.name)
         self.capabilities = CapabilityStore(self.notes, model.first)
         self.measured = self.notes.measured
-        coordinates = self.measured and self.measured.coordinates
-        family = model.family if coordinates is None else model.family.model_copy(update={"coordinates": coordinates})
-        self.family = family
+        coordinates = (self.measured and self.measured.coordinates) or model.family.coordinates
+        self.family = model.family.model_copy(update={"coordinates": coordinates})
         self._instructions = load_prompt(SYSTEM_PROMPT)
         self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
         self._thread = EventLoopThread(model.model)
@@ -245,6 +244,8 @@ class MllmClient:
         return MllmBadReply(
             f"{self._name} was asked {model.calls} times ({call.prompt}) and gave no usable reply. "
             f"Of the last one, '{excerpt}': {fault}."
+            + " `cow models check` tells how it writes places."
+            * (self.model.manifest.name == UNKNOWN)
         )
 
     def _refusal(self, error: errors.ModelAPIError) -> dict[str, Any] | None:
@@ -433,7 +434,7 @@ class LearningModel(RetryingModel):
         super().__init__(model.model, places, timeout, seconds, calls, place_seconds)
         self._variant, self._capabilities, self._call = model.variant, capabilities, call
         self._takes, self._steps = capabilities.current, 0
-        self._key = model.upstream and model.upstream.key
+        self._key = model.key
         self._note, self._is_longer = "", False
 
     async def _attempt(

@@ -1,7 +1,7 @@
 """The multimodal LLM of the settings: its manifest and family, and a client model of pydantic-ai to call it with."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from openai import AsyncAzureOpenAI, AsyncOpenAI
@@ -34,6 +34,7 @@ class ConfiguredModel:
     deterministic: bool = False  # temperature 0 gives the same reply each time: no provider promises that
     upstream: Upstream | None = None  # the OpenAI-compatible server; None for another protocol
     server: str = "local"  # its address, its provider's name, or that it runs in this process
+    key: str | None = field(default=None, repr=False)  # that it is called with
     # The model for what its server takes; None: pydantic-ai knows that.
     variant: Callable[[ServerCapabilities], Model] | None = None
 
@@ -64,9 +65,8 @@ def configure(settings: Settings) -> ConfiguredModel:
             return OpenAIChatModel(name, provider=server, profile=profile)
 
         upstream, model = Upstream(base_url.rstrip("/"), name, key), variant(ServerCapabilities())
-        return ConfiguredModel(
-            model, name, manifest, family, upstream=upstream, variant=variant, server=resolved.server
-        )
+        made = ConfiguredModel(model, name, manifest, family, upstream=upstream, server=resolved.server, key=key)
+        return replace(made, variant=variant)
 
     # A provider, of whatever protocol.
     if provider is None:
@@ -83,7 +83,8 @@ def configure(settings: Settings) -> ConfiguredModel:
     if isinstance(client, AsyncOpenAI) and not isinstance(client, AsyncAzureOpenAI):  # whose addresses are its own
         key = None if client.api_key in ("", NO_KEY) else client.api_key
         upstream = Upstream(str(client.base_url).rstrip("/"), name, key)
-    return ConfiguredModel(model, name, manifest, family, upstream=upstream, server=resolved.server)
+    key = getattr(client, "api_key", None) or key
+    return ConfiguredModel(model, name, manifest, family, upstream=upstream, server=resolved.server, key=key)
 
 
 def _model_of(name: str, model: str, base_url: str | None, key: str | None) -> Model:
