@@ -25,7 +25,8 @@ from cow_service.settings import SettingsError
 from cow_service.workers.pool import WorkerPool
 
 EVERYWHERE = ("0.0.0.0", "::")  # addresses to listen at, which callers cannot use
-LOAD_WAIT_SECONDS = 0.5  # that the start waits for models; after that the server answers probes while they load
+# That the start waits for the job database, and for models; after that the server answers probes meanwhile.
+START_WAIT_SECONDS, LOAD_WAIT_SECONDS = 1.0, 0.5
 LOAD_SECONDS = 3600.0  # longest that models may take to load where nothing is asked before
 START_POLL_SECONDS = 0.01
 TICK_SECONDS = 1.0  # between two looks at the clock
@@ -105,10 +106,9 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
             except OSError as error:
                 raise SettingsError(f"Bad settings: COW_METRICS_PORT={port}: {error.strerror or error}.") from error
         pool.load(ended)
-        engine.wait_for_database(ended)
+        engine.start_when_possible(ended)
         if ended.is_set():
             return
-        engine.start()
         log.info("this worker takes jobs from: %s", ", ".join(service.settings.queues) or "of all queues")
         ended.wait()
     finally:
@@ -121,33 +121,33 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
 def run_server(service: Service, pool: WorkerPool | None = None) -> None:
     """Serves until a signal ends it. Jobs are computed by the pool, where there is one.
 
-    Raises the `CowError` for which the default request cannot be served.
+    Raises the `CowError` for which the default request cannot be served, and `SettingsError`.
     """
     server, engine, readiness = _server(service, pool)
-    failures: list[CowError] = []
+    failures: list[SettingsError] = []
 
     def failed() -> None:
         server.should_exit = True
 
-    def start_later() -> None:
-        engine.wait_for_database(server.is_ending)
+    def start() -> None:
         try:
-            if not server.is_ending.is_set():
-                engine.start()
-        except CowError as error:
+            engine.start_when_possible(server.is_ending)
+        except SettingsError as error:
             failures.append(error)
             failed()
 
     readiness.start(failed)
     try:
-        starting = threading.Thread(target=start_later, name="cow-starting", daemon=True)
-        if engine.database.is_away():
-            starting.start()  # probes are answered while it waits, and all other requests with 503
-        else:
-            engine.start()
+        starting = threading.Thread(target=start, name="cow-starting", daemon=True)
+        starting.start()  # probes are answered while it waits, and all other requests with 503
+        starting.join(START_WAIT_SECONDS)
+        if failures:
+            raise failures[0]
         try:
             readiness.wait(LOAD_WAIT_SECONDS)
         except CowError:
+            server.is_ending.set()
+            starting.join()
             if engine.is_running:
                 engine.close()
             raise
@@ -170,13 +170,13 @@ def serving(service: Service, pool: WorkerPool | None = None) -> Generator[str]:
     readiness.start()
     readiness.wait(LOAD_SECONDS)
 
-    failures: list[CowError] = []
+    failures: list[CowError | SettingsError] = []
 
     def serve() -> None:
         try:
             engine.start()  # here and not in the caller's thread, whose event loop may be running
             server.run()
-        except CowError as error:
+        except (CowError, SettingsError) as error:
             failures.append(error)
 
     # A daemon: a program that ends without closing this, as Inspect does, would wait for a pool's threads for ever.

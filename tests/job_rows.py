@@ -8,6 +8,7 @@ from typing import Any
 import sqlalchemy as sa
 from pydantic import SecretStr
 
+from cow_service.jobs import opening
 from cow_service.jobs.database import OPEN, Database
 from cow_service.jobs.job_table import JobSpec, JobTable, TakenJob
 from cow_service.jobs.schema import JOBS
@@ -19,7 +20,7 @@ STEP = 100
 
 def open_database(folder: Path, url: SecretStr | None = None) -> Database:
     """A database with all tables: in a file of the folder, or that of the URL."""
-    database = Database(Settings(data_dir=folder, database_url=url))
+    database = opening.open_database(Settings(data_dir=folder, database_url=url))
     database.create_tables()
     return database
 
@@ -30,7 +31,7 @@ def add_job(database: Database, job_id: str, owner: str | None = None, **more: A
     request = {"image": {"artifact": "0" * 64}, "question": "?"}
     asked = {"kind": "simulate", "request": request, "reader": "embedded", "generator": "cutout"}
     spec = JobSpec(**({**asked, "created_at": now()} | more))
-    return JobTable(database).insert(job_id, spec, owner, queue, step)
+    return JobTable(database).add(job_id, spec, owner, queue, step)
 
 
 def take_new_job(database: Database, job_id: str, executor: str) -> TakenJob:

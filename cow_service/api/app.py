@@ -21,8 +21,8 @@ from cow_service.api.problems import documented, install_problem_handlers
 from cow_service.api.routes import artifacts, health, jobs, page, simulate
 from cow_service.api.routes.artifacts import MAX_CONCURRENT_DOWNLOADS
 from cow_service.api.submission import Submitter
-from cow_service.errors import NotReady, OriginNotAllowed, RateLimited, Unauthorized
-from cow_service.jobs.engine import NOT_STARTED, JobEngine
+from cow_service.errors import CowError, OriginNotAllowed, RateLimited, Unauthorized
+from cow_service.jobs.engine import JobEngine
 from cow_service.jobs.readiness import Readiness
 from cow_service.observability import tracing
 from cow_service.observability.metrics import Metrics
@@ -89,8 +89,8 @@ def create_app(
     app.state.downloads = CapacityLimiter(MAX_CONCURRENT_DOWNLOADS)
     install_problem_handlers(app)
 
-    def refuse_until_started(scope: Scope) -> NotReady | None:
-        return None if engine.is_running or is_open(scope["path"]) else NotReady(NOT_STARTED)
+    def refuse_until_started(scope: Scope) -> CowError | None:
+        return None if engine.is_running or is_open(scope["path"]) else engine.not_started()
 
     if not starting:
         app.add_middleware(Guard, refuse=refuse_until_started)

@@ -338,7 +338,7 @@ class Submitter:
                 self.engine.may_read(picture.artifact, submission.owner)
         backends = self.engine.service.precheck(body)
         if body.webhook is not None:
-            self.engine.calls.check(body.webhook)
+            self.engine.webhooks.check(body.webhook)
         return backends
 
     def _submit(self, submission: Submission, body: SimulateRequest) -> str | None:

@@ -10,7 +10,7 @@ import re
 import socket
 import sys
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -71,7 +71,7 @@ def worker(
 
     run_worker(service, pool)
     tracing.stop()
-    os._exit(0)  # Python would wait for the threads in which DBOS retries while the database is down
+    os._exit(0)  # Python would wait for threads that a database holds up
 
 
 def migrate() -> None:
@@ -79,10 +79,11 @@ def migrate() -> None:
 
     Servers and workers do this when they start, unless COW_MIGRATE is false.
     """
-    from cow_service.jobs.webhooks import migrate as run  # noqa: PLC0415
+    from cow_service.jobs.opening import open_database  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
-    run(load_settings())
+    with closing(open_database(load_settings())) as database:
+        database.create_tables()
     typer.echo("The job database is up to date.")
 
 

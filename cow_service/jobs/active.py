@@ -7,7 +7,6 @@ from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from cow_service.concurrency import BackgroundThread
 from cow_service.errors import Canceled, CowError
 from cow_service.records import JobKind, WorkerJob
 from cow_service.requests import Stage
@@ -65,8 +64,8 @@ class ActiveJobs:
         self._running: dict[str, ActiveJob] = {}
         self._elsewhere: dict[str, At] = {}  # how far jobs are that other processes run
         self._waiters: dict[str, list[Waiter]] = {}
-        self._stirred = threading.Condition()
-        self._busy_at = time.monotonic()  # when there was last a sign of a job
+        self.stirred = threading.Event()  # set by each sign of a job
+        self._busy_at = time.monotonic()  # when there was last one
 
     @property
     def is_quiet(self) -> bool:
@@ -74,33 +73,24 @@ class ActiveJobs:
         return not (self._running or self._waiters) and time.monotonic() - self._busy_at > QUIET_SECONDS
 
     def stir(self) -> None:
-        """There is a sign of a job, or a thread that rests is to end."""
-        with self._stirred:
-            self._busy_at = time.monotonic()
-            self._stirred.notify_all()
+        """There is a sign of a job."""
+        self._busy_at = time.monotonic()
+        self.stirred.set()
 
-    def rest(self, stop: threading.Event, seconds: float, quiet_seconds: float) -> None:
-        """Waits for a time, or for the other one while it is quiet. `stop`, with `stir`, ends it."""
-        with self._stirred:
-            if self.is_quiet and not stop.is_set():
-                self._stirred.wait(quiet_seconds)
-                return
-        stop.wait(seconds)
-
-    @contextmanager
-    def running(self, job: str, kind: JobKind, run: str = "") -> Generator[ActiveJob]:
-        """Around an attempt to compute a job."""
+    def begin(self, job: str, kind: JobKind, run: str) -> ActiveJob:
+        """An attempt to compute a job begins."""
         active = ActiveJob(kind, run)
         self.stir()
         with self._lock:
             self._running[job] = active
-        try:
-            yield active
-        finally:
-            with self._lock:
-                if self._running.get(job) is active:  # else another job of the same id runs by now
-                    del self._running[job]
-            self._busy_at = time.monotonic()
+        return active
+
+    def end(self, job: str, active: ActiveJob) -> None:
+        """The attempt is over."""
+        with self._lock:
+            if self._running.get(job) is active:  # else another job of the same id runs by now
+                del self._running[job]
+        self._busy_at = time.monotonic()
 
     def progress(self, job: str, active: ActiveJob, stage: Stage | None, done: float) -> None:
         """Records how far the work on a job is, and wakes its waiters. Raises `Canceled` on request."""
@@ -196,25 +186,6 @@ class ActiveJobs:
     def _waiters_of(self, job: str) -> list[Waiter]:
         with self._lock:
             return [waiter for waiter in self._waiters.get(job, []) if not waiter.loop.is_closed()]
-
-
-class RestingThread(BackgroundThread):
-    """A thread that looks for work of its own accord, more rarely while there are no jobs."""
-
-    def __init__(self, name: str, active: ActiveJobs, join_seconds: float | None = None) -> None:
-        super().__init__(name, join_seconds)
-        self._active = active
-
-    def rest(self, seconds: float, quiet_seconds: float) -> bool:
-        """Waits for a time, or for the other one while it is quiet; returns whether to go on."""
-        self._active.rest(self._stop, seconds, quiet_seconds)
-        return not self._stop.is_set()
-
-    def stop(self) -> None:
-        """Ends the thread."""
-        self._stop.set()
-        self._active.stir()
-        super().stop()
 
 
 def share_done(kind: str, stage: str | None, done: float) -> float:

@@ -1,8 +1,7 @@
 """The job engine: accepts jobs, has them computed durably, and reports their state.
 
 A job is a row of the job database, in the database before its submission is acknowledged. It waits in the queue of its
-generator, from which any process on the same database may take it. Where webhooks are called, DBOS keeps the calls, and
-a process has one engine, as DBOS is one per process.
+generator, from which any process on the same database may take it.
 """
 
 import logging
@@ -12,23 +11,33 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from http import HTTPStatus
 
-from cow_service.errors import ArtifactNotFound, IdempotencyKeyReused, JobNotFound, NotReady, QueueFull, ShuttingDown
+from cow_service.errors import (
+    ArtifactNotFound,
+    CowError,
+    IdempotencyKeyReused,
+    JobNotFound,
+    NotReady,
+    QueueFull,
+    ShuttingDown,
+    StorageUnavailable,
+)
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.attempts import Dispatcher, Runner
-from cow_service.jobs.calls import Calls
+from cow_service.jobs.cleaning import remove
 from cow_service.jobs.computing import Computer, EngineParts, InProcess
-from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import JobFilters, JobSpec, JobState, JobTable, TakenJob
-from cow_service.jobs.maintenance import FolderLease, Lease, Maintenance
-from cow_service.jobs.notifications import Notification, Notifications, PolledNotifications
+from cow_service.jobs.database import Notification
+from cow_service.jobs.job_table import JobFilters, JobSpec, JobState, JobTable
+from cow_service.jobs.loop import JobLoop
+from cow_service.jobs.opening import open_database
 from cow_service.jobs.processes import Processes
 from cow_service.jobs.queues import queue_of, step_of
 from cow_service.jobs.readiness import StorageCheck
+from cow_service.jobs.ticker import Ticker
+from cow_service.jobs.webhooks import Webhooks
 from cow_service.records import TERMINAL, AcceptedRequest, JobPage, ProcessRole
 from cow_service.service import Service
+from cow_service.settings import SettingsError
 
-FIRST_WAIT, LONGEST_WAIT = 1.0, 5.0  # seconds between two tries to reach the database
-NOT_STARTED = "The server is waiting for its job database. Ask again later."
+FIRST_WAIT, LONGEST_WAIT = 1.0, 5.0  # seconds between two tries to start
 HANDOVER_SECONDS = 3.0  # for interrupted jobs to end, after the grace period
 
 log = logging.getLogger("cow_service")
@@ -42,58 +51,57 @@ class JobEngine:
 
     def __init__(self, service: Service, computer: Computer | None = None, role: ProcessRole | None = None) -> None:
         """`computer`: computes the jobs; by default in this process. `role`: by default that of the settings."""
-        self.service, self.database, self.active = service, Database(service.settings), ActiveJobs()
-        self.calls = Calls()
-        if service.settings.webhook_secret is not None:
-            from cow_service.jobs.webhooks import Webhooks  # noqa: PLC0415 # DBOS takes long to import
-
-            self.calls = Webhooks(service.settings, service.metrics, self.database)
-        self.jobs = JobTable(self.database, self.calls.enqueue)
+        self.service, self.database, self.active = service, open_database(service.settings), ActiveJobs()
+        self.jobs = JobTable(self.database)
         self._parts = EngineParts(service, self.database, self.jobs, self.active)
         self._computer = computer or InProcess(self._parts)
-        if self.database.file is None:
-            from cow_service.jobs import postgres  # noqa: PLC0415 # its driver takes long to import
-
-            self._lease: Lease = postgres.SessionLease(self.database)
-            self._notifications: Notifications = postgres.PostgresNotifications(self._parts, self._receive)
-        else:
-            self._lease = FolderLease(service.settings.data_dir / "executors")
-            self._notifications = PolledNotifications(self._parts, self._receive)
-        self._runner = Runner(self._parts, self._computer, self._notifications, self._attempt_ended)
-        self._dispatcher = Dispatcher(self._parts, self._computer.capacity, self._runner.start, self._tell_queued)
-        self._maintenance = Maintenance(self._parts, self.calls, self._lease, self.remove, self._offer)
-        self.processes = Processes(self._parts, self._computer, role)
+        self._loop = JobLoop(self._parts, self._computer)
+        self.processes, self.webhooks = Processes(self._parts, self._computer, role), Webhooks(self._parts)
+        self._ticker = Ticker(self._parts, self._loop, self.processes, self.webhooks)
         self.storage = StorageCheck(service.artifacts)
         self.is_running = False
         self._stopping = False
+        self._not_started = "The server is starting."  # or why it waits
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
         self._submitting = threading.Lock()
+        if not self.database.is_shared and (role or service.settings.role) != "all":
+            raise SettingsError(
+                "Bad settings: a server that computes nothing (COW_ROLE=api), and `cow worker`, need a job database on "
+                "PostgreSQL (COW_DATABASE_URL): with a file one server does all."
+            )
 
-    def wait_for_database(self, stop: threading.Event) -> None:
-        """Waits until the database can be reached, or until `stop` is set, and logs that it waits."""
+    def start_when_possible(self, stop: threading.Event) -> None:
+        """Starts, and waits while storage is away, until `stop` is set. Raises `SettingsError`."""
         pause = FIRST_WAIT
-        while self.database.is_away():
-            log.warning("the job database cannot be reached: check COW_DATABASE_URL. Next try in %g s.", pause)
-            if stop.wait(pause):
+        while not stop.is_set():
+            try:
+                self.start()
+            except StorageUnavailable as error:
+                self._not_started = f"{error.detail} The server waits for it."
+                log.warning("%s Next try in %g s.", error.detail, pause)
+                stop.wait(pause)
+                pause = min(2 * pause, LONGEST_WAIT)
+            else:
                 return
-            pause = min(2 * pause, LONGEST_WAIT)
 
     def start(self) -> None:
-        """Opens the database and recovers the jobs that were interrupted. Raises `StorageUnavailable`."""
+        """Opens the database and recovers the jobs that were interrupted.
+
+        Raises `StorageUnavailable`, and `SettingsError` where waiting would not help.
+        """
         settings = self.service.settings
         self.service.artifacts.check()
         try:
-            self._parts.executor = self._lease.acquire()
+            self._parts.executor = self.database.acquire()
             self.database.prepare(migrate=settings.migrate)
-            self.calls.start(self.jobs, self._parts.executor, migrate=settings.migrate)
-            self.database.claim(self.service.artifacts.address)
-            self.database.watch()
+            self.database.claim(self.service.artifacts.address)  # it writes, as jobs do
+            self._ticker.recover()
         except BaseException:
-            self.calls.stop()
-            self._lease.release()
+            self.database.release()
             raise
+        self.database.watch(self._receive)
         self._stopping, self.is_running = False, True
-        for part in (self._computer, self._notifications, self._dispatcher, self.processes, self._maintenance):
+        for part in (self._computer, self._loop, self.processes, self._ticker):
             part.start()
 
     def drain(self) -> None:
@@ -103,7 +111,7 @@ class JobEngine:
         """
         if not self._stopping:
             self._stopping = True
-            self._dispatcher.drain()
+            self._loop.drain()
             self.processes.drain()
             self._grace = threading.Timer(self.service.settings.shutdown_grace, self._interrupt)
             self._grace.daemon = True
@@ -113,17 +121,15 @@ class JobEngine:
     def close(self) -> None:
         """Waits for running jobs during the grace period, then interrupts them: they continue after the next start."""
         self.drain()
-        self._maintenance.stop()
-        self._dispatcher.stop()
-        self._notifications.stop()
-        self._runner.wait(self.service.settings.shutdown_grace + HANDOVER_SECONDS)
-        self.calls.stop()
+        self._loop.stop()
+        self._loop.wait(self.service.settings.shutdown_grace + HANDOVER_SECONDS)
+        self._ticker.stop()
         if self._grace is not None:
             self._grace.cancel()
         self._interrupt()
         self.processes.stop()
         self._computer.close()
-        self._lease.release()  # before the database's: a session that has no answer is ended by what that stops
+        self.database.release()
         self.database.close()
         self.is_running = False
 
@@ -132,10 +138,14 @@ class JobEngine:
         `NotReady` where jobs wait that no process takes."""
         if self._stopping:
             raise ShuttingDown("The server is stopping. Ask another one, or ask again later.")
-        self.database.check()
         if not self.is_running:
-            raise NotReady(NOT_STARTED)
-        self.processes.overview.check_served()
+            raise self.not_started()
+        self.database.check()
+        self.processes.check_served()
+
+    def not_started(self) -> CowError:
+        """Why nothing can be asked yet."""
+        return NotReady(f"{self._not_started} Ask again later.")
 
     def check_capacity(self, owner: str | None) -> None:
         """Raises `QueueFull` if another job would be too many, `ShuttingDown` where none is accepted."""
@@ -181,7 +191,7 @@ class JobEngine:
                 continue  # it was deleted just now
             if found.error is None or found.error.status != HTTPStatus.SERVICE_UNAVAILABLE:
                 return False
-            self.remove([job_id], 0)
+            remove(self._parts, [job_id], 0)
 
     def _submit(self, job_id: str, spec: JobSpec, owner: str | None, keep: Callable[[], None]) -> bool:
         keep()
@@ -191,9 +201,9 @@ class JobEngine:
         if self._stopping:
             self.check_capacity(owner)
         with self._submitting:  # the number of jobs must not change between the check and the insertion
-            is_new = self.jobs.insert(job_id, spec, owner, queue, step, partial(self._check_open, owner))
+            is_new = self.jobs.add(job_id, spec, owner, queue, step, partial(self._check_open, owner))
         if is_new:
-            self._dispatcher.wake(queue)
+            self._loop.wake()
         return is_new
 
     def find(self, job_id: str, owner: str | None, *, full: bool = True) -> JobState:
@@ -220,9 +230,8 @@ class JobEngine:
         kind = self.find(job_id, owner, full=False).job.kind
         if self.jobs.cancel(job_id):
             self.active.request_cancel(job_id)
-            self._notifications.send(Notification("canceled", job_id))
             self.active.notify_ended(job_id)
-            self._dispatcher.wake()
+            self._loop.wake()
             self.service.metrics.jobs.labels(kind, "canceled").inc()
         return self.find(job_id, owner)
 
@@ -231,37 +240,18 @@ class JobEngine:
         found = self.find(job_id, owner, full=False)
         if found.job.status not in TERMINAL:
             found = self.cancel(job_id, owner)
-        self.remove([job_id], found.ended or 0)
-
-    def remove(self, jobs: list[str], untouched_since: float) -> None:
-        """Removes jobs that have ended, and those of their artifacts that were not used since (Unix time, s)."""
-        self.calls.forget(jobs)
-        self.service.artifacts.delete(self.jobs.delete(jobs), untouched_since + 1)
+        remove(self._parts, [job_id], found.ended or 0)
 
     def may_read(self, sha256: str, owner: str | None) -> None:
         """Raises `ArtifactNotFound` for an artifact that no job of the owner refers to."""
         if owner is not None and not self.jobs.may_read(sha256, owner):
             raise ArtifactNotFound(f"No artifact of yours has the SHA-256 {sha256[:64]}.")
 
-    def _attempt_ended(self, job: TakenJob, has_ended: bool) -> None:
-        """This process stopped working on a job. Callers are notified if the job has ended."""
-        self._dispatcher.give_place_back(job.queue)
-        if has_ended:
-            self.active.notify_ended(job.id)
-
-    def _offer(self) -> None:
-        """Jobs are back in their queues."""
-        self._dispatcher.wake()
-        self._tell_queued()
-
-    def _tell_queued(self) -> None:
-        self._notifications.send(Notification("queued"))
-
     def _receive(self, notification: Notification) -> None:
         """Handles a message of another process about a job."""
         match notification:
             case Notification("queued"):
-                self._dispatcher.wake()
+                self._loop.wake()
             case Notification("progress", job_id, stage, done):
                 self.active.set_progress_elsewhere(job_id, stage, done)
             case Notification("canceled", job_id):
@@ -269,7 +259,7 @@ class JobEngine:
                 self.active.notify_ended(job_id)
             case Notification(job_id=job_id):
                 self.active.notify_ended(job_id)
-                self._dispatcher.wake()  # its key may have another one
+                self._loop.wake()  # its key may have another one
 
     def _interrupt(self) -> None:
         """Has running jobs end without an outcome: they continue after the next start."""

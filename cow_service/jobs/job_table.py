@@ -5,13 +5,16 @@ Every change of a job is one transaction. Methods raise `StorageUnavailable` whe
 
 import base64
 import binascii
+import hashlib
 import json
+import logging
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from itertools import product
-from typing import Any, cast, get_args
+from typing import Any, Literal, cast, get_args
+from urllib.parse import urlsplit
 from uuid import uuid4
 
 import sqlalchemy as sa
@@ -20,17 +23,17 @@ from pydantic_core import to_json
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds
 from cow_service.jobs.active import At, share_done
-from cow_service.jobs.database import OPEN, Database
+from cow_service.jobs.database import OPEN, Database, Notification
 from cow_service.jobs.packing import packed, unpacked
 from cow_service.jobs.queues import moves, next_turn
-from cow_service.jobs.schema import JOBS, REFERENCES, STAGES, TRAJECTORIES
+from cow_service.jobs.schema import CALLS, JOBS, REFERENCES, STAGES, TRAJECTORIES
 from cow_service.observability.logging import rfc3339
 from cow_service.records import AcceptedRequest, Answer, Job, JobKind, JobPage, JobStatus, Problem, Record, Simulation
-from cow_service.requests import AnswerRequest, Priority, SimulateRequest
+from cow_service.requests import AnswerRequest, Priority, SimulateRequest, Stage
 from cow_service.stages.keys import FORMAT, digest_of
 
 VERSION = "2"  # of the workflow that computes jobs; those of another version wait for a server that has it
-MAX_STARTS = 20  # of a job that ends its process each time
+MAX_DEATHS = 20  # of processes that had a job
 RATE_SECONDS = 300.0  # over which ended jobs are counted
 MIN_ENDS = 2  # in that time, from which on a rate is known
 MAX_LISTED = 200  # characters of a question in lists, and of an answer
@@ -38,14 +41,7 @@ GIVEN = ("grounding", "motion", "trajectory", "objects", "interventions", "camer
 EARLIEST, LATEST = datetime(1970, 1, 1, tzinfo=UTC), datetime(9000, 1, 1, tzinfo=UTC)  # that a filter distinguishes
 CLAIM_LOCK = 0x434F5702  # of PostgreSQL, held while jobs are taken that a limit across processes applies to
 
-OnEnd = Callable[[sa.Connection, str, str], None]
-"""Called in the transaction that ends a job: with the job, and the webhook that it has."""
-Tell = Callable[[sa.Connection], None]
-"""Called in a transaction, to tell other processes of it when it is committed."""
-
-
-def _tell_nobody(connection: sa.Connection) -> None:
-    """Does nothing."""
+log = logging.getLogger("cow_service")
 
 
 class JobSpec(Record):
@@ -161,17 +157,17 @@ class OpenCount:
 
 
 class JobTable:
-    """The jobs of a database."""
+    """The jobs of a database. Other processes are notified of what happens to them."""
 
-    def __init__(self, database: Database, on_end: OnEnd = lambda connection, job_id, url: None) -> None:
-        self._database, self._on_end = database, on_end
+    def __init__(self, database: Database) -> None:
+        self._database = database
 
     def count_open(self, owner: str | None) -> tuple[int, int]:
         """How many jobs are open: all, and those of an owner."""
         ((jobs, own),) = self._database.read(_OPEN_JOBS, {"owner": owner})
         return jobs, own
 
-    def insert(
+    def add(
         self,
         job_id: str,
         spec: JobSpec,
@@ -193,7 +189,7 @@ class JobTable:
             turn = next_turn([*first, *jobs], owner, spec.priority, step)
             spec = spec.model_copy(update={"turn": turn})
             row = spec.model_dump(include={"kind", "created_at", "priority", "turn", "generator", "webhook"})
-            row |= {"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION, "starts": 0}
+            row |= {"id": job_id, "owner": owner, "queue": queue, "status": "queued", "version": VERSION, "deaths": 0}
             row |= {"question": spec.request["question"], "image": spec.image, "spec": packed(spec.model_dump_json())}
             row["given"] = ",".join(name for name in GIVEN if name in spec.request) or None
             added = self._database.insert(JOBS).on_conflict_do_nothing().returning(JOBS.c.id)
@@ -204,6 +200,7 @@ class JobTable:
             if behind := [job.id for job in jobs if moves(job, owner, spec.priority, turn)]:
                 waits = JOBS.c.id.in_(behind), JOBS.c.executor.is_(None)
                 connection.execute(sa.update(JOBS).where(*waits).values(turn=JOBS.c.turn + step))
+            self._database.notify(connection, Notification("queued", job_id))
         return True
 
     def waiting_queues(self) -> list[str]:
@@ -223,32 +220,48 @@ class JobTable:
         taken = (
             sa.update(JOBS)
             .where(JOBS.c.id.in_(sa.select(chosen.c.id)), JOBS.c.executor.is_(None))
-            .values(executor=executor, run=uuid4().hex, starts=JOBS.c.starts + 1)
+            .values(executor=executor, run=uuid4().hex)
             .returning(JOBS.c.id, JOBS.c.owner, JOBS.c.turn, JOBS.c.created_at, JOBS.c.run, JOBS.c.spec)
         )
         with self._database.transaction() as connection:
-            if limit_per_owner is not None and self._database.file is None:
-                connection.execute(sa.select(sa.func.pg_advisory_xact_lock(CLAIM_LOCK)))
+            if limit_per_owner is not None:
+                self._database.lock(connection, CLAIM_LOCK)
             rows = connection.execute(taken).all()
         return [
             TakenJob(row.id, JobSpec.model_validate(unpacked(row.spec) | {"turn": row.turn}), row.owner, queue, row.run)
             for row in sorted(rows, key=lambda row: (row.turn, row.created_at, row.id))
         ]
 
-    def begin(self, job: TakenJob, tell: Tell = _tell_nobody) -> bool:
+    def begin(self, job: TakenJob, stage: Stage, done: float) -> bool:
         """Marks a job as running. False if it is no longer this process's: it was canceled, for example."""
-        mine = JOBS.c.id == job.id, JOBS.c.run == job.run, JOBS.c.status.in_(OPEN)
         with self._database.transaction() as connection:
-            is_mine = connection.execute(sa.update(JOBS).where(*mine).values(status="running")).rowcount > 0
+            running = sa.update(JOBS).where(*_attempt(job.id, job.run)).values(status="running")
+            is_mine = connection.execute(running).rowcount > 0
             if is_mine:
-                tell(connection)
+                self._database.notify(connection, Notification("progress", job.id, stage, done))
         return is_mine
 
-    def release(self, job_id: str, run: str) -> bool:
-        """Puts a job back into its queue. False if it is no longer this process's, or has ended."""
-        mine = JOBS.c.id == job_id, JOBS.c.run == run, JOBS.c.status.in_(OPEN)
+    def tell_progress(self, jobs: Mapping[str, At]) -> None:
+        """Notifies the other processes of how far jobs are."""
         with self._database.transaction() as connection:
-            return connection.execute(sa.update(JOBS).where(*mine).values(_RELEASED)).rowcount > 0
+            told = (Notification("progress", job_id, stage, done) for job_id, (stage, done) in jobs.items())
+            self._database.notify(connection, *told)
+
+    def release(self, job_id: str, run: str, why: str) -> bool:
+        """Puts a job back into its queue. False if it is no longer this process's, or has ended.
+
+        Where another process took it, as this one seemed to have ended, that was a mistake, and is not held against it.
+        """
+        others = JOBS.c.id == job_id, JOBS.c.run.is_distinct_from(run), JOBS.c.status.in_(OPEN), JOBS.c.deaths > 0
+        with self._database.transaction() as connection:
+            released = sa.update(JOBS).where(*_attempt(job_id, run)).values(_RELEASED)
+            is_mine = connection.execute(released).rowcount > 0
+            if is_mine:
+                log.info("job %s goes back to its queue: %s", job_id, why)
+                self._database.notify(connection, Notification("queued", job_id))
+            else:
+                connection.execute(sa.update(JOBS).where(*others).values(deaths=JOBS.c.deaths - 1))
+        return is_mine
 
     def succeed(
         self,
@@ -257,7 +270,6 @@ class JobTable:
         trajectory_key: str | None,
         stages: Collection[str],
         answer: str = "",
-        tell: Tell = _tell_nobody,
     ) -> bool:
         """Stores the result of a job, and its answer in words.
 
@@ -267,11 +279,11 @@ class JobTable:
         values = {"result": packed(result), "format": FORMAT, "trajectory_key": trajectory_key}
         values["answer"] = answer if len(answer) <= MAX_LISTED else answer[: MAX_LISTED - 1] + "…"
         stored = sa.select(sa.func.count()).where(STAGES.c.job_id == job.id, STAGES.c.stage.in_(stages))
-        return self._end(job.id, "succeeded", job.run, stored.scalar_subquery() == len(stages), tell, **values)
+        return self._end(job.id, "succeeded", job.run, stored.scalar_subquery() == len(stages), **values)
 
-    def fail(self, job: TakenJob, error: CowError, tell: Tell = _tell_nobody) -> bool:
+    def fail(self, job: TakenJob, error: CowError) -> bool:
         """Stores what a job failed with. False where the job is no longer this process's."""
-        return self._end(job.id, "failed", job.run, tell=tell, error=json.dumps(error_as_json(error)))
+        return self._end(job.id, "failed", job.run, error=json.dumps(error_as_json(error)))
 
     def cancel(self, job_id: str) -> bool:
         """Ends a job; False if it had ended."""
@@ -290,17 +302,21 @@ class JobTable:
     def recover(self, executors: Iterable[str]) -> list[str]:
         """Puts the jobs of processes that have ended back into their queues; returns their ids.
 
-        One that was started too often fails: it ends its process each time.
+        One of which too many processes ended fails: it ends its process each time.
         """
         theirs = JOBS.c.executor.in_(list(executors)), JOBS.c.status.in_(OPEN)
-        worn_out = sa.select(JOBS.c.id, JOBS.c.run).where(*theirs, JOBS.c.starts >= MAX_STARTS)
+        worn_out = sa.select(JOBS.c.id, JOBS.c.run).where(*theirs, JOBS.c.deaths >= MAX_DEATHS)
         detail = "The server ended repeatedly while it worked on this job, so the job is not tried again."
         error = json.dumps(error_as_json(InternalError(detail)))
         for row in self._database.read(worn_out):
             self._end(row.id, "failed", row.run, error=error)
         with self._database.transaction() as connection:
-            recovered = sa.update(JOBS).where(*theirs).values(_RELEASED).returning(JOBS.c.id)
-            return [row.id for row in connection.execute(recovered)]
+            released = sa.update(JOBS).where(*theirs).values(_RELEASED | {"deaths": JOBS.c.deaths + 1})
+            rows = connection.execute(released.returning(JOBS.c.id, JOBS.c.deaths)).all()
+            self._database.notify(connection, *(Notification("queued", row.id) for row in rows))
+        for row in rows:
+            log.info("job %s goes back to its queue: its process has ended (number %d)", row.id, row.deaths)
+        return [row.id for row in rows]
 
     def find(self, job_id: str, at: At | None, *, full: bool = True) -> JobState | None:
         """A job by its id: with its result unless `full` is false, and with its place while it waits.
@@ -372,11 +388,6 @@ class JobTable:
         query = sa.select(JOBS.c.id).join(REFERENCES).where(REFERENCES.c.sha256 == sha256, JOBS.c.owner == owner)
         return bool(self._database.read(query.limit(1)))
 
-    def ended_of(self, jobs: Sequence[str]) -> list[str]:
-        """Those of some jobs that have ended."""
-        query = sa.select(JOBS.c.id).where(JOBS.c.id.in_(jobs), JOBS.c.status.not_in(OPEN))
-        return [row.id for row in self._database.read(query)]
-
     def ended_before(self, moment: float, limit: int) -> list[str]:
         """Some jobs that ended before a time (Unix time, s)."""
         return [row.id for row in self._database.read(sa.select(JOBS.c.id).where(JOBS.c.ended < moment).limit(limit))]
@@ -408,7 +419,6 @@ class JobTable:
         status: JobStatus,
         run: str | None = None,
         condition: sa.ColumnElement[bool] | None = None,
-        tell: Tell = _tell_nobody,
         **values: Any,
     ) -> bool:
         """Ends an open job, and has its webhook called. Of an attempt: only if it is the latest."""
@@ -418,10 +428,14 @@ class JobTable:
         with self._database.transaction(durable=True) as connection:
             row = connection.execute(ended.returning(JOBS.c.webhook)).one_or_none()
             if row is not None:
-                tell(connection)
+                told: Literal["canceled", "ended"] = "canceled" if status == "canceled" else "ended"
+                self._database.notify(connection, Notification(told, job_id))
                 if row.webhook is not None:
-                    self._on_end(connection, job_id, row.webhook)
-            if row is None and run is not None:  # an earlier try whose commit was not heard of may have done it
+                    host = urlsplit(row.webhook).netloc.rpartition("@")[2].lower()
+                    receiver = hashlib.sha256(host.encode()).hexdigest()
+                    call = {"job_id": job_id, "url": row.webhook, "receiver": receiver, "attempts": 0}
+                    connection.execute(sa.insert(CALLS).values(**call, due=self._database.now))
+            elif run is not None:  # an earlier try whose commit was not heard of may have done it
                 row = connection.execute(sa.select(JOBS.c.id).where(*this, JOBS.c.status == status)).one_or_none()
         return row is not None
 
@@ -453,6 +467,11 @@ _NAMES = (
     "generator", "question", "answer", "given", "image", "error",
 )  # fmt: skip
 _SHOWN = [JOBS.c[name] for name in _NAMES]
+
+
+def _attempt(job_id: str, run: str) -> tuple[sa.ColumnElement[bool], ...]:
+    """The job while this attempt is its latest, and it has not ended."""
+    return JOBS.c.id == job_id, JOBS.c.run == run, JOBS.c.status.in_(OPEN)
 
 
 def error_as_json(error: CowError) -> dict[str, Any]:

@@ -6,28 +6,26 @@ import platform
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
-from functools import partial
+from collections.abc import Iterable, Sequence
+from contextlib import closing, suppress
 from typing import Any, Literal, TypeVar
 
 import sqlalchemy as sa
 
 from cow_service import __version__
-from cow_service.errors import CowError, NotReady
-from cow_service.jobs.active import RestingThread
+from cow_service.errors import NotReady, StorageUnavailable
 from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import RATE_SECONDS, VERSION, JobTable, OpenCount
+from cow_service.jobs.opening import open_database
 from cow_service.jobs.queues import LIGHT, known_queues, queue_of
 from cow_service.jobs.schema import ALIVE_SECONDS, PROCESSES
+from cow_service.jobs.sqlite import Sqlite
 from cow_service.observability.logging import rfc3339
-from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, WorkerInfo, Workers
+from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, Workers
 from cow_service.settings import Settings
 
-TELL_SECONDS, QUIET_TELL_SECONDS = 2.0, 5.0  # between two rows, and while there are no jobs
 FORGOTTEN_SECONDS = 3600.0  # after which a row is deleted
-JOIN_TIMEOUT_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 MAX_AGE_SECONDS = 1.0  # of an overview that is given out again
 
 # What not every caller may know: where processes are, and the ids of others' jobs.
@@ -39,70 +37,38 @@ Key = TypeVar("Key")
 log = logging.getLogger("cow_service")
 
 
-class ProcessTable:
-    """One row for each process that runs an engine. Times are the database's: the clocks of machines differ.
+class Processes:
+    """This process among those on the job database, and the state of all of them. Safe to use from every thread.
 
-    Every method raises `StorageUnavailable` where the database cannot be used.
+    On PostgreSQL each has a row. Times are the database's: the clocks of machines differ.
     """
-
-    def __init__(self, database: Database) -> None:
-        self._database, self._now = database, database.now
-
-    def write(self, info: ProcessInfo) -> None:
-        """Records that a process is alive, and what it does; deletes rows of processes long gone."""
-        row = self._database.insert(PROCESSES)
-        row = row.values(executor=info.executor_id, seen=self._now, info=info.model_dump_json())
-        kept = {"seen": row.excluded.seen, "info": row.excluded.info}
-        with self._database.transaction() as connection:
-            connection.execute(row.on_conflict_do_update(index_elements=["executor"], set_=kept))
-            connection.execute(sa.delete(PROCESSES).where(PROCESSES.c.seen < self._now - FORGOTTEN_SECONDS))
-
-    def remove(self, executor: str) -> None:
-        """Deletes the row of a process that ends."""
-        with self._database.transaction() as connection:
-            connection.execute(sa.delete(PROCESSES).where(PROCESSES.c.executor == executor))
-
-    def alive(self) -> tuple[ProcessInfo, ...]:
-        """Those seen in the last `ALIVE_SECONDS`, by role, host and process id."""
-        query = sa.select(PROCESSES.c.executor, PROCESSES.c.info)
-        found: list[ProcessInfo] = []
-        for executor, info in self._database.read(query.where(PROCESSES.c.seen > self._now - ALIVE_SECONDS)):
-            try:
-                found.append(ProcessInfo.model_validate_json(info, extra="ignore"))  # a later version has more fields
-            except ValueError:
-                log.warning("the process %s runs a version that this one does not understand", executor)
-        return tuple(sorted(found, key=lambda one: (one.role, one.host or "", one.pid or 0)))
-
-
-class Processes(RestingThread):
-    """This process among those on the job database. A thread of its own: maintenance may take minutes."""
 
     def __init__(self, parts: EngineParts, computer: Computer, role: ProcessRole | None) -> None:
         """`role`: by default that of the settings."""
-        super().__init__("cow-processes", parts.active, JOIN_TIMEOUT_SECONDS)
         self._parts, self._computer = parts, computer
-        self._role: ProcessRole = role or parts.service.settings.role
-        self._table = ProcessTable(parts.database)
-        self.overview = Overview(parts.database, parts.service.settings)
+        self._settings = parts.service.settings
+        self._role: ProcessRole = role or self._settings.role
         self._draining = False
+        self._lock = threading.Lock()
+        self._picture: tuple[Workers, list[OpenCount]] = Workers(processes=(), queues=()), []
+        self._read_at = -MAX_AGE_SECONDS
 
     def start(self) -> None:
-        """Begins to tell, and to count for the metrics."""
+        """Begins to count for the metrics."""
         self._draining = False
-        metrics, overview = self._parts.service.metrics, self.overview
-        metrics.workers = self.workers
+        metrics = self._parts.service.metrics
+        metrics.workers = lambda: self._computer.workers(self._parts.active)
         metrics.gauges |= {
             "cow_queue_depth": lambda: _sums(
-                ((one.queue, one.generator, one.state), one.jobs) for one in overview.counts()
+                ((one.queue, one.generator, one.state), one.jobs) for one in self._latest()[1]
             ).items(),
             "cow_queue_oldest_seconds": lambda: [
-                ((one.name,), one.oldest_seconds or 0.0) for one in overview.workers().queues
+                ((one.name,), one.oldest_seconds or 0.0) for one in self.overview().queues
             ],
             "cow_queue_unserved": lambda: _sums(
-                ((one.queue, one.reason), one.jobs) for one in overview.workers().unserved
+                ((one.queue, one.reason), one.jobs) for one in self.overview().unserved
             ).items(),
         }
-        super().start()
 
     def drain(self) -> None:
         """The process takes no more jobs, and finishes those that it has."""
@@ -110,63 +76,28 @@ class Processes(RestingThread):
 
     def stop(self) -> None:
         """The process ends."""
-        if self._thread is not None:
-            super().stop()
-            self._try(lambda: self._table.remove(self._parts.executor))
+        if self._parts.database.is_shared:
+            with suppress(StorageUnavailable), self._parts.database.transaction() as connection:
+                connection.execute(sa.delete(PROCESSES).where(PROCESSES.c.executor == self._parts.executor))
 
-    def workers(self) -> tuple[WorkerInfo, ...]:
-        """What computes jobs in this process and its worker processes."""
-        return self._computer.workers(self._parts.active)
+    def tell(self) -> None:
+        """Records that the process is alive, and what it does; deletes rows of processes long gone."""
+        database = self._parts.database
+        row = database.insert(PROCESSES)
+        row = row.values(executor=self._parts.executor, seen=database.now, info=self._own().model_dump_json())
+        kept = {"seen": row.excluded.seen, "info": row.excluded.info}
+        with database.transaction() as connection:
+            connection.execute(row.on_conflict_do_update(index_elements=["executor"], set_=kept))
+            connection.execute(sa.delete(PROCESSES).where(PROCESSES.c.seen < database.now - FORGOTTEN_SECONDS))
 
-    def run(self) -> None:
-        """Writes the row of this process, again and again."""
-        capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._parts.service.settings))
-        queues = {name: capacity for name, capacity in capacities if capacity > 0}
-        while not self._stop.is_set():
-            info = ProcessInfo(
-                executor_id=self._parts.executor,
-                seen_at=rfc3339(time.time()),
-                role=self._role,
-                host=platform.node(),
-                pid=os.getpid(),
-                version=__version__,
-                workflow_version=VERSION,
-                queues={} if self._draining else queues,
-                workers=self.workers(),
-            )
-            self._try(partial(self._table.write, info))
-            self.rest(TELL_SECONDS, QUIET_TELL_SECONDS)
-
-    def _try(self, work: Callable[[], None]) -> None:
-        """Reports the process, and ignores failures: the report is for people, and no job depends on it."""
-        try:
-            work()
-        except CowError as error:
-            log.warning("the state of this process could not be reported: %s", error.detail)
-
-
-class Overview:
-    """Reads the picture, at most once a second however many ask. Safe to use from every thread."""
-
-    def __init__(self, database: Database, settings: Settings) -> None:
-        self._settings = settings
-        self._table, self._jobs = ProcessTable(database), JobTable(database)
-        self._lock = threading.Lock()
-        self._picture: tuple[Workers, list[OpenCount]] = Workers(processes=(), queues=()), []
-        self._read_at = -MAX_AGE_SECONDS
-
-    def workers(self, *, for_admin: bool = True) -> Workers:
-        """What `GET /workers` returns. Raises `StorageUnavailable`."""
+    def overview(self, *, for_admin: bool = True) -> Workers:
+        """What `GET /workers` returns, at most a second old however many ask. Raises `StorageUnavailable`."""
         found = self._latest()[0]
         return found if for_admin else Workers.model_validate(found.model_dump(exclude=FOR_ADMINS))
 
-    def counts(self) -> list[OpenCount]:
-        """The jobs that wait or run. Raises `StorageUnavailable`."""
-        return self._latest()[1]
-
     def check_served(self) -> None:
         """Raises `NotReady` if no process takes the jobs of the default request, or those of another version."""
-        found, settings = self.workers(), self._settings
+        found, settings = self.overview(), self._settings
         queue = queue_of(settings.reader, settings.generator, settings)
         if settings.role == "api" and not _serving(found.processes, queue, VERSION):
             raise NotReady(remedy(Unserved(queue=queue, workflow_version=VERSION, jobs=1, reason="queue")))
@@ -174,14 +105,41 @@ class Overview:
             if one.reason == "version":
                 raise NotReady(f"{describe_unserved(one)} {remedy(one)}")
 
+    def _own(self) -> ProcessInfo:
+        capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._settings))
+        return ProcessInfo(
+            executor_id=self._parts.executor,
+            seen_at=rfc3339(time.time()),
+            role=self._role,
+            host=platform.node(),
+            pid=os.getpid(),
+            version=__version__,
+            workflow_version=VERSION,
+            queues={} if self._draining else {name: number for name, number in capacities if number > 0},
+            workers=self._computer.workers(self._parts.active),
+        )
+
     def _latest(self) -> tuple[Workers, list[OpenCount]]:
         with self._lock:
             if time.monotonic() - self._read_at >= MAX_AGE_SECONDS:
-                processes, counts = self._table.alive(), self._jobs.open_counts()
-                queues = _queues(processes, counts, self._jobs.ended_lately())
+                database, counts = self._parts.database, self._parts.jobs.open_counts()
+                processes = alive(database) if database.is_shared else (self._own(),)
+                queues = _queues(processes, counts, self._parts.jobs.ended_lately())
                 found = Workers(processes=processes, queues=queues, unserved=unserved(processes, counts))
                 self._picture, self._read_at = (found, counts), time.monotonic()
             return self._picture
+
+
+def alive(database: Database) -> tuple[ProcessInfo, ...]:
+    """The processes seen in the last `ALIVE_SECONDS`, by role, host and process id. Raises `StorageUnavailable`."""
+    query = sa.select(PROCESSES.c.executor, PROCESSES.c.info).where(PROCESSES.c.seen > database.now - ALIVE_SECONDS)
+    found: list[ProcessInfo] = []
+    for executor, info in database.read(query):
+        try:
+            found.append(ProcessInfo.model_validate_json(info, extra="ignore"))  # a later version has more fields
+        except ValueError:
+            log.warning("the process %s runs a version that this one does not understand", executor)
+    return tuple(sorted(found, key=lambda one: (one.role, one.host or "", one.pid or 0)))
 
 
 def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> tuple[Unserved, ...]:
@@ -197,11 +155,17 @@ def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> t
 
 
 def unserved_jobs(settings: Settings) -> tuple[Unserved, ...]:
-    """Queued jobs that no live process takes, of a database that is not changed. Raises `StorageUnavailable`."""
-    with closing(Database(settings, read_only=True)) as database:
-        if (database.file is not None and not database.file.exists()) or not database.schema():
+    """Queued jobs that no live process takes, of a database that is not changed. Raises `StorageUnavailable`.
+
+    In a file they wait for the next start of the server, but those of another version.
+    """
+    with closing(open_database(settings, read_only=True)) as database:
+        if (isinstance(database, Sqlite) and not database.file.exists()) or not database.schema():
             return ()  # no server has used it
-        return unserved(ProcessTable(database).alive(), JobTable(database).open_counts())
+        counts = JobTable(database).open_counts()
+        if not database.is_shared:
+            return unserved((), [one for one in counts if one.workflow_version != VERSION])
+        return unserved(alive(database), counts)
 
 
 def describe_unserved(one: Unserved) -> str:

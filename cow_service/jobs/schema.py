@@ -12,14 +12,15 @@ import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
+from cow_service.settings import SettingsError
 
-SCHEMA = 3  # of our tables; 1 is that without `cow_schema`, 2 that without answers of jobs
+SCHEMA = 4  # of our tables; 1 is that without `cow_schema`, 2 without answers of jobs, 3 without calls of webhooks
 # The oldest version of COW, by its own `SCHEMA`, that can serve on these tables. It stays where a version only adds
 # tables, and columns that may be null: such a change is made while older servers run.
 OLDEST_SERVING = 1
 BEFORE_SCHEMA_1 = "cow_holds"  # a table of the versions that kept jobs elsewhere
 ALIVE_SECONDS = 10.0  # since a process last told of itself
-INDEXES_LOCK = 0x434F5703  # of PostgreSQL, held while indexes are added
+TABLES_LOCK, INDEXES_LOCK = 0x434F5701, 0x434F5703  # of PostgreSQL, held while these are made
 
 log = logging.getLogger("cow_service")
 
@@ -39,7 +40,8 @@ JOBS = sa.Table(
     sa.Column("turn", sa.Integer, nullable=False),  # among the jobs of its queue: the lowest is taken first
     sa.Column("executor", sa.String(64)),  # the process that has taken it; null while it waits in its queue
     sa.Column("run", sa.String(64)),  # names this attempt: an earlier one can change nothing any more
-    sa.Column("starts", sa.Integer, nullable=False),  # how often it was taken
+    # How often a process ended that had it; in earlier versions, how often it was taken.
+    sa.Column("starts", sa.Integer, nullable=False, key="deaths"),
     sa.Column("generator", sa.Text, nullable=False),
     sa.Column("question", sa.Text, nullable=False),
     sa.Column("answer", sa.Text),  # in words, for lists
@@ -97,6 +99,16 @@ STAGES = sa.Table(
     _of_job(primary_key=True),
     sa.Column("stage", sa.String(32), primary_key=True),
 )
+# Webhooks to be called: one row for each job that has ended, until its receiver has heard of it or is given up.
+CALLS = sa.Table(
+    "cow_webhooks",
+    METADATA,
+    _of_job(primary_key=True),
+    sa.Column("url", sa.Text, nullable=False),
+    sa.Column("receiver", sa.String(64), nullable=False),  # a digest of host and port
+    sa.Column("attempts", sa.Integer, nullable=False),  # that have begun
+    sa.Column("due", sa.Float, nullable=False, index=True),  # the next one; Unix time of the database, s
+)
 # Where the artifacts of all jobs are: one row, once a server has started.
 STORES = sa.Table(
     "cow_artifact_store",
@@ -130,19 +142,19 @@ PROCESSES = sa.Table(
 
 
 def schema_of(connection: sa.Connection) -> int:
-    """That of the tables; 0 where there are none. Raises `StorageUnavailable` if this version cannot use it."""
+    """That of the tables; 0 where there are none. Raises `SettingsError` if this version cannot use it."""
     there = set(sa.inspect(connection).get_table_names())
     if SCHEMAS.name in there:
         found = connection.execute(sa.select(SCHEMAS)).one_or_none()
         if found is not None and found.oldest_serving > SCHEMA:
-            raise StorageUnavailable(
+            raise SettingsError(
                 f"The job database is of a later version of COW (schema {found.version}), on whose tables this one "
                 f"(schema {SCHEMA}) cannot serve: update it."
             )
         if found is not None:  # otherwise a restore has lost the row, and it is written again
             return found.version
     if BEFORE_SCHEMA_1 in there and JOBS.name not in there:
-        raise StorageUnavailable(
+        raise SettingsError(
             "The job database is of a version of COW whose jobs this one cannot take over: let that version end them, "
             "and give this one an empty database (COW_DATABASE_URL)."
         )
@@ -152,8 +164,8 @@ def schema_of(connection: sa.Connection) -> int:
 def update_tables(connection: sa.Connection, now: sa.ColumnElement[float]) -> None:
     """Makes our tables, or adds what those of an earlier version lack; those of a later one stay as they are.
 
-    Raises `StorageUnavailable` if this version cannot use them, or would change them in a way that processes which
-    run do not bear.
+    Raises `SettingsError` if this version cannot use them, `StorageUnavailable` while it would change them in a way
+    that processes which run do not bear.
     """
     found = schema_of(connection)
     if found > SCHEMA:

@@ -142,8 +142,4 @@ def set_up(settings: Settings, *, out: TextIO | None = None, err: TextIO | None 
         logger.setLevel(level)
     access = logging.getLogger(ACCESS)
     access.handlers, access.propagate = [requests], False
-    # The job engine adds a handler of its own to a logger that has none.
-    engine = logging.getLogger("dbos")
-    engine.handlers, engine.propagate = [problems], False
-    engine.setLevel(logging.WARNING)
     logging.captureWarnings(True)

@@ -24,6 +24,7 @@ from cow_service.jobs.active import QUIET_SECONDS, ActiveJob
 from cow_service.jobs.computing import Work, compute
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import TakenJob, error_as_json
+from cow_service.jobs.opening import open_database
 from cow_service.jobs.readiness import warm_up
 from cow_service.observability import logging as context
 from cow_service.observability import tracing
@@ -94,7 +95,7 @@ class WorkerProcess:
         self._pipe = pipe
         self._sending = threading.Lock()
         self._service = Service(settings)
-        self._database = Database(settings)
+        self._database = open_database(settings)
         self._jobs: dict[str, _Job] = {}
         self._busy_at = time.monotonic()
         self._threads = ThreadPoolExecutor(max_workers=1024, thread_name_prefix="job")

@@ -68,7 +68,7 @@ def workers(engine: Engine, owner: Owner) -> Workers:
     process takes. A second old at most; processes tell of themselves every two seconds. Where the server has keys,
     only the keys in `COW_ADMIN_KEYS` see hosts, process ids and ids of jobs.
     """
-    return engine.processes.overview.workers(for_admin=engine.service.settings.is_admin(owner))
+    return engine.processes.overview(for_admin=engine.service.settings.is_admin(owner))
 
 
 @router.get("/metrics", tags=["health"], summary="Counters for Prometheus", response_class=PlainTextResponse)
