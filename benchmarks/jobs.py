@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
+from cow_service.jobs.cleaning import collect_artifacts, remove_old_jobs
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobFilters, JobSpec
-from cow_service.jobs.maintenance import collect_artifacts
 from cow_service.media.images import encode_png
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -147,7 +147,7 @@ def measure(engine: JobEngine, counts: list[int]) -> list[dict[str, Any]]:
         )
 
         def tidy() -> None:
-            engine._maintenance.clean_up_jobs()  # pyright: ignore[reportPrivateUsage]
+            remove_old_jobs(engine._parts, lambda: False)  # pyright: ignore[reportPrivateUsage]
             collect_artifacts(engine.service, engine.database, lambda: False)
 
         tidy()  # the first round after such a change of the tables is not typical

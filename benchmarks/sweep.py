@@ -20,10 +20,10 @@ from typing import Any, cast
 
 import psutil
 import sqlalchemy as sa
+from cow_service.jobs.maintenance import UNREFERENCED_GRACE_SECONDS, collect_artifacts
 
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobSpec, JobTable
-from cow_service.jobs.maintenance import UNREFERENCED_GRACE_SECONDS, collect_artifacts
 from cow_service.media.artifacts import DiskArtifacts, ListedArtifact
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -64,20 +64,20 @@ def fill(database: Database, names: int) -> None:
     database.create_tables()
     request = {"image": {"artifact": "f" * 64}, "question": "?"}
     asked: dict[str, Any] = {"kind": "simulate", "reader": "embedded", "generator": "cutout"}
-    JobTable(database).insert("job", JobSpec(**asked, request=request, created_at=time_text()), None, "light", 1)
+    JobTable(database).add("job", JobSpec(**asked, request=request, created_at=time_text()), None, "light", 1)
     JobTable(database).cancel("job")
     series = (
         f"SELECT generate_series(0, {names - 1}) AS n"
-        if database.file is None
+        if database.is_shared
         else f"SELECT 0 AS n UNION ALL SELECT n + 1 FROM numbers WHERE n < {names - 1}"
     )
     name = (
         f"rpad(lpad(to_hex(n), {DIGITS}, '0'), 64, '0')"
-        if database.file is None
+        if database.is_shared
         else f"printf('%0{DIGITS}x', n) || '{'0' * (64 - DIGITS)}'"
     )
     with database.transaction() as connection:
-        if database.file is None:
+        if database.is_shared:
             connection.execute(sa.text("SET LOCAL statement_timeout = 0"))
         connection.execute(
             sa.text(

@@ -18,6 +18,11 @@ from cow_service.stages.run import now
 STEP = 100
 
 
+def url_of(database: Database) -> SecretStr:
+    """The address of a database, with its password."""
+    return SecretStr(database.engine.url.render_as_string(hide_password=False))
+
+
 def open_database(folder: Path, url: SecretStr | None = None) -> Database:
     """A database with all tables: in a file of the folder, or that of the URL."""
     database = opening.open_database(Settings(data_dir=folder, database_url=url))

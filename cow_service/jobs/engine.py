@@ -61,7 +61,7 @@ class JobEngine:
         self.storage = StorageCheck(service.artifacts)
         self.is_running = False
         self._stopping = False
-        self._not_started = "The server is starting."  # or why it waits
+        self._waits_for = ""  # what keeps it from starting
         self._grace: threading.Timer | None = None  # until running jobs are interrupted
         self._submitting = threading.Lock()
         if not self.database.is_shared and (role or service.settings.role) != "all":
@@ -77,7 +77,7 @@ class JobEngine:
             try:
                 self.start()
             except StorageUnavailable as error:
-                self._not_started = f"{error.detail} The server waits for it."
+                self._waits_for = error.detail
                 log.warning("%s Next try in %g s.", error.detail, pause)
                 stop.wait(pause)
                 pause = min(2 * pause, LONGEST_WAIT)
@@ -145,7 +145,9 @@ class JobEngine:
 
     def not_started(self) -> CowError:
         """Why nothing can be asked yet."""
-        return NotReady(f"{self._not_started} Ask again later.")
+        if self._waits_for:
+            return StorageUnavailable(f"{self._waits_for} The server starts when it can be used.")
+        return NotReady("The server is starting. Ask again later.")
 
     def check_capacity(self, owner: str | None) -> None:
         """Raises `QueueFull` if another job would be too many, `ShuttingDown` where none is accepted."""

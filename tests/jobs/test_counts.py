@@ -40,7 +40,7 @@ from cow_service.settings import Settings
 TABLE: dict[str, float] = json.loads((DATA / "counts.json").read_text())
 # What depends on versions of libraries is held less exactly.
 TOLERANCE = {"artifact_bytes": 0.02, "row_bytes": 0.02, "modules_of_a_server": 0.05}
-BY_THE_CLOCK = ("cow-notifications", "cow-maintenance", "cow-clean-up", "cow-processes", "cow-dispatcher")
+BY_THE_CLOCK = ("cow-ticker", "cow-clean-up", "cow-jobs")
 AT_THE_START = "asyncio-portal"  # the thread of the event loop
 BALL = example("ball-and-mug")
 HALF = math.prod(BALL.meta["image_size"]) / 2

@@ -8,7 +8,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,21 +17,20 @@ import pytest
 import sqlalchemy as sa
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from job_rows import add_job, open_database, take_new_job
+from job_rows import add_job, open_database, take_new_job, url_of
 from postgres import PostgresServer, postgres
 from pydantic import SecretStr
 from refusals import refused
 from waiting import TIME_LIMIT, eventually
 
 from cow_service.errors import Canceled, InternalError
-from cow_service.jobs import maintenance
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.attempts import Dispatcher, Runner
-from cow_service.jobs.calls import Calls
-from cow_service.jobs.computing import Computer, EngineParts
+from cow_service.jobs.computing import Computer, EngineParts, JobOutcome, Work
 from cow_service.jobs.database import Database, StoredResult
-from cow_service.jobs.job_table import MAX_LISTED, MAX_STARTS, VERSION, JobFilters, JobTable
-from cow_service.jobs.schema import JOBS
+from cow_service.jobs.job_table import MAX_DEATHS, MAX_LISTED, VERSION, JobFilters, JobTable
+from cow_service.jobs.loop import JobLoop
+from cow_service.jobs.schema import CALLS, JOBS
+from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
 
 
@@ -185,7 +184,7 @@ def test_what_is_no_cursor_is_refused(database: Database, cursor: str) -> None:
 def test_no_list_looks_at_other_jobs(database: Database, owner: str | None) -> None:
     """Each is answered from ranges of an index that hold nothing else."""
     fill(database, 20_000)
-    if database.file is None:
+    if database.is_shared:
         with database.engine.connect() as connection:
             connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql("VACUUM ANALYZE cow_jobs")
     asked: list[tuple[str, Any]] = []
@@ -195,7 +194,7 @@ def test_no_list_looks_at_other_jobs(database: Database, owner: str | None) -> N
         JobTable(database).page(owner, JobFilters(**wanted), {})
         ((statement, values),) = tuple(asked)
         with database.engine.connect() as connection:
-            if database.file is None:
+            if database.is_shared:
                 (plan,) = connection.exec_driver_sql(f"EXPLAIN (ANALYZE, FORMAT JSON) {statement}", values).scalars()
                 used = re.findall(r'"(?:Index|Relation) Name": "(cow_jobs\w*)"', json.dumps(plan))
                 assert used.count("cow_jobs") * 2 == len(used), "a table is read without an index"
@@ -240,16 +239,16 @@ def test_only_the_latest_attempt_ends_a_job_and_what_has_ended_stays(database: D
     table = JobTable(database)
     add_job(database, "job")
     (old,) = table.take("light", "frozen", 1, None)
-    assert table.begin(old)
+    assert table.begin(old, "grounding", 0.0)
     assert table.recover(["frozen"]) == ["job"]
     found = table.find("job", None)
     assert found is not None
     assert (found.job.status, found.job.position) == ("queued", 0)
     (new,) = table.take("light", "me", 1, None)
-    assert not table.begin(old)
+    assert not table.begin(old, "grounding", 0.0)
     assert not table.succeed(old, '{"by":"old"}', None, ())
-    table.release("job", old.run)
-    assert table.begin(new)
+    table.release("job", old.run, "it was frozen")
+    assert table.begin(new, "grounding", 0.0)
     assert table.succeed(new, '{"by":"new"}', None, ())
     assert table.succeed(new, '{"by":"new"}', None, ()), "a repeated try whose first commit was not heard of"
     assert not table.fail(new, InternalError("late"))
@@ -271,7 +270,7 @@ def test_a_queued_job_says_how_long_it_will_wait(database: Database, monkeypatch
 
     for number in range(4):
         job = take_new_job(database, f"ended-{number}", "me")
-        assert table.begin(job)
+        assert table.begin(job, "grounding", 0.0)
         assert table.succeed(job, "{}", None, ())
         clock[0] += 10
     assert table.ended_lately() == {"light": 4}
@@ -280,7 +279,7 @@ def test_a_queued_job_says_how_long_it_will_wait(database: Database, monkeypatch
     add_job(database, "second")
     assert place("second") == (1, 20.0)
     (first,) = table.take("light", "me", 1, None)
-    assert table.begin(first)
+    assert table.begin(first, "grounding", 0.0)
     assert place("second") == (0, 10.0)
     clock[0] += 285  # three of the ends are more than five minutes ago
     assert table.ended_lately() == {"light": 1}
@@ -305,27 +304,9 @@ def test_results_of_a_deleted_job_lock_nobody_out(database: Database, tmp_path: 
     JobTable(database).delete(["job"])
     with pytest.raises(Canceled) as held:
         database.find_result("key", "job", [StoredResult("key", "grounding", "{}", ("a" * 64,))])
-    with closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(database.url)))) as another_process:
+    with closing(open_database(tmp_path, url_of(database))) as another_process:
         assert add_job(another_process, "another job")
     assert held
-
-
-def test_after_jobs_connections_are_closed(database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cow_service.jobs.active.QUIET_SECONDS", 0.5)
-    monkeypatch.setattr(maintenance, "QUIET_POLL_SECONDS", 0.05)
-    service: Any = SimpleNamespace(settings=Settings())
-    parts = EngineParts(service, database, JobTable(database), ActiveJobs(), "me")
-    lease = maintenance.FolderLease(tmp_path)
-    thread = maintenance.Maintenance(parts, Calls(), lease, lambda jobs, since: None, lambda: None)
-    for one in [database.engine.connect() for _ in range(5)]:
-        one.close()
-    with parts.active.running("job", "simulate"):
-        thread.start()
-        pool: Any = database.engine.pool
-        assert pool.checkedin() >= 4
-    eventually(lambda: pool.checkedin() <= 1)
-    thread.stop()
-    database.check()
 
 
 def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(database: Database) -> None:
@@ -339,17 +320,34 @@ def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(datab
 
 
 def test_a_job_that_ends_its_process_each_time_fails(database: Database) -> None:
-    ended: list[str] = []
-    table = JobTable(database, lambda connection, job_id, url: ended.append(url))
+    table = JobTable(database)
     add_job(database, "killer", webhook="https://call.test")
-    for _ in range(MAX_STARTS):
-        assert ended == []
-        assert ids(table.take("light", "me", 1, None)) == ["killer"]
-        table.recover(["me"])
+    for _ in range(MAX_DEATHS):
+        table.take("light", "me", 1, None)
+        assert table.recover(["me"]) == ["killer"]
+    assert not database.read(sa.select(CALLS))
+    table.take("light", "me", 1, None)
+    assert table.recover(["me"]) == []
     found = table.find("killer", None)
     assert found is not None
-    assert (found.job.status, ended) == ("failed", ["https://call.test"])
-    assert isinstance(found.error, InternalError)
+    assert (found.job.status, type(found.error)) == ("failed", InternalError)
+    assert [(row.job_id, row.url) for row in database.read(sa.select(CALLS))] == [("killer", "https://call.test")]
+
+
+def test_what_only_seemed_an_end_and_what_was_given_back_count_for_nothing(
+    database: Database, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "cow_service")
+    table = JobTable(database)
+    add_job(database, "job")
+    for number in range(2 * MAX_DEATHS):
+        (frozen,) = table.take("light", "frozen", 1, None)
+        assert table.recover(["frozen"]) == ["job"]
+        (taken,) = table.take("light", "me", 1, None)
+        assert not table.release("job", frozen.run, "it woke up"), "another process has it"
+        assert table.release("job", taken.run, f"stop {number}")
+    assert "job job goes back to its queue: its process has ended (number 1)" in caplog.text
+    assert "job job goes back to its queue: stop 1" in caplog.text
 
 
 def test_long_answers_are_listed_in_short(database: Database) -> None:
@@ -360,44 +358,70 @@ def test_long_answers_are_listed_in_short(database: Database) -> None:
     assert shown == {"job-200": "x" * 200, "job-201": "x" * 199 + "…"}
 
 
-def test_a_job_that_the_system_gives_no_thread_for_is_left_to_maintenance(
+class Places(Computer):
+    """Computes nothing, at so many places."""
+
+    def __init__(self, places: int) -> None:
+        self.places = places
+        self.computed: list[str] = []
+        self.may_end = threading.Event()
+
+    def capacity(self, queue: str) -> int:
+        return self.places
+
+    def compute(self, work: Work) -> JobOutcome:
+        self.computed.append(work.job.id)
+        self.may_end.wait(TIME_LIMIT)
+        raise Canceled("It was interrupted.")
+
+
+@contextmanager
+def looping(database: Database, computer: Computer) -> Iterator[tuple[JobLoop, ActiveJobs]]:
+    service: Any = SimpleNamespace(settings=Settings(), metrics=Metrics())
+    parts = EngineParts(service, database, JobTable(database), ActiveJobs(), "me")
+    loop = JobLoop(parts, computer)
+    loop.start()
+    yield loop, parts.active
+    loop.stop()
+    loop.wait(TIME_LIMIT)
+
+
+def test_no_more_jobs_are_taken_than_there_are_places(database: Database) -> None:
+    computer, table = Places(0), JobTable(database)
+    for number in range(5):
+        add_job(database, str(number))
+    with looping(database, computer) as (loop, _):
+        computer.places = 3
+        loop.wake()
+        eventually(lambda: len(computer.computed) == 3)
+        add_job(database, "late")
+        loop.wake()
+        assert sorted(table.taken_by("me")) == sorted(computer.computed) == ["0", "1", "2"]
+        computer.places = 0
+        computer.may_end.set()
+        eventually(lambda: not table.taken_by("me"))
+    assert len(table.open_counts()) == 1, "all are back in the queue"
+
+
+def test_a_job_that_the_system_gives_no_thread_for_leaves_its_place(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(_: object) -> None:
-        raise RuntimeError("can't start new thread")
+    start = threading.Thread.start
 
-    ends: list[tuple[str, bool]] = []
-    parts: Any = SimpleNamespace(jobs=JobTable(database), active=ActiveJobs())
-    runner = Runner(parts, Computer(), None, lambda job, has_ended: ends.append((job.id, has_ended)))  # type: ignore[arg-type]
-    job = take_new_job(database, "job", "me")
+    def fail(thread: threading.Thread) -> None:
+        if thread.name.startswith("job-"):
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    add_job(database, "job")
+    computer = Places(1)
     monkeypatch.setattr(threading.Thread, "start", fail)
-    runner.start(job)
-    assert ends == [("job", False)]
-
-
-@pytest.mark.parametrize("capacity", [0, 3])
-def test_no_more_jobs_are_taken_than_there_are_places(capacity: int) -> None:
-    waiting, started, told = list("abcdefgh"), [], threading.Event()
-
-    def take(queue: str, executor: str, number: int, limit: int | None) -> list[str]:
-        taken = waiting[:number]
-        del waiting[:number]
-        return taken
-
-    jobs = SimpleNamespace(waiting_queues=lambda: ["light"], take=take)
-    settings = SimpleNamespace(running_limit_per_key=None)
-    service, database = SimpleNamespace(settings=settings), SimpleNamespace(file=None)
-    parts: Any = SimpleNamespace(executor="me", jobs=jobs, service=service, database=database, active=ActiveJobs())
-    dispatcher = Dispatcher(parts, lambda queue: capacity, started.append, told.set)
-    dispatcher.start()
-    eventually(lambda: len(started) == capacity)
-    if capacity:
-        assert dispatcher.free_places("light") == 0
-        dispatcher.give_place_back("light")
-        eventually(lambda: len(started) == capacity + 1)
-    assert not told.is_set(), "jobs that were not new here are told by those who took them in"
-    dispatcher.wake("light")
-    assert told.wait(TIME_LIMIT), "others may have a place for a new job"
-    dispatcher.stop()
-    assert dispatcher.free_places("light") == dispatcher.free_places("other") == 0
-    assert len(waiting) + len(started) == 8
+    with looping(database, computer) as (loop, active):
+        eventually(lambda: JobTable(database).taken_by("me"))
+        eventually(lambda: not active.runs())
+        monkeypatch.undo()
+        add_job(database, "next")
+        loop.wake()
+        eventually(lambda: computer.computed == ["next"])
+        computer.may_end.set()
+    assert [*JobTable(database).taken_by("me")] == ["job"], "the ticker finds it, and gives it back"

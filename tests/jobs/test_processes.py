@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import sqlalchemy as sa
 from job_rows import add_job, open_database
-from pydantic import ValidationError
+from postgres import postgres
+from pydantic import SecretStr, ValidationError
 from refusals import refused
 
-from cow_service.jobs.job_table import VERSION
-from cow_service.jobs.processes import FORGOTTEN_SECONDS, Overview, ProcessTable, unserved_jobs
+from cow_service.jobs.active import ActiveJobs
+from cow_service.jobs.computing import Computer, EngineParts
+from cow_service.jobs.database import Database
+from cow_service.jobs.job_table import JobTable
+from cow_service.jobs.processes import FORGOTTEN_SECONDS, Processes, unserved_jobs
 from cow_service.jobs.schema import ALIVE_SECONDS
-from cow_service.records import ProcessInfo, WorkerInfo, WorkerJob
+from cow_service.records import WorkerInfo, WorkerJob
 from cow_service.settings import Settings
 
 
@@ -23,36 +29,74 @@ def test_an_administrator_has_a_key() -> None:
         Settings(api_keys={"alice": "0" * 64}, admin_keys=("bob",))
 
 
+class Worker(Computer):
+    """It has a worker at work, and takes jobs of some queues."""
+
+    def __init__(self, *queues: str) -> None:
+        self._queues = queues
+
+    def capacity(self, queue: str) -> int:
+        return 3 if queue in self._queues else 0
+
+    def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
+        job = WorkerJob(id="secret", kind="answer", progress=0, seconds=1)
+        return (WorkerInfo(name="light-1", queue="light", pid=2, memory_mb=1, jobs_done=0, jobs=(job,)),)
+
+
+def processes_of(database: Database, settings: Settings, executor: str, *queues: str) -> Processes:
+    service: Any = SimpleNamespace(settings=settings)
+    parts = EngineParts(service, database, JobTable(database), ActiveJobs(), executor)
+    return Processes(parts, Worker(*queues), None if executor == "api" else "worker")
+
+
+@pytest.mark.slow
 def test_processes_are_shown_while_they_tell_of_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cow_service.jobs.processes.MAX_AGE_SECONDS", 0.0)
-    settings = Settings(data_dir=tmp_path, role="api")
+    with postgres() as server:
+        url = SecretStr(server.url)
+        settings = Settings(data_dir=tmp_path, role="api", database_url=url)
+        assert unserved_jobs(settings) == (), "no server has used it"
+        with closing(open_database(tmp_path, url)) as database:
+            api, other = processes_of(database, settings, "api"), processes_of(database, settings, "other", "light")
+            with refused("not-ready"):
+                api.check_served()
+            other.tell()
+            api.tell()
+            api.check_served()
+            told = api.overview().processes
+            assert ([one.role for one in told], told[1].workers[0].jobs[0].id) == (["api", "worker"], "secret")
+            hidden = api.overview(for_admin=False).processes[1]
+            assert (hidden.host, hidden.workers[0].jobs[0].id) == (None, None)
+            (queue,) = api.overview().queues
+            assert (queue.name, queue.capacity, queue.queued, queue.oldest_seconds) == ("light", 3, 0, None)
+            for name in ("light", "ati"):
+                add_job(database, name, queue=name)
+            assert [(one.queue, one.reason) for one in unserved_jobs(settings)] == [("ati", "queue")]
+            assert unserved_jobs(settings) == api.overview().unserved
+            other.drain()
+            other.tell()
+            assert [one.queue for one in api.overview().unserved] == ["ati", "light"]
+            age = sa.text("UPDATE cow_executors SET seen = seen - :seconds WHERE executor = 'other'")
+            for seconds in (ALIVE_SECONDS + 1, FORGOTTEN_SECONDS):
+                with database.transaction() as connection:
+                    connection.execute(age, {"seconds": seconds})
+                api.tell()
+                assert [one.role for one in api.overview().processes] == ["api"]
+            assert database.read(sa.text("SELECT executor FROM cow_executors")) == [("api",)], "the other is forgotten"
+            api.stop()
+            assert api.overview().processes == ()
+
+
+def test_the_server_of_a_file_is_all_that_there_is(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
     assert unserved_jobs(settings) == (), "no server has used it"
     with closing(open_database(tmp_path)) as database:
-        table, overview = ProcessTable(database), Overview(database, settings)
-        job = WorkerJob(id="secret", kind="answer", progress=0, seconds=1)
-        worker = WorkerInfo(name="light-1", queue="light", pid=2, memory_mb=1, jobs_done=0, jobs=(job,))
-        info = {"host": "box", "pid": 1, "version": "9", "workflow_version": VERSION, "seen_at": "now"}
-        with refused("not-ready"):
-            overview.check_served()
-        table.write(ProcessInfo(executor_id="other", role="worker", workers=(worker,), queues={"light": 3}, **info))
-        table.write(ProcessInfo(executor_id="api", role="api", workers=(), queues={}, **info))
-        overview.check_served()
-        told = overview.workers().processes
-        assert ([one.role for one in told], told[1].workers[0].jobs[0].id) == (["api", "worker"], "secret")
-        hidden = overview.workers(for_admin=False).processes[1]
-        assert (hidden.host, hidden.workers[0].jobs[0].id) == (None, None)
-        (queue,) = overview.workers().queues
-        assert (queue.name, queue.capacity, queue.queued, queue.oldest_seconds) == ("light", 3, 0, None)
         for name in ("light", "ati"):
             add_job(database, name, queue=name)
-        assert [(one.queue, one.reason) for one in unserved_jobs(settings)] == [("ati", "queue")]
-        assert unserved_jobs(settings) == overview.workers().unserved
-        age = sa.text("UPDATE cow_executors SET seen = seen - :seconds WHERE executor = 'other'")
-        for seconds in (ALIVE_SECONDS + 1, FORGOTTEN_SECONDS):
-            with database.transaction() as connection:
-                connection.execute(age, {"seconds": seconds})
-            table.write(ProcessInfo(executor_id="api", role="api", workers=(), queues={}, **info))
-            assert [one.role for one in overview.workers().processes] == ["api"]
-        assert database.read(sa.text("SELECT executor FROM cow_executors")) == [("api",)], "the other is forgotten"
-        table.remove("api")
-        assert overview.workers().processes == ()
+        assert unserved_jobs(settings) == (), "they wait for the next start"
+        found = processes_of(database, settings, "me", "light").overview()
+        assert [one.queues for one in found.processes] == [{"light": 3}]
+        assert [(one.queue, one.reason) for one in found.unserved] == [("ati", "queue")]
+        with database.transaction() as connection:
+            connection.execute(sa.text("UPDATE cow_jobs SET version = '0' WHERE id = 'ati'"))
+        assert [(one.workflow_version, one.reason) for one in unserved_jobs(settings)] == [("0", "version")]

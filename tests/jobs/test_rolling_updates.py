@@ -20,7 +20,7 @@ import pytest
 import sqlalchemy as sa
 from command_line import cow_from_nothing
 from conftest import DATA, ROOT
-from job_rows import add_job, open_database
+from job_rows import add_job, open_database, url_of
 from postgres import postgres
 from pydantic import SecretStr
 from refusals import refused
@@ -28,14 +28,14 @@ from servers import BODY, IMAGE, Served, problem
 from waiting import eventually
 
 from cow_service.client import Client
-from cow_service.jobs import schema
+from cow_service.jobs import opening, schema
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobSpec, JobTable
 from cow_service.jobs.packing import packed
 from cow_service.jobs.schema import METADATA, PROCESSES, SCHEMAS
 from cow_service.media.artifacts import DiskArtifacts
 from cow_service.records import Answer, Simulation
-from cow_service.settings import Settings
+from cow_service.settings import Settings, SettingsError
 from cow_service.stages.keys import FORMAT
 from cow_service.stages.run import now
 
@@ -49,18 +49,18 @@ def old(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
     folder = tmp_path / "data"
     folder.mkdir()
     if request.param == "sqlite":
-        with closing(with_old_tables(Database(Settings(data_dir=folder)))) as database:
+        with closing(with_old_tables(opening.open_database(Settings(data_dir=folder)))) as database:
             yield database
         return
     settings = {"data_dir": folder}
     with postgres() as server:
         address = SecretStr(server.url)
-        with closing(with_old_tables(Database(Settings(database_url=address, **settings)))) as database:
+        with closing(with_old_tables(opening.open_database(Settings(database_url=address, **settings)))) as database:
             yield database
 
 
 def with_old_tables(database: Database) -> Database:
-    text = OLD_TABLES if database.file is not None else OLD_TABLES.replace("BLOB", "BYTEA")
+    text = OLD_TABLES if not database.is_shared else OLD_TABLES.replace("BLOB", "BYTEA")
     statements = "\n".join(line for line in text.splitlines() if not line.startswith("--")).split(";")
     with database.transaction() as connection:
         for statement in filter(None, map(str.strip, statements)):
@@ -118,7 +118,10 @@ def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
     }
     waiting = write_old(old, image)
     tell_of_a_process(old, 0.0)  # the older server runs
-    with Served(tmp_path, COW_DATABASE_URL=old.url) as new, Client(str(new.http.base_url)) as client:
+    with (
+        Served(tmp_path, COW_DATABASE_URL=url_of(old).get_secret_value()) as new,
+        Client(str(new.http.base_url)) as client,
+    ):
         for kind, job in finished.items():
             result = new.job(job)["result"]
             told = (result["simulation"] if kind == "answer" else result)["trajectory"]
@@ -135,11 +138,11 @@ def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
         # Work of another workflow version is left to servers that have it, and told of.
         foreign = write_old(old, image, version="1")
         unready = eventually(lambda: None if (answer := new.http.get("/readyz")).is_success else answer)
-        assert "version 1" in problem(unready, 503, "not-ready")["detail"]
+        assert "version 1" in problem(unready, 503, "storage-unavailable")["detail"]
         told = new.http.get("/workers").json()["unserved"]
         assert told == [{"queue": "light", "workflow_version": "1", "jobs": 1, "reason": "version"}]
         assert 'cow_queue_unserved{queue="light",reason="version"} 1.0' in new.http.get("/metrics").text
-        report = cow_from_nothing(tmp_path, "doctor", COW_DATABASE_URL=old.url)
+        report = cow_from_nothing(tmp_path, "doctor", COW_DATABASE_URL=url_of(old).get_secret_value())
         assert (report.returncode, "workflow version 1" in report.stdout) == (1, True)
         assert new.job(foreign)["status"] == "queued"
 
@@ -169,7 +172,7 @@ def test_tables_only_gain_what_older_servers_do_not_notice(tmp_path: Path) -> No
     for name in there.get_table_names():
         known = {column["name"]: column for column in there.get_columns(name)}
         table = METADATA.tables[name]
-        assert known.keys() <= set(table.columns.keys())
+        assert known.keys() <= {column.name for column in table.columns}
         for column in table.columns:
             was = known.get(column.name)
             assert column.nullable if was is None else column.nullable == was["nullable"], column
@@ -178,7 +181,7 @@ def test_tables_only_gain_what_older_servers_do_not_notice(tmp_path: Path) -> No
 
 def indexes_of(database: Database) -> dict[str, bool]:
     """Those of the table of jobs, and whether they are used."""
-    if database.file is not None:
+    if not database.is_shared:
         return {str(one["name"]): True for one in sa.inspect(database.engine).get_indexes("cow_jobs")}
     joined = "pg_index JOIN pg_class ON pg_class.oid = indexrelid"
     query = f"SELECT relname, indisvalid FROM {joined} WHERE relname ~ '^cow_jobs_[^p]'"
@@ -196,7 +199,7 @@ def test_columns_and_indexes_that_an_older_version_lacks_are_added(old: Database
     assert old.read(sa.text("SELECT answer FROM cow_jobs")) == [(None,)]
     assert (old.schema(), indexes_of(old)) == (schema.SCHEMA, wanted)
     old.prepare(migrate=False)
-    if old.file is None:  # the making of one was interrupted
+    if old.is_shared:  # the making of one was interrupted
         with old.transaction() as connection:
             broken = "UPDATE pg_index SET indisvalid = false WHERE indexrelid = 'cow_jobs_of_kind'::regclass"
             connection.execute(sa.text(broken))
@@ -211,7 +214,7 @@ def test_an_index_that_must_wait_for_too_long_keeps_no_server_from_starting(old:
         connection.execute(sa.text("ALTER TABLE cow_jobs ADD COLUMN answer TEXT, ADD COLUMN given TEXT"))
     with old.engine.connect() as backup:
         backup.execution_options(isolation_level="REPEATABLE READ").execute(sa.text("SELECT * FROM cow_jobs"))
-        with closing(Database(Settings(data_dir=tmp_path, database_url=SecretStr(old.url)))) as other:
+        with closing(opening.open_database(Settings(data_dir=tmp_path, database_url=url_of(old)))) as other:
 
             @sa.event.listens_for(other.engine, "connect")
             def hurry(connection: Any, _: object) -> None:
@@ -246,16 +249,16 @@ def test_tables_of_another_version_stay_as_they_are(tmp_path: Path) -> None:
                 database.create_tables()
                 assert database.schema() == version
             for migrate in (True, False) if oldest > schema.SCHEMA else ():
-                with refused("storage-unavailable"):
+                with pytest.raises(SettingsError, match="later version"):
                     database.prepare(migrate=migrate)
             assert "cow_stages_of_jobs" not in sa.inspect(database.engine).get_table_names()
 
 
 def test_tables_that_are_too_old_are_refused(tmp_path: Path) -> None:
-    with closing(Database(Settings(data_dir=tmp_path))) as database:
+    with closing(opening.open_database(Settings(data_dir=tmp_path))) as database:
         with database.transaction() as connection:
             connection.execute(sa.text("CREATE TABLE cow_holds (sha256 TEXT)"))
-        with refused("storage-unavailable"):
+        with pytest.raises(SettingsError, match="cannot take over"):
             database.create_tables()
         assert sa.inspect(database.engine).get_table_names() == ["cow_holds"]
 
@@ -288,10 +291,15 @@ def test_a_server_runs_on_tables_that_it_may_not_create(tmp_path: Path) -> None:
     with postgres() as server:
         owner = {"COW_DATABASE_URL": server.url}
         server.run_script(ROLES, COW_SERVING_PASSWORD="it's secret")
-        early = cow_from_nothing(tmp_path, "serve", "--port", "0", COW_MIGRATE="false", **owner)
-        assert (early.returncode, "`cow migrate`" in early.stderr) == (1, True)
-        told = cow_from_nothing(tmp_path, "migrate", **owner)
-        assert told.returncode == 0, told.stderr
+        early = Served(tmp_path, log="early", COW_MIGRATE="false", **owner)
+        try:
+            early.start("/livez")
+            assert "`cow migrate`" in problem(early.http.get("/readyz"), 503, "storage-unavailable")["detail"]
+            told = cow_from_nothing(tmp_path, "migrate", **owner)
+            assert told.returncode == 0, told.stderr
+            eventually(lambda: early.http.get("/readyz").status_code == 200)
+        finally:
+            early.kill()
         with psycopg.connect(server.url) as connection:
             connection.execute("CREATE TABLE of_a_later_version (id int)")
         weak = server.url.replace("cow@", "cow_serving@")

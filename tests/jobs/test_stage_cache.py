@@ -23,6 +23,7 @@ from cow_service.jobs.job_table import JobTable
 from cow_service.media.artifacts import DiskArtifacts
 from cow_service.observability.metrics import Metrics
 from cow_service.records import MetresPerPixel, Motion
+from cow_service.settings import SettingsError
 from cow_service.stages.keys import FirstAnswers, StageKey, StageResult
 
 SHARED, OWN = StageKey("a" * 64), StageKey("b" * 64, shareable=False)
@@ -43,7 +44,7 @@ def step(
     budget: float = 0,
 ) -> StoredStep:
     add_job(database, job_id, owner)
-    artifacts, outages = DiskArtifacts(Path(database.file or "").parent), Outages(budget, check)
+    artifacts, outages = DiskArtifacts(Path(database.engine.url.database or "").parent), Outages(budget, check)
     return StoredStep(job_id, owner, fresh, database, artifacts, Metrics().stage_cache, KeyLocks().held, outages)
 
 
@@ -140,7 +141,7 @@ def test_servers_of_one_database_have_one_place_for_artifacts(tmp_path: Path) ->
     with closing(open_database(tmp_path, url)) as one, closing(open_database(tmp_path, url)) as other:
         for _ in range(2):
             one.claim("folder-1")
-        with refused("storage-unavailable"):
+        with pytest.raises(SettingsError, match="folder-1"):
             other.claim("folder-2")
         other.claim("folder-1")
 

@@ -21,9 +21,11 @@ import pytest
 import sqlalchemy as sa
 from engines import app_for, end_engine, running_engine
 from fastapi.testclient import TestClient
-from servers import ASYNC, BODY, SLOW_GENERATOR, events_of, problem, slow
+from servers import ASYNC, BODY, SLOW_GENERATOR, TERMINAL, events_of, problem, slow
 from waiting import TIME_LIMIT, eventually
 
+from cow_service.jobs.schema import CALLS
+from cow_service.jobs.webhooks import ATTEMPT_SECONDS
 from cow_service.net import Egress
 from cow_service.records import Job
 from cow_service.service import Service
@@ -76,12 +78,12 @@ class Receiver:
 @pytest.fixture(scope="module")
 def http(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """Of an app with a secret and the one before it, that may call this machine, and does not wait long."""
-    from cow_service.jobs import webhooks
+    from cow_service.jobs import ticker, webhooks
 
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(SLOW_GENERATOR))
         patch.setattr(webhooks, "RETRY_SECONDS", (0, 0))
-        patch.setattr(webhooks, "POLL_SECONDS", 0.05)
+        patch.setattr(ticker, "TICK_SECONDS", 0.05)
         secret = " ".join(f"whsec_{base64.b64encode(each).decode()}" for each in (b"n" * 32, SECRET))
         app = app_for(Service(Settings(data_dir=tmp_path_factory.mktemp("hooks"), webhook_secret=secret)))
         calls().egress = Egress(None, permitted=lambda address: address == "127.0.0.1", seconds=TIME_LIMIT)
@@ -91,7 +93,7 @@ def http(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 
 def calls() -> Any:
     """The webhooks of the app."""
-    return running_engine().calls
+    return running_engine().webhooks
 
 
 @pytest.fixture
@@ -138,19 +140,16 @@ def submitted(http: TestClient, body: dict[str, Any], **headers: str) -> str:
     return response.json()["id"]
 
 
-def attempts(job: str) -> list[str]:
-    """How the attempts to tell of a job's end have ended, as far as they were made."""
-    from dbos import DBOS
-
-    from cow_service.jobs import webhooks
-
-    found = [DBOS.get_workflow_status(name) for name in webhooks.attempt_ids(job)]
-    return [one.status for one in found if one is not None]
+def waiting(job: str) -> tuple[int, float] | None:
+    """Attempts to tell of a job's end, and the seconds until the next one; None where none follows."""
+    query = sa.select(CALLS.c.attempts, CALLS.c.due).where(CALLS.c.job_id == job)
+    rows = running_engine().database.read(query)
+    return (rows[0].attempts, rows[0].due - time.time()) if rows else None
 
 
-def done(job: str, count: int) -> None:
-    """So many attempts have been made, and no other follows."""
-    eventually(lambda: attempts(job) == ["SUCCESS"] * count)
+def done(http: TestClient, job: str) -> None:
+    """The job has ended, and no call follows."""
+    eventually(lambda: http.get(f"/jobs/{job}").json()["status"] in TERMINAL and waiting(job) is None)
 
 
 def verify(message: Message) -> None:
@@ -181,7 +180,7 @@ def test_an_end_is_told_once_and_signed(
     # A receiver that asks for the job gets it as it ended.
     assert message.job.json() | {"result": None} == message.told["data"]
     assert (message.job.json()["result"] is not None) == (status == "succeeded")
-    done(job, 1)
+    done(http, job)
     assert len(receiver.heard) == 1
     assert "webhook" not in http.get(f"/jobs/{job}/request").json()["request"]
     stages = [e["data"]["stage"] for e in events_of(http.get(f"/jobs/{job}/events")) if e["event"] == "stage"]
@@ -198,13 +197,12 @@ def test_canceled_and_deleted_jobs_are_told_once_at_most(http: TestClient, recei
     (message,) = receiver.until(1)
     verify(message)
     assert (message.told["type"], message.job.json()["status"]) == ("job.canceled", "canceled")
-    done(job, 1)
+    done(http, job)
     assert http.delete(f"/jobs/{job}").status_code == 204
-    assert not attempts(job), "nothing is left of them"
     at_once = submitted(http, {**slow(100), "webhook": receiver.url})
     assert http.delete(f"/jobs/{at_once}").status_code == 204
     last = http.post("/simulate", json={**BODY, "webhook": receiver.url}).json()["id"]  # by a caller who waits
-    done(last, 1)
+    done(http, last)
     heard = Counter(one.told["data"]["id"] for one in receiver.heard)
     assert (heard[job], heard[last], heard[at_once] <= 1) == (1, 1, True)
 
@@ -214,7 +212,7 @@ def test_whoever_did_not_take_it_is_asked_again(http: TestClient, receiver: Rece
     key = {"Idempotency-Key": "hook"}
     body = {**BODY, "webhook": receiver.url}
     job = submitted(http, body, **key)
-    done(job, 3)
+    done(http, job)
     for message in receiver.heard:
         verify(message)
     assert len(receiver.heard) == 3
@@ -224,14 +222,14 @@ def test_whoever_did_not_take_it_is_asked_again(http: TestClient, receiver: Rece
     problem(other, 422, "idempotency-key-reused")
     http.delete(f"/jobs/{job}")
     assert submitted(http, body | {"seed": 1}, **key) == job
-    done(job, 1)
+    done(http, job)
 
 
 def test_it_is_given_up_in_the_end(http: TestClient, receiver: Receiver, counted: Counted) -> None:
     receiver.statuses = [500]
     for url in (receiver.url, "http://127.0.0.1:1/"):
         job = submitted(http, {**BODY, "webhook": url})
-        done(job, 3)
+        done(http, job)
         assert http.get(f"/jobs/{job}").json()["status"] == "succeeded"
     assert len(receiver.heard) == 3
     assert counted() == {"refused": 3, "unreachable": 3, "s_given_up": 2}
@@ -242,29 +240,29 @@ def test_a_receiver_that_is_gone_is_left_alone_and_a_retry_waits_for_its_time(
 ) -> None:
     monkeypatch.setattr("cow_service.jobs.webhooks.RETRY_SECONDS", (1000,))
     receiver.statuses = [410, 500]
-    done(submitted(http, {**BODY, "webhook": receiver.url}), 1)
+    done(http, submitted(http, {**BODY, "webhook": receiver.url}))
     assert counted() == {"gone": 1}
     job = submitted(http, {**BODY, "webhook": receiver.url})
-    eventually(lambda: attempts(job) == ["SUCCESS", "DELAYED"])
-    (waiting,) = calls().client.list_workflows(status="DELAYED")
-    begun = float(receiver.heard[-1].headers["webhook-timestamp"])
-    assert 800 <= waiting.delay_until_epoch_ms / 1000 - begun <= 1200 + TIME_LIMIT
+    attempts, seconds = eventually(lambda: left if (left := waiting(job)) and left[1] > 200 else None)
+    assert (attempts, len(receiver.heard)) == (1, 2)
+    assert 800 - TIME_LIMIT <= seconds <= 1200
     http.delete(f"/jobs/{job}")
+    assert waiting(job) is None
 
 
 def test_silent_receivers_hold_up_their_own_calls_alone(http: TestClient, receiver: Receiver) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:  # connections are made, and never answered
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/"
-        waiting = [submitted(http, {**BODY, "seed": seed, "webhook": url}) for seed in range(9)]
+        jobs = [submitted(http, {**BODY, "seed": seed, "webhook": url}) for seed in range(9)]
 
-        def pending() -> int:
-            return [status for job in waiting for status in attempts(job)].count("PENDING")
+        def begun() -> int:
+            return sum(left[0] for job in jobs if (left := waiting(job)) is not None)
 
-        eventually(lambda: pending() == 2)
+        eventually(lambda: begun() == 2)
         submitted(http, {**BODY, "webhook": receiver.url})
         receiver.until(1)
-        assert pending() <= 2
-        for job in waiting:
+        assert begun() == 2
+        for job in jobs:
             assert http.delete(f"/jobs/{job}").status_code == 204
 
 
@@ -290,38 +288,27 @@ def test_a_name_that_leads_inside_is_not_called(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(calls(), "egress", Egress(None))
-    done(submitted(http, {**BODY, "webhook": receiver.url.replace("127.0.0.1", "localhost")}), 1)
+    done(http, submitted(http, {**BODY, "webhook": receiver.url.replace("127.0.0.1", "localhost")}))
     assert counted() == {"not-allowed": 1}, "nor is it tried again"
     assert not receiver.heard
 
 
-def test_calls_that_a_process_left_are_made_by_another_and_old_records_go(http: TestClient) -> None:
-    """By the public interface of DBOS: what was left pending goes back to its queue, and nothing else is touched."""
-    from dbos import DBOS
-
-    from cow_service.jobs import webhooks
-
-    engine, hooks = running_engine(), calls()
-    table = sa.Table("workflow_status", sa.MetaData(), autoload_with=engine.database.engine)
-    left = {name: f"left-{name}" for name in (webhooks.WORKFLOW, "job")}
-    shared = {"status": "PENDING", "executor_id": "ended", "application_version": "none"}
-    with engine.database.transaction() as connection:
-        for name, workflow in left.items():
-            connection.execute(sa.insert(table).values(workflow_uuid=workflow, name=name, **shared))
-    assert "ended" in hooks.busy_executors()
-    hooks.recover(["ended"])
-    webhook = DBOS.get_workflow_status(left[webhooks.WORKFLOW])
-    assert webhook is not None
-    assert (webhook.status, webhook.queue_name) == ("ENQUEUED", webhooks.QUEUE)
-    assert DBOS.get_workflow_status(left["job"]) is None
-    hooks.client.delete_workflows([left[webhooks.WORKFLOW]])
-    assert hooks.client.list_workflows(status="SUCCESS"), "of the tests before"
-    hooks.clean_up(0.0, lambda: False)
-    assert hooks.client.list_workflows(status="SUCCESS"), "none of them is so old"
-    hooks.clean_up(time.time() + 10, lambda: True)
-    assert hooks.client.list_workflows(status="SUCCESS"), "it was stopped"
-    hooks.clean_up(time.time() + 10, lambda: False)
-    assert not hooks.client.list_workflows(status="SUCCESS")
+def test_an_attempt_whose_process_ended_is_made_again_in_time(
+    http: TestClient, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread that never comes back is what its process has left."""
+    hooks = calls()
+    with monkeypatch.context() as patch:
+        patch.setattr(type(hooks), "_call", lambda *_: None)
+        job = submitted(http, {**BODY, "webhook": receiver.url})
+        attempts, seconds = eventually(lambda: left if (left := waiting(job)) and left[0] else None)
+        assert (attempts, receiver.heard) == (1, [])
+        assert seconds > ATTEMPT_SECONDS - TIME_LIMIT
+    hooks._calling.clear()
+    with running_engine().database.transaction() as connection:
+        connection.execute(sa.update(CALLS).values(due=time.time()))
+    verify(receiver.until(1)[0])
+    done(http, job)
 
 
 @pytest.mark.parametrize(

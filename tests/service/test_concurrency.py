@@ -14,8 +14,6 @@ import pytest
 from waiting import eventually
 
 from cow_service.concurrency import PrioritySemaphore, on_one_core
-from cow_service.jobs import active
-from cow_service.jobs.active import ActiveJobs
 from cow_service.settings import WORKER_BYTES, usable_cores
 
 
@@ -150,32 +148,3 @@ def test_there_are_as_many_workers_as_cores_where_memory_allows(
     assert usable_cores() == min(expected, 2)
     told["/sys/fs/cgroup/memory.max"] = f"{2 * WORKER_BYTES:.0f}"
     assert usable_cores() == 1
-
-
-def test_rest_is_long_without_jobs_and_a_job_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 1000.0
-    monkeypatch.setattr(time, "monotonic", lambda: now)
-    jobs, stop = ActiveJobs(), threading.Event()
-    now += active.QUIET_SECONDS
-    assert not jobs.is_quiet
-    now += 1
-    assert jobs.is_quiet
-    resting = threading.Thread(target=jobs.rest, args=(stop, 0.0, 600.0))
-    resting.start()
-    resting.join(0.2)
-    assert resting.is_alive()
-    with jobs.running("job", "simulate"):  # begins with a sign of it
-        resting.join()
-        now += active.QUIET_SECONDS + 1
-        assert not jobs.is_quiet
-
-
-def test_what_is_to_end_does_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the sign comes between a look and the rest."""
-    monkeypatch.setattr(active, "QUIET_SECONDS", -1.0)
-    jobs, stop = ActiveJobs(), threading.Event()
-    stop.set()
-    jobs.stir()
-    resting = threading.Thread(target=jobs.rest, args=(stop, 600.0, 600.0))
-    resting.start()
-    resting.join()

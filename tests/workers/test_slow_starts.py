@@ -127,7 +127,7 @@ def test_a_server_whose_database_is_away_says_so_from_its_start_on(tmp_path: Pat
         eventually(lambda: served.http.get("/readyz").json()["type"].endswith("storage-unavailable"))
         problem(served.http.get("/readyz"), 503, "storage-unavailable")
         refused = served.http.post("/simulate", json=BODY)
-        problem(refused, 503, "not-ready")
+        problem(refused, 503, "storage-unavailable")
         assert refused.headers["Retry-After"]
         assert "COW_DATABASE_URL" in served.log()
         database.start()

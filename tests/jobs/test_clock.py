@@ -6,7 +6,7 @@ import os
 import random
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,14 +18,17 @@ from job_rows import add_job, open_database, take_new_job
 from refusals import refused
 from waiting import eventually
 
-from cow_service.jobs import maintenance
+from cow_service.jobs import cleaning
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.calls import Calls
-from cow_service.jobs.computing import EngineParts
+from cow_service.jobs.cleaning import BUDGET_GRACE_SECONDS, CHUNK, UNREFERENCED_GRACE_SECONDS, collect_artifacts
+from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import JobTable
-from cow_service.jobs.maintenance import BUDGET_GRACE_SECONDS, CHUNK, UNREFERENCED_GRACE_SECONDS, collect_artifacts
+from cow_service.jobs.loop import JobLoop
+from cow_service.jobs.processes import Processes
 from cow_service.jobs.schema import JOBS
+from cow_service.jobs.ticker import Ticker
+from cow_service.jobs.webhooks import Webhooks
 from cow_service.media.artifacts import DiskArtifacts, ListedArtifact
 from cow_service.settings import Settings
 
@@ -164,75 +167,93 @@ class EndlessListing(ManyArtifacts):
 
 
 @contextmanager
-def running(
-    service: Any, database: Database, active: ActiveJobs, remove: Any = None, offer: Callable[[], None] = lambda: None
-) -> Iterator[maintenance.Maintenance]:
-    """Maintenance at work. Jobs of "me" are this process's, and those of "gone" of one that has ended."""
+def ticking(service: Any, database: Database) -> Iterator[tuple[Ticker, ActiveJobs]]:
+    """A ticker, of the process "me"."""
+    active = ActiveJobs()
     parts = EngineParts(service, database, JobTable(database), active, "me")
-    lease = maintenance.FolderLease(Path(database.file or "").parent / "executors")
-    lease.acquire()
-    thread = maintenance.Maintenance(parts, Calls(), lease, remove, offer)
-    thread.start()
-    yield thread
-    thread.stop()
-    lease.release()
+    loop = JobLoop(parts, Computer())
+    ticker = Ticker(parts, loop, Processes(parts, Computer(), None), Webhooks(parts))
+    ticker.start()
+    yield ticker, active
+    ticker.stop()
 
 
-def test_a_long_listing_holds_up_no_other_maintenance(
+def test_a_long_listing_holds_up_nothing_else(
     tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(maintenance, "CLEAN_UP_SECONDS", 0.0)
-    monkeypatch.setattr(maintenance, "POLL_SECONDS", 0.01)
-    store, active, turns, take_turn = EndlessListing(tmp_path), ActiveJobs(), list[Any](), database.take_turn
+    for name in ("ticker.CLEAN_UP_SECONDS", "ticker.CHECK_SECONDS", "ticker.TICK_SECONDS"):
+        monkeypatch.setattr(f"cow_service.jobs.{name}", 0.01)
+    store, turns, take_turn = EndlessListing(tmp_path), list[Any](), database.take_turn
     monkeypatch.setattr(database, "take_turn", lambda *turn: (turns.append(turn), take_turn(*turn))[1])
-    with running(SimpleNamespace(artifacts=store, settings=Settings()), database, active):
+    with ticking(SimpleNamespace(artifacts=store, settings=Settings()), database) as (_, active):
         eventually(store.is_listed.is_set)
-        with active.running("job", "simulate", "1") as job:  # which another process has canceled
-            eventually(job.cancel_requested.is_set)
-        assert turns[:2] == [("jobs", maintenance.TURN_SECONDS), ("artifacts", maintenance.LISTING_SECONDS)]
+        job = active.begin("job", "simulate", "1")  # which another process has canceled
+        eventually(job.cancel_requested.is_set)
+        assert turns[:2] == [("jobs", cleaning.TURN_SECONDS), ("artifacts", cleaning.LISTING_SECONDS)]
         assert not database.take_turn("artifacts", 600)
-    assert database.take_turn("artifacts", 600), "it was stopped before it was done: another process may begin"
+    eventually(lambda: database.take_turn("artifacts", 600))  # it was stopped before it was done: another may begin
 
 
 def test_jobs_that_nobody_works_on_go_back_to_their_queue(
-    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
+    database: Database, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Those of a process that has ended, and those of this one that could not be started."""
-    monkeypatch.setattr(maintenance, "POLL_SECONDS", 0.01)
-    monkeypatch.setattr(maintenance, "STALLED_SECONDS", 0.05)
-    active, offered = ActiveJobs(), list[int]()
+    caplog.set_level("INFO", "cow_service")
+    for name in ("CHECK_SECONDS", "TICK_SECONDS"):
+        monkeypatch.setattr(f"cow_service.jobs.ticker.{name}", 0.05)
     at_work = take_new_job(database, "at work", "me")
     for job, executor in (("stalled", "me"), ("left", "gone")):
         take_new_job(database, job, executor)
     waits = sa.select(JOBS.c.id).where(JOBS.c.executor.is_(None))
-    service = SimpleNamespace(settings=Settings())
-    with (
-        active.running("at work", "simulate", at_work.run) as job,
-        running(service, database, active, offer=lambda: offered.append(1)),
-    ):
-        eventually(lambda: {row.id for row in database.read(waits)} == {"stalled", "left"} and len(offered) == 2)
+    with ticking(SimpleNamespace(settings=Settings()), database) as (ticker, active):
+        job = active.begin("at work", "simulate", at_work.run)
+        ticker.recover()  # as a start does
+        eventually(lambda: {row.id for row in database.read(waits)} == {"stalled", "left"})
         assert not job.cancel_requested.is_set()
-    assert not [*(tmp_path / "executors").iterdir()], "no locks are left"
+    assert "job left goes back to its queue: its process has ended" in caplog.text
+    assert "job stalled goes back to its queue: nothing works on it" in caplog.text
+
+
+def test_after_jobs_connections_are_closed(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cow_service.jobs.active.QUIET_SECONDS", 0.5)
+    monkeypatch.setattr("cow_service.jobs.ticker.TICK_SECONDS", 0.05)
+    for one in [database.engine.connect() for _ in range(5)]:
+        one.close()
+    pool: Any = database.engine.pool
+    assert pool.checkedin() >= 4
+    with ticking(SimpleNamespace(settings=Settings()), database):
+        eventually(lambda: pool.checkedin() <= 1)
+    database.check()
+
+
+def test_a_sign_of_a_job_ends_a_long_rest(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cow_service.jobs.active.QUIET_SECONDS", -1.0)
+    monkeypatch.setattr("cow_service.jobs.ticker.QUIET_TICK_SECONDS", 600.0)
+    monkeypatch.setattr("cow_service.jobs.ticker.CHECK_SECONDS", 0.0)
+    with ticking(SimpleNamespace(settings=Settings()), database) as (_, active):
+        eventually(lambda: not active.stirred.is_set())
+        job = active.begin("job", "simulate", "1")
+        eventually(job.cancel_requested.is_set)  # it is not in the table
+        active.end("job", job)
+        assert active.is_quiet
+    assert not [one for one in threading.enumerate() if one.name == "cow-ticker"], "a stop ends it, too"
 
 
 def test_jobs_go_when_they_were_kept_as_long_as_they_are_to_be(database: Database) -> None:
-    removed: list[tuple[list[str], float]] = []
-
-    def remove(jobs: list[str], since: float) -> None:
-        removed.append((jobs, since))
-        JobTable(database).delete(jobs)
-
-    service: Any = SimpleNamespace(settings=Settings(job_retention_hours=2))
+    deleted: list[tuple[set[str], float]] = []
+    artifacts = SimpleNamespace(delete=lambda names, since: deleted.append((names, since)))
+    service: Any = SimpleNamespace(settings=Settings(job_retention_hours=2), artifacts=artifacts)
     parts = EngineParts(service, database, JobTable(database), ActiveJobs(), "me")
-    cleaner = maintenance.Maintenance(parts, Calls(), maintenance.FolderLease(Path()), remove, lambda: None)
     for job, hours in (("old", 2.1), ("young", 1.9), ("open", None)):
         add_job(database, job)
         if hours is not None:
             with database.transaction() as connection:
                 ended = {"status": "failed", "ended": time.time() - 3600 * hours}
                 connection.execute(sa.update(JOBS).where(JOBS.c.id == job).values(ended))
+            database.reuse_result(job, "generation", [job * 8])
     began = time.time()
-    cleaner.clean_up_jobs()
-    ((jobs, since),) = removed
-    assert jobs == ["old"]
-    assert began - 7200 <= since <= time.time() - 7200
+    cleaning.remove_old_jobs(parts, lambda: False)
+    ((names, since),) = deleted
+    assert names == {"old" * 8}
+    assert began - 7200 <= since - 1 <= time.time() - 7200
+    assert {row.id for row in database.read(sa.select(JOBS.c.id))} == {"young", "open"}
