@@ -9,6 +9,7 @@ from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 from platformdirs import user_data_path
 from pydantic import Field, SecretStr, ValidationError, ValidationInfo, field_validator
@@ -193,6 +194,16 @@ class Settings(BaseSettings):
             raise ValueError("neither a folder nor an object store")
         return place
 
+    @field_validator("database_url")
+    @classmethod
+    def _is_database(cls, url: SecretStr | None) -> SecretStr | None:
+        parts = urlsplit("" if url is None else url.get_secret_value())
+        has_host = parts.hostname is not None and parts.port != 0  # or a ValueError
+        known = {"sqlite": parts.path[1:], "postgresql": has_host, "postgres": has_host}
+        if url is not None and not known.get(parts.scheme.partition("+")[0]):
+            raise ValueError("no database")
+        return url
+
     @field_validator("api_keys")
     @classmethod
     def _different(cls, hashes: dict[str, str]) -> dict[str, str]:
@@ -263,6 +274,7 @@ SECRET_SETTINGS = {
     "mllm_base_url": "must begin with http:// or https://",
     "artifacts": "must be a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX, without "
     "credentials: set these by the provider's own variables, such as AWS_*",
+    "database_url": "must be sqlite:///FILE or postgresql://USER:PASSWORD@HOST:PORT/NAME, with a number for a port",
     "webhook_secret": "must be whsec_ and the base64 of 24 to 64 random bytes, or two of them",
     "api_keys": 'must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes ("sha256:" and 64 '
     "hexadecimal digits), a different one for each; it takes no plain keys. `cow keys new NAME` makes both",

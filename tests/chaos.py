@@ -21,7 +21,17 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
-from faults import Fault, Machine, Station, faults_of, faults_of_network, power_cut
+from faults import (
+    Fault,
+    Machine,
+    Station,
+    a_cleaner,
+    a_second_server,
+    faults_of,
+    faults_of_database,
+    faults_of_network,
+    power_cut,
+)
 from postgres import postgres
 from proxy import Proxy
 from servers import BODY, TERMINAL, Served, Worker, data_url, picture
@@ -133,7 +143,10 @@ def schedule(
         pause, seconds = chance.uniform(0, max(1, longest / 5)), longest * chance.random() ** 3
         is_alone = chance.random() < 0.5 or (fault.halts and second.halts and fault.station is second.station)
         made.append(Wave((fault,) if is_alone or fault is second else (fault, second), pause, seconds))
-    return made
+    halting = {id(fault.station): fault for fault in chance.sample(others, len(others)) if fault.halts}
+    others_at_once = [fault for fault in others if not fault.halts]
+    at_once = (always, *halting.values(), *others_at_once) if always.station is None else (always, *others_at_once)
+    return [*made, Wave(at_once, 0.0, longest / 2)]
 
 
 class Laboratory:
@@ -382,7 +395,8 @@ def one_machine(folder: Path) -> Generator[tuple[Laboratory, Fault, list[Fault]]
         station = server_in(folder / "server", **settings)
         ending.callback(station.program.end)
         laboratory = Laboratory([station], keys, station.program.journal)
-        yield laboratory, power_cut(station), faults_of("the server", station)
+        others = [*faults_of("the server", station), a_second_server(station), a_cleaner(station)]
+        yield laboratory, power_cut(station), others
 
 
 @contextmanager
@@ -406,6 +420,7 @@ def fleet(folder: Path) -> Generator[tuple[Laboratory, Fault, list[Fault]]]:
         faults = [
             Fault("object store away", store.stop, store.start),
             *faults_of_network("the object store", to_store),
+            *faults_of_database(database),
         ]
         stations: list[Station] = []
         for name, role in (("api", "api"), ("server", "all"), ("worker", None)):

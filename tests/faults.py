@@ -9,14 +9,17 @@ import struct
 import subprocess
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
+import psycopg
 import pytest
+from postgres import PostgresServer
 from proxy import Proxy
 from servers import Program, send
-from waiting import TIME_LIMIT
+from waiting import TIME_LIMIT, eventually
 
 
 class Machine:
@@ -148,6 +151,58 @@ def power_cut(station: Station) -> Fault:
         station.machine.lose_power()
 
     return Fault("power cut", strike, station.program.launch, station, halts=True)
+
+
+def a_second_server(station: Station) -> Fault:
+    """Somebody starts another server on the same folder. It is refused while the first one lives."""
+    others: list[subprocess.Popen[bytes]] = []
+
+    def end() -> None:
+        for other in others:
+            other.kill()
+            other.wait()
+
+    return Fault("a second server on the folder", lambda: others.append(station.program.another()), end, station)
+
+
+def a_cleaner(station: Station) -> Fault:
+    """Somebody deletes all that looks temporary."""
+
+    def clean() -> None:
+        for one in station.program.data.rglob("*"):
+            if one.is_file() and (one.suffix == ".lock" or one.name.startswith("tmp")):
+                one.unlink(missing_ok=True)
+
+    return Fault("a cleaner of temporary files", clean, station=station)
+
+
+def faults_of_database(database: PostgresServer) -> list[Fault]:
+    """What people and failovers do to PostgreSQL."""
+    held = ExitStack()
+
+    def lock() -> None:
+        with suppress(psycopg.OperationalError):  # it is away
+            held.enter_context(database.locked_tables())
+
+    def unlock() -> None:
+        with suppress(psycopg.OperationalError):  # it was away meanwhile
+            held.close()
+
+    def demote() -> None:
+        with suppress(psycopg.OperationalError):
+            database.set_read_only(True)
+
+    def is_promoted() -> bool:
+        try:
+            database.set_read_only(False)
+        except psycopg.OperationalError:
+            return False
+        return True
+
+    def promote() -> None:
+        eventually(is_promoted)
+
+    return [Fault("a standby in place of the database", demote, promote), Fault("locked tables", lock, unlock)]
 
 
 class Slowness:

@@ -86,6 +86,11 @@ class Program:
             self.process = subprocess.Popen(self._command, env=self._environment, stdout=log, stderr=log)
         return said
 
+    def another(self) -> subprocess.Popen[bytes]:
+        """A second process like it, at the same time."""
+        with self._log_file.open("ab") as log:
+            return subprocess.Popen(self._command, env=self._environment | {"COW_PORT": "0"}, stdout=log, stderr=log)
+
     def processes(self) -> list[psutil.Process]:
         """Its children, and itself last; none where it is gone."""
         if self.process is None or self.process.poll() is not None:  # its number may be another process's by now

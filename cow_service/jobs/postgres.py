@@ -52,7 +52,7 @@ class Postgres(Database):
     is_shared = True
     now = sa.cast(sa.extract("epoch", sa.func.clock_timestamp()), sa.Float)
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: sa.URL) -> None:
         options = {
             # A commit outlives the end of this process at once, and is on the disk where that matters (`transaction`).
             "options": "-c synchronous_commit=off -c statement_timeout=60s -c lock_timeout=20s",
@@ -64,7 +64,7 @@ class Postgres(Database):
         }
         pool = {"pool_size": 16, "max_overflow": 32, "hide_parameters": True}
         super().__init__(sa.create_engine(url, connect_args=options, **pool))
-        self._address = sa.make_url(url).set(drivername="postgresql").render_as_string(hide_password=False)
+        self._address = url.set(drivername="postgresql").render_as_string(hide_password=False)
         self._stalled = StalledConnections(self.engine)
         self._executor = ""
         self._lease: psycopg.Connection[Any] | None = None

@@ -32,7 +32,7 @@ class Sqlite(Database):
     is_shared = False
     now = (sa.func.julianday("now") - 2440587.5) * 86400.0
 
-    def __init__(self, url: str, file: Path, *, read_only: bool = False) -> None:
+    def __init__(self, file: Path, *, read_only: bool = False) -> None:
         """`read_only`: the file must exist, and is not changed."""
         self.file = file
         self._held: int | None = None  # the descriptor of the folder
@@ -40,7 +40,7 @@ class Sqlite(Database):
         if read_only:
             super().__init__(sa.create_engine(f"sqlite:///file:{quote(str(file.resolve()))}?mode=ro&uri=true"))
             return
-        super().__init__(sa.create_engine(url, pool_size=16, max_overflow=32, hide_parameters=True))
+        super().__init__(sa.create_engine(f"sqlite:///{file}", pool_size=16, max_overflow=32, hide_parameters=True))
         event.listen(self.engine, "connect", _prepare)
 
     def acquire(self) -> str:
