@@ -4,9 +4,9 @@ import asyncio
 import json
 import re
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
@@ -128,15 +128,13 @@ class Submission:
 
 
 class FairThreads:
-    """Does work of owners in a few threads. A thread that is free takes that of the owner whose work is in the fewest,
-    then what came first. One is left for others: no owner with a key has more than three quarters of them.
+    """Does work of owners in a few threads, in the order in which it comes. One is left for others: no owner with a key
+    has more than three quarters of them.
     """
 
     def __init__(self, threads: int) -> None:
-        self._limiter = CapacityLimiter(threads)  # never waited for
-        self._free, self._most = threads, threads - threads // 4
-        self._working = Counter[str | None]()
-        self._waiting: list[tuple[str | None, asyncio.Event]] = []
+        self._all = CapacityLimiter(threads)
+        self._of = defaultdict[str, CapacityLimiter](lambda: CapacityLimiter(threads - threads // 4))
 
     async def run(self, owner: str | None, work: Callable[[], Made]) -> Made:
         """What the work returns or raises. The caller is charged for its CPU time."""
@@ -150,31 +148,11 @@ class FairThreads:
             finally:
                 used = time.thread_time() - began
 
-        mine = owner, asyncio.Event()
-        self._waiting.append(mine)
-        self._admit()
         try:
-            await mine[1].wait()
-            return await to_thread.run_sync(timed, limiter=self._limiter)
+            async with nullcontext() if owner is None else self._of[owner]:
+                return await to_thread.run_sync(timed, limiter=self._all)
         finally:
             charge.get()("CPU seconds for reading bodies", used)
-            if mine[1].is_set():
-                self._free += 1
-                self._working[owner] -= 1
-            else:
-                self._waiting.remove(mine)
-            self._admit()
-
-    def _admit(self) -> None:
-        while self._free:
-            may = [one for one in self._waiting if one[0] is None or self._working[one[0]] < self._most]
-            if not may:
-                return
-            owner, admitted = first = min(may, key=lambda one: self._working[one[0]])
-            self._waiting.remove(first)
-            self._free -= 1
-            self._working[owner] += 1
-            admitted.set()
 
 
 class Submitter:

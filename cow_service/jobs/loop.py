@@ -38,6 +38,7 @@ class JobLoop(BackgroundThread):
         self._held: Counter[str] = Counter()  # the places of each queue that jobs have
         self._threads: list[threading.Thread] = []
         self._woken = threading.Event()
+        self._some_wait = True  # jobs may wait for a place
 
     def wake(self) -> None:
         """Has it look at the queues now: there may be a job, or is a place."""
@@ -63,10 +64,9 @@ class JobLoop(BackgroundThread):
         """Starts what waits in the queues."""
         while not self._stop.is_set():
             self._woken.clear()
-            pause = RETRY_SECONDS
+            self._some_wait, pause = True, RETRY_SECONDS
             try:
-                for queue in self._jobs.waiting_queues():
-                    self._fill(queue)
+                self._some_wait = sum(self._fill(queue) for queue in self._jobs.waiting_queues()) > 0
                 pause = LOOK_SECONDS
             except CowError as error:
                 log.warning("no jobs are taken: %s", error.detail)
@@ -74,12 +74,14 @@ class JobLoop(BackgroundThread):
                 log.exception("no jobs were taken")
             self._woken.wait(pause)
 
-    def _fill(self, queue: str) -> None:
+    def _fill(self, queue: str) -> bool:
+        """Whether some of the queue may wait still."""
         places = self._computer.capacity(queue) - self._held[queue]
         if places <= 0 or self._stop.is_set():
-            return
+            return True
         limit = self._parts.service.settings.running_limit_per_key
-        for job in self._jobs.take(queue, self._parts.executor, places, limit):
+        taken = self._jobs.take(queue, self._parts.executor, places, limit)
+        for job in taken:
             with self._lock:
                 self._held[queue] += 1
             running = self._active.begin(job.id, job.spec.kind, job.run)
@@ -91,6 +93,7 @@ class JobLoop(BackgroundThread):
                 log.warning("job %s could not be started: %s", job.id, error)
                 self._threads.remove(thread)
                 self._finish(job, running)
+        return len(taken) == places or limit is not None
 
     def _run(self, job: TakenJob, running: ActiveJob) -> None:
         """Computes a job, stores its outcome, and notifies who waits for it."""
@@ -107,12 +110,15 @@ class JobLoop(BackgroundThread):
             self._finish(job, running)
             if ended:
                 self._active.notify_ended(job.id)
+            else:
+                self.wake()  # it may be in its queue again
 
     def _finish(self, job: TakenJob, running: ActiveJob) -> None:
         self._active.end(job.id, running)
         with self._lock:
             self._held[job.queue] -= 1
-        self.wake()
+        if self._some_wait:
+            self.wake()
 
     def _compute(self, job: TakenJob, running: ActiveJob) -> bool:
         """Whether the result or the error of a job is stored; not where it was canceled."""
