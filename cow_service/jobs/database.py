@@ -312,5 +312,10 @@ def database_errors() -> Generator[None]:
             raise Canceled("The job was deleted before it was finished.") from error
         told = getattr(error, "orig", None) or error
         code = getattr(told, "sqlstate", None) or getattr(told, "sqlite_errorname", "") or ""
-        reason = _REASONS.get(code, f"cannot be used ({type(told).__name__})")
-        raise StorageUnavailable(f"The job database {reason}: check COW_DATABASE_URL and its disk.") from error
+        raise unavailable(code, type(told).__name__) from error
+
+
+def unavailable(code: str, name: str = "") -> StorageUnavailable:
+    """Says why the database cannot be used, by SQLSTATE or SQLite's name, or else by that of the error's class."""
+    reason = _REASONS.get(code, f"cannot be used ({name})")
+    return StorageUnavailable(f"The job database {reason}: check COW_DATABASE_URL and its disk.")

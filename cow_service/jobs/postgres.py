@@ -25,7 +25,7 @@ from sqlalchemy import event
 from sqlalchemy.exc import DisconnectionError
 
 from cow_service.concurrency import BackgroundThread
-from cow_service.jobs.database import Database, Notification, Receive, database_errors
+from cow_service.jobs.database import Database, Notification, Receive, database_errors, unavailable
 from cow_service.settings import SettingsError
 
 CONNECT_SECONDS = 4  # for a connection
@@ -55,7 +55,7 @@ class Postgres(Database):
     def __init__(self, url: sa.URL) -> None:
         options = {
             # A commit outlives the end of this process at once, and is on the disk where that matters (`transaction`).
-            "options": "-c synchronous_commit=off -c statement_timeout=60s -c lock_timeout=20s",
+            "options": "-c synchronous_commit=off -c statement_timeout=60s -c lock_timeout=4s",
             "connect_timeout": CONNECT_SECONDS,
             "keepalives_idle": 10,
             "keepalives_interval": 3,
@@ -144,6 +144,12 @@ class Postgres(Database):
             if durable:
                 connection.execute(sa.text("SET LOCAL synchronous_commit = on"))
             yield connection
+
+    def check(self) -> None:
+        """As the base class says: a standby answers, and cannot be used."""
+        ((read_only,),) = self.read(sa.text("SELECT current_setting('transaction_read_only')"))
+        if read_only == "on":
+            raise unavailable("25006")
 
     def flush(self) -> None:
         """As the base class says."""

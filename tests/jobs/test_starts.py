@@ -59,6 +59,7 @@ def test_a_server_on_a_standby_waits_until_it_is_promoted(tmp_path: Path) -> Non
             database.set_read_only(True)  # as after a failover: its connections lead to what is a standby now
             eventually(lambda: "a job waits: The job database is read-only" in served.log())
             problem(served.http.post("/simulate", json=BODY | {"seed": 1}), 503, "storage-unavailable")
+            assert "read-only" in problem(served.http.get("/readyz"), 503, "storage-unavailable")["detail"]
             database.set_read_only(False)
             assert served.ended(job)["status"] == "succeeded"
 
@@ -70,7 +71,9 @@ def test_a_server_waits_for_tables_that_another_session_has_locked(tmp_path: Pat
             job = served.submit(slow(1.0))["id"]
             served.rendering(job)
             with database.locked_tables():
-                problem(served.http.post("/simulate", json=BODY), 503, "storage-unavailable")
+                told = problem(served.http.post("/simulate", json=BODY), 503, "storage-unavailable")
+                assert "locked" in told["detail"]
+                assert "locked" in problem(served.http.get("/readyz"), 503, "storage-unavailable")["detail"]
             assert served.ended(job)["status"] == "succeeded"
         with ExitStack() as lock:
             lock.enter_context(database.locked_tables())
