@@ -1,9 +1,9 @@
-"""Following a job: the database is read once for all who do."""
+"""Following a job that goes away, and followers that do."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -12,90 +12,32 @@ from engines import app_for, running_engine
 from servers import BODY, events_of
 from waiting import eventually_async
 
-from cow_service.errors import StorageUnavailable
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.job_table import JobState
-from cow_service.jobs.subscriptions import JobEvent, JobView, subscribed
+from cow_service.jobs.subscriptions import JobView, follow
 from cow_service.records import Job
 from cow_service.service import Service
 
-LAST, FOLLOWERS = 5, 40
-FOUND = JobState(Job(id="job", kind="simulate", status="running", progress=0, created_at="", generator="cutout"), None)
 
+def test_nobody_waits_for_a_follower_that_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    running = Job(id="job", kind="simulate", status="running", progress=0, created_at="", generator="cutout")
+    monkeypatch.setattr("cow_service.jobs.subscriptions.view_of", lambda *_: JobView(JobState(running, None)))
+    engine: Any = SimpleNamespace(active=ActiveJobs())
 
-@pytest.fixture(autouse=True)
-def polls_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cow_service.jobs.subscriptions.POLL_SECONDS", 0.01)
+    async def heard() -> None:
+        async for _ in follow(engine, "job", 0):
+            pass
 
-
-def view(number: int) -> JobView:
-    return JobView(None if number >= LAST else FOUND, (JobEvent("stage", number, None),))
-
-
-async def followed(active: ActiveJobs, read: Callable[[], JobView]) -> list[int]:
-    heard, number = [], 0
-    with subscribed(active, "job", read) as subscription:
-        while not heard or heard[-1] < LAST:
-            found, number = await subscription.after(number)
-            heard.append(found.events[0].number)
-    return heard
-
-
-def test_all_followers_hear_what_is_read_once() -> None:
-    reads = []
-
-    def read() -> JobView:
-        reads.append(len(reads))
-        return view(min(reads[-1] // 2, LAST))  # the same twice is no news
-
-    async def all_of_them() -> list[list[int]]:
-        active = ActiveJobs()
-        first = await asyncio.gather(*(followed(active, read) for _ in range(FOLLOWERS)))
-        assert active.awaited() == []
-        return [*first, await followed(active, read)]
-
-    *heard, later = asyncio.run(all_of_them())
-    assert all(each == sorted(set(each)) and each[-1] == LAST for each in heard)
-    assert later == [LAST], "who comes after the end reads anew"
-    assert len(reads) == 2 * LAST + 2
-
-
-def test_what_reading_raises_reaches_all() -> None:
-    def read() -> JobView:
-        raise StorageUnavailable("away")
-
-    async def all_of_them() -> list[object]:
-        active = ActiveJobs()
-        return await asyncio.gather(*(followed(active, read) for _ in range(FOLLOWERS)), return_exceptions=True)
-
-    assert {type(each) for each in asyncio.run(all_of_them())} == {StorageUnavailable}
-
-
-def test_reading_ends_with_the_last_follower() -> None:
-    reads = [0]
-
-    def read() -> JobView:
-        reads[0] += 1
-        return view(0)
+    async def is_followed() -> bool:
+        return engine.active.awaited() == ["job"]
 
     async def leave() -> None:
-        active = ActiveJobs()
-
-        async def is_followed(followed: bool, beyond: int = 0) -> None:
-            async def look() -> bool:
-                return active.awaited() == (["job"] if followed else []) and reads[0] >= beyond
-
-            await eventually_async(look)
-
-        tasks = [asyncio.create_task(followed(active, read)) for _ in range(FOLLOWERS)]
-        await is_followed(True)
-        tasks[0].cancel()
-        await asyncio.gather(tasks[0], return_exceptions=True)
-        await is_followed(True, reads[0] + 3)  # it goes on
+        tasks = [asyncio.create_task(heard()) for _ in range(5)]
+        await eventually_async(is_followed)
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await is_followed(False)
+        assert engine.active.awaited() == []
 
     asyncio.run(leave())
 
