@@ -63,7 +63,7 @@ class Service:
         self._guard = Lock()
         self.seen = SeenImages()  # what jobs have measured in images, for those that come with the same
         self.metrics = Metrics()
-        self._image_urls = ImageUrls(settings)
+        self.image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)
         self.perception = Perception(settings)
         self.readers: Registry[Reader] = Registry("cow_service.readers", errors.ReaderUnavailable, settings)
@@ -189,7 +189,7 @@ class Service:
         if isinstance(ref, ImageArtifact):
             return self.artifacts.read(ref.artifact)
         url = ref.url if isinstance(ref, ImageUrl) else ref
-        return self._image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
+        return self.image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
         """Makes the cheap checks of a request at once; returns its reader and generator.

@@ -89,6 +89,9 @@ class Settings(BaseSettings):
     """Longest wait for the multimodal LLM including retries, seconds."""
     mllm_concurrency: int = Field(default=64, ge=1, le=1024)
     """Most simultaneous calls of the multimodal LLM; lowered while it refuses calls."""
+    chat_fields: str = Field(default="", pattern=r"^[\w, -]*$")
+    """Fields of /v1 chats that the multimodal LLM's server is sent besides OpenAI's own, comma-separated, such as
+    top_k, enable_thinking; every caller may set them."""
     reader: str = Field(default_factory=lambda values: "mllm" if values.get("mllm") else "embedded")
     """Default reader, the part that understands the question; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"

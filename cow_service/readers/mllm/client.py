@@ -27,6 +27,7 @@ from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, wait_ran
 
 from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable, shortened
+from cow_service.net import EgressError
 from cow_service.readers.base import CallLog, ReaderInput
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore
@@ -107,7 +108,7 @@ class MllmClient:
         self.family = model.family.model_copy(update={"coordinates": coordinates})
         self._instructions = load_prompt(SYSTEM_PROMPT)
         self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
-        self._thread = EventLoopThread(model.model)
+        self._thread = EventLoopThread(model)
 
     def close(self) -> None:
         """Closes its connections; no call can be made any more."""
@@ -298,7 +299,7 @@ _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     (errors.ModelConnectionError, "it could not be reached, or broke off; check that it runs, and COW_MLLM_BASE_URL"),
 )
 # What pydantic-ai's and the providers' code raises over a response that is not shaped as it should be.
-_MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
+_MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError, EgressError)
 
 
 class RetryingModel(WrapperModel):
@@ -537,14 +538,14 @@ CLOSE_SECONDS = 5.0  # that closing waits for connections
 class EventLoopThread:
     """Runs the coroutines that call one model. Ends with the process, or earlier by `close`."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ConfiguredModel) -> None:
         self._model = model
         self._loop = asyncio.new_event_loop()
         # A daemon, so that a reader that was not closed does not keep the process alive.
         self._thread = Thread(target=self._loop.run_forever, name="mllm", daemon=True)
         self.closed = False
         self._thread.start()
-        self.submit(model.__aenter__()).result()
+        self.submit(model.model.__aenter__()).result()
 
     def submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
         """Starts a coroutine; its future may be canceled."""
@@ -561,7 +562,9 @@ class EventLoopThread:
             for task in running:
                 task.cancel()
             await asyncio.gather(*running, return_exceptions=True)
-            await self._model.__aexit__(None, None, None)
+            await self._model.model.__aexit__(None, None, None)
+            if self._model.http is not None:
+                await self._model.http.aclose()
 
         concurrent.futures.wait([self.submit(end())], CLOSE_SECONDS)
         self._loop.call_soon_threadsafe(self._loop.stop)
