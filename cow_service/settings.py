@@ -270,6 +270,10 @@ SECRET_SETTINGS = {
     "api_keys": 'must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes ("sha256:" and 64 '
     "hexadecimal digits), a different one for each; it takes no plain keys. `cow keys new NAME` makes both",
 }
+JSON_EXAMPLES = {  # of settings that are no lists
+    "api_keys": '{"alice": "sha256:0123..."}, as `cow keys new alice` prints it',
+    "checkpoints": '{"ati": "/models/ati"}', "generator_concurrency": '{"ati": 2}', "key_weights": '{"alice": 2}',
+}  # fmt: skip
 
 
 def load_settings(**overrides: Any) -> Settings:
@@ -282,8 +286,9 @@ def load_settings(**overrides: Any) -> Settings:
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except UnreadableSetting as error:
-        field = str(error).split('"')[1:2]
-        raise SettingsError(f"Bad settings: COW_{''.join(field).upper()} is not JSON.") from error
+        field = "".join(str(error).split('"')[1:2])
+        example = JSON_EXAMPLES.get(field, '["one", "another"]')
+        raise SettingsError(f"Bad settings: COW_{field.upper()} is not JSON such as {example}.") from error
     except ValidationError as error:
         messages: list[str] = []
         for item in error.errors():
