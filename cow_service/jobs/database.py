@@ -27,6 +27,7 @@ from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs import schema
 from cow_service.jobs.packing import packed, packed_paths, unpacked
 from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES
+from cow_service.media.artifacts import PRIVATE, disk_errors, make_private
 from cow_service.settings import Settings, SettingsError
 
 if TYPE_CHECKING:
@@ -106,7 +107,9 @@ class Database:
         would change them in a way that processes which run do not bear.
         """
         if self.file is not None:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
+            with disk_errors():
+                make_private(self.file.parent)
+                self.file.touch(PRIVATE)  # SQLite gives its other files the same mode
         with self.transaction() as connection:
             # Two processes that create the same table at the same time would fail one another.
             lock = f"SELECT pg_advisory_xact_lock({TABLES_LOCK})" if self.file is None else "BEGIN IMMEDIATE"

@@ -20,7 +20,7 @@ from cow_service.jobs.active import RestingThread
 from cow_service.jobs.calls import Calls
 from cow_service.jobs.computing import EngineParts
 from cow_service.jobs.database import Database
-from cow_service.media.artifacts import ArtifactStore, ListedArtifact
+from cow_service.media.artifacts import PRIVATE, ArtifactStore, ListedArtifact, make_private
 from cow_service.service import Service
 
 # For processes that ended, and for jobs that run here and were canceled by another process; the same without any job.
@@ -71,8 +71,8 @@ class FolderLease:
         """As `Lease` says."""
         self._executor = uuid4().hex
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._lock = FileLock(self._folder / f"{self._executor}.lock")
+            make_private(self._folder)
+            self._lock = FileLock(self._folder / f"{self._executor}.lock", mode=PRIVATE)
             self._lock.acquire(timeout=0)
         except OSError as error:
             raise StorageUnavailable("Cannot write to the data folder: check its permissions.") from error
