@@ -5,7 +5,6 @@ Its errors come back with their status and code alone: their words may name acco
 
 import asyncio
 import json
-import logging
 import re
 from collections.abc import AsyncGenerator, Generator
 from contextlib import AsyncExitStack, aclosing, asynccontextmanager, contextmanager, suppress
@@ -21,13 +20,12 @@ from cow_service import __version__
 from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.api.openai.chats import as_json, wrong
 from cow_service.client.protocol import retry_after
-from cow_service.errors import MllmBadReply, MllmUnavailable, shortened
+from cow_service.errors import MllmBadReply, MllmUnavailable
 from cow_service.net import Unreachable, limit_replies
-from cow_service.readers.chat import ChatTurn, Upstream
+from cow_service.readers.chat import ChatTurn, Upstream, log_refusal
 from cow_service.settings import Settings
 
 CONNECT_SECONDS = 10.0
-MAX_LOGGED = 2000  # characters of a server's own words
 PASSED_HEADERS = ("retry-after", "retry-after-ms", "x-should-retry")
 PASSED_PREFIX = "x-ratelimit-"
 # These say that this server's own key, or address, is wrong: nothing that a caller could mend.
@@ -35,7 +33,6 @@ NOT_THE_CALLERS = (HTTPStatus.UNAUTHORIZED, HTTPStatus.PROXY_AUTHENTICATION_REQU
 DONE = "[DONE]"  # the data of a stream's last event
 _CODE = re.compile(r"[\w.\[\]-]{1,64}", re.ASCII)  # what a code, a type or the name of a field looks like
 
-log = logging.getLogger("cow_service")
 Events: TypeAlias = AsyncGenerator[ServerSentEvent]
 
 
@@ -95,8 +92,8 @@ class Forwarder:
                     async with asyncio.timeout(self._timeout):
                         response = await client.send(request, stream=True)
                         stack.push_async_callback(response.aclose)
-                        kind = response.headers.get("content-type", "")
-                        is_stream = response.is_success and kind.startswith("text/event-stream")
+                        kind, ok = response.headers.get("content-type", ""), response.status_code == HTTPStatus.OK
+                        is_stream = ok and kind.startswith("text/event-stream")
                         if not is_stream:
                             await response.aread()
             except MllmUnavailable:
@@ -150,6 +147,7 @@ def _whole(response: httpx.Response, key: str | None) -> ChatTurn:
             if isinstance(value := json.loads(text), dict):
                 return ChatTurn(cast("dict[str, Any]", value))
         raise MllmBadReply("The server of the multimodal LLM replied with something other than a JSON object.")
+    error = _error_of(text, status, key) or {}
     if status in NOT_THE_CALLERS or status < HTTPStatus.BAD_REQUEST:
         raise MllmUnavailable(
             f"The server of the multimodal LLM answered with status {status}: its address or this server's own key for "
@@ -160,7 +158,7 @@ def _whole(response: httpx.Response, key: str | None) -> ChatTurn:
         for name, value in response.headers.items()
         if name in PASSED_HEADERS or name.startswith(PASSED_PREFIX)
     }
-    return ChatTurn(_error_of(text, status, key) or {}, status, headers=headers)
+    return ChatTurn(error, status, headers=headers)
 
 
 def _error_of(text: str, status: int | None, key: str | None) -> dict[str, Any] | None:
@@ -174,8 +172,7 @@ def _error_of(text: str, status: int | None, key: str | None) -> dict[str, Any] 
     found = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
     if status is None and not found.get("error"):
         return None
-    said = shortened(text.replace(key, "***") if key else text, MAX_LOGGED)
-    log.debug("an MLLM refused a chat: %s", said)
+    log_refusal(text, key)
     found = found["error"] if isinstance(found.get("error"), dict) else found
     told = {name: each for name in ("type", "param", "code") if _CODE.fullmatch(str((each := found.get(name)) or ""))}
     how = "broke off its reply" if status is None else f"answered with status {status}"

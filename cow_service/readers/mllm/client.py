@@ -26,10 +26,10 @@ from pydantic_ai.usage import RunUsage
 from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, wait_random_exponential
 
 from cow_service.adaptive import BUSY, AdaptivePlaces
-from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable, shortened
+from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable
 from cow_service.net import EgressError
 from cow_service.readers.base import CallLog, ReaderInput
-from cow_service.readers.chat import ChatTurn
+from cow_service.readers.chat import ChatTurn, log_refusal
 from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
 from cow_service.readers.mllm.coordinates import MEDIA_TYPE
@@ -159,6 +159,7 @@ class MllmClient:
         except errors.UserError as error:
             raise InvalidRequest(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}") from error
         except errors.ModelHTTPError as error:
+            log_refusal(str(error), self.model.key)
             message = f"{self._name} answered with status {error.status_code}: {reason_of(error)}."
             told = {"message": message, "type": "upstream_error", "param": None, "code": str(error.status_code)}
             retry = {} if error.retry_after is None else {"Retry-After": f"{error.retry_after:.0f}"}
@@ -282,7 +283,6 @@ _CALLERS_STATUS = (
     HTTPStatus.BAD_REQUEST, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.UNPROCESSABLE_ENTITY,
     HTTPStatus.TOO_MANY_REQUESTS,
 )  # fmt: skip
-MAX_LOGGED = 2000  # characters of a server's own words
 _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     (errors.ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
     (
@@ -448,8 +448,7 @@ class LearningModel(RetryingModel):
             except errors.ModelAPIError as error:
                 self._steps += 1
                 if isinstance(error, errors.ModelHTTPError):
-                    said = shortened(str(error), MAX_LOGGED)
-                    log.debug("an MLLM refused a call: %s", said.replace(self._key, "***") if self._key else said)
+                    log_refusal(str(error), self._key)
                 # A first fault of a server may pass; a refusal of the call itself does not.
                 is_refusal = isinstance(error, errors.ModelHTTPError) and error.status_code in REFUSED
                 may_pass = not is_refusal and len(self.failures) == 1
