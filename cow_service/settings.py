@@ -105,8 +105,8 @@ class Settings(BaseSettings):
     max_bodies_mb: float = Field(default=256, gt=0, le=65536)
     """Most MB of request bodies held at the same time; further requests are refused with 503."""
     allow_image_urls: tuple[str, ...] = ()
-    """Hosts that images may be fetched from, as JSON: name, name:port, *.name for its subdomains, * for every public
-    host; by default none."""
+    """Hosts that images may be fetched from, and that videos and sounds of chats may have in their URLs, as JSON: name,
+    name:port, *.name for its subdomains, * for every public host; by default none."""
     body_timeout: float = Field(default=30, gt=0, le=3600)
     """Longest wait for a whole request body, seconds."""
     models_dir: Path | None = None

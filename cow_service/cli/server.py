@@ -212,7 +212,11 @@ def end_well() -> None:
 
     While uvicorn serves it has a handler of its own, which raises the signal again when all is closed.
     """
-    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+
+    def end(number: int, frame: object) -> None:
+        os._exit(0)
+
+    signal.signal(signal.SIGTERM, end)
 
 
 @contextmanager
