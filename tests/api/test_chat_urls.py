@@ -106,12 +106,13 @@ def test_pictures_by_url_are_fetched_once_and_sent_as_data(app: Callable[..., Fa
         return pictures[0]
 
     one = app(fetch, allow_image_urls=("images.test",))
+    cited = {"role": "assistant", "content": "A", "annotations": [{"url_citation": {"url": "http://other.test"}}]}
     video = part("video_url", {"url": "https://images.test/a.mp4"})
     by_url = part("image_url", {"url": URL, "detail": "low"})
-    response = post(one, messages=[user(by_url, by_url, video, text(URL))])
+    response = post(one, messages=[cited, user(by_url, by_url, video, text(URL))])
     assert response.status_code == 200, response.text
     by_data = part("image_url", {"url": data_url(pictures[0]), "detail": "low"})
-    assert mllm.asked[-1]["messages"][0]["content"] == [by_data, by_data, video, text(URL)]
+    assert mllm.asked[-1]["messages"][1]["content"] == [by_data, by_data, video, text(URL)]
     assert fetched == [URL]
     problem(post(one, messages=[user(part("video_url", "http://other.test/a"))]), 422, "image-url-not-allowed")
     many = [part("image_url", f"{URL}?{number}") for number in range(17)]

@@ -13,7 +13,7 @@ from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_par
 from cow_service.requests.values import SHOWN_CHARACTERS
 from cow_service.service import Service
 
-MAX_FETCHED = 16  # pictures of one chat that are given by URL
+MAX_URLS = 16  # of one chat: each may take 10 s to look up or to fetch
 MAX_LEVELS = 20  # of a message
 MEDIA = ("url", "image", "video", "audio")  # ends of the names that fields with URLs have in parts of a message
 EXTENSION = "cow"  # COW's own field of a request, and of a reply
@@ -81,13 +81,6 @@ class Chat:
         place = max((place for place, each in enumerate(self.messages) if role_of(each) == "user"), default=-1)
         return place, "" if place < 0 else "\n".join(texts_of(self.messages[place]))
 
-    def media_urls(self) -> "Iterator[MediaUrl]":
-        """The URLs of pictures, videos and sounds in its messages; data URLs are none. Raises `InvalidRequest`."""
-        for place, message in enumerate(self.messages):
-            if isinstance(message, dict):
-                content = cast("dict[str, Any]", message).get("content")
-                yield from _media_urls(content, f"/messages/{place}/content")
-
 
 def role_of(message: Any) -> str:
     """The role of a message; empty if it has none."""
@@ -142,17 +135,20 @@ class MediaUrl:
     is_picture: bool
 
 
-def _media_urls(value: Any, pointer: str, name: str = "") -> Iterator[MediaUrl]:
-    """Those anywhere in a value; `name` is that of the field that holds it."""
+def media_urls(value: Any, pointer: str = "/messages", name: str = "") -> Iterator[MediaUrl]:
+    """The URLs of pictures, videos and sounds anywhere in messages, or in the field `name` of one; data URLs are none.
+
+    Raises `InvalidRequest`.
+    """
     if pointer.count("/") > MAX_LEVELS:
         raise wrong("/messages", f"is nested too deep: no part needs more than {MAX_LEVELS} levels")
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, each in cast("Iterator[tuple[Any, Any]]", items):
         below = f"{pointer}/{pointer_part(key)}"
         kind = name if isinstance(key, int) or (key == "url" and "image" in name) else key
-        if not isinstance(each, str):
-            yield from _media_urls(each, below, kind)
-        elif kind.endswith(MEDIA) and each[:5].lower() != "data:":
+        if not isinstance(each, str) and key != "annotations":  # of earlier replies: pages that were cited
+            yield from media_urls(each, below, kind)
+        elif isinstance(each, str) and kind.endswith(MEDIA) and each[:5].lower() != "data:":
             yield MediaUrl(value, key, below, "image" in kind)
 
 
@@ -178,6 +174,8 @@ def fetch_pictures(urls: Sequence[MediaUrl], service: Service) -> tuple[None, in
     """
     fetched: dict[str, str] = {}
     size = 0
+    if len({each.holder[each.key] for each in urls}) > MAX_URLS:
+        raise wrong("/messages", f"hold more than {MAX_URLS} URLs of pictures, videos and sounds: send data")
     for each in urls:
         url = each.holder[each.key]
         try:
@@ -187,8 +185,8 @@ def fetch_pictures(urls: Sequence[MediaUrl], service: Service) -> tuple[None, in
             if url not in fetched:
                 data = service.image_urls.fetch(url)
                 size += len(data)
-                if len(fetched) == MAX_FETCHED or size > service.settings.max_body_mb * 1e6:
-                    raise InvalidRequest(f"A chat takes {MAX_FETCHED} URLs, of no more bytes than a body. Send data.")
+                if size > service.settings.max_body_mb * 1e6:
+                    raise InvalidRequest("The pictures by URL have more bytes than a body may have: send smaller ones.")
                 fetched[url] = f"data:{service.check_image(data)};base64,{base64.b64encode(data).decode()}"
             each.holder[each.key] = fetched[url]
         except CowError as error:
