@@ -212,11 +212,7 @@ def end_well() -> None:
 
     While uvicorn serves it has a handler of its own, which raises the signal again when all is closed.
     """
-
-    def end(number: int, frame: object) -> None:
-        os._exit(0)
-
-    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
 
 
 @contextmanager

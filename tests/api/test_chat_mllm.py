@@ -56,6 +56,7 @@ def test_a_plain_pass_through_is_the_callers_body(served: Served, mllm: RandomMl
     assert received.headers["authorization"] == f"Bearer {KEY}"
     assert "callers-key-99" not in str(received.headers)
     assert "cookie" not in received.headers
+    assert received.headers["accept-encoding"] == "identity"
     assert received.path == "/v1/chat/completions"
 
 
