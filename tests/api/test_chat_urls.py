@@ -167,6 +167,14 @@ def test_a_reply_that_unpacks_to_too_much_is_given_up(mllm: MllmServer, encoding
     assert asyncio.run(chat()).body == say.completion("A")  # of a server that compresses although it was told not to
 
 
+def test_a_stream_may_be_longer_than_a_reply_but_no_event_of_it(app: Callable[..., FastAPI], mllm: MllmServer) -> None:
+    chunk = b'data: {"choices": [], "x": "%s"}\n\n' % (b"y" * 1_000_000)
+    mllm.say(say.raw(chunk * 20 + b"data: [DONE]\n\n", "text/event-stream"))
+    assert post(app(), messages=HELLO, stream=True).text.endswith("data: [DONE]\n\n")
+    mllm.say(say.raw(b"data: " + bytes(MAX_REPLY_BYTES), "text/event-stream"))
+    assert "mllm-bad-reply" in post(app(), messages=HELLO, stream=True).text
+
+
 def test_an_error_inside_a_stream_keeps_its_words_to_itself(app: Callable[..., FastAPI], mllm: MllmServer) -> None:
     error = {"error": {"message": "organization org-77 at 10.0.0.7", "code": "rate_limit"}}
     stream = f"data: {json.dumps(error)}\n\ndata: [DONE]\n\n".encode()
