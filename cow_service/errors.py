@@ -23,6 +23,7 @@
     ├── CannotReadDirection        cannot-read-direction    422
     ├── ReaderUnavailable          reader-unavailable       503
     ├── PerceptionUnavailable      perception-unavailable   503
+    │   └── PerceptionMissing      perception-missing       501
     ├── MllmBadReply               mllm-bad-reply           502
     ├── MllmRefused                mllm-refused             422
     ├── MllmUnavailable            mllm-unavailable         503
@@ -215,6 +216,10 @@ class ReaderUnavailable(CowError, code="reader-unavailable", status=503):
 
 class PerceptionUnavailable(CowError, code="perception-unavailable", status=503):
     """A vision model of the server cannot run: it is missing, damaged, or does not fit into memory."""
+
+
+class PerceptionMissing(PerceptionUnavailable, code="perception-missing", status=501):
+    """The server has no vision models: none is chosen, or their packages are not installed."""
 
 
 class MllmBadReply(CowError, code="mllm-bad-reply", status=502):

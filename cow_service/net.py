@@ -1,9 +1,10 @@
-"""Outgoing HTTP to URLs of callers, safe against requests into the private network (SSRF) and against slow servers.
+"""Outgoing HTTP: to URLs of callers, safe against requests into the private network (SSRF) and against slow servers,
+and to the multimodal LLM's server, whose replies are limited (`limit_replies`).
 
-Every hop is checked in full before anything is sent: scheme, host, and every address that the name has now. The
-connection goes to the addresses that were checked, never to the name, so that a name server that answers otherwise the
-second time changes nothing. Proxies of the environment are not asked, redirects of a POST are not followed, no body is
-decompressed, and one deadline covers name, connection, TLS, headers and body together.
+Of a caller's URL every hop is checked in full before anything is sent: scheme, host, and every address that the name
+has now. The connection goes to the addresses that were checked, never to the name, so that a name server that answers
+otherwise the second time changes nothing. Proxies of the environment are not asked, redirects of a POST are not
+followed, no body is decompressed, and one deadline covers name, connection, TLS, headers and body together.
 
 httpcore, the lower half of httpx, takes its connections from a backend of ours: the deadline has to stop a server that
 sends its headers byte by byte, and httpx's time limits begin anew with every read.
@@ -14,15 +15,16 @@ from __future__ import annotations
 import re
 import socket
 import ssl
-from collections.abc import Callable, Generator, Iterable, Mapping
+import zlib
+from collections.abc import AsyncGenerator, Callable, Generator, Iterable, Mapping
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import aclosing, contextmanager
 from dataclasses import KW_ONLY, InitVar, dataclass
 from functools import cached_property
 from ipaddress import IPv4Address, IPv4Network, IPv6Network, ip_address
 from threading import Thread
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 import httpcore
 import httpx
@@ -34,6 +36,8 @@ from cow_service.settings import Settings, SettingsError
 MAX_REDIRECTS = 3
 MAX_URL = 4096  # characters
 REDIRECTS = frozenset((301, 302, 303, 307, 308))
+MAX_REPLY_BYTES = 16_000_000  # of a multimodal LLM: as 10 000 tokens with 20 alternatives each, of 80 bytes, would take
+Client = TypeVar("Client", bound=Any)
 _DEFAULT_PORTS = {"http": 80, "https": 443}
 
 
@@ -217,11 +221,15 @@ class Egress:
         with _translated(target.host), self._exchange("POST", target, deadline, body, headers) as response:
             return response.status
 
-    def check(self, url: str) -> None:
-        """Raises `NotAllowed` for a URL that is never asked. What a name leads to is not looked up yet."""
+    def check(self, url: str, *, look_up: bool = False) -> None:
+        """Raises `NotAllowed` for a URL that is never asked.
+
+        What a name leads to now is only checked with `look_up`; that may raise `Unreachable`.
+        """
         target = self._target(url, "The URL")
-        if is_address(target.host):
-            self._check_addresses(target, [target.host])
+        with _translated(target.host):
+            if look_up or is_address(target.host):
+                self._addresses(target, _Deadline(monotonic() + self.seconds))
 
     def _target(self, text: str, what: str) -> _Target:
         """A URL taken apart, once; what is checked is what is used. Raises `NotAllowed`."""
@@ -291,12 +299,9 @@ class Egress:
         addresses = answer.result(deadline.left())
         if not addresses:
             raise Unreachable(f"The host name '{target.host}' has no address.")
-        self._check_addresses(target, addresses)
-        return addresses
-
-    def _check_addresses(self, target: _Target, addresses: list[str]) -> None:
         if not all(self.permitted(address) for address in addresses):
             raise NotAllowed(f"{target.what} leads to the host '{target.host}', which does not have a public address.")
+        return addresses
 
     @cached_property
     def _tls(self) -> ssl.SSLContext:
@@ -404,7 +409,40 @@ def _body(response: httpcore.Response, host: str, most_bytes: int) -> bytes:
     return bytes(body)
 
 
-_REMEDY = "Or send the image itself, as a data URL or as a file part."
+def limit_replies(client: Client, *, each_event: bool = False) -> Client:
+    """An `AsyncClient` of httpx or httpx2 that asks for replies without compression, and gives up those of more than
+    `MAX_REPLY_BYTES`, unpacked, with `Unreachable`.
+
+    `each_event`: the limit holds for every event of a stream. The client's own decoders would unpack a compressed reply
+    before its bytes could be counted.
+    """
+
+    async def limit(response: Any) -> None:
+        encoding, received = response.headers.pop("content-encoding", "identity").lower(), response.aiter_raw
+        if encoding not in ("", "identity", "gzip"):
+            raise Unreachable("It answered with a compressed body, which was not requested.")
+        gzip = zlib.decompressobj(zlib.MAX_WBITS | 16) if encoding == "gzip" else None
+
+        async def counted(_: int | None = None) -> AsyncGenerator[bytes]:
+            left = MAX_REPLY_BYTES
+            async with aclosing(received()) as parts:
+                async for part in parts:
+                    try:
+                        data = gzip.decompress(part, left + 1) if gzip else part
+                    except zlib.error as error:
+                        raise Unreachable("Its compressed body cannot be unpacked.") from error
+                    left -= len(data)
+                    if left < 0:
+                        raise Unreachable(f"It answered with more than {MAX_REPLY_BYTES} bytes.")
+                    if each_event and (b"\n\n" in data or b"\r\n\r\n" in data):  # an event has ended
+                        left = MAX_REPLY_BYTES
+                    yield data
+
+        response.aiter_raw = counted
+
+    client.headers["Accept-Encoding"] = "identity"
+    client.event_hooks["response"].append(limit)
+    return client
 
 
 class ImageUrls:
@@ -427,11 +465,22 @@ class ImageUrls:
 
         Raises `ImageUrlNotAllowed`, or `ImageUrlUnreachable` where the host does not deliver. Takes at most 10 s.
         """
-        if self._egress is None:
-            raise ImageUrlNotAllowed("This server fetches no images. Send the image as a data URL or as a file part.")
+        with self._allowed() as egress:
+            return egress.fetch(url, self._most_bytes)
+
+    def check(self, url: str) -> None:
+        """Raises as `fetch` for the URL of a video or sound, which the multimodal LLM's server fetches by itself."""
+        with self._allowed() as egress:
+            egress.check(url, look_up=True)
+
+    @contextmanager
+    def _allowed(self) -> Generator[Egress]:
+        remedy = "Or send the data itself, as a data URL or as a file part."
         try:
-            return self._egress.fetch(url, self._most_bytes)
+            if self._egress is None:
+                raise NotAllowed("This server fetches nothing by URL: no host is in COW_ALLOW_IMAGE_URLS.")
+            yield self._egress
         except NotAllowed as error:
-            raise ImageUrlNotAllowed(f"{error} {_REMEDY}") from error
+            raise ImageUrlNotAllowed(f"{error} {remedy}") from error
         except Unreachable as error:
-            raise ImageUrlUnreachable(f"{error} {_REMEDY}") from error
+            raise ImageUrlUnreachable(f"{error} {remedy}") from error

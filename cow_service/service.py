@@ -63,7 +63,7 @@ class Service:
         self._guard = Lock()
         self.seen = SeenImages()  # what jobs have measured in images, for those that come with the same
         self.metrics = Metrics()
-        self._image_urls = ImageUrls(settings)
+        self.image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)
         self.perception = Perception(settings)
         self.readers: Registry[Reader] = Registry("cow_service.readers", errors.ReaderUnavailable, settings)
@@ -189,7 +189,7 @@ class Service:
         if isinstance(ref, ImageArtifact):
             return self.artifacts.read(ref.artifact)
         url = ref.url if isinstance(ref, ImageUrl) else ref
-        return self._image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
+        return self.image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
         """Makes the cheap checks of a request at once; returns its reader and generator.
@@ -202,7 +202,7 @@ class Service:
             check_modules(reader, errors.ReaderUnavailable)
             check_modules(name, errors.GeneratorUnavailable)
             for model in self.perception.names.values():
-                check_modules(model, errors.PerceptionUnavailable)
+                check_modules(model, errors.PerceptionMissing)
         limits: Limits | None = None  # where only the generator itself knows them, and it is not loaded
         if name in self._generator_limits:
             limits = self._generator_limits[name].load()()
@@ -220,7 +220,7 @@ class Service:
         is not in memory any more, and the errors of `fetch` and `images.decode`.
         """
         if self.settings.role == "api":
-            raise errors.PerceptionUnavailable("This server runs no models (COW_ROLE=api): give a box instead.")
+            raise errors.PerceptionMissing("This server runs no models (COW_ROLE=api): give a box instead.")
         known = request.image.artifact if isinstance(request.image, ImageArtifact) and image is None else None
         if known is None and image is None:
             image = self.fetch(request.image)

@@ -90,6 +90,9 @@ class Settings(BaseSettings):
     """Longest wait for the multimodal LLM including retries, seconds."""
     mllm_concurrency: int = Field(default=64, ge=1, le=1024)
     """Most simultaneous calls of the multimodal LLM; lowered while it refuses calls."""
+    chat_fields: str = Field(default="", pattern=r"^[\w, -]*$")
+    """Fields of /v1 chats that the multimodal LLM's server is sent besides OpenAI's own, comma-separated, such as
+    top_k, enable_thinking; every caller may set them."""
     reader: str = Field(default_factory=lambda values: "mllm" if values.get("mllm") else "embedded")
     """Default reader, the part that understands the question; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"
@@ -103,8 +106,8 @@ class Settings(BaseSettings):
     max_bodies_mb: float = Field(default=256, gt=0, le=65536)
     """Most MB of request bodies held at the same time; further requests are refused with 503."""
     allow_image_urls: tuple[str, ...] = ()
-    """Hosts that images may be fetched from, as JSON: name, name:port, *.name for its subdomains, * for every public
-    host; by default none."""
+    """Hosts that images may be fetched from, and that videos and sounds of chats may have in their URLs, as JSON: name,
+    name:port, *.name for its subdomains, * for every public host; by default none."""
     body_timeout: float = Field(default=30, gt=0, le=3600)
     """Longest wait for a whole request body, seconds."""
     models_dir: Path | None = None
@@ -279,6 +282,10 @@ SECRET_SETTINGS = {
     "api_keys": 'must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes ("sha256:" and 64 '
     "hexadecimal digits), a different one for each; it takes no plain keys. `cow keys new NAME` makes both",
 }
+JSON_EXAMPLES = {  # of settings that are no lists
+    "api_keys": '{"alice": "sha256:0123..."}, as `cow keys new alice` prints it',
+    "checkpoints": '{"ati": "/models/ati"}', "generator_concurrency": '{"ati": 2}', "key_weights": '{"alice": 2}',
+}  # fmt: skip
 
 
 def load_settings(**overrides: Any) -> Settings:
@@ -291,8 +298,9 @@ def load_settings(**overrides: Any) -> Settings:
     try:
         return Settings(**{name: value for name, value in overrides.items() if value is not None})
     except UnreadableSetting as error:
-        field = str(error).split('"')[1:2]
-        raise SettingsError(f"Bad settings: COW_{''.join(field).upper()} is not JSON.") from error
+        field = "".join(str(error).split('"')[1:2])
+        example = JSON_EXAMPLES.get(field, '["one", "another"]')
+        raise SettingsError(f"Bad settings: COW_{field.upper()} is not JSON such as {example}.") from error
     except ValidationError as error:
         messages: list[str] = []
         for item in error.errors():

@@ -201,8 +201,7 @@ class Submitter:
         asked = await self.in_thread(owner, partial(parse, raw, LookRequest))
         image = raw.image
         if is_url(asked.image):
-            image = await self._fetches.run(owner, partial(service.fetch, asked.image))
-            charge.get()("MB of bodies", len(image) / 1e6)
+            image = await self.fetch(owner, lambda: (data := service.fetch(asked.image), len(data)))
 
         def see() -> Look:
             try:
@@ -226,6 +225,12 @@ class Submitter:
         """Reads a body of an owner in a thread, a few at the same time."""
         return await self._bodies.run(owner, work)
 
+    async def fetch(self, owner: str | None, work: Callable[[], tuple[Made, int]]) -> Made:
+        """What work that fetches images returns. The owner is charged for its second result, the bytes fetched."""
+        made, size = await self._fetches.run(owner, work)
+        charge.get()("MB of bodies", size / 1e6)
+        return made
+
     async def submit(self, submission: Submission, body: SimulateRequest) -> str | None:
         """Makes a job of a request; returns its creation time, or None for one that exists.
 
@@ -234,9 +239,8 @@ class Submitter:
         """
         if is_url(body.image):
             await self.in_thread(submission.owner, partial(self._precheck, submission, body))
-            fetch = partial(self.engine.service.fetch, body.image)
-            submission.image = await self._fetches.run(submission.owner, fetch)
-            charge.get()("MB of bodies", len(submission.image) / 1e6)
+            fetch = self.engine.service.fetch
+            submission.image = await self.fetch(submission.owner, lambda: (data := fetch(body.image), len(data)))
         created_at = await self.in_thread(submission.owner, partial(self._submit, submission, body))
         submission.replayed = created_at is None
         return created_at

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import signal
 import socket
 import sys
 from collections.abc import Generator
@@ -36,6 +37,7 @@ def serve(
     ] = None,
 ) -> None:
     """Start the server."""
+    end_well()
     with quick_imports():
         service = _served(host=host, port=port, role=role)
         check_port(service.settings)
@@ -59,6 +61,7 @@ def worker(
     ] = None,
 ) -> None:
     """Compute jobs for the servers on the same job database."""
+    end_well()
     named = None if queues is None else tuple(name.strip() for name in queues.split(",") if name.strip())
     with quick_imports():
         service = _served(queues=named)
@@ -121,6 +124,7 @@ def mcp(
     from cow_service.observability import logging as logs  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
+    end_well()
     settings = load_settings(host=host, port=port)
     # Standard output is the protocol's.
     logs.set_up(settings, out=sys.stderr)
@@ -202,6 +206,14 @@ def _served(**overrides: Any) -> Service:
     logs.set_up(service.settings)
     tracing.start()
     return service
+
+
+def end_well() -> None:
+    """Has SIGTERM end this process with the code 0, also while it starts: supervisors take every other for a failure.
+
+    While uvicorn serves it has a handler of its own, which raises the signal again when all is closed.
+    """
+    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
 
 
 @contextmanager

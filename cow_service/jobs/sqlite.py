@@ -18,6 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
 from cow_service.jobs.database import Database, Notification, Receive, database_errors
+from cow_service.media.artifacts import PRIVATE, disk_errors, make_private
 from cow_service.settings import SettingsError
 
 BUSY_TIMEOUT_MS = 30_000  # how long a writer waits for another one
@@ -46,7 +47,7 @@ class Sqlite(Database):
     def acquire(self) -> str:
         """As the base class says. The system gives the folder back however the process ends."""
         try:
-            self.file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            make_private(self.file.parent)
             self._held = os.open(self.file.parent, os.O_RDONLY)
         except OSError as error:
             raise SettingsError(f"Cannot use {self.file.parent} for the job database: {error.strerror}.") from error
@@ -60,6 +61,13 @@ class Sqlite(Database):
             ) from error
         self._executor = uuid4().hex
         return self._executor
+
+    def create_tables(self) -> None:
+        """As the base class says. Makes the file and its folder."""
+        with disk_errors():
+            make_private(self.file.parent)
+            self.file.touch(PRIVATE)  # SQLite gives its other files the same mode
+        super().create_tables()
 
     def keep(self) -> None:
         """Nothing: what the system has given, it does not take back."""

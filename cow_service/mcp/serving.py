@@ -191,7 +191,8 @@ def run_stdio(backend: Backend) -> None:
         with anyio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
             async for number in signals:
                 await backend.close()
-                os._exit(128 + number)  # the thread that reads standard input cannot be woken, and would be waited for
+                # The thread that reads standard input cannot be woken, and would be waited for.
+                os._exit(0 if number == signal.SIGTERM else 128 + number)
 
     async def serve() -> None:
         async with stdio_server() as (read, write), anyio.create_task_group() as tasks:

@@ -32,6 +32,7 @@ MEDIA_TYPES = {
     "video/mp4": "mp4",
     "application/json": "json",
 }
+PRIVATE = 0o600  # what the service keeps is for its own user alone: pictures and questions of callers
 MAX_VERIFIED = 10_000  # digests that a process remembers to have compared with their bytes
 TEMPORARY_SUFFIX = ".part"
 
@@ -53,6 +54,12 @@ class ListedArtifact:
 # and `Canceled`.
 RetryPolicy: TypeAlias = Callable[[Callable[[], Artifact]], Artifact]
 Put: TypeAlias = Callable[[bytes, str], Artifact]  # `ArtifactStore.put`
+
+
+def make_private(folder: Path) -> None:
+    """Makes a folder, and those above it that are missing, for this process's user alone. Raises `OSError`."""
+    for each in (*reversed(folder.parents), folder):
+        each.mkdir(mode=0o700, exist_ok=True)
 
 
 def try_once(work: Callable[[], Artifact]) -> Artifact:
@@ -79,10 +86,11 @@ class ArtifactStore(ABC):
 
     @contextmanager
     def scratch(self) -> Generator[Path]:
-        """A path on this machine for a temporary file, which is deleted afterwards."""
+        """An empty temporary file on this machine, which is deleted afterwards."""
         with disk_errors():
-            self.scratch_folder.mkdir(parents=True, exist_ok=True)
-        path = self.scratch_folder / f".{uuid4().hex}{TEMPORARY_SUFFIX}"
+            make_private(self.scratch_folder)
+            path = self.scratch_folder / f".{uuid4().hex}{TEMPORARY_SUFFIX}"
+            path.touch(PRIVATE)
         try:
             yield path
         finally:
@@ -167,8 +175,8 @@ class DiskArtifacts(ArtifactStore):
         """A random name that lies in the folder: other machines may see the folder under another path."""
         name = self._folder / "name"
         with disk_errors():
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with FileLock(self._folder / "name.lock"):
+            make_private(self._folder)
+            with FileLock(self._folder / "name.lock", mode=PRIVATE):
                 if not name.exists():
                     with self._written(uuid4().hex.encode()) as temporary:
                         _move(temporary, name)
@@ -187,7 +195,7 @@ class DiskArtifacts(ArtifactStore):
                 stored = self._find_intact(sha256)
                 if stored is None:
                     stored = self._folder / sha256[:2] / f"{sha256}.{extension}"
-                    stored.parent.mkdir(parents=True, exist_ok=True)
+                    make_private(stored.parent)
                     _move(temporary, stored)
                     self._note_verified(sha256, _version(stored))
             return _artifact_at(stored)
@@ -249,7 +257,7 @@ class DiskArtifacts(ArtifactStore):
     def _written(self, data: bytes) -> Generator[Path]:
         """A temporary file of these bytes, which are on the disk."""
         with self.scratch() as path:
-            with path.open("xb") as file:
+            with path.open("wb") as file:
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, cast
 
 import cv2
 
-from cow_service.errors import PerceptionUnavailable
+from cow_service.errors import PerceptionMissing, PerceptionUnavailable
 from cow_service.records import BBox, Point
 from cow_service.registry import Registry
 from cow_service.settings import Settings, SettingsError
@@ -178,7 +178,7 @@ class Perception:
         """The model of a kind, None if the server has none. Raises `PerceptionUnavailable`."""
         if kind not in self.names:
             return None
-        check_modules(self.names[kind], PerceptionUnavailable)
+        check_modules(self.names[kind], PerceptionMissing)
         return self._registries[kind].get(self.names[kind])
 
     @property

@@ -1,11 +1,15 @@
 """Chats with the MLLM of a reader, which such a reader offers besides its readings."""
 
+import logging
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any, Protocol, runtime_checkable
 
 from cow_service.adaptive import AdaptivePlaces
+from cow_service.errors import shortened
 from cow_service.records import ServerCapabilities
+
+MAX_LOGGED = 2000  # characters of a server's own words
 
 
 @dataclass(frozen=True)
@@ -79,3 +83,10 @@ def adapted(
         messages = [{**each, "role": "user"} if one else each for each, one in zip(messages, moved, strict=True)]
         warnings.append("Sent as messages of the user: those of the system, which the MLLM's server does not take.")
     return sent, messages, warnings
+
+
+def log_refusal(words: str, key: str | None) -> None:
+    """Logs the words of the MLLM's server, without this server's key. Callers are not told them: they may name accounts
+    and addresses."""
+    said = words.replace(key, "***") if key else words
+    logging.getLogger("cow_service").debug("an MLLM refused a call: %s", shortened(said, MAX_LOGGED))

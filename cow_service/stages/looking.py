@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Sequence
 
-from cow_service.errors import ArtifactNotFound, FieldError, InvalidRequest, PerceptionUnavailable
+from cow_service.errors import ArtifactNotFound, FieldError, InvalidRequest, PerceptionMissing, install_line
 from cow_service.media.images import decode, encode_png
 from cow_service.perception.base import ImageKey, Perception
 from cow_service.perception.outlines import Outline, outlines_at, outlines_in
@@ -31,9 +31,9 @@ def look(
     needed = ("segmenter",) if request.question is None else ("segmenter", "detector")
     lacking = [kind for kind in needed if kind not in perception.names]
     if lacking:
-        raise PerceptionUnavailable(
+        raise PerceptionMissing(
             f"This server has no {' and no '.join(lacking)}: give a box instead, or start it with COW_PERCEPTION=cpu, "
-            "gpu, or names of models."
+            f"gpu, or names of models, which need {install_line('perception')}."
         )
     embedded = perception.embed(key, image, data)
     width, height = embedded.size

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import pytest
 from chats import KEY
+from conftest import DATA
 from random_mllm import RandomMllm, random_mllm
 from servers import Served
 
 if TYPE_CHECKING:
     from openai import OpenAI
+
+
+FIELDS = {name for row in json.loads((DATA / "chat_fields.json").read_text()) for name in row["fields"]}
 
 
 @pytest.fixture(scope="session")
@@ -32,7 +37,8 @@ def mllm(session_mllm: RandomMllm) -> RandomMllm:
 @pytest.fixture(scope="session")
 def served(tmp_path_factory: pytest.TempPathFactory, session_mllm: RandomMllm) -> Iterator[Served]:
     own = {"COW_MLLM": "qwen3-vl-8b", "COW_MLLM_BASE_URL": session_mllm.address, "COW_MLLM_API_KEY": KEY}
-    with Served(tmp_path_factory.mktemp("chats"), COW_MAX_BODY_MB="3", **own) as one:
+    own |= {"COW_MAX_BODY_MB": "3", "COW_CHAT_FIELDS": ", ".join([*FIELDS, "x", "unknown"])}
+    with Served(tmp_path_factory.mktemp("chats"), **own) as one:
         yield one
         assert "Traceback" not in one.log()
         assert KEY not in one.log()

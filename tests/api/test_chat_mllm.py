@@ -56,6 +56,7 @@ def test_a_plain_pass_through_is_the_callers_body(served: Served, mllm: RandomMl
     assert received.headers["authorization"] == f"Bearer {KEY}"
     assert "callers-key-99" not in str(received.headers)
     assert "cookie" not in received.headers
+    assert received.headers["accept-encoding"] == "identity"
     assert received.path == "/v1/chat/completions"
 
 
@@ -152,7 +153,6 @@ VIDEO = {"type": "video_url", "video_url": {"url": "data:video/mp4;base64,AAAA"}
         ([user(VIDEO, text("What happens?"))], "other-parts"),
         ([user(image())], "no-question"),
         (what_if(words="x" * 4001), "invalid-request"),
-        ([user(image("https://x.org/a.png"), text("?"))], "image-url-not-allowed"),
         ([user(image("data:image/gif;base64,R0lGODlh"), text("?"))], "image-type-unsupported"),
         ([{"role": "tool", "content": "1", "tool_call_id": "x"}], "no-image"),
         ([1, None, {"role": 3, "content": {"a": 1}}], "no-image"),
@@ -225,7 +225,7 @@ def test_streams_that_break_off(served: Served, openai: ModuleType, client: Open
     mllm.next_replies = [failing(429, SLOW_DOWN, retry_after="0")]
     with pytest.raises(openai.APIError) as caught:  # progress was
         list(create(model=NAME, messages=what_if(1), stream=True, extra_body={"cow": COW}))
-    assert (caught.value.message, caught.value.code) == ("slow down", "rate")
+    assert ("status 429" in caught.value.message, caught.value.code) == (True, "rate")
     mllm.next_replies = [saying("x")]  # it does not stream
     assert content_of(chunks_of(post(served, {"model": NAME, "messages": HELLO, "stream": True}))) == "x"
 
@@ -234,28 +234,30 @@ def test_streams_that_break_off(served: Served, openai: ModuleType, client: Open
 
 
 @pytest.mark.parametrize(
-    ("status", "body", "content_type", "message", "code"),
+    ("status", "body", "content_type", "code"),
     [
-        (400, {"error": {"message": "too many images", "type": "bad", "param": "messages", "code": "x"}},
-         "application/json", "too many images", "x"),
-        (400, {"object": "error", "message": "no such template", "type": "BadRequestError", "code": 400},
-         "application/json", "no such template", 400),
-        (422, {"detail": [{"loc": ["n"], "msg": "no"}]}, "application/json", '[{"loc":["n"],"msg":"no"}]', "422"),
-        (404, b"not here", "text/plain", "not here", "404"),
-        (500, b"<html>secrets of a proxy</html>", "text/html",
-         "The server of the multimodal LLM answered with status 500.", "500"),
-        (403, {"error": {"message": f"the key {KEY} may not", "code": None}}, "application/json",
-         "the key *** may not", None),
+        (400, {"error": {"message": "organization org-77", "type": "bad", "param": "messages", "code": "x"}},
+         "application/json", "x"),
+        (400, {"object": "error", "message": "see http://10.0.0.7:8000", "type": "BadRequestError", "code": 400},
+         "application/json", 400),
+        (422, {"detail": [{"loc": ["n"], "msg": "no"}]}, "application/json", "422"),
+        (404, b"not here, at 10.0.0.7", "text/plain", "404"),
+        (500, b"<html>secrets of a proxy</html>", "text/html", "500"),
+        (403, {"error": {"message": f"the key {KEY} may not", "code": None, "type": "see http://10.0.0.7"}},
+         "application/json", "403"),
     ],
 )  # fmt: skip
-def test_what_the_mllm_refuses_comes_back_with_its_status(
-    served: Served, mllm: RandomMllm, status: int, body: Any, content_type: str, message: str, code: Any
+def test_what_the_mllm_refuses_comes_back_with_its_status_and_code_alone(
+    served: Served, mllm: RandomMllm, status: int, body: Any, content_type: str, code: Any
 ) -> None:
     mllm.next_replies = [failing(status, body, content_type, x_ratelimit_limit_requests="9", set_cookie="a=b")]
     response = post(served, {"model": NAME, "messages": HELLO})
     assert response.status_code == status
     assert response.headers["content-type"] == "application/json"
-    assert (response.json()["error"]["message"], response.json()["error"]["code"]) == (message, code)
+    said = response.json()["error"]
+    assert said["message"].startswith(f"The server of the multimodal LLM answered with status {status} (COW_LOG_LEVEL=")
+    assert said["code"] == code
+    assert not re.search(f"{KEY}|org-77|10.0.0.7|proxy", response.text)
     assert response.headers["x-ratelimit-limit-requests"] == "9"
     assert "set-cookie" not in response.headers
     assert len(mllm.received) == 1  # no retries

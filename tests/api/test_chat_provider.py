@@ -110,7 +110,6 @@ def test_what_another_protocol_refuses_or_cannot_be_sent(app: FastAPI, mllm: Mll
     assert len(mllm.asked) == 1  # no retries
     for message, param in (
         (user({"type": "video_url", "video_url": {}}), "messages[0].content[0]"),
-        (user(image("https://x.org/a.png")), "messages[0].content[0]"),
         ({"role": "narrator", "content": "x"}, "messages[0].role"),
         ("x", "messages[0]"),
     ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from typing import Any
 
@@ -62,6 +63,13 @@ def test_other_operations_tell_that_it_is_final(served: Served, mllm: RandomMllm
     with Client(str(served.http.base_url)) as client, pytest.raises(MllmRefused) as caught:
         client.simulate(picture(), QUESTION)
     assert caught.value.refusal == refusal
+
+
+def test_a_reply_that_unpacks_to_too_much_is_none_for_readers_either(served: Served, mllm: RandomMllm) -> None:
+    bomb = gzip.compress(bytes(300_000_000))
+    mllm.next_replies = [failing(200, bomb, content_encoding="gzip"), refusing(400)]
+    problem(post(served, "/simulate", SIMULATE), 422, "mllm-refused")
+    assert [one.headers["accept-encoding"] for one in mllm.received] == ["identity"] * 2, "it was asked again"
 
 
 def test_a_chat_asks_again_within_the_patience_of_its_caller(served: Served, mllm: RandomMllm) -> None:

@@ -284,9 +284,10 @@ TABLE: dict[str, list[tuple[Any, ...]]] = {
     ],
     "image-type-unsupported": [(sent(b"GIF89a......."), "The image is a GIF file: send it as PNG, JPEG or WebP.")],
     "image-url-not-allowed": [(simulated(image={"url": "http://example.org/a.png"}),
-         "This server fetches no images. Send the image as a data URL or as a file part.")],
+         "This server fetches nothing by URL: no host is in COW_ALLOW_IMAGE_URLS. Or send the data itself, as a data "
+         "URL or as a file part.")],
     "image-url-unreachable": [(unreachable,
-         "The host name 'nosuch.invalid' is unknown. Check its spelling. Or send the image itself, as a data URL "
+         "The host name 'nosuch.invalid' is unknown. Check its spelling. Or send the data itself, as a data URL "
          "or as a file part.")],
     "cannot-ground": [(simulated(grounding=None, question="If the pink car moves to the left?"),
          "What moves is not clear: 'pink car' was not found, or not for certain. Seen: blue at (188, 79), red at "
@@ -302,9 +303,12 @@ TABLE: dict[str, list[tuple[Any, ...]]] = {
     "reader-unavailable": [(without_its_package(errors.ReaderUnavailable),
          "'far' needs the Python package that provides 'no_such_package', which is not installed here. `cow "
          "doctor` shows the line that installs it.")],
-    "perception-unavailable": [(called("POST", "/look", json={"image": BODY["image"], "point": [60, 80]}),
+    "perception-unavailable": [(without_its_package(errors.PerceptionUnavailable),
+         "'far' needs the Python package that provides 'no_such_package', which is not installed here. `cow "
+         "doctor` shows the line that installs it.")],
+    "perception-missing": [(called("POST", "/look", json={"image": BODY["image"], "point": [60, 80]}),
          "This server has no segmenter: give a box instead, or start it with COW_PERCEPTION=cpu, gpu, or names "
-         "of models.")],
+         f"of models, which need {errors.install_line('perception')}.")],
     "mllm-bad-reply": [(chatted(failing(200, b"<html>")),
          "The server of the multimodal LLM replied with something other than a JSON object.")],
     "mllm-refused": [(read_by_the_mllm(failing(400, {}), QUESTION),

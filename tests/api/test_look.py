@@ -63,7 +63,7 @@ def test_what_a_question_names(served: Served) -> None:
 def test_an_image_is_named_by_its_digest_until_the_server_forgets_it(served: Served) -> None:
     image = known(served)
     assert [each["bbox"] for each in things(look(served, image, point=[60, 80]))] == [BALL]
-    served.stop()
+    assert served.stop() == 0
     served.start()
     for place in ({"point": [60, 80]}, {"question": QUESTION}):
         problem(look(served, image, **place), 404, "artifact-not-found")

@@ -19,7 +19,9 @@ from job_rows import open_database
 from PIL import Image
 from refusals import refused
 from sdk import SIMULATION
+from servers import Program
 from typer.testing import CliRunner
+from waiting import TIME_LIMIT, eventually
 
 from cow_service import __version__
 from cow_service.cli.main import app
@@ -259,6 +261,8 @@ def test_bad_settings_are_named(cow: Any) -> None:
     for settings, says in (
         ({"COW_RATE_LIMIT": "many", "COW_PORT": "99999"}, ("COW_RATE_LIMIT='many'", "COW_PORT='99999'")),
         ({"COW_CHECKPOINTS": "nonsense"}, ("COW_CHECKPOINTS is not JSON",)),
+        ({"COW_API_KEYS": "alice:sha256:00"}, ("COW_API_KEYS is not JSON", '{"alice": "sha256:', "cow keys new")),
+        ({"COW_QUEUES": "light"}, ("COW_QUEUES is not JSON", '["one", "another"]')),
         ({"COW_APIKEYS": "{}", "COW_API_KEY": "key"}, ("COW_APIKEYS is no setting; COW_API_KEYS is.",)),
     ):
         result = cow("models", **settings)
@@ -277,6 +281,21 @@ def test_what_a_server_cannot_start_with_is_told_before_anything_is_loaded(tmp_p
     result = cow_from_nothing(tmp_path, "serve", "--port", "0", COW_GENERATOR="dream")
     assert result.returncode == 2
     assert "COW_GENERATOR='dream': known are " in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["serve", "worker"])
+def test_sigterm_ends_every_role_with_0_also_while_the_database_is_away(tmp_path: Path, command: str) -> None:
+    away = {"COW_DATABASE_URL": "postgresql://cow@127.0.0.1:1/cow", "COW_PORT": "0", "COW_CONCURRENCY": "1"}
+    program = Program(tmp_path, ["-m", "cow_service.cli.main", command], "log", **away)
+    program.launch()
+    try:
+        assert program.process is not None
+        eventually(lambda: "the job database cannot be reached" in program.log())
+        program.process.terminate()
+        assert program.process.wait(TIME_LIMIT) == 0, program.log()
+    finally:
+        program.end()
 
 
 @pytest.mark.slow

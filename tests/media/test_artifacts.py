@@ -5,13 +5,19 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import stat
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from refusals import refused
 
+from cow_service.jobs.engine import JobEngine
 from cow_service.media.artifacts import MEDIA_TYPES, DiskArtifacts
+from cow_service.readers.mllm.known import MllmNotes
+from cow_service.records import ServerCapabilities
+from cow_service.service import Service
+from cow_service.settings import Settings
 
 DATA = b"frame" * 1000
 SHA256 = hashlib.sha256(DATA).hexdigest()
@@ -158,3 +164,23 @@ def test_temporary_files_of_processes_that_were_killed_go(store, folder):
 
 def test_a_folder_has_one_name_for_all_processes(store, folder, tmp_path):
     assert store.address == DiskArtifacts(folder).address != DiskArtifacts(tmp_path / "other").address
+
+
+def test_what_is_kept_is_for_its_own_user_alone(tmp_path: Path) -> None:
+    """A folder of before keeps its mode."""
+    before = tmp_path / "before"
+    before.mkdir(mode=0o755)
+    for folder in (tmp_path / "new" / "data", before):
+        settings = Settings(data_dir=folder, mllm="openai:gpt-5")
+        with Service(settings) as service:
+            engine = JobEngine(service)
+            engine.start()
+            service.artifacts.put(b"\x89PNG\r\n\x1a\n", "image/png")
+            with service.artifacts.scratch() as scratch:
+                MllmNotes(settings.data_dir, "server", "m").keep(ServerCapabilities())
+                kept = {path: stat.filemode(path.stat().st_mode) for path in folder.rglob("*")}
+            engine.close()
+        assert {scratch, settings.data_dir / "jobs.sqlite3-wal"} <= kept.keys()
+        assert set(kept.values()) == {"drwx------", "-rw-------"}, kept
+    assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o700
+    assert stat.S_IMODE(before.stat().st_mode) == 0o755

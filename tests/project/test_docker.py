@@ -408,6 +408,7 @@ def test_vllm_serves_the_model_that_is_asked(monkeypatch: pytest.MonkeyPatch) ->
     assert named.get("served-model-name", model) == (settings.mllm_model or manifest["model"])
     assert settings.mllm_base_url == "http://vllm:8000/v1"
     assert isinstance(json.loads(named["limit-mm-per-prompt"]), dict)
+    assert named["allowed-media-domains"] == "none.invalid", "an empty list would allow every host"
     assert int(named["max-model-len"]) > manifest["defaults"]["max_tokens"]
     assert "deploy" in SERVICES["vllm"]
     assert SERVICES["cow"]["environment"].keys().isdisjoint({"COW_MLLM", "COW_READER"})

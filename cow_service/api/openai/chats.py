@@ -1,14 +1,21 @@
 """A chat as it arrived, and what COW needs to know about it. Its meaning is forwarded unchanged."""
 
+import base64
 import json
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self, cast
 
 from pydantic import BaseModel, Field
 
-from cow_service.errors import CowError, FieldError, InvalidRequest
+from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part, shortened
+from cow_service.requests.values import SHOWN_CHARACTERS
+from cow_service.service import Service
 
+MAX_URLS = 16  # of one chat: each may take 10 s to look up or to fetch
+MAX_LEVELS = 20  # of a message
+MEDIA = ("url", "image", "video", "audio")  # ends of the names that fields with URLs have in parts of a message
 EXTENSION = "cow"  # COW's own field of a request, and of a reply
 
 
@@ -118,6 +125,76 @@ def _parts(messages: list[Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
                 yield f"{pointer}/{number}", role_of(message), cast("dict[str, Any]", held)
 
 
+@dataclass(frozen=True)
+class MediaUrl:
+    """A URL in a part of a message: a field of an object of the chat."""
+
+    holder: Any
+    key: Any
+    pointer: str
+    is_picture: bool
+
+
+def media_urls(value: Any, pointer: str = "/messages", name: str = "") -> Iterator[MediaUrl]:
+    """The URLs of pictures, videos and sounds anywhere in messages, or in the field `name` of one; data URLs are none.
+
+    Raises `InvalidRequest`.
+    """
+    if pointer.count("/") > MAX_LEVELS:
+        raise wrong("/messages", f"is nested too deep: no part needs more than {MAX_LEVELS} levels")
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, each in cast("Iterator[tuple[Any, Any]]", items):
+        below = f"{pointer}/{pointer_part(key)}"
+        kind = name if isinstance(key, int) or (key == "url" and "image" in name) else key
+        if not isinstance(each, str) and key != "annotations":  # of earlier replies: pages that were cited
+            yield from media_urls(each, below, kind)
+        elif isinstance(each, str) and kind.endswith(MEDIA) and each[:5].lower() != "data:":
+            yield MediaUrl(value, key, below, "image" in kind)
+
+
+def check_passed_on(chat: Chat, allowed: str) -> None:
+    """Raises `InvalidRequest` for a field that is neither OpenAI's nor among those allowed (`COW_CHAT_FIELDS`).
+
+    Servers take fields that set more than a caller's own chat, such as a template that runs there.
+    """
+    from openai.types.chat import completion_create_params as openai  # noqa: PLC0415 # an extra, as the reader is
+
+    known = {*openai.CompletionCreateParamsBase.__annotations__, "stream", EXTENSION, *re.findall(r"[^\s,]+", allowed)}
+    for name, value in chat.fields.items():
+        if name not in known and value is not None:
+            remedy = "leave it out, or have the server's operator list it in COW_CHAT_FIELDS"
+            raise wrong(f"/{pointer_part(name)}", f"is no field of OpenAI's chats, so it is not passed on: {remedy}")
+
+
+def fetch_pictures(urls: Sequence[MediaUrl], service: Service) -> tuple[None, int]:
+    """Puts data in the place of the URLs of pictures; its second result is the number of bytes fetched.
+
+    The MLLM's server fetches videos and sounds itself, so that only their host is checked. Raises `InvalidRequest`, and
+    the errors of `ImageUrls.fetch` and `Service.check_image`.
+    """
+    fetched: dict[str, str] = {}
+    size = 0
+    if len({each.holder[each.key] for each in urls}) > MAX_URLS:
+        raise wrong("/messages", f"hold more than {MAX_URLS} URLs of pictures, videos and sounds: send data")
+    for each in urls:
+        url = each.holder[each.key]
+        try:
+            if not each.is_picture:
+                service.image_urls.check(url)
+                continue
+            if url not in fetched:
+                data = service.image_urls.fetch(url)
+                size += len(data)
+                if size > service.settings.max_body_mb * 1e6:
+                    raise InvalidRequest("The pictures by URL have more bytes than a body may have: send smaller ones.")
+                fetched[url] = f"data:{service.check_image(data)};base64,{base64.b64encode(data).decode()}"
+            each.holder[each.key] = fetched[url]
+        except CowError as error:
+            detail = f"'{shortened(url, SHOWN_CHARACTERS)}' is not sent on. {error.detail}"
+            raise type(error)(f"{each.pointer}: {detail}", errors=(FieldError(each.pointer, detail),)) from error
+    return None, size
+
+
 def point_into_chat(pointer: str, own: Mapping[str, str]) -> str:
     """The JSON Pointer into a chat for one into the request made of it; `own` has those outside the field `cow`."""
     head = "/".join(pointer.split("/")[:2])
@@ -133,14 +210,15 @@ def locate_in_chat(error: CowError, own: Mapping[str, str]) -> CowError:
 
 
 class ChatMessage(BaseModel, extra="allow"):
-    """One message. It goes on to the MLLM unchanged; imagined frames are added behind the last one of a user."""
+    """One message. Pictures by URL go on as data, and imagined frames are added behind the last one of a user."""
 
     role: str | None = None
     content: str | list[str | dict[str, Any]] | None = Field(default=None, description="Text, or parts.")
 
 
 class ChatRequest(BaseModel, extra="allow"):
-    """A chat, as OpenAI's chat completions have it. All other fields go on to the MLLM unchanged, too.
+    """A chat, as OpenAI's chat completions have it. All its other fields go on to the MLLM unchanged, and so do those
+    that the server's operator lists (`COW_CHAT_FIELDS`); more are refused.
 
     A model without an MLLM behind it, such as `cow/embedded`, answers the last user message about exactly one image;
     it uses no other field than these, and a warning names those that ask for something.
@@ -159,7 +237,7 @@ class ChatRequest(BaseModel, extra="allow"):
 
 
 class ResponsesRequest(BaseModel, extra="allow"):
-    """A request of OpenAI's responses, without state. All other fields go on to the MLLM unchanged."""
+    """A request of OpenAI's responses, without state. Other fields are as in chats."""
 
     model: str = Field(description="One of `GET /v1/models`.")
     input: str | list[dict[str, Any]] = Field(description="Text, or items: messages, function calls and their outputs.")

@@ -22,7 +22,7 @@ from cow_service.api import submission as submitting
 from cow_service.api.body import read_object
 from cow_service.api.openai import records, stream
 from cow_service.api.openai.answering import answer_events, completion_of, parse_chat
-from cow_service.api.openai.chats import EXTENSION, Chat, locate_in_chat
+from cow_service.api.openai.chats import EXTENSION, Chat, check_passed_on, fetch_pictures, locate_in_chat, media_urls
 from cow_service.api.openai.forwarding import Events, Forwarder
 from cow_service.api.openai.imagining import EnrichedChat, WhatIf, find_what_if
 from cow_service.api.openai.records import Answerer
@@ -78,6 +78,10 @@ class Completer:
         owner = submitting.owner_of(request)
         seconds = submitting.preferences_of(request.headers).wait
         until = time.time() + (DEFAULT_WAIT_SECONDS if seconds is None else seconds)
+        if reader.upstream is not None:
+            check_passed_on(chat, self.service.settings.chat_fields)
+        if urls := list(media_urls(chat.messages)):
+            await submitter.fetch(owner, partial(fetch_pictures, urls, self.service))
         what_if = await submitter.in_thread(owner, partial(find_what_if, chat, answerer))
         if isinstance(what_if, records.ChatImagination):
             return await self._forward(request, EnrichedChat(chat, answerer, chat.messages, what_if), reader)

@@ -1,13 +1,18 @@
-"""Forwards chats to the OpenAI-compatible server behind a model, and its replies back, once and unchanged."""
+"""Forwards chats to the OpenAI-compatible server behind a model, once, and its replies back unchanged.
+
+Its errors come back with their status and code alone: their words may name accounts and addresses.
+"""
 
 import asyncio
 import json
+import re
 from collections.abc import AsyncGenerator, Generator
 from contextlib import AsyncExitStack, aclosing, asynccontextmanager, contextmanager, suppress
 from http import HTTPStatus
 from typing import Any, TypeAlias, cast
 
 import httpx
+from anyio import to_thread
 from httpx_sse import EventSource
 from sse_starlette import ServerSentEvent
 
@@ -15,17 +20,18 @@ from cow_service import __version__
 from cow_service.adaptive import BUSY, AdaptivePlaces
 from cow_service.api.openai.chats import as_json, wrong
 from cow_service.client.protocol import retry_after
-from cow_service.errors import MllmBadReply, MllmUnavailable, shortened
-from cow_service.readers.chat import ChatTurn, Upstream
+from cow_service.errors import MllmBadReply, MllmUnavailable
+from cow_service.net import Unreachable, limit_replies
+from cow_service.readers.chat import ChatTurn, Upstream, log_refusal
 from cow_service.settings import Settings
 
 CONNECT_SECONDS = 10.0
-MAX_ERROR_CHARACTERS = 2000  # of a server's own words
 PASSED_HEADERS = ("retry-after", "retry-after-ms", "x-should-retry")
 PASSED_PREFIX = "x-ratelimit-"
 # These say that this server's own key, or address, is wrong: nothing that a caller could mend.
 NOT_THE_CALLERS = (HTTPStatus.UNAUTHORIZED, HTTPStatus.PROXY_AUTHENTICATION_REQUIRED)
 DONE = "[DONE]"  # the data of a stream's last event
+_CODE = re.compile(r"[\w.\[\]-]{1,64}", re.ASCII)  # what a code, a type or the name of a field looks like
 
 Events: TypeAlias = AsyncGenerator[ServerSentEvent]
 
@@ -62,11 +68,12 @@ class Forwarder:
             headers["Authorization"] = f"Bearer {upstream.key}"
         url = f"{upstream.base_url}/chat/completions"
         if self._client is None:
-            self._client = httpx.AsyncClient(
+            client = httpx.AsyncClient(
                 timeout=httpx.Timeout(self._timeout, connect=CONNECT_SECONDS, pool=None),
                 limits=httpx.Limits(max_connections=None, max_keepalive_connections=self._places.limit.most),
                 headers={"User-Agent": f"cow-service/{__version__}"},
             )
+            self._client = limit_replies(client, each_event=True)
         client = self._client
         request = client.build_request("POST", url, content=content, headers=headers)
         async with AsyncExitStack() as stack:
@@ -82,22 +89,22 @@ class Forwarder:
                 ) from error
             try:
                 with _translated():
-                    response = await client.send(request, stream=True)
+                    async with asyncio.timeout(self._timeout):
+                        response = await client.send(request, stream=True)
+                        stack.push_async_callback(response.aclose)
+                        kind, ok = response.headers.get("content-type", ""), response.status_code == HTTPStatus.OK
+                        is_stream = ok and kind.startswith("text/event-stream")
+                        if not is_stream:
+                            await response.aread()
             except MllmUnavailable:
                 call.refuse()
                 raise
-            stack.push_async_callback(response.aclose)
             if response.status_code in BUSY:
                 seconds = retry_after(response)
                 call.refuse(seconds if (seconds or 0.0) < self._budget else None)  # else no other chat could be sent
             call.succeeded = response.is_success
-            is_stream = response.headers.get("content-type", "").startswith("text/event-stream")
-            if response.status_code == HTTPStatus.OK and is_stream:
-                yield _events(response)
-            else:
-                with _translated():
-                    await response.aread()
-                yield _whole(response, upstream)
+            key = upstream.key
+            yield _events(response, key) if is_stream else await to_thread.run_sync(_whole, response, key)
 
 
 @contextmanager
@@ -105,8 +112,10 @@ def _translated() -> Generator[None]:
     """Translates the errors of a connection, in words without addresses."""
     try:
         yield
-    except httpx.HTTPError as error:
-        if isinstance(error, httpx.TimeoutException):
+    except Unreachable as error:
+        raise MllmBadReply(f"The server of the multimodal LLM gave no usable reply. {error}") from error
+    except (httpx.HTTPError, TimeoutError) as error:
+        if isinstance(error, (httpx.TimeoutException, TimeoutError)):
             reason = "it did not reply in time (COW_MLLM_TIMEOUT)"
         elif isinstance(error, httpx.ConnectError):
             reason = "it could not be reached; check that it runs, and COW_MLLM_BASE_URL"
@@ -116,7 +125,7 @@ def _translated() -> Generator[None]:
         raise MllmUnavailable(detail) from error
 
 
-async def _events(response: httpx.Response) -> Events:
+async def _events(response: httpx.Response, key: str | None) -> Events:
     """The events of a stream. Raises `MllmUnavailable` if it ends early."""
     ended = False
     with _translated():
@@ -124,21 +133,21 @@ async def _events(response: httpx.Response) -> Events:
             async for event in events:
                 ended = ended or event.data.strip() == DONE
                 name = None if event.event == "message" else event.event  # that of an event without one
-                yield ServerSentEvent(event.data, event=name, sep="\n")
+                error = _error_of(event.data, None, key) if '"error"' in event.data else None
+                yield ServerSentEvent(as_json(error) if error else event.data, event=name, sep="\n")
     if not ended:
         raise MllmUnavailable("The server of the multimodal LLM ended its stream before the reply was whole ([DONE]).")
 
 
-def _whole(response: httpx.Response, upstream: Upstream) -> ChatTurn:
-    """A reply, or what the server says went wrong, in OpenAI's form. Raises `MllmBadReply`, `MllmUnavailable`."""
-    status = response.status_code
-    text, value = response.content.decode("utf-8", errors="replace"), None
-    with suppress(ValueError, RecursionError):
-        value = json.loads(text)
+def _whole(response: httpx.Response, key: str | None) -> ChatTurn:
+    """A reply, or what went wrong, in OpenAI's form. Raises `MllmBadReply`, `MllmUnavailable`. CPU work."""
+    status, text = response.status_code, response.content.decode("utf-8", errors="replace")
     if status == HTTPStatus.OK:
-        if not isinstance(value, dict):
-            raise MllmBadReply("The server of the multimodal LLM replied with something other than a JSON object.")
-        return ChatTurn(cast("dict[str, Any]", value))
+        with suppress(ValueError, RecursionError):
+            if isinstance(value := json.loads(text), dict):
+                return ChatTurn(cast("dict[str, Any]", value))
+        raise MllmBadReply("The server of the multimodal LLM replied with something other than a JSON object.")
+    error = _error_of(text, status, key) or {}
     if status in NOT_THE_CALLERS or status < HTTPStatus.BAD_REQUEST:
         raise MllmUnavailable(
             f"The server of the multimodal LLM answered with status {status}: its address or this server's own key for "
@@ -149,26 +158,24 @@ def _whole(response: httpx.Response, upstream: Upstream) -> ChatTurn:
         for name, value in response.headers.items()
         if name in PASSED_HEADERS or name.startswith(PASSED_PREFIX)
     }
-    error = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
-    if not isinstance(error.get("error"), dict):  # else it is in OpenAI's form already
-        plain = text.strip() if response.headers.get("content-type", "").startswith("text/plain") else ""
-        said = error.get("message") or error.get("error") or error.get("detail") or plain
-        message = shortened(said if isinstance(said, str) else as_json(said), MAX_ERROR_CHARACTERS)
-        error = {
-            "error": {
-                "message": message or f"The server of the multimodal LLM answered with status {status}.",
-                "type": error.get("type", "upstream_error"),
-                "param": error.get("param"),
-                "code": error.get("code", str(status)),
-            }
-        }
-    return ChatTurn(_without(error, upstream.key) if upstream.key else error, status, headers=headers)
+    return ChatTurn(error, status, headers=headers)
 
 
-def _without(value: Any, key: str) -> Any:
-    """A JSON value in which this server's own key does not stand."""
-    if isinstance(value, dict):
-        return {name: _without(held, key) for name, held in cast("dict[str, Any]", value).items()}
-    if isinstance(value, list):
-        return [_without(held, key) for held in cast("list[Any]", value)]
-    return value.replace(key, "***") if isinstance(value, str) else value
+def _error_of(text: str, status: int | None, key: str | None) -> dict[str, Any] | None:
+    """An error of the server in OpenAI's form, without its words, which are logged.
+
+    `status` is None for an event of a stream, which may be no error: then None is returned.
+    """
+    value: Any = None
+    with suppress(ValueError, RecursionError):
+        value = json.loads(text)
+    found = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
+    if status is None and not found.get("error"):
+        return None
+    log_refusal(text, key)
+    found = found["error"] if isinstance(found.get("error"), dict) else found
+    told = {name: each for name in ("type", "param", "code") if _CODE.fullmatch(str((each := found.get(name)) or ""))}
+    how = "broke off its reply" if status is None else f"answered with status {status}"
+    message = f"The server of the multimodal LLM {how} (COW_LOG_LEVEL=debug logs its own words)."
+    code = None if status is None else str(status)
+    return {"error": {"message": message, "type": "upstream_error", "param": None, "code": code} | told}

@@ -40,7 +40,7 @@ OF_CLIP = ("generator", "generator_options", "num_frames", "fps", "seed", "video
 # of what the caller told COW itself: those are not passed over, or a figure would be that of another condition.
 PASSED_OVER = (
     errors.InvalidRequest, errors.CannotGround, errors.CannotReadDirection, errors.MllmBadReply, errors.ImageTooLarge,
-    errors.ImageUnreadable, errors.ImageTypeUnsupported, errors.ImageUrlNotAllowed, errors.ImageUrlUnreachable,
+    errors.ImageUnreadable, errors.ImageTypeUnsupported,
 )  # fmt: skip
 
 

@@ -156,9 +156,9 @@ class ChatChunk(Record):
 
 
 class UpstreamError(BaseModel, extra="allow"):
-    """An error of the MLLM's server, with its status, in OpenAI's form."""
+    """An error of the MLLM's server, with its status, in OpenAI's form. Its words are only logged."""
 
-    error: dict[str, Any] = Field(description="`message`, `type`, `param` and `code`, as far as the server gave them.")
+    error: dict[str, Any] = Field(description="`message` of COW; `type`, `param` and `code` as the server gave them.")
 
 
 PREFIX = "cow/"

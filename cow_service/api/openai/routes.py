@@ -24,7 +24,7 @@ ANSWER_FIELDS = "ChatExtension"  # the schema of `cow` in a request
 REFERENCE = "#/components/schemas/{model}"
 UPSTREAM_ERRORS: dict[int | str, dict[str, Any]] = {
     "default": {
-        "description": "What the server of the MLLM answered with, as it came, in OpenAI's form.",
+        "description": "What the server of the MLLM answered with: its status and code, in OpenAI's form.",
         "content": {"application/json": {"schema": {"$ref": REFERENCE.format(model=records.UpstreamError.__name__)}}},
     }
 }

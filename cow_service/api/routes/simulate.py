@@ -18,9 +18,9 @@ _ELSEWHERE = (  # errors of the server as a whole, and of other operations
 )  # fmt: skip
 FAILURES = tuple(kind for kind in errors.kinds().values() if kind not in _ELSEWHERE)
 LOOK_FAILURES = (
-    errors.PerceptionUnavailable, errors.InvalidRequest, errors.MalformedBody, errors.BodyTypeUnsupported,
-    errors.BodyTooLarge, errors.BodyTooSlow, errors.ImageUnreadable, errors.ImageTooLarge, errors.ImageTypeUnsupported,
-    errors.ImageUrlNotAllowed, errors.ImageUrlUnreachable, errors.ArtifactNotFound,
+    errors.PerceptionUnavailable, errors.PerceptionMissing, errors.InvalidRequest, errors.MalformedBody,
+    errors.BodyTypeUnsupported, errors.BodyTooLarge, errors.BodyTooSlow, errors.ImageUnreadable, errors.ImageTooLarge,
+    errors.ImageTypeUnsupported, errors.ImageUrlNotAllowed, errors.ImageUrlUnreachable, errors.ArtifactNotFound,
 )  # fmt: skip
 ACCEPTED: dict[int | str, dict[str, Any]] = {
     202: {
@@ -103,6 +103,6 @@ async def answer(request: Request, submitter: JobSubmitter) -> Response:
 async def look(request: Request, submitter: JobSubmitter) -> Look:
     """Outlines what the models of the server see at a point, in a box, or of what a question names. Makes no job.
 
-    A server without such models answers `perception-unavailable`.
+    A server without such models answers `perception-missing`.
     """
     return await submitter.look(request)

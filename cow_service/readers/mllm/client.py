@@ -26,9 +26,10 @@ from pydantic_ai.usage import RunUsage
 from tenacity import AsyncRetrying, RetryCallState, retry_if_exception, wait_random_exponential
 
 from cow_service.adaptive import BUSY, AdaptivePlaces
-from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable, shortened
+from cow_service.errors import CowError, InvalidRequest, MllmBadReply, MllmRefused, MllmUnavailable
+from cow_service.net import EgressError
 from cow_service.readers.base import CallLog, ReaderInput
-from cow_service.readers.chat import ChatTurn
+from cow_service.readers.chat import ChatTurn, log_refusal
 from cow_service.readers.mllm.capabilities import MAX_STEPS, REFUSED, CapabilityStore
 from cow_service.readers.mllm.chat import completion_of, prepare_chat
 from cow_service.readers.mllm.coordinates import MEDIA_TYPE
@@ -107,7 +108,7 @@ class MllmClient:
         self.family = model.family.model_copy(update={"coordinates": coordinates})
         self._instructions = load_prompt(SYSTEM_PROMPT)
         self._agent = Agent(retries=MAX_REASKS, instructions=self._instructions.render())
-        self._thread = EventLoopThread(model.model)
+        self._thread = EventLoopThread(model)
 
     def close(self) -> None:
         """Closes its connections; no call can be made any more."""
@@ -158,6 +159,7 @@ class MllmClient:
         except errors.UserError as error:
             raise InvalidRequest(f"{self._name} cannot be asked this: {str(error).splitlines()[0]}") from error
         except errors.ModelHTTPError as error:
+            log_refusal(str(error), self.model.key)
             message = f"{self._name} answered with status {error.status_code}: {reason_of(error)}."
             told = {"message": message, "type": "upstream_error", "param": None, "code": str(error.status_code)}
             retry = {} if error.retry_after is None else {"Retry-After": f"{error.retry_after:.0f}"}
@@ -281,7 +283,6 @@ _CALLERS_STATUS = (
     HTTPStatus.BAD_REQUEST, HTTPStatus.REQUEST_ENTITY_TOO_LARGE, HTTPStatus.UNPROCESSABLE_ENTITY,
     HTTPStatus.TOO_MANY_REQUESTS,
 )  # fmt: skip
-MAX_LOGGED = 2000  # characters of a server's own words
 _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     (errors.ModelAuthenticationError, "it refused the key; set COW_MLLM_API_KEY, or the provider's own variable"),
     (
@@ -298,7 +299,7 @@ _REASONS: tuple[tuple[type[errors.ModelAPIError], str], ...] = (
     (errors.ModelConnectionError, "it could not be reached, or broke off; check that it runs, and COW_MLLM_BASE_URL"),
 )
 # What pydantic-ai's and the providers' code raises over a response that is not shaped as it should be.
-_MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError)
+_MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError, EgressError)
 
 
 class RetryingModel(WrapperModel):
@@ -447,8 +448,7 @@ class LearningModel(RetryingModel):
             except errors.ModelAPIError as error:
                 self._steps += 1
                 if isinstance(error, errors.ModelHTTPError):
-                    said = shortened(str(error), MAX_LOGGED)
-                    log.debug("an MLLM refused a call: %s", said.replace(self._key, "***") if self._key else said)
+                    log_refusal(str(error), self._key)
                 # A first fault of a server may pass; a refusal of the call itself does not.
                 is_refusal = isinstance(error, errors.ModelHTTPError) and error.status_code in REFUSED
                 may_pass = not is_refusal and len(self.failures) == 1
@@ -537,14 +537,14 @@ CLOSE_SECONDS = 5.0  # that closing waits for connections
 class EventLoopThread:
     """Runs the coroutines that call one model. Ends with the process, or earlier by `close`."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: ConfiguredModel) -> None:
         self._model = model
         self._loop = asyncio.new_event_loop()
         # A daemon, so that a reader that was not closed does not keep the process alive.
         self._thread = Thread(target=self._loop.run_forever, name="mllm", daemon=True)
         self.closed = False
         self._thread.start()
-        self.submit(model.__aenter__()).result()
+        self.submit(model.model.__aenter__()).result()
 
     def submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
         """Starts a coroutine; its future may be canceled."""
@@ -561,7 +561,9 @@ class EventLoopThread:
             for task in running:
                 task.cancel()
             await asyncio.gather(*running, return_exceptions=True)
-            await self._model.__aexit__(None, None, None)
+            await self._model.model.__aexit__(None, None, None)
+            if self._model.http is not None:
+                await self._model.http.aclose()
 
         concurrent.futures.wait([self.submit(end())], CLOSE_SECONDS)
         self._loop.call_soon_threadsafe(self._loop.stop)

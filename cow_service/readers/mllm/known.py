@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from cow_service.errors import ReaderUnavailable
+from cow_service.media.artifacts import make_private
 from cow_service.records import MllmMeasurement, MllmStatus, Record, ServerCapabilities
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Family, Manifest, load_families, load_manifests
@@ -109,7 +110,7 @@ class MllmNotes:
     def keep(self, note: ServerCapabilities | MllmMeasurement) -> None:
         """Replaces what was known. Raises `OSError`."""
         path = self._takes if isinstance(note, ServerCapabilities) else self._measured
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_private(path.parent)
         with tempfile.NamedTemporaryFile("w", dir=path.parent, encoding="utf-8", delete=False) as part:
             part.write(note.model_dump_json())
         os.replace(part.name, path)
