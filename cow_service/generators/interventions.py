@@ -66,7 +66,7 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
         for index, each in enumerate(as_it_is.obstacles[:kept], start=1)
     )
     if 0 in behind:
-        changed = changed.with_mask(mover, _completed(CroppedMask.of(scene.silhouette(mover)), gone).full())
+        changed = changed.with_mask(mover, _completed(scene.cropped(mover), gone).full())
     return replace(as_it_is, scene=changed, trajectory=trajectory, obstacles=obstacles)
 
 
@@ -108,7 +108,7 @@ def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
         if path.body not in put:
             continue
         bbox, degrees = given.trajectory.bodies[path.body].bbox, path.rotation[1] if path.rotation else 0.0
-        mask = given.obstacles[path.body - 1].mask if path.body else CroppedMask.of(scene.silhouette(grounding.bbox))
+        mask = given.obstacles[path.body - 1].mask if path.body else scene.cropped(grounding.bbox)
         mask = mask.moved(np.array(path.points[0]), np.array(path.points[1]), path.scale[1], degrees)
         if path.body:
             obstacles[path.body - 1] = replace(obstacles[path.body - 1], bbox=bbox, mask=mask)

@@ -212,7 +212,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
     scene, grounding, bodies = situation.scene, situation.grounding, list[SeenBody]()
     located = {each.bbox: each for each in situation.located}
     mover = LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior, source=grounding.source)
-    first = Obstacle(mover.object, mover.bbox, CroppedMask.of(scene.silhouette(mover.bbox)))
+    first = Obstacle(mover.object, mover.bbox, scene.cropped(mover.bbox))
     # What is asked to fall off a thing stands on it.
     asked, carrier, carried = grounding.asked, None, ""
     if asked is not None and asked.relation == "lands" and situation.motion.kind == "linear":

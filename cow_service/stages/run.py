@@ -20,7 +20,7 @@ from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, RetryPolicy, try_once
-from cow_service.media.images import DecodedImage, decode_depth, decode_own
+from cow_service.media.images import DecodedImage, decode_depth, decode_own_mask
 from cow_service.observability.logging import rfc3339
 from cow_service.perception.base import Embedded, Perception
 from cow_service.physics.geometry import DepthMap
@@ -107,7 +107,7 @@ def priority_of(turn: int, created_at: str) -> str:
 
 def _stored_mask(artifacts: ArtifactStore, mask: Artifact) -> Mask:
     """A function apart from the run: a scene that knew its run would hold its pixels until garbage is collected."""
-    return decode_own(artifacts.read(mask.sha256))[..., 0] > 0
+    return decode_own_mask(artifacts.read(mask.sha256))
 
 
 def _no_depth(fault: str) -> InvalidRequest:

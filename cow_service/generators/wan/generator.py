@@ -215,7 +215,7 @@ class WanGenerator(WanLimits):
         spacing, least, most = (self.manifest.defaults[f"track_{name}"] for name in ("spacing", "least", "most"))
         scene, trajectory = given.scene, given.trajectory
         if not trajectory.tracks_given:
-            mover = CroppedMask.of(scene.silhouette(given.grounding.bbox))
+            mover = scene.cropped(given.grounding.bbox)
             masks = [mover, *(each.mask for each in given.obstacles)]
             density = Density(float(spacing) * scene.width / width, int(least), int(most))
             trajectory = with_tracks(trajectory, masks, given.grounding.point, density)
