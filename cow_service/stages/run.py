@@ -232,7 +232,7 @@ class Run(Generic[Request_co]):
         nearest, usual = (float(value) for value in np.percentile(values[values > 0], (1, 50)))
         if given.scale is None and nearest < LEAST_NEAREST * usual:
             raise _no_depth("begins at the camera itself: depths must be proportional to distances, without an offset")
-        depth = np.where(values > 0, values.astype(np.float64), np.nan)
+        depth = np.where(values > 0, values, np.float32(np.nan))  # 16 bits: exact
         source = "model" if self._is_estimated else "request"
         return DepthMap(depth, given.scale, given.deviation, given.focal, source)
 
