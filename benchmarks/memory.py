@@ -170,6 +170,19 @@ def changes(width: int, height: int) -> Asked:
     return encode_png(drawn(width, height)), {**request, "interventions": [taken]}
 
 
+@kind
+def arrow(width: int, height: int) -> Asked:
+    """The photograph with an arrow drawn over it, which is erased."""
+    image, request = of_size(width * height / 1e6)
+    pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None
+    x0, y0, x1, y1 = (round(side) for side in request["grounding"]["bbox"])
+    start, tip = (x1 + (x1 - x0) // 2, (y0 + y1) // 2), (x1 + 3 * (x1 - x0), (y0 + y1) // 2)
+    cv2.arrowedLine(pixels, start, tip, (60, 20, 255), max(4, width // 160), cv2.LINE_AA, 0, 0.25)
+    _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    return encoded.tobytes(), {"grounding": request["grounding"]}
+
+
 def reset_peak(process: psutil.Process) -> None:
     """Forgets the largest resident set of a process."""
     Path(f"/proc/{process.pid}/clear_refs").write_text("5")
