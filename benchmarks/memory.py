@@ -148,10 +148,17 @@ def masks(width: int, height: int) -> Asked:
 
     side = (blue[2] - blue[0]) // 5
     things = [
-        {"object": f"thing {at}", "mask": mask(x := blue[0] + at % 4 * side, y := blue[1] + at // 4 * side, x + side // 2, y + side // 2)}
+        {
+            "object": f"thing {at}",
+            "mask": mask(x := blue[0] + at % 4 * side, y := blue[1] + at // 4 * side, x + side // 2, y + side // 2),
+        }
         for at in range(MASKS)
     ]
-    return encode_png(drawn(width, height)), {**request, "grounding": {"object": "red box", "mask": mask(*red)}, "objects": things}
+    return encode_png(drawn(width, height)), {
+        **request,
+        "grounding": {"object": "red box", "mask": mask(*red)},
+        "objects": things,
+    }
 
 
 @kind

@@ -27,7 +27,6 @@ from cow_service.stages.run import UNREADABLE, Run
 from cow_service.stages.settling import SeenThings, settle_mover, settle_places, settle_question, things_of
 from cow_service.vision.masks import CroppedMask, iou, is_among, is_same_object, mask_iou
 from cow_service.vision.segmentation import mask_from_bbox
-from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice

@@ -24,7 +24,7 @@ from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.stages.run import Run
 from cow_service.vision.edges import divide
 from cow_service.vision.forms import shape_seen
-from cow_service.vision.masks import CroppedMask, iou, is_same_object
+from cow_service.vision.masks import iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import CLEAR_CUT, Obstacle, Scene
 from cow_service.vision.shadows import find_shadow

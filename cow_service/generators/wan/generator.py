@@ -42,7 +42,6 @@ from cow_service.narration.story import shown
 from cow_service.physics.tracks import Density, at_rate, with_tracks
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Image, Mask
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import Manifest
