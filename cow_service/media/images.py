@@ -103,6 +103,11 @@ def check(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT) 
     return _read_header(data, max_megapixels)[0]
 
 
+def pixels_in(data: bytes) -> int:
+    """How many pixels a file has, by its header. Raises what `check` raises."""
+    return math.prod(_read_header(data, math.inf)[3])
+
+
 def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT) -> DecodedImage:
     """Decode one PNG, JPEG or WebP file, recognised by its content, to upright 8-bit RGB.
 
@@ -113,7 +118,7 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     Raises `ImageTypeUnsupported` for other types and for animations, `ImageTooLarge` above `max_megapixels` (millions
     of pixels), and `ImageUnreadable` for damaged files and for sides under `MIN_SIDE` px.
     """
-    media_type, stripped, exif = _read_header(data, max_megapixels)
+    media_type, stripped, exif, _ = _read_header(data, max_megapixels)
     kind, opener = _OPENERS[media_type]
     with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
         _check_frames(kind, int(getattr(image, "n_frames", 1)))
@@ -127,8 +132,9 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     return DecodedImage(pixels, info, media_type)
 
 
-def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, dict[int, int]]:
-    """The media type, the file without what is not the picture, and its EXIF values, unless it is a WebP file."""
+def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, dict[int, int], tuple[int, int]]:
+    """The media type, the file without what is not the picture, its EXIF values, unless it is a WebP file, and its size
+    as stored (px)."""
     if not data:
         raise errors.ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
     media_type = media_type_of(data)
@@ -139,15 +145,16 @@ def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, dict[i
         if kind == "WebP":
             # Opening a WebP file runs its decoder, and allocates its whole canvas. Its other blocks can stay: they are
             # never decoded or joined by the decoder.
-            _check_size(*_webp_size(data), max_megapixels)
+            size = _webp_size(data)
+            _check_size(*size, max_megapixels)
             if data[12:16] == b"VP8X" and data[20] & _WEBP_ANIMATED:
                 _check_frames(kind, data.count(b"ANMF"))
-            return media_type, data, {}
+            return media_type, data, {}, size
         stripped, exif = _strip_png(data) if kind == "PNG" else _strip_jpeg(data)
         with opener(io.BytesIO(stripped)) as image:  # of these two pillow reads the header alone, in Python
             _check_size(image.width, image.height, max_megapixels)
             _check_frames(kind, int(getattr(image, "n_frames", 1)))
-        return media_type, stripped, exif
+            return media_type, stripped, exif, image.size
 
 
 @contextmanager
@@ -187,7 +194,7 @@ def _decode_own(data: bytes, how: int) -> NDArray[np.uint8]:
 
 def decode_depth(data: bytes, *, max_megapixels: float) -> NDArray[np.uint16]:
     """The values [H, W] of a grey PNG of 16 bits, as they are stored. Raises as `decode`, and for other PNGs."""
-    media_type, stripped, _ = _read_header(data, max_megapixels)
+    media_type, stripped, _, _ = _read_header(data, max_megapixels)
     kind, opener = _OPENERS[media_type]
     with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
         if not image.mode.startswith("I"):

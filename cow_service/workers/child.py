@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 import cv2
 import psutil
 
-from cow_service.concurrency import leave_decisions_to_the_parent
+from cow_service.concurrency import free_memory, leave_decisions_to_the_parent
 from cow_service.errors import CowError, unforeseen
 from cow_service.jobs.active import QUIET_SECONDS, ActiveJob
 from cow_service.jobs.computing import Work, compute
@@ -148,6 +148,7 @@ class WorkerProcess:
         del self._jobs[job_id]
         self._busy_at = time.monotonic()
         self._send(end)
+        free_memory()
 
 
 def main(descriptor: int) -> None:
