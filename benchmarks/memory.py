@@ -133,7 +133,7 @@ def objects(width: int, height: int) -> Asked:
     x0, y0, x1, y1 = request["grounding"]["bbox"]
     across, down = factor, height / pixels.shape[0]
     box = [x0 * across, y0 * down, x1 * across, y1 * down]
-    return encode_png(np.ascontiguousarray(large)), {**request, "grounding": {"object": "ball", "bbox": box}}
+    return encode_png(np.ascontiguousarray(large, np.uint8)), {**request, "grounding": {"object": "ball", "bbox": box}}
 
 
 @kind
