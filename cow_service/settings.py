@@ -25,7 +25,8 @@ MAX_SECRETS = 2  # that sign at the same time, while a new secret replaces an ol
 OBJECT_STORE = re.compile(r"(s3|gs|az)://[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._-]+)*/?")
 ORIGIN = r"^(\*|[a-z][a-z0-9+.-]*://[^/\s?#@A-Z]+)$"  # as browsers write it: lower case, no path
 MAX_WORKERS = 256
-WORKER_BYTES = 400e6  # of memory for each process that computes
+WORKER_BYTES = 400e6  # of memory for each process that computes: 190 MB without a job, and what encodes a clip
+SHARE_OF_MEMORY = 0.8  # of the machine's, that a server may take
 
 
 def usable_cores() -> int:
@@ -132,8 +133,12 @@ class Settings(BaseSettings):
     queues: tuple[str, ...] = ()
     """Queues to take jobs from, as JSON: light, and the names of backends with a device of their own, such as ati; by
     default all."""
+    memory_mb: float | None = Field(default=None, gt=0)
+    """Most MB of memory for the server and its worker processes together; a job waits until what it will need is free.
+    By default 80% of what the machine, or the container, has."""
     worker_memory_mb: float | None = Field(default=None, gt=0)
-    """Most MB of memory for one worker process, beyond which its job fails with worker-ended; by default 80% of all."""
+    """Most MB of memory for one worker process, beyond which its job fails with worker-ended; by default only
+    COW_MEMORY_MB limits it."""
     worker_jobs: int = Field(default=1000, ge=1)
     """Number of jobs after which a worker process is replaced."""
     load_timeout: float = Field(default=600, gt=0, le=86_400)
@@ -249,6 +254,11 @@ class Settings(BaseSettings):
         """Most jobs of one key that wait or run."""
         shared = max(1, self.queue_limit // 2) if len(self.api_keys) > 1 else self.queue_limit
         return min(self.queue_limit, self.queue_limit_per_key or shared)
+
+    @property
+    def memory(self) -> float:
+        """Most bytes of memory for all processes of this server."""
+        return self.memory_mb * 1e6 if self.memory_mb else SHARE_OF_MEMORY * usable_memory()
 
     @property
     def weights_dir(self) -> Path:

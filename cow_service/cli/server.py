@@ -44,7 +44,11 @@ def serve(
         from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
         settings = service.settings
-        pool = WorkerPool(settings, service.metrics) if settings.workers and settings.role == "all" else None
+        pool = (
+            WorkerPool(settings, service.metrics, service.artifacts)
+            if settings.workers and settings.role == "all"
+            else None
+        )
         if pool is not None:
             pool.start()  # its processes start while the server's modules are imported
         from cow_service.api.app import warn_if_open  # noqa: PLC0415
@@ -67,7 +71,7 @@ def worker(
         service = _served(queues=named)
         from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
 
-        pool = WorkerPool(service.settings, service.metrics)
+        pool = WorkerPool(service.settings, service.metrics, service.artifacts)
         pool.start()
         from cow_service.observability import tracing  # noqa: PLC0415
         from cow_service.server import run_worker  # noqa: PLC0415

@@ -121,7 +121,7 @@ def _server(folder: Path, settings: Mapping[str, Any]) -> Generator[str]:
         logging.set_up(known, out=log, err=log)
         stack.callback(logging.set_up, known)
         service = Service(known)
-        pool = WorkerPool(known, service.metrics) if known.workers else None
+        pool = WorkerPool(known, service.metrics, service.artifacts) if known.workers else None
         if pool is not None:
             stack.callback(pool.close)
             pool.start()  # it computes in processes of its own: replies are read, and kept, as they come

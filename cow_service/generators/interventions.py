@@ -15,7 +15,7 @@ from cow_service.generators.cutout.bodies import Extent, Ground, StillBody, movi
 from cow_service.generators.cutout.generator import compose
 from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, take_apart, without_bodies
 from cow_service.generators.cutout.shadows import take_shadows
-from cow_service.media.images import fit_within
+from cow_service.media.images import BAND, fit_within
 from cow_service.physics.camera import FloorCamera
 from cow_service.records import BBox, Path, Point, Trajectory
 from cow_service.vision.masks import CroppedMask, hull, resized_mask
@@ -66,7 +66,7 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
         for index, each in enumerate(as_it_is.obstacles[:kept], start=1)
     )
     if 0 in behind:
-        changed = changed.with_mask(mover, _completed(CroppedMask.of(scene.silhouette(mover)), gone).full())
+        changed = changed.with_mask(mover, _completed(scene.cropped(mover), gone).full())
     return replace(as_it_is, scene=changed, trajectory=trajectory, obstacles=obstacles)
 
 
@@ -85,9 +85,11 @@ def _with_changes(scene: Scene, after: Image) -> Scene:
         grown = cv2.dilate(changed, np.ones((FEATHER, FEATHER), np.uint8)).astype(np.float32)
         size = full.shape[1], full.shape[0]
         share = cv2.resize(cv2.GaussianBlur(grown, (0, 0), 1.5), size, interpolation=cv2.INTER_LINEAR)[..., None]
-        enlarged = cv2.resize(after, size, interpolation=cv2.INTER_CUBIC).astype(np.float32)
-        after = np.where(share > 0, full + share * (enlarged - full), full).astype(np.uint8)
-    return scene.changed(np.where(scene.cues[..., None], scene.image, after), after)
+        enlarged, after = cv2.resize(after, size, interpolation=cv2.INTER_CUBIC), full.copy()
+        for rows in (slice(top, top + BAND) for top in range(0, full.shape[0], BAND)):
+            mixed = full[rows] + share[rows] * (enlarged[rows].astype(np.float32) - full[rows])
+            after[rows] = np.where(share[rows] > 0, mixed, full[rows])
+    return scene.changed(np.where(scene.cues[..., None], scene.image, after) if scene.cues.any() else after, after)
 
 
 def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
@@ -108,7 +110,7 @@ def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
         if path.body not in put:
             continue
         bbox, degrees = given.trajectory.bodies[path.body].bbox, path.rotation[1] if path.rotation else 0.0
-        mask = given.obstacles[path.body - 1].mask if path.body else CroppedMask.of(scene.silhouette(grounding.bbox))
+        mask = given.obstacles[path.body - 1].mask if path.body else scene.cropped(grounding.bbox)
         mask = mask.moved(np.array(path.points[0]), np.array(path.points[1]), path.scale[1], degrees)
         if path.body:
             obstacles[path.body - 1] = replace(obstacles[path.body - 1], bbox=bbox, mask=mask)

@@ -58,14 +58,15 @@ _FILM = math.hypot(36.0, 24.0)  # mm: the diagonal that focal lengths "on 35 mm 
 _WEBP_ANIMATED = 0x02  # flag of the first chunk (RFC 9649, section 2.7)
 _TIFF_INTEGERS = {3: 2, 4: 4}  # bytes of a SHORT and a LONG
 
-_TRANSPOSE_TO_UPRIGHT = {  # by EXIF orientation
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
+# By EXIF orientation: whether rows are stored as columns; the steps in which rows and columns are then stored.
+_STORED = {
+    2: (False, 1, -1),
+    3: (False, -1, -1),
+    4: (False, -1, 1),
+    5: (True, 1, 1),
+    6: (True, -1, 1),
+    7: (True, -1, -1),
+    8: (True, 1, -1),
 }
 
 _FOREIGN = {  # by what their first bytes match
@@ -102,6 +103,11 @@ def check(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT) 
     return _read_header(data, max_megapixels)[0]
 
 
+def pixels_in(data: bytes) -> int:
+    """How many pixels a file has, by its header. Raises what `check` raises."""
+    return math.prod(_read_header(data, math.inf)[3])
+
+
 def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT) -> DecodedImage:
     """Decode one PNG, JPEG or WebP file, recognised by its content, to upright 8-bit RGB.
 
@@ -112,15 +118,13 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     Raises `ImageTypeUnsupported` for other types and for animations, `ImageTooLarge` above `max_megapixels` (millions
     of pixels), and `ImageUnreadable` for damaged files and for sides under `MIN_SIDE` px.
     """
-    media_type, stripped, exif = _read_header(data, max_megapixels)
+    media_type, stripped, exif, _ = _read_header(data, max_megapixels)
     kind, opener = _OPENERS[media_type]
     with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
         _check_frames(kind, int(getattr(image, "n_frames", 1)))
-        rgb = _to_rgb(image)
         if kind == "WebP":
             exif = _read_exif(image.info.get("exif", b""))
-    turn = _TRANSPOSE_TO_UPRIGHT.get(exif.get(_ORIENTATION, UPRIGHT))
-    pixels = _pixels_of(rgb if turn is None else rgb.transpose(turn))
+        pixels = _pixels_of(image, exif.get(_ORIENTATION, UPRIGHT))
     height, width = pixels.shape[:2]
     on_film = exif.get(_FOCAL_ON_FILM, 0)
     focal = on_film / _FILM * math.hypot(width, height) if 5 <= on_film <= 2000 else None  # mm, of any lens
@@ -128,8 +132,9 @@ def decode(data: bytes, *, max_megapixels: float = MAX_IMAGE_MEGAPIXELS_DEFAULT)
     return DecodedImage(pixels, info, media_type)
 
 
-def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, dict[int, int]]:
-    """The media type, the file without what is not the picture, and its EXIF values, unless it is a WebP file."""
+def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, dict[int, int], tuple[int, int]]:
+    """The media type, the file without what is not the picture, its EXIF values, unless it is a WebP file, and its size
+    as stored (px)."""
     if not data:
         raise errors.ImageUnreadable("The image is empty (0 bytes): send the bytes of a PNG, JPEG or WebP file.")
     media_type = media_type_of(data)
@@ -140,15 +145,16 @@ def _read_header(data: bytes, max_megapixels: float) -> tuple[str, bytes, dict[i
         if kind == "WebP":
             # Opening a WebP file runs its decoder, and allocates its whole canvas. Its other blocks can stay: they are
             # never decoded or joined by the decoder.
-            _check_size(*_webp_size(data), max_megapixels)
+            size = _webp_size(data)
+            _check_size(*size, max_megapixels)
             if data[12:16] == b"VP8X" and data[20] & _WEBP_ANIMATED:
                 _check_frames(kind, data.count(b"ANMF"))
-            return media_type, data, {}
+            return media_type, data, {}, size
         stripped, exif = _strip_png(data) if kind == "PNG" else _strip_jpeg(data)
         with opener(io.BytesIO(stripped)) as image:  # of these two pillow reads the header alone, in Python
             _check_size(image.width, image.height, max_megapixels)
             _check_frames(kind, int(getattr(image, "n_frames", 1)))
-        return media_type, stripped, exif
+            return media_type, stripped, exif, image.size
 
 
 @contextmanager
@@ -171,15 +177,24 @@ def _check_frames(kind: str, frames: int) -> None:
 
 def decode_own(data: bytes) -> NDArray[np.uint8]:
     """Upright RGB pixels [H, W, 3] of a picture that this service wrote. Raises `InternalError` if it is damaged."""
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(_decode_own(data, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def decode_own_mask(data: bytes) -> NDArray[np.bool_]:
+    """The mask [H, W] of a PNG that this service wrote. Raises as `decode_own`."""
+    return _decode_own(data, cv2.IMREAD_GRAYSCALE) > 0
+
+
+def _decode_own(data: bytes, how: int) -> NDArray[np.uint8]:
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), how)
     if pixels is None:
         raise errors.InternalError("A stored picture can no longer be read.")
-    return np.ascontiguousarray(pixels[..., ::-1], np.uint8)
+    return np.asarray(pixels, np.uint8)
 
 
 def decode_depth(data: bytes, *, max_megapixels: float) -> NDArray[np.uint16]:
     """The values [H, W] of a grey PNG of 16 bits, as they are stored. Raises as `decode`, and for other PNGs."""
-    media_type, stripped, _ = _read_header(data, max_megapixels)
+    media_type, stripped, _, _ = _read_header(data, max_megapixels)
     kind, opener = _OPENERS[media_type]
     with _damage_named(kind, data), opener(io.BytesIO(stripped)) as image:
         if not image.mode.startswith("I"):
@@ -311,17 +326,17 @@ def _to_rgb(image: Image.Image) -> Image.Image:
     if image.has_transparency_data:
         white = Image.new("RGBA", image.size, "white")
         return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
-    if image.mode != "RGB":
-        return image.convert("RGB")
-    image.load()
-    return image
+    return image if image.mode == "RGB" else image.convert("RGB")
 
 
-def _pixels_of(rgb: Image.Image) -> NDArray[np.uint8]:
-    """[H, W, 3], copied in bands: at once, pillow would make two more copies on the way."""
-    pixels = np.empty((rgb.height, rgb.width, 3), np.uint8)
-    for top in range(0, rgb.height, BAND):
-        pixels[top : top + BAND] = np.asarray(rgb.crop((0, top, rgb.width, min(top + BAND, rgb.height))))
+def _pixels_of(image: Image.Image, orientation: int) -> NDArray[np.uint8]:
+    """RGB [H, W, 3], upright, converted and copied in bands: at once, pillow would make several copies on the way."""
+    width, height = image.size
+    is_turned, down, across = _STORED.get(orientation, (False, 1, 1))
+    pixels = np.empty((width, height, 3) if is_turned else (height, width, 3), np.uint8)
+    stored = (pixels.swapaxes(0, 1) if is_turned else pixels)[::down, ::across]
+    for top in range(0, height, BAND):
+        stored[top : top + BAND] = np.asarray(_to_rgb(image.crop((0, top, width, min(top + BAND, height)))))
     return pixels
 
 

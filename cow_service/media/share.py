@@ -1,25 +1,37 @@
-"""Results to share: a film with question, futures and verdict, and a still picture of it for a link."""
+"""Results to share: a film with question, futures and verdict, a still picture of it for a link, a page to play with.
+
+What has to decode a picture or a video runs in a process of its own (`make_apart`).
+"""
 
 from __future__ import annotations
 
 import base64
 import html
 import json
+import math
+import os
 import re
+import subprocess
+import sys
 import tempfile
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from string import Template
 
 import cv2
 import numpy as np
+from pydantic import TypeAdapter
 
-from cow_service.media.images import encode_jpeg, fit_within
+from cow_service.concurrency import leave_decisions_to_the_parent
+from cow_service.errors import InternalError
+from cow_service.media.artifacts import media_type_of
+from cow_service.media.images import decode, encode_jpeg, fit_within
 from cow_service.media.overlay import DARK, LIGHT, PATH, Image, in_letters_thread
-from cow_service.media.video import frames_in, write_mp4
+from cow_service.media.video import FORMATS, animation, frames_in, write_mp4
 from cow_service.records import Answer, Simulation, verdict_of
 
 SIDES = 720, 480, 320  # px: the first whose film is small enough for a chat
@@ -197,8 +209,15 @@ MODULES = "app/geometry.js", "app/words.js", "live/world.js", "live/preview.js",
 WEB = Path(__file__).parents[1] / "web"
 
 
-def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
-    """HTML that needs no network: the picture [H, W, 3], and its worlds, computed anew while you drag the arrow.
+def still(data: bytes) -> bytes:
+    """A JPEG, `PICTURE` px at most, of an image or of a video's first frame."""
+    is_video = media_type_of(data) == "video/mp4"
+    image = next(frames_in(data))[0] if is_video else decode(data, max_megapixels=math.inf).pixels
+    return encode_jpeg(fit_within(image, PICTURE))
+
+
+def page(picture: bytes, world: str, simulation: Simulation, told: Told) -> bytes:
+    """HTML that needs no network: the picture, a JPEG, and its worlds, computed anew while you drag the arrow.
 
     `world` is the JSON of `trajectory.live`.
     """
@@ -212,7 +231,7 @@ def page(image: Image, world: str, simulation: Simulation, told: Told) -> bytes:
     template = Template((WEB / "live" / "file.html").read_text())
     return template.substitute(
         {name: html.escape(text) for name, text in words.items()},
-        image="data:image/jpeg;base64," + base64.b64encode(encode_jpeg(fit_within(image, PICTURE))).decode(),
+        image="data:image/jpeg;base64," + base64.b64encode(picture).decode(),
         width=simulation.image.width,
         height=simulation.image.height,
         worlds=json.loads(world)["worlds"],
@@ -267,3 +286,37 @@ def _wrapped(text: str, letter: float, width: float) -> tuple[str, ...]:
     if len(lines) > MOST_LINES:
         lines = [*lines[: MOST_LINES - 1], joint.join(lines[MOST_LINES - 1 :])]
     return tuple(_cut(line, letter / 1.08, width) for line in lines)
+
+
+WITH_WORDS: dict[str, Callable[[bytes, Told], bytes]] = {"film": film, "card": card}
+OF_MEDIA: dict[str, Callable[[bytes], bytes]] = {
+    "still": still,
+    **{name: partial(animation, format=name) for name in FORMATS},
+}
+TOLD = TypeAdapter[Told | None](Told | None)
+INHERITED = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "TMPDIR", "TEMP", "SYSTEMROOT")  # of the environment: no secrets
+LONGEST_SECONDS = 300
+
+
+def make_apart(wanted: str, data: bytes, told: Told | None = None) -> bytes:
+    """What `WITH_WORDS` or `OF_MEDIA` makes of an image or video, made by a process that has nothing else.
+
+    A decoder with a hole gives no more than that process has. Raises `InternalError` where it fails.
+    """
+    command = [sys.executable, "-m", __name__, wanted]
+    given = TOLD.dump_json(told) + b"\n" + data
+    environment = {name: os.environ[name] for name in INHERITED if name in os.environ}
+    try:
+        return subprocess.run(
+            command, input=given, stdout=subprocess.PIPE, env=environment, timeout=LONGEST_SECONDS, check=True
+        ).stdout
+    except (OSError, subprocess.SubprocessError) as error:
+        raise InternalError(f"The file could not be made ({type(error).__name__}); the log says more.") from error
+
+
+if __name__ == "__main__":
+    leave_decisions_to_the_parent()
+    line, _, media = sys.stdin.buffer.read().partition(b"\n")
+    words = TOLD.validate_json(line)
+    made = OF_MEDIA[sys.argv[1]](media) if words is None else WITH_WORDS[sys.argv[1]](media, words)
+    sys.stdout.buffer.write(made)

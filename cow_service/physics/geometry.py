@@ -56,7 +56,7 @@ RAISED = 0.2  # of the pixels of a thing are nearer than the floor behind it
 class DepthMap:
     """How far from the camera, along its optical axis, what the pixels of an image show is."""
 
-    depth: Floats  # [H, W] in the unit of the map; nan where nothing is known
+    depth: Floats | Floats32  # [H, W] in the unit of the map; nan where nothing is known
     scale: float | None  # metres per unit; None: relative depth
     deviation: float  # relative, one standard deviation
     focal: float | None  # px; None: it is not known
@@ -219,7 +219,7 @@ def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], rol
         return None
     rng = np.random.default_rng(0)  # the same map must give the same floor
     chosen = np.stack(np.unravel_index(free[rng.integers(0, len(free), SAMPLES)], (height, width)), axis=1)
-    depth = given.depth[tuple(chosen.T)]
+    depth = given.depth[tuple(chosen.T)].astype(np.float64)
     near = depth < FARTHEST * np.percentile(depth, 5)
     chosen, depth = chosen[near], depth[near]
     rays = _rays(chosen[:, 1], chosen[:, 0], width, height, focal)
@@ -291,7 +291,7 @@ def measure(
     known, covered = np.isfinite(given.depth), np.zeros(given.depth.shape, bool)
     for body in bodies:
         body.mask.add_to(covered)
-    filled = np.where(known, given.depth, 0.0).astype(np.float32)
+    filled = np.where(known, given.depth, np.float32(0)).astype(np.float32, copy=False)
     smooth = np.asarray(cv2.medianBlur(filled, EDGE), np.float32)
     known &= smooth > 0
     size, free, found = (known.shape[1], known.shape[0]), known & ~covered, list[Footprint | None]()

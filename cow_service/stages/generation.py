@@ -12,7 +12,7 @@ import numpy as np
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.interventions import with_put, without_removed
 from cow_service.media.artifacts import Put, disk_errors
-from cow_service.media.images import encode_jpeg, encode_png, fit_within, size_within
+from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import DARK, LIGHT, Label, Replaced, draw_labels, draw_overlay
 from cow_service.records import Clip, Frame, GeneratorInfo, Grounding, Motion, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
@@ -35,10 +35,10 @@ class EncodedFrame:
     @staticmethod
     def of(pixels: Image, index: int, fps: float, max_side: int | None, encoder: Executor) -> EncodedFrame:
         """Of an image [H, W, 3] that its maker may change afterwards."""
-        picture = pixels.copy()
-        width, height = size_within(pixels.shape[1], pixels.shape[0], max_side)
-        png = encoder.submit(lambda: encode_png(fit_within(picture, max_side)))
-        return EncodedFrame(index, index / fps, width, height, png)
+        small = fit_within(pixels, max_side)
+        picture = pixels.copy() if small is pixels else small
+        png = encoder.submit(lambda: encode_png(picture))
+        return EncodedFrame(index, index / fps, picture.shape[1], picture.shape[0], png)
 
 
 def stored(frames: Sequence[EncodedFrame], put: Put) -> tuple[Frame, ...]:

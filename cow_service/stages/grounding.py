@@ -25,9 +25,8 @@ from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, Pl
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
 from cow_service.stages.settling import SeenThings, settle_mover, settle_places, settle_question, things_of
-from cow_service.vision.masks import bbox_of, iou, is_among, is_same_object, mask_iou
+from cow_service.vision.masks import CroppedMask, iou, is_among, is_same_object, mask_iou
 from cow_service.vision.segmentation import mask_from_bbox
-from cow_service.vision.types import Mask
 
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
@@ -165,11 +164,11 @@ def _settled(
     return settled, (*objections, *misnamed, *misread), bool(misnamed or misread)
 
 
-def _is_mover(thing: LocatedObject, mask: Mask | None, mover: GroundingReading) -> bool:
-    """Whether a thing is what moves. Two masks [H, W] tell, however much their boxes overlap."""
+def _is_mover(thing: LocatedObject, mask: CroppedMask | None, mover: GroundingReading) -> bool:
+    """Whether a thing is what moves. Two masks tell, however much their boxes overlap."""
     if mask is None or mover.mask is None:
         return is_same_object(thing.bbox, mover.bbox)
-    return mask_iou(mask, mover.mask) > SAME_MASK
+    return mask_iou(mask.full(), mover.mask) > SAME_MASK
 
 
 # --- places that the request gives
@@ -180,14 +179,14 @@ class Place:
     """Where an object is."""
 
     bbox: BBox  # px, inside the image
-    mask: Mask | None = None  # [H, W], where it does not follow from the box
+    mask: CroppedMask | None = None  # where it does not follow from the box
     warnings: tuple[str, ...] = ()
     is_doubtful: bool = False  # no two looks at it agree on its outline
 
 
 def _read_places(
     run: Run[SimulateRequest],
-) -> tuple[tuple[LocatedObject, ...], list[Mask | None], GroundingReading | None, list[str]]:
+) -> tuple[tuple[LocatedObject, ...], list[CroppedMask | None], GroundingReading | None, list[str]]:
     """The objects of a request with their masks, what it says of the mover and asks in words, and warnings.
 
     The third is None where the mover is left to the reader. Raises as `_locate` does, and for an object that is given
@@ -205,7 +204,7 @@ def _read_places(
             detail = f"lies in the same box as `objects.{twin}`"
             message = f"`{field_of(pointer)}` {detail}: give each object once."
             raise InvalidRequest(message, errors=(FieldError(pointer, detail),))
-        mask = None if place.mask is None else run.backends.artifacts.put(encode_png(place.mask), "image/png")
+        mask = None if place.mask is None else run.backends.artifacts.put(encode_png(place.mask.full()), "image/png")
         objects.append(
             LocatedObject(
                 object=each.object,
@@ -224,7 +223,7 @@ def _read_places(
         request.place.object or DEFAULT_NAME,
         places[-1].bbox,
         prior=request.place.prior,
-        mask=places[-1].mask,
+        mask=None if places[-1].mask is None else places[-1].mask.full(),
         warnings=places[-1].warnings,
         changes=() if request.interventions else run.question.changes,
         asked=run.question.asked,
@@ -244,8 +243,8 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     outside = f"lies outside the upright image of {scene.width} x {scene.height} px"
     if given.mask is not None:
         mask = _read_mask(run, given.mask, f"{pointer}/mask")
-        scene.preset_mask(bbox_of(mask), lambda: mask)
-        return Place(bbox_of(mask), mask)
+        scene.preset_mask(mask.bbox, mask.full)
+        return Place(mask.bbox, mask)
     if given.bbox is not None:
         x0, y0, x1, y1 = given.bbox
         clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
@@ -265,8 +264,9 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     if run.can_segment:
         found = outlines_at(run.embedded(), (x, y))
         if len(found) == 1 or (found and may_guess):
-            scene.preset_mask(found[0].bbox, lambda: found[0].mask)
-            return Place(found[0].bbox, found[0].mask)
+            mask = CroppedMask.of(found[0].mask)
+            scene.preset_mask(found[0].bbox, mask.full)
+            return Place(found[0].bbox, mask)
         fault = (
             f"{len(found)} objects lie there, one inside the other."
             if found
@@ -281,7 +281,7 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
         raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {cutout.fault}.", pointer)
     box = ", ".join(f"{value:.0f}" for value in cutout.bbox)
     warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
-    return Place(cutout.bbox, cutout.mask, (warning,))
+    return Place(cutout.bbox, CroppedMask.of(cutout.mask), (warning,))
 
 
 def _not_cut_out(detail: str, pointer: str) -> CannotGround:
@@ -297,9 +297,11 @@ def _outlined_box(run: Run[SimulateRequest], bbox: BBox, field: str, warnings: t
     (outline,) = outlines_in(run.embedded(), [bbox])
     if outline is None or not outline.is_sure:
         doubt = f"Two attempts to outline what is in `{field}.bbox` disagree: give its outline as `{field}.mask`."
-        return Place(bbox, None if outline is None else outline.mask, (*warnings, doubt), is_doubtful=True)
-    run.scene.preset_mask(outline.bbox, lambda: outline.mask)
-    return Place(outline.bbox, outline.mask, warnings)
+        mask = None if outline is None else CroppedMask.of(outline.mask)
+        return Place(bbox, mask, (*warnings, doubt), is_doubtful=True)
+    mask = CroppedMask.of(outline.mask)
+    run.scene.preset_mask(outline.bbox, mask.full)
+    return Place(outline.bbox, mask, warnings)
 
 
 def _find(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, ...]:
@@ -370,8 +372,8 @@ def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidReque
     return InvalidRequest(message, errors=(FieldError(pointer, detail),))
 
 
-def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
-    """The mask [H, W] of the image that a request names. Raises `InvalidRequest`."""
+def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> CroppedMask:
+    """The mask of the image that a request names. Raises `InvalidRequest`."""
     assert isinstance(given, ImageArtifact), "the masks of a request are kept before its stages run"
     image = run.image.info
 
@@ -396,7 +398,7 @@ def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Mask:
         raise refused("is empty: no pixel is white")
     if share > MAX_SHARE:
         raise refused(f"covers {share:.0%} of the image: white, or transparent, is the object alone")
-    return mask
+    return CroppedMask.of(mask)
 
 
 # --- interventions

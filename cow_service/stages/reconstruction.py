@@ -24,7 +24,7 @@ from cow_service.stages.grounding import others_of, placed_mover, removed_of
 from cow_service.stages.run import Run
 from cow_service.vision.edges import divide
 from cow_service.vision.forms import shape_seen
-from cow_service.vision.masks import CroppedMask, iou, is_same_object
+from cow_service.vision.masks import iou, is_same_object
 from cow_service.vision.openings import measure_opening
 from cow_service.vision.scene import CLEAR_CUT, Obstacle, Scene
 from cow_service.vision.shadows import find_shadow
@@ -212,7 +212,7 @@ def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
     scene, grounding, bodies = situation.scene, situation.grounding, list[SeenBody]()
     located = {each.bbox: each for each in situation.located}
     mover = LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior, source=grounding.source)
-    first = Obstacle(mover.object, mover.bbox, CroppedMask.of(scene.silhouette(mover.bbox)))
+    first = Obstacle(mover.object, mover.bbox, scene.cropped(mover.bbox))
     # What is asked to fall off a thing stands on it.
     asked, carrier, carried = grounding.asked, None, ""
     if asked is not None and asked.relation == "lands" and situation.motion.kind == "linear":

@@ -20,7 +20,7 @@ from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, RetryPolicy, try_once
-from cow_service.media.images import DecodedImage, decode_depth, decode_own
+from cow_service.media.images import DecodedImage, decode_depth, decode_own_mask
 from cow_service.observability.logging import rfc3339
 from cow_service.perception.base import Embedded, Perception
 from cow_service.physics.geometry import DepthMap
@@ -107,7 +107,7 @@ def priority_of(turn: int, created_at: str) -> str:
 
 def _stored_mask(artifacts: ArtifactStore, mask: Artifact) -> Mask:
     """A function apart from the run: a scene that knew its run would hold its pixels until garbage is collected."""
-    return decode_own(artifacts.read(mask.sha256))[..., 0] > 0
+    return decode_own_mask(artifacts.read(mask.sha256))
 
 
 def _no_depth(fault: str) -> InvalidRequest:
@@ -232,7 +232,7 @@ class Run(Generic[Request_co]):
         nearest, usual = (float(value) for value in np.percentile(values[values > 0], (1, 50)))
         if given.scale is None and nearest < LEAST_NEAREST * usual:
             raise _no_depth("begins at the camera itself: depths must be proportional to distances, without an offset")
-        depth = np.where(values > 0, values.astype(np.float64), np.nan)
+        depth = np.where(values > 0, values, np.float32(np.nan))  # 16 bits: exact
         source = "model" if self._is_estimated else "request"
         return DepthMap(depth, given.scale, given.deviation, given.focal, source)
 

@@ -17,7 +17,7 @@ from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.contrast import View
 from cow_service.vision.edges import find_segments
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import CroppedMask, bbox_of, dilated, is_among, is_same_object, without_holes
+from cow_service.vision.masks import CroppedMask, bbox_of, dilated, iou, is_among, is_same_object, without_holes
 from cow_service.vision.regions import (
     WORKING_SIDE,
     Region,
@@ -308,15 +308,20 @@ class Scene:
         return self.once(("confidence", bbox), agreement)
 
     def silhouette(self, bbox: BBox) -> Mask:
-        """Mask [H, W] of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
+        """As `cropped`, of the whole image [H, W]: a new array."""
+        return self.cropped(bbox).full()
 
-        def cut() -> Mask:
+    def cropped(self, bbox: BBox) -> CroppedMask:
+        """Mask of the object in a box [x0, y0, x1, y1], cut from the image without its cues."""
+
+        def cut() -> CroppedMask:
             if bbox in self._preset:
-                return self._preset[bbox]()
+                return CroppedMask.of(self._preset[bbox]())
             region = self.region_of(bbox)
             if region is not None and (region.is_disc or max(self.width, self.height) <= SHARP_SIDE):
-                return region.mask.full()
-            return mask_from_bbox(self.clean, bbox, None if region is None else region.mask.full())
+                return region.mask
+            guess = None if region is None else region.mask.full()
+            return CroppedMask.of(mask_from_bbox(self.clean, bbox, guess))
 
         return self.once(("mask", bbox), cut)
 
@@ -350,7 +355,7 @@ class Scene:
     def with_mask(self, bbox: BBox, mask: Mask) -> Scene:
         """The same with another mask [H, W] of the object in a box."""
         other = self.changed(self.image, self.clean)
-        other._found["mask", bbox] = mask
+        other._found["mask", bbox] = CroppedMask.of(mask)
         return other
 
     def obstacles(self, mover: BBox, named: Sequence[LocatedObject] = ()) -> tuple[Obstacle, ...]:
@@ -367,11 +372,11 @@ class Scene:
             for other in named:
                 if other.mask is not None or not is_same_object(other.bbox, mover):
                     region = None if other.mask is not None else self.region_of(other.bbox)
-                    mask = CroppedMask.of(self.silhouette(other.bbox)) if region is None else region.mask
+                    mask = self.cropped(other.bbox) if region is None else region.mask
                     found = region is not None and region.bbox == other.bbox  # here, not by the request or a reader
                     confidence = region.confidence if region is not None and found else 1.0
                     obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
-            outlined = [self.silhouette(other.bbox) for other in named if other.mask is not None]
+            outlined = [self.cropped(other.bbox) for other in named if other.mask is not None]
             for region in self.regions:
                 area = region.mask.area
                 if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
@@ -380,7 +385,8 @@ class Scene:
                     continue
                 if is_among(region.bbox, (other.bbox for other in obstacles)):
                     continue
-                if any(region.mask.shared_with(mask) > PART_OF * area for mask in outlined):
+                near_ones = [mask.full() for mask in outlined if iou(mask.bbox, region.bbox)]
+                if any(region.mask.shared_with(mask) > PART_OF * area for mask in near_ones):
                     continue
                 doubtful = region.confidence < DOUBTFUL
                 larger = [other.mask for other in obstacles if doubtful and area < OWN_SHARE * other.mask.area]
@@ -408,7 +414,7 @@ class Scene:
             return min(under, key=lambda region: region.mask.area).bbox
         mask = mask_from_point(self.clean, (float(x), float(y)))
         bbox = bbox_of(mask)
-        self._found["mask", bbox] = mask
+        self._found["mask", bbox] = CroppedMask.of(mask)
         return bbox
 
 

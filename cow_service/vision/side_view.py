@@ -5,7 +5,8 @@ In such a picture there is no depth: the ground is a line, and what is drawn abo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ LINE = 0.15  # of the image's width: a shorter piece of a line is no ground
 THIN = 0.007  # of the larger side: half the width of an outline, at most
 LEAST_SHAPE = 0.0003  # of the image
 HIGHEST_GROUND = 0.55  # of the image's height, from the top
+BAND = 1 << 18  # px
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,9 @@ def find_side_view(image: Image) -> SideView | None:
     colours = _flat_colours(image)
     if colours is None:
         return None
-    labels = np.stack([np.abs(image - colour).sum(axis=2) for colour in colours]).argmin(axis=0)
+    labels = np.empty(image.shape[:2], np.uint8)
+    for rows in _bands(image):
+        labels[rows] = np.stack([np.abs(image[rows] - colour).sum(axis=2) for colour in colours]).argmin(axis=0)
     background = int(np.bincount(labels[: max(2, height // 50)].ravel()).argmax())
     ground, level = _ground(labels, background)
     if ground is None:
@@ -54,7 +58,7 @@ def find_side_view(image: Image) -> SideView | None:
     rest = (labels != background) & ~masks.dilated(ground, 5)  # its edge is blurred
     open_ground = (labels[level : level + 2] == background).all(axis=0) & ~ground.any(axis=0)
     whole = bool(open_ground.mean() < NO_GAP)
-    shapes = [CroppedMask.of(each) for each in _shapes(labels, rest)]
+    shapes = _shapes(labels, rest)
     if not whole:
         count, pieces = cv2.connectedComponents(ground.astype(np.uint8))
         shapes += [CroppedMask.of(pieces == i) for i in range(1, count)]
@@ -66,10 +70,18 @@ def find_side_view(image: Image) -> SideView | None:
     return SideView(tuple(shapes), float(level if whole else height), empty)
 
 
+def _bands(image: Image) -> Iterator[slice]:
+    """Rows that are looked at together: numbers for all pixels of a large image at once would fill the memory."""
+    step = max(1, BAND // image.shape[1])
+    yield from (slice(top, top + step) for top in range(0, image.shape[0], step))
+
+
 def _flat_colours(image: Image) -> list[NDArray[np.int16]] | None:
     """The few colours [3] of a drawing; None for a photograph."""
-    red, green, blue = np.moveaxis((image >> 2).astype(np.int32), 2, 0)
-    counts = np.bincount((red << 12 | green << 6 | blue).ravel(), minlength=1 << 18)
+    counts = np.zeros(1 << 18, np.int64)
+    for rows in _bands(image):
+        red, green, blue = np.moveaxis((image[rows] >> 2).astype(np.int32), 2, 0)
+        counts += np.bincount((red << 12 | green << 6 | blue).ravel(), minlength=len(counts))
     size = image.shape[0] * image.shape[1]
     common = np.nonzero(counts >= LEAST_COLOUR * size)[0]
     found, has_one = list[NDArray[np.int16]](), np.zeros(image.shape[:2], np.uint8)
@@ -84,7 +96,7 @@ def _flat_colours(image: Image) -> list[NDArray[np.int16]] | None:
     return found if len(found) > 1 and np.count_nonzero(has_one) > FLAT * size else None
 
 
-def _ground(labels: NDArray[np.int64], background: int) -> tuple[Mask | None, int]:
+def _ground(labels: NDArray[np.uint8], background: int) -> tuple[Mask | None, int]:
     """The ground [H, W] of one colour, and the height in the image of its upper edge; None if there is none."""
     height, width = labels.shape
     kernel = np.ones((1, round(LINE * width)), np.uint8)
@@ -98,32 +110,38 @@ def _ground(labels: NDArray[np.int64], background: int) -> tuple[Mask | None, in
             continue
         top = min(stats[i][1] for i in sides)
         level_ones = [i for i in range(1, count) if abs(stats[i][1] - top) <= 1 + LEVEL * height]
-        ground = np.isin(parts, level_ones)
+        ground = np.logical_or.reduce([parts == i for i in level_ones])
         if ground.any(axis=0).mean() > GROUND and (best is None or top < level):
             best, level = ground, int(top)
     return best, level
 
 
-def _shapes(labels: NDArray[np.int64], rest: Mask) -> list[Mask]:
+def _shapes(labels: NDArray[np.uint8], rest: Mask) -> list[CroppedMask]:
     """The things among what is neither background nor ground [H, W]: of one colour each, with their outlines."""
     thin = max(3.0, THIN * max(rest.shape))
-    bodies, lines = list[Mask](), list[Mask]()
+    bodies, lines = list[CroppedMask](), list[CroppedMask]()
     for colour in np.unique(labels[rest]):
-        count, parts, stats, _ = cv2.connectedComponentsWithStats((rest & (labels == colour)).astype(np.uint8))
+        count, parts, stats, _ = cv2.connectedComponentsWithStats((rest & (labels == colour)).view(np.uint8))
         for i in range(1, count):
-            if stats[i][4] < 8:
+            left, top, width, height, area = stats[i].tolist()
+            if area < 8:
                 continue
-            part = parts == i
-            reach = float(cv2.distanceTransform(np.pad(part, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
+            window = slice(top, top + height), slice(left, left + width)
+            part = CroppedMask(rest.shape, *window, parts[window] == i)
+            reach = float(cv2.distanceTransform(np.pad(part.patch, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
             (lines if reach <= thin else bodies).append(part)
     for line in lines:  # an outline belongs to the shape that it runs along
-        near = masks.dilated(line, 5)
-        shared = [int(np.count_nonzero(near & body)) for body in bodies]
+        near = masks.dilated(line.full(), 5)
+        shared = [body.shared_with(near) for body in bodies]
         if shared and max(shared) > 0:
-            bodies[int(np.argmax(shared))] |= line
-    found = [(body, masks.without_holes(body)) for body in bodies if body.mean() > LEAST_SHAPE]
+            at = int(np.argmax(shared))
+            whole = bodies[at].full()
+            line.add_to(whole)
+            bodies[at] = CroppedMask.of(whole)
+    large = [body for body in bodies if body.area / rest.size > LEAST_SHAPE]
+    whole = [replace(body, patch=masks.without_holes(body.patch)) for body in large]
     # Small holes are patterns on a shape: nothing has room in them.
-    return [whole if np.count_nonzero(body) > 0.8 * np.count_nonzero(whole) else body for body, whole in found]
+    return [filled if body.area > 0.8 * filled.area else body for body, filled in zip(large, whole, strict=True)]
 
 
 def pieces_of(shape: CroppedMask) -> list[Floats32]:

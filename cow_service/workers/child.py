@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 import cv2
 import psutil
 
-from cow_service.concurrency import leave_decisions_to_the_parent
+from cow_service.concurrency import free_memory, leave_decisions_to_the_parent, return_large_blocks
 from cow_service.errors import CowError, unforeseen
 from cow_service.jobs.active import QUIET_SECONDS, ActiveJob
 from cow_service.jobs.computing import Work, compute
@@ -149,11 +149,13 @@ class WorkerProcess:
         del self._jobs[job_id]
         self._busy_at = time.monotonic()
         self._send(end)
+        free_memory()
 
 
 def main(descriptor: int) -> None:
     """Works on the pipe of a file descriptor until it ends."""
     leave_decisions_to_the_parent()
+    return_large_blocks()
     cv2.setNumThreads(1)  # a process for each core: threads of their own would take a quarter more time, all together
     pipe = Connection(descriptor)
     try:

@@ -18,11 +18,13 @@ from cow_service.errors import Canceled, DeviceFailed, WorkerEnded
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, JobOutcome, KeyLocks, Work, waiting_jobs
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
+from cow_service.media.artifacts import ArtifactStore
 from cow_service.observability.metrics import Metrics
 from cow_service.records import WorkerInfo
-from cow_service.settings import Settings, usable_memory
+from cow_service.settings import Settings
 from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
+from cow_service.workers.memory import memory_for_jobs, memory_needed
 from cow_service.workers.process import EndReason, Worker, WorkerGone
 
 MAX_CRASHES = 3  # of workers that had nothing but the job, or of their device
@@ -30,8 +32,7 @@ HEARTBEAT_TIMEOUT_SECONDS = 15.0  # after which a worker that says nothing is en
 WATCH_SECONDS = 1.0  # between two looks at each worker
 FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS = 1.0, 60.0  # after a worker that could not start; doubled each time
 POLL_SECONDS = 0.1  # how often a job that waits for such a pause checks whether it was canceled
-SHARE_OF_MEMORY = 0.8  # of the machine's, that one worker may take where no setting says how much
-RENEW_SHARE = 0.75  # of that, from which on a worker without a job is replaced
+RENEW_SHARE = 0.75  # of the memory that a worker may take, from which on one without a job is replaced
 
 log = logging.getLogger("cow_service")
 
@@ -177,14 +178,14 @@ class Group:
 class WorkerPool(Computer):
     """All workers of this process."""
 
-    def __init__(self, settings: Settings, metrics: Metrics) -> None:
-        self._settings, self._metrics = settings, metrics
-        self._locks = KeyLocks()
+    def __init__(self, settings: Settings, metrics: Metrics, artifacts: ArtifactStore) -> None:
+        self._settings, self._metrics, self._artifacts = settings, metrics, artifacts
+        self._locks, self._memory = KeyLocks(), PrioritySemaphore(memory_for_jobs(settings))
         self._guard = threading.Lock()
         self._groups: dict[str, Group] = {}
         self._closed = threading.Event()
         limit = settings.worker_memory_mb
-        self._memory_limit = limit * 1e6 if limit else SHARE_OF_MEMORY * usable_memory()
+        self._memory_limit = limit * 1e6 if limit else settings.memory
         self._watching: threading.Thread | None = None
 
     def start(self) -> None:
@@ -262,8 +263,9 @@ class WorkerPool(Computer):
         """
         group = self._group(queue_of(work.job.spec.reader, work.job.spec.generator, self._settings))
         priority = priority_of(work.job.spec.turn, work.job.spec.created_at)
-        crashes, alone = 0, group.jobs_each == 1
-        with group.places.held(priority, partial(work.progress, None, 0.0)):
+        crashes, alone, check = 0, group.jobs_each == 1, partial(work.progress, None, 0.0)
+        needed = memory_needed(work, self._artifacts, self._settings)
+        with self._memory.held(priority, check, needed), group.places.held(priority, check):
             while True:
                 try:
                     if alone and group.jobs_each > 1:
@@ -319,6 +321,7 @@ class WorkerPool(Computer):
                     self._judge(worker, looked)
                 group.recover()
                 group.fill()
+            self._judge_all()
 
     def _judge(self, worker: Worker, now: float) -> None:
         if not worker.is_loaded and now - worker.started > self._settings.load_timeout:
@@ -328,3 +331,12 @@ class WorkerPool(Computer):
             worker.kill("frozen", f"was ended, as it did not respond for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
         elif worker.memory_bytes > self._memory_limit:
             worker.kill("memory", f"was ended, as it used {worker.memory_bytes / 1e6:.0f} MB", is_final=True)
+
+    def _judge_all(self) -> None:
+        """Ends the worker whose jobs take most, where all workers together take more than they may."""
+        workers = [worker for group in self.groups for worker in group.alive()]
+        together, idle = sum(one.memory_bytes for one in workers), sum(one.idle_bytes for one in workers)
+        if idle < self._settings.memory < together:
+            largest = max(workers, key=lambda one: one.memory_bytes - one.idle_bytes)
+            reason = f"was ended, as all workers used {together / 1e6:.0f} MB, and it took most of that for its jobs"
+            largest.kill("memory", reason, is_final=True)

@@ -53,7 +53,7 @@ class Worker:
         spawned = spawn(MODULE)
         self.name = name
         self.jobs_done = 0
-        self.memory_bytes = 0
+        self.memory_bytes = self.idle_bytes = 0  # resident; when it last had no job
         self.gpus: tuple[GpuMemory, ...] = ()
         self.load: WorkerLoad | None = None
         self.started = self.heard = time.monotonic()  # `heard`: when it last sent a heartbeat
@@ -200,6 +200,8 @@ class Worker:
                     case messages.Heartbeat(memory_bytes=memory_bytes, gpus=gpus, load=load):
                         self.heard, self.memory_bytes = time.monotonic(), memory_bytes
                         self.gpus, self.load = gpus, load
+                        if not self._inboxes:
+                            self.idle_bytes = memory_bytes
                     case messages.Loaded(error=error):
                         self._load_error = None if error is None else error_from_json(error)
                         self.heard, self.is_loaded = time.monotonic(), True

@@ -16,8 +16,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from cow_service.media.images import decode_own, encode_jpeg, fit_within
-from cow_service.media.share import Told
+from cow_service.media.images import encode_jpeg, fit_within
+from cow_service.media.share import Told, still
 from cow_service.media.share import page as page_of
 from cow_service.media.video import Pixels, frames_of, write_mp4
 from cow_service.records import Simulation
@@ -123,7 +123,7 @@ def card(service: Service, place: str, name: str, files: dict[str, bytes]) -> st
         if simulation.grounding.interventions:  # what is taken away is in the picture, but not in the clip
             first = f"{name}-first.jpg"
             files[first] = encode_jpeg(frames[0])
-        whole = page_of(decode_own(picture), service.artifacts.read(live.sha256).decode(), simulation, told).decode()
+        whole = page_of(still(picture), service.artifacts.read(live.sha256).decode(), simulation, told).decode()
         files["engine.js"] = (ENGINE + json.dumps("".join(PART.findall(whole))) + ");\n").encode()
         files[f"{name}.html"] = in_frame(PART.sub("", whole), first).encode()
         shown, given = (

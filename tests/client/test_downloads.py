@@ -15,6 +15,7 @@ from sdk import served
 from servers import BODY, IMAGE, Served, problem, slow
 from waiting import eventually
 
+from cow_service.api.routes.artifacts import FILES
 from cow_service.client import Client
 from cow_service.media.share import Told, card
 from cow_service.media.video import frames_of
@@ -138,3 +139,25 @@ def test_lists_tell_answers_and_what_was_given(served: Served, answered: str) ->
     found = served.http.get(f"/jobs/{answered}").json()
     assert job["answer"] == (found["result"]["option"] or found["result"]["answer"] or "Not sure") == found["answer"]
     assert job["given"] == ["grounding", "motion", "objects", "interventions"]
+
+
+WITHOUT_DECODERS = """
+import av, cv2
+from PIL import ImageFile
+from cow_service.cli.main import app
+
+def refuse(*_, **__):
+    raise AssertionError("a decoder runs in the server")
+
+cv2.imdecode = cv2.imread = av.open = ImageFile.ImageFile.load = refuse
+app(["serve"])
+"""
+
+
+def test_no_decoder_runs_in_the_server(tmp_path: Path) -> None:
+    own = {"COW_WORKERS": "true", "COW_CONCURRENCY": "1", "COW_WARMUP": "false"}
+    with Served(tmp_path, code=WITHOUT_DECODERS, **own) as served:
+        job = served.ended(served.submit({**BODY, "live": True, "video": True})["id"])
+        for wanted in FILES:
+            response = served.http.get(f"/jobs/{job['id']}/download", params={"format": wanted})
+            assert response.status_code == 200, (wanted, served.log())

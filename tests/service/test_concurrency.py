@@ -88,6 +88,29 @@ def test_a_canceled_wait_leaves_its_permit_to_others(monkeypatch: pytest.MonkeyP
         semaphore.acquire("b")
 
 
+def test_who_waits_for_many_permits_is_passed_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    semaphore, order = PrioritySemaphore(3), []
+    semaphore.acquire()
+
+    def heavy() -> None:
+        with semaphore.held("a", weight=99):  # more than there are: it takes all
+            order.append("a")
+
+    thread = threading.Thread(target=heavy)
+    thread.start()
+    until_waiting(semaphore, 1)
+    waiting(semaphore, "b", order).join()
+    assert order == ["b"], "what fits beside the other one does not wait"
+    monkeypatch.setattr("cow_service.concurrency.PASSED_SECONDS", 0.0)
+    last = waiting(semaphore, "c", order)
+    until_waiting(semaphore, 2)
+    semaphore.release()
+    for each in (thread, last):
+        each.join()
+    assert order == ["b", "a", "c"]
+    semaphore.acquire(weight=3)  # no permit is lost
+
+
 @pytest.mark.parametrize("permits", [1, 3])
 def test_never_more_holders_than_permits(permits: int) -> None:
     semaphore, lock, holders, most = PrioritySemaphore(permits), threading.Lock(), 0, 0

@@ -18,6 +18,7 @@ from tables import rows
 from waiting import TIME_LIMIT, eventually
 from worker_processes import workers_of
 
+from cow_service.media.artifacts import DiskArtifacts
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
 from cow_service.workers import pool
@@ -87,7 +88,7 @@ def test_no_job_fails_because_a_worker_cannot_start_or_freezes(tmp_path: Path) -
 class Silent:
     """A worker that was started long ago, and has said nothing for a while."""
 
-    is_alive, memory_bytes, jobs = True, 0, ()
+    is_alive, memory_bytes, idle_bytes, jobs = True, 0, 0, ()
 
     def __init__(self, name: str, settings: Settings, on_end: object) -> None:
         self.is_loaded, self.started = settings.load_timeout > 100, time.monotonic() - 100
@@ -104,10 +105,13 @@ class Silent:
 @pytest.mark.parametrize(
     ("load_timeout", "reason"), rows({"loading takes too long": (99, "load"), "it is frozen": (1000, "frozen")})
 )
-def test_a_worker_that_says_nothing_is_ended(load_timeout: float, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_says_nothing_is_ended(
+    load_timeout: float, reason: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(pool, "Worker", Silent)
     monkeypatch.setattr(pool, "WATCH_SECONDS", 0.01)
-    workers = pool.WorkerPool(Settings(load_timeout=load_timeout, concurrency=1), Metrics())
+    settings = Settings(load_timeout=load_timeout, concurrency=1)
+    workers = pool.WorkerPool(settings, Metrics(), DiskArtifacts(tmp_path))
     workers.start()
     (worker,) = workers.groups[0].workers
     assert isinstance(worker, Silent)

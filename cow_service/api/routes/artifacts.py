@@ -1,7 +1,6 @@
 """`GET /artifacts/{sha256}` and `GET /jobs/{id}/download`: files."""
 
 import json
-import math
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -28,9 +27,7 @@ from cow_service.api.submission import Engine, Owner
 from cow_service.errors import DownloadUnavailable, StorageUnavailable
 from cow_service.jobs.engine import JobEngine
 from cow_service.media.artifacts import extension_of
-from cow_service.media.images import decode
-from cow_service.media.share import Told, card, film, page
-from cow_service.media.video import animation, frames_in
+from cow_service.media.share import WITH_WORDS, Told, make_apart, page
 from cow_service.narration.words import direction_words
 from cow_service.records import Answer, Job, Simulation, artifacts_of, documents_of
 
@@ -162,9 +159,6 @@ def _told(result: Simulation | Answer, simulation: Simulation) -> Told:
     return Told.of(result, simulation, given)
 
 
-SHARED = {"film": film, "card": card}  # with words of the result; other formats are of the video alone
-
-
 def make_file(engine: JobEngine, job_id: str, owner: str | None, wanted: str) -> bytes:
     """What a format other than `zip` makes of a job. Blocks, and raises as `make_zip` does."""
     job, result = _find_succeeded(engine, job_id, owner)
@@ -181,9 +175,7 @@ def make_file(engine: JobEngine, job_id: str, owner: str | None, wanted: str) ->
         raise DownloadUnavailable(f"The job {job.id} has no video. {again}, with `video: true`.")
     video = engine.service.artifacts.read(simulation.video.sha256)
     with engine.service.cpu.held():
-        if wanted in SHARED:
-            return SHARED[wanted](video, _told(result, simulation))
-        return animation(video, wanted)
+        return make_apart(wanted, video, _told(result, simulation) if wanted in WITH_WORDS else None)
 
 
 def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simulation, again: str) -> bytes:
@@ -194,12 +186,11 @@ def make_page(engine: JobEngine, result: Simulation | Answer, simulation: Simula
             f"The job has no live simulation. {again}, with `live: true`; objects that are put somewhere, or do not "
             "move along a direction, have none."
         )
+    # The clip is without what was taken away.
+    shown = (simulation.trajectory.factual and simulation.video) or simulation.image
     with engine.service.cpu.held():
-        if simulation.trajectory.factual is not None and simulation.video is not None:  # without what was taken away
-            image, _ = next(frames_in(read(simulation.video.sha256)))
-        else:
-            image = decode(read(simulation.image.sha256), max_megapixels=math.inf).pixels
-        return page(image, read(live.sha256).decode(), simulation, _told(result, simulation))
+        picture = make_apart("still", read(shown.sha256))
+    return page(picture, read(live.sha256).decode(), simulation, _told(result, simulation))
 
 
 def _find_succeeded(engine: JobEngine, job_id: str, owner: str | None) -> tuple[Job, Simulation | Answer]:

@@ -42,7 +42,6 @@ from cow_service.narration.story import shown
 from cow_service.physics.tracks import Density, at_rate, with_tracks
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Image, Mask
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import Manifest
@@ -215,7 +214,7 @@ class WanGenerator(WanLimits):
         spacing, least, most = (self.manifest.defaults[f"track_{name}"] for name in ("spacing", "least", "most"))
         scene, trajectory = given.scene, given.trajectory
         if not trajectory.tracks_given:
-            mover = CroppedMask.of(scene.silhouette(given.grounding.bbox))
+            mover = scene.cropped(given.grounding.bbox)
             masks = [mover, *(each.mask for each in given.obstacles)]
             density = Density(float(spacing) * scene.width / width, int(least), int(most))
             trajectory = with_tracks(trajectory, masks, given.grounding.point, density)
