@@ -31,7 +31,7 @@ from cow_service.observability import tracing
 from cow_service.observability.metrics import gpu_memory
 from cow_service.requests import Stage
 from cow_service.service import Service
-from cow_service.settings import Settings
+from cow_service.settings import WORKER_BYTES, Settings
 from cow_service.workers import messages
 from cow_service.workers.messages import FromWorker
 
@@ -97,7 +97,7 @@ class WorkerProcess:
         self._service = Service(settings)
         self._database = open_database(settings)
         self._jobs: dict[str, _Job] = {}
-        self._busy_at = time.monotonic()
+        self._busy_at, self._this = time.monotonic(), psutil.Process()
         self._threads = ThreadPoolExecutor(max_workers=1024, thread_name_prefix="job")
 
     def run(self) -> None:
@@ -124,11 +124,10 @@ class WorkerProcess:
             messages.send(self._pipe, message)
 
     def _beat(self) -> None:
-        this = psutil.Process()
         while True:
             if not self._jobs and time.monotonic() - self._busy_at > QUIET_SECONDS:
                 self._database.close_idle()
-            self._send(messages.Heartbeat(this.memory_info().rss, gpu_memory(), self._service.load()))
+            self._send(messages.Heartbeat(self._this.memory_info().rss, gpu_memory(), self._service.load()))
             time.sleep(HEARTBEAT_SECONDS)
 
     def _load(self) -> None:
@@ -149,7 +148,8 @@ class WorkerProcess:
         del self._jobs[job_id]
         self._busy_at = time.monotonic()
         self._send(end)
-        free_memory()
+        if self._this.memory_info().rss > WORKER_BYTES:  # it takes 10 ms
+            free_memory()
 
 
 def main(descriptor: int) -> None:
