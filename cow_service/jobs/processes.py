@@ -120,9 +120,10 @@ class Processes(RestingThread):
 
     def run(self) -> None:
         """Writes the row of this process, again and again."""
-        capacities = ((name, self._computer.capacity(name)) for name in known_queues(self._parts.service.settings))
-        queues = {name: capacity for name, capacity in capacities if capacity > 0}
+        names = known_queues(self._parts.service.settings)
         while not self._stop.is_set():
+            capacities = ((name, self._computer.capacity(name)) for name in names)
+            queues = {name: capacity for name, capacity in capacities if capacity > 0}
             info = ProcessInfo(
                 executor_id=self._parts.executor,
                 seen_at=rfc3339(time.time()),
