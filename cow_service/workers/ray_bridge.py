@@ -68,7 +68,7 @@ class Actor:
 def main(descriptor: int) -> None:
     """The bridge: connects to the cluster, and passes on what comes, until either end is gone."""
     import ray  # noqa: PLC0415 # only where it is used
-    from ray.exceptions import RayError  # noqa: PLC0415
+    from ray.exceptions import ActorUnavailableError, RayError  # noqa: PLC0415
 
     leave_decisions_to_the_parent()
     pipe, sending, actors = Connection(descriptor), threading.Lock(), dict[int, Any]()
@@ -78,16 +78,17 @@ def main(descriptor: int) -> None:
             pipe.send_bytes(pack(kind, number, data))
 
     def follow(number: int, actor: Any) -> None:
-        kind, how = "placed", "ended"
+        kind, end, how = "placed", "end", "ended"
         try:
             for reference in actor.messages.options(num_returns="streaming").remote():
                 send(kind, number, ray.get(reference))
                 kind = "message"
-            ray.kill(actor)  # it has come to its end
-        except RayError as error:
-            how = f"{type(error).__name__}\n{error}"
+        except RayError as error:  # its node ended, or cannot be reached, where nobody knows what became of it
+            end, how = "lost" if isinstance(error, ActorUnavailableError) else "end", f"{type(error).__name__}\n{error}"
         del actors[number]
-        send("end", number, how.encode())
+        send(end, number, how.encode())
+        with suppress(RayError):
+            ray.kill(actor)
 
     def tell_nodes() -> None:
         own = ray.get_runtime_context().get_node_id()
@@ -105,18 +106,19 @@ def main(descriptor: int) -> None:
         send("fault", 0, str(error).partition("\n")[0].rstrip(".").encode())
         return
     threading.Thread(target=tell_nodes, name="nodes", daemon=True).start()
-    make, tell = ray.remote(Actor), {"concurrency_group": "tell"}  # whose single thread keeps messages in order
+    groups: Any = {"concurrency_groups": {"tell": 1}}  # whose single thread keeps messages in order
+    make = ray.remote(**groups)(Actor)
     with suppress(EOFError, OSError):
         while True:
             kind, number, data = unpack(pipe.recv_bytes())
             if kind == "stop":
                 break
             if kind == "start":
-                options = json.loads(data) | {"scheduling_strategy": "SPREAD", "concurrency_groups": {"tell": 1}}
+                options = json.loads(data) | {"scheduling_strategy": "SPREAD"}
                 actors[number] = make.options(**options).remote()
                 threading.Thread(target=follow, args=(number, actors[number]), daemon=True).start()
             elif (actor := actors.get(number)) is not None and kind == "message":
-                actor.tell.options(**tell).remote(data)
+                actor.tell.options(concurrency_group="tell").remote(data)
             elif actor is not None:
                 ray.kill(actor)
     ray.shutdown()

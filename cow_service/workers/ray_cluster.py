@@ -85,7 +85,7 @@ class ActorLink:
             how, _, details = data.decode().partition("\n")
             if details and not self._ended.is_set():
                 log.warning("a Ray actor ended: %s", details)
-            self.end(how)
+            self.end(how, is_lost=kind == "lost")
 
     def end(self, how: str, *, is_lost: bool = False) -> None:
         """Nothing more comes from the actor."""
@@ -151,12 +151,12 @@ class Cluster(BackgroundThread):
                 while True:
                     kind, number, data = unpack(bridge.pipe.recv_bytes(MAX_MESSAGE_BYTES))
                     if kind == "nodes":
-                        self._note_nodes(json.loads(data))
+                        self.note_nodes(json.loads(data))
                     elif kind == "fault":
                         why = data.decode()
                     elif number in self._links:
                         self._links[number].receive(kind, data)
-                        if kind == "end":
+                        if kind in ("end", "lost"):
                             del self._links[number]
             except (EOFError, OSError):
                 bridge.process.kill()  # also where it sent a message that is too long
@@ -176,13 +176,14 @@ class Cluster(BackgroundThread):
                 raise OSError("not connected")
             self._pipe.send_bytes(frame)
 
-    def _note_nodes(self, nodes: list[tuple[str, dict[str, float]]]) -> None:
+    def note_nodes(self, nodes: list[tuple[str, dict[str, float]]]) -> None:
+        """Takes the nodes that are alive: the host of each, and its resources."""
         self._heard, fault = time.monotonic(), None
         others = {host for host, _ in nodes} - {platform.node()}
         if others and not self._is_shared:
             fault = (
                 f"The Ray cluster COW_RAY={self.address} has nodes on other machines, such as {min(others)}: set "
-                "COW_DATABASE_URL to a PostgreSQL, and COW_ARTIFACTS to an object store or a folder that all of them have."
+                "COW_DATABASE_URL to a PostgreSQL, and COW_ARTIFACTS to an object store or a folder that all have."
             )
         self.nodes = () if fault else tuple(resources for _, resources in nodes)
         self._fault = fault
@@ -232,6 +233,9 @@ class ActorGroup(Group):
         self.places = PrioritySemaphore(UNLIMITED)
         self._cluster, self._waiting = cluster, 0
         self._fit()
+
+    def start(self) -> None:
+        """Does nothing: there are no nodes yet. `fill` starts the first actors."""
 
     def alive(self) -> list[Worker]:
         """Those that have a place."""
