@@ -80,7 +80,6 @@ def test_jobs_wait_while_the_head_is_away(served: Served, nodes: RayNodes) -> No
     for one in (job, waits):
         assert served.ended(one["id"])["status"] == "succeeded"
     assert served.http.get("/readyz").is_success
-    assert served.clips().count(300) == 2
 
 
 def test_a_server_that_others_cannot_share_takes_no_nodes_of_other_machines(
