@@ -111,8 +111,6 @@ def main(descriptor: int) -> None:
     with suppress(EOFError, OSError):
         while True:
             kind, number, data = unpack(pipe.recv_bytes())
-            if kind == "stop":
-                break
             if kind == "start":
                 options = json.loads(data) | {"scheduling_strategy": "SPREAD"}
                 actors[number] = make.options(**options).remote()

@@ -15,12 +15,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from itertools import count
-from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
 from pydantic_core import to_json
 
-from cow_service.concurrency import BackgroundThread, PrioritySemaphore, spawn
+from cow_service.concurrency import BackgroundThread, PrioritySemaphore, Spawned, spawn
 from cow_service.errors import install_line
 from cow_service.jobs.queues import LIGHT, places, queue_of
 from cow_service.observability.metrics import Metrics
@@ -101,14 +100,13 @@ class Cluster(BackgroundThread):
     def __init__(self, settings: Settings) -> None:
         super().__init__("cow-ray")
         self.address = settings.ray or ""
-        url = settings.database_url
-        self._is_shared = url is not None and settings.artifacts is not None
-        self._is_shared &= url is None or not url.get_secret_value().startswith("sqlite")
+        url = settings.database_url.get_secret_value() if settings.database_url is not None else ""
+        self._is_shared = url.startswith("postgres") and settings.artifacts is not None
         self.nodes: tuple[dict[str, float], ...] = ()  # the resources of each that can be used
         self.starved = set[str]()  # queues whose jobs wait for an actor that finds no place
         self._fault: str | None = f"The Ray cluster COW_RAY={self.address} is being connected to. Ask again later."
         self._heard = 0.0
-        self._pipe: Connection | None = None
+        self._bridge: Spawned | None = None
         self._sending, self._links, self._numbers = threading.Lock(), dict[int, ActorLink](), count(1)
 
     @property
@@ -136,19 +134,20 @@ class Cluster(BackgroundThread):
     def stop(self) -> None:
         """Ends the connection, and with it every actor."""
         self._stop.set()
-        with suppress(OSError):
-            self._send(pack("stop"))
+        with self._sending:
+            if self._bridge is not None:
+                self._bridge.process.kill()
         super().stop()
 
     def run(self) -> None:
         """Connects, and hands each message to the actor's link that it is for."""
         while not self._stop.is_set():
-            bridge, why = spawn(MODULE), "the connection ended"
             with self._sending:
-                self._pipe = bridge.pipe
+                bridge = self._bridge = spawn(MODULE)
+            why = "the connection ended"
             try:
                 self._send(self.address.encode())
-                while True:
+                while not self._stop.is_set():
                     kind, number, data = unpack(bridge.pipe.recv_bytes(MAX_MESSAGE_BYTES))
                     if kind == "nodes":
                         self.note_nodes(json.loads(data))
@@ -159,10 +158,12 @@ class Cluster(BackgroundThread):
                         if kind in ("end", "lost"):
                             del self._links[number]
             except (EOFError, OSError):
-                bridge.process.kill()  # also where it sent a message that is too long
+                pass
             with self._sending:
-                self._pipe = None
+                self._bridge = None
+            bridge.process.kill()  # also where it sent a message that is too long
             bridge.process.wait()
+            bridge.pipe.close()
             self.nodes = ()
             self._fault = f"The Ray cluster COW_RAY={self.address} cannot be reached: {why}."
             for number in list(self._links):
@@ -172,9 +173,9 @@ class Cluster(BackgroundThread):
 
     def _send(self, frame: bytes) -> None:
         with self._sending:
-            if self._pipe is None:
+            if self._bridge is None:
                 raise OSError("not connected")
-            self._pipe.send_bytes(frame)
+            self._bridge.pipe.send_bytes(frame)
 
     def note_nodes(self, nodes: list[tuple[str, dict[str, float]]]) -> None:
         """Takes the nodes that are alive: the host of each, and its resources."""
@@ -195,7 +196,7 @@ class ActorWorker(Worker):
     def __init__(
         self, name: str, settings: Settings, on_end: Callable[[Worker, EndReason], None], link: ActorLink
     ) -> None:
-        self.used = time.monotonic()  # when it last had a job, or was started
+        self.asked = self.used = time.monotonic()  # `used`: when it last had a job, or could have none
         super().__init__(name, settings, on_end, link)
 
     @property
@@ -259,8 +260,8 @@ class ActorGroup(Group):
                     coming = [one for one in actors if not one.is_placed]
                     if (best is None or self._taken[best]) and len(coming) < self._waiting:
                         self._start_another(self.size)
-                    began = max((one.started for one in coming), default=-math.inf)
-                    if best is not None and (not self._taken[best] or time.monotonic() - began > PLACE_SECONDS):
+                    asked = max((one.asked for one in coming), default=-math.inf)
+                    if best is not None and (not self._taken[best] or time.monotonic() - asked > PLACE_SECONDS):
                         self._taken[best] += 1
                         return best
                 check()
@@ -279,7 +280,7 @@ class ActorGroup(Group):
                 return
             self._start_another(min(self.fewest, self.size))
             now, crowded = time.monotonic(), bool(self._cluster.starved - {self.name})
-            has_late = any(not one.is_placed and now - one.started > PLACE_SECONDS for one in self._actors())
+            has_late = any(not one.is_placed and now - one.asked > PLACE_SECONDS for one in self._actors())
             (self._cluster.starved.add if self._waiting and has_late else self._cluster.starved.discard)(self.name)
             for one in self._actors():
                 spare = len(self.workers) > self.fewest
@@ -294,8 +295,8 @@ class ActorGroup(Group):
         return [one for one in self.workers if isinstance(one, ActorWorker)]
 
     def _fit(self) -> None:
-        nodes = bool(self._cluster.nodes)
-        self.size = self._cluster.room(self.needs) if self.most is None else self.most * nodes
+        room = self._cluster.room(self.needs)
+        self.size = room if self.most is None or not self._cluster.nodes else self.most  # there may be more nodes soon
 
     def _start_another(self, most: int) -> None:
         if len(self.workers) < most and time.monotonic() >= self._next_start and self._cluster.fault is None:
@@ -331,10 +332,10 @@ class RayCluster(WorkerPool):
     def fault(self) -> str | None:
         """Why jobs wait."""
         for group in self._default_groups():
-            if self.cluster.fault is None and group.size == 0:
-                assert isinstance(group, ActorGroup)
-                needs = ", ".join(f"{name} {amount:g}" for name, amount in group.needs.items())
-                return f"No node of the Ray cluster has room for jobs of the queue {group.name!r}, which need {needs}."
+            if self.cluster.fault is None and isinstance(group, ActorGroup) and group.size == 0:
+                unit = "GPU" if "GPU" in group.needs else "CPU"
+                needs = f"a {unit} and {group.needs['memory'] / 1e6:.0f} MB of memory"
+                return f"No node of the Ray cluster has {needs} for an actor of the queue {group.name!r}."
         return self.cluster.fault or super().fault()
 
     def _new_group(self, name: str) -> Group:
@@ -342,5 +343,5 @@ class RayCluster(WorkerPool):
 
     def _judge(self, worker: Worker, now: float) -> None:
         if not worker.link.pid and worker.is_alive:
-            return  # it waits for a place, however long
+            worker.started = now  # it waits for a place, however long
         super()._judge(worker, now)
