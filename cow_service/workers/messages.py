@@ -23,7 +23,6 @@ class Pipe(Protocol):
 
     def send_bytes(self, buf: bytes, /) -> None:
         """Sends one message."""
-        ...
 
     def recv_bytes(self, maxlength: int | None = None, /) -> bytes:
         """Waits for the next message. Raises `OSError` for one that is longer."""

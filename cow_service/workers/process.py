@@ -60,7 +60,6 @@ class Link(messages.Pipe, Protocol):
 
     def kill(self) -> None:
         """Ends it at once."""
-        ...
 
     def wait(self, seconds: float | None = None) -> str:
         """Waits until it has ended; returns how. Raises `TimeoutError`."""
@@ -68,7 +67,6 @@ class Link(messages.Pipe, Protocol):
 
     def close(self) -> None:
         """Releases what leads to a worker that has ended."""
-        ...
 
 
 class Child:

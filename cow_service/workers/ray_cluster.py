@@ -26,7 +26,7 @@ from cow_service.observability.metrics import Metrics
 from cow_service.settings import WORKER_BYTES, Settings, SettingsError
 from cow_service.workers.messages import MAX_MESSAGE_BYTES
 from cow_service.workers.pool import POLL_SECONDS, Group, WorkerPool
-from cow_service.workers.process import EndReason, Worker
+from cow_service.workers.process import Worker
 from cow_service.workers.ray_bridge import pack, unpack
 
 MODULE = "cow_service.workers.ray_bridge"  # what the bridge runs
@@ -67,6 +67,8 @@ class ActorLink:
 
     def wait(self, seconds: float | None = None) -> str:
         """As `Link` says."""
+        if seconds is not None and not self.pid:
+            raise TimeoutError  # it has no place, and hears nothing
         if not self._ended.wait(seconds):
             raise TimeoutError
         return self._how
@@ -190,27 +192,6 @@ class Cluster(BackgroundThread):
         self._fault = fault
 
 
-class ActorWorker(Worker):
-    """A worker that is an actor."""
-
-    def __init__(
-        self, name: str, settings: Settings, on_end: Callable[[Worker, EndReason], None], link: ActorLink
-    ) -> None:
-        self.asked = self.used = time.monotonic()  # `used`: when it last had a job, or could have none
-        super().__init__(name, settings, on_end, link)
-
-    @property
-    def is_placed(self) -> bool:
-        """Whether a node has it."""
-        return self.link.pid > 0
-
-    def close(self, end_reason: EndReason = "stopped") -> None:
-        """Ends the actor. It has no jobs."""
-        if not self.is_placed:
-            self.kill(end_reason, "was not needed")
-        super().close(end_reason)
-
-
 class ActorGroup(Group):
     """The actors for one kind of jobs: from the fewest to the most that the settings allow, as jobs need them."""
 
@@ -233,6 +214,7 @@ class ActorGroup(Group):
         self._settings = self._settings.model_copy(update={"ray": None, **own})
         self.places = PrioritySemaphore(UNLIMITED)
         self._cluster, self._waiting = cluster, 0
+        self._idle: dict[Worker, float] = {}  # since when each has had nothing to do
         self._fit()
 
     def start(self) -> None:
@@ -253,14 +235,14 @@ class ActorGroup(Group):
             while True:
                 with self._lock:
                     self._remove_dead()
-                    actors = self._actors()
                     limit = 1 if fresh else self.jobs_each
-                    free = [one for one in actors if one.is_alive and one.is_placed and self._taken[one] < limit]
+                    placed = [one for one in self.workers if one.link.pid and one.is_alive]
+                    free = [one for one in placed if self._taken[one] < limit]
                     best = min(free, key=lambda one: (self._taken[one], not one.is_loaded), default=None)
-                    coming = [one for one in actors if not one.is_placed]
+                    coming = [one for one in self.workers if not one.link.pid]
                     if (best is None or self._taken[best]) and len(coming) < self._waiting:
                         self._start_another(self.size)
-                    asked = max((one.asked for one in coming), default=-math.inf)
+                    asked = max((one.heard for one in coming), default=-math.inf)
                     if best is not None and (not self._taken[best] or time.monotonic() - asked > PLACE_SECONDS):
                         self._taken[best] += 1
                         return best
@@ -280,19 +262,17 @@ class ActorGroup(Group):
                 return
             self._start_another(min(self.fewest, self.size))
             now, crowded = time.monotonic(), bool(self._cluster.starved - {self.name})
-            has_late = any(not one.is_placed and now - one.asked > PLACE_SECONDS for one in self._actors())
+            has_late = any(not one.link.pid and now - one.heard > PLACE_SECONDS for one in self.workers)
             (self._cluster.starved.add if self._waiting and has_late else self._cluster.starved.discard)(self.name)
-            for one in self._actors():
-                spare = len(self.workers) > self.fewest
-                if self._taken[one] or not (one.is_loaded or (spare and not one.is_placed and not self._waiting)):
-                    one.used = now
-                elif crowded or (spare and now - one.used > (IDLE_SECONDS if one.is_placed else PLACE_SECONDS)):
+            free = [one for one in self.workers if not self._taken[one]]
+            free = [one for one in free if one.is_loaded or not (one.link.pid or self._waiting)]
+            self._idle = {one: self._idle.get(one, now) for one in free}
+            for one, since in self._idle.items():
+                limit = IDLE_SECONDS if one.is_loaded else PLACE_SECONDS
+                if (crowded and one.is_loaded) or (len(self.workers) > self.fewest and now - since > limit):
                     self.workers.remove(one)
                     del self._taken[one]
                     threading.Thread(target=one.close, args=("renewed",), name="cow-actor-end", daemon=True).start()
-
-    def _actors(self) -> list[ActorWorker]:
-        return [one for one in self.workers if isinstance(one, ActorWorker)]
 
     def _fit(self) -> None:
         room = self._cluster.room(self.needs)
@@ -303,7 +283,7 @@ class ActorGroup(Group):
             self._start()
 
     def _make(self, name: str) -> Worker:
-        return ActorWorker(name, self._settings, self._note_end, self._cluster.open_actor(self.needs))
+        return Worker(name, self._settings, self._note_end, self._cluster.open_actor(self.needs))
 
 
 class RayCluster(WorkerPool):

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import os
+import platform
 import signal
 from collections.abc import Iterator
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from pydantic_core import to_json
 from ray_nodes import RayNodes
 from servers import Served, problem, slow
-from waiting import eventually
+from waiting import TIME_LIMIT, eventually
 from worker_contract import GIVES_UP_SOONER, Contract, workers_told
 
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings, SettingsError, load_settings
+from cow_service.workers import messages, process, ray_cluster
 
 pytestmark = pytest.mark.slow
 
@@ -88,22 +91,48 @@ def test_jobs_wait_while_the_head_is_away(served: Served, nodes: RayNodes) -> No
     assert served.http.get("/readyz").is_success
 
 
-def test_a_server_that_others_cannot_share_takes_no_nodes_of_other_machines(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from cow_service.workers.ray_cluster import Cluster
-
+def test_a_server_that_others_cannot_share_takes_no_nodes_of_other_machines() -> None:
     there = [("another", {"CPU": 4.0, "memory": 1e12})]
     for own, room in (({}, 0), ({"database_url": "postgresql://cow@db/cow", "artifacts": "s3://cow"}, 4)):
-        cluster = Cluster(Settings(ray="auto", **own))
+        cluster = ray_cluster.Cluster(Settings(ray="auto", **own))
         cluster.note_nodes(there)
         assert cluster.room({"CPU": 1.0, "memory": 1e9}) == room
         assert ("COW_DATABASE_URL" in (cluster.fault or "")) == (room == 0)
 
 
-def test_what_is_missing_or_wrong_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    from cow_service.workers import ray_cluster
+def test_an_idle_actor_gives_its_place_to_jobs_of_another_queue(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_cluster, "PLACE_SECONDS", 0.0)
+    monkeypatch.setattr(process, "END_SECONDS", 0.1)
+    cluster, links = ray_cluster.Cluster(Settings(ray="auto")), list[ray_cluster.ActorLink]()
+    cluster.note_nodes([(platform.node(), {"CPU": 1.0, "memory": 1e12})])
 
+    def open_actor(needs: dict[str, float]) -> ray_cluster.ActorLink:
+        links.append(ray_cluster.ActorLink(len(links), lambda frame: None))
+        return links[-1]
+
+    monkeypatch.setattr(cluster, "open_actor", open_actor)
+    settings = Settings(ray="auto", generator_concurrency={"slow": 1})
+    light, other = (ray_cluster.ActorGroup(name, settings, Metrics(), cluster) for name in ("light", "slow"))
+    light.fill()
+    (idle,) = light.workers
+    links[0].receive("placed", b"1")
+    links[0].receive("message", to_json(messages.Loaded(None)))
+    eventually(lambda: idle.is_loaded)
+    light.fill()
+    assert light.workers == [idle], "it is the fewest that there are to be"
+    with ThreadPoolExecutor() as jobs:
+        taken = jobs.submit(other.take, lambda: None)
+        eventually(lambda: len(links) == 2)
+        other.fill()
+        light.fill()
+        assert light.workers == []
+        assert links[0].wait(TIME_LIMIT) == "killed"
+        links[1].receive("placed", b"2")
+        assert [taken.result(TIME_LIMIT)] == other.workers
+    links[1].kill()
+
+
+def test_what_is_missing_or_wrong_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SettingsError, match="COW_RAY"):
         load_settings(ray="ray://head:10001")
     monkeypatch.setattr(ray_cluster, "find_spec", lambda name: None)
