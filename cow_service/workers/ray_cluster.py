@@ -21,9 +21,11 @@ from pydantic_core import to_json
 
 from cow_service.concurrency import BackgroundThread, PrioritySemaphore, Spawned, spawn
 from cow_service.errors import install_line
+from cow_service.generators.wan.profiles import profile_of
 from cow_service.jobs.queues import LIGHT, places, queue_of
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import WORKER_BYTES, Settings, SettingsError
+from cow_service.weights.manifests import find_manifest
 from cow_service.workers.messages import MAX_MESSAGE_BYTES
 from cow_service.workers.pool import POLL_SECONDS, Group, WorkerPool
 from cow_service.workers.process import Worker
@@ -201,14 +203,15 @@ class ActorGroup(Group):
         if name == LIGHT and self.most:  # which share the calls of an MLLM
             settings = settings.model_copy(update={"concurrency": self.most})
         super().__init__(name, settings, metrics)
-        has_device = places(name) is not None
-        gpus = settings.device != "cpu" and (has_device or settings.perception == "gpu")
-        # One that has a GPU to itself takes no core, so that light jobs on its node do not keep it waiting.
-        self.needs = {"GPU": 1.0} if gpus else {}
-        if not (gpus and has_device):
-            self.needs["CPU"] = 1.0
-        limit = settings.worker_memory_mb
-        self.needs["memory"] = limit * 1e6 if limit else WORKER_BYTES
+        limit, manifest = settings.worker_memory_mb, find_manifest(name)
+        self.needs = {"CPU": 1.0, "memory": limit * 1e6 if limit else WORKER_BYTES}
+        if settings.device != "cpu" and places(name) is not None:
+            del self.needs["CPU"]  # jobs of other actors on its node do not keep it waiting
+            self.needs["GPU"] = 1
+            if manifest is not None and manifest.role == "generator" and settings.profile in manifest.profiles:
+                self.needs["GPU"] = profile_of(manifest, settings.profile).acceleration.ranks
+        elif settings.device != "cpu" and settings.perception == "gpu":
+            self.needs["GPU"] = 1
         # Ray shows each actor its own GPU alone.
         own = {"device": "cuda"} if settings.device.startswith("cuda") else {}
         self._settings = self._settings.model_copy(update={"ray": None, **own})
@@ -313,9 +316,10 @@ class RayCluster(WorkerPool):
         """Why jobs wait."""
         for group in self._default_groups():
             if self.cluster.fault is None and isinstance(group, ActorGroup) and group.size == 0:
-                unit = "GPU" if "GPU" in group.needs else "CPU"
-                needs = f"a {unit} and {group.needs['memory'] / 1e6:.0f} MB of memory"
-                return f"No node of the Ray cluster has {needs} for an actor of the queue {group.name!r}."
+                needs = [f"{amount:g} {name}" for name, amount in group.needs.items() if name != "memory"]
+                memory = f"{group.needs['memory'] / 1e6:.0f} MB of memory"
+                told = ", ".join([*needs, memory])
+                return f"No node of the Ray cluster has what an actor of the queue {group.name!r} needs: {told}."
         return self.cluster.fault or super().fault()
 
     def _new_group(self, name: str) -> Group:

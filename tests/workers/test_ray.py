@@ -12,6 +12,7 @@ import pytest
 from pydantic_core import to_json
 from ray_nodes import RayNodes
 from servers import Served, problem, slow
+from tables import rows
 from waiting import TIME_LIMIT, eventually
 from worker_contract import GIVES_UP_SOONER, Contract, workers_told
 
@@ -130,6 +131,25 @@ def test_an_idle_actor_gives_its_place_to_jobs_of_another_queue(monkeypatch: pyt
         links[1].receive("placed", b"2")
         assert [taken.result(TIME_LIMIT)] == other.workers
     links[1].kill()
+
+
+@pytest.mark.parametrize(
+    ("queue", "own", "needs"),
+    rows(
+        {
+            "light": ("light", {}, {"CPU": 1}),
+            "vision on a GPU": ("light", {"perception": "gpu"}, {"CPU": 1, "GPU": 1}),
+            "a clip": ("ati", {}, {"GPU": 1}),
+            "a clip on two GPUs": ("ati", {"profile": "exact-2"}, {"GPU": 2}),
+            "an MLLM": ("local", {"reader": "local"}, {"GPU": 1}),
+            "no GPU": ("ati", {"device": "cpu"}, {"CPU": 1}),
+        }
+    ),
+)
+def test_an_actor_asks_for_what_its_backend_takes(queue: str, own: dict[str, str], needs: dict[str, float]) -> None:
+    settings = Settings.model_validate({"ray": "auto", "worker_memory_mb": 500.0, **own})
+    group = ray_cluster.ActorGroup(queue, settings, Metrics(), ray_cluster.Cluster(settings))
+    assert group.needs == {**needs, "memory": 5e8}
 
 
 def test_what_is_missing_or_wrong_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
