@@ -14,7 +14,7 @@ TOOLS ?= .tools
 # The images' Python and every machine; torch as the tests hold it, and none without the extras of video models.
 LOCK = $(TOOLS)/bin/uv pip compile --quiet --python-version 3.13 --universal --generate-hashes --no-annotate \
 	--custom-compile-command "make lock" --constraint tests/constraints.txt $(UPGRADE)
-CPU_EXTRAS := --extra providers --extra otel --extra mcp --extra objects
+CPU_EXTRAS := --extra providers --extra otel --extra mcp --extra objects --extra ray
 CUDA_EXTRAS := $(CPU_EXTRAS) --extra wan --extra fp8 --extra local
 
 demo: $(VENV)/.base ## run the main job on an example

@@ -125,6 +125,14 @@ class Settings(BaseSettings):
     workers: bool = True
     """Compute in separate worker processes; 0: in the server's own process, where a crash ends every job and only one
     job computes at a time."""
+    ray: str | None = Field(default=None, pattern=r"^(auto|[A-Za-z0-9._-]+:\d{1,5})$")
+    """Compute on a Ray cluster: auto, or HOST:PORT of its head. This machine must be one of its nodes. By default jobs
+    are computed by worker processes of this machine."""
+    ray_actors: dict[str, tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1, le=MAX_WORKERS)]]] = Field(
+        default_factory=dict
+    )
+    """Fewest and most Ray actors of a queue, as JSON: name to [fewest, most]; by default from 1 (default queues) or 0
+    to as many as the nodes have room for. Where nodes come and go as needed, set the most."""
     role: Literal["all", "api"] = "all"
     """What a server does: all accepts requests and computes them; api only accepts them, and needs `cow worker` on the
     same job database."""

@@ -62,6 +62,7 @@ FIRST = (
     "test_chaos.py",
     "test_jobs.py",
     "test_page.py",
+    "test_ray.py",
     "test_slow_starts.py",
     "test_workers.py",
 )

@@ -22,6 +22,7 @@ from cow_service.errors import CowError, InvalidRequest, install_line
 if TYPE_CHECKING:
     from cow_service.service import Service
     from cow_service.settings import Settings
+    from cow_service.workers.pool import WorkerPool
 
 # Log levels of libraries that print notes when they are imported, such as on optional packages.
 QUIET = {"TRANSFORMERS_VERBOSITY": "error", "DIFFUSERS_VERBOSITY": "error"}
@@ -41,16 +42,9 @@ def serve(
     with quick_imports():
         service = _served(host=host, port=port, role=role)
         check_port(service.settings)
-        from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
-
         settings = service.settings
-        pool = (
-            WorkerPool(settings, service.metrics, service.artifacts)
-            if settings.workers and settings.role == "all"
-            else None
-        )
-        if pool is not None:
-            pool.start()  # its processes start while the server's modules are imported
+        computes = settings.role == "all" and (settings.workers or settings.ray is not None)
+        pool = _start_pool(service) if computes else None  # while the server's modules are imported
         from cow_service.api.app import warn_if_open  # noqa: PLC0415
         from cow_service.server import run_server  # noqa: PLC0415
 
@@ -69,10 +63,7 @@ def worker(
     named = None if queues is None else tuple(name.strip() for name in queues.split(",") if name.strip())
     with quick_imports():
         service = _served(queues=named)
-        from cow_service.workers.pool import WorkerPool  # noqa: PLC0415
-
-        pool = WorkerPool(service.settings, service.metrics, service.artifacts)
-        pool.start()
+        pool = _start_pool(service)
         from cow_service.observability import tracing  # noqa: PLC0415
         from cow_service.server import run_worker  # noqa: PLC0415
 
@@ -190,7 +181,7 @@ def open_service(*, ahead: bool = False, **overrides: Any) -> Service:
     for name, level in QUIET.items():
         os.environ.setdefault(name, level)
     settings = load_settings(**overrides)
-    if ahead and settings.workers and settings.role == "all":
+    if ahead and settings.workers and settings.role == "all" and settings.ray is None:
         from cow_service.concurrency import spawn_ahead  # noqa: PLC0415
 
         spawn_ahead("cow_service.workers")
@@ -218,6 +209,17 @@ def end_well() -> None:
     While uvicorn serves it has a handler of its own, which raises the signal again when all is closed.
     """
     signal.signal(signal.SIGTERM, lambda number, frame: os._exit(0))
+
+
+def _start_pool(service: Service) -> WorkerPool:
+    """What computes the jobs: processes of this machine, or a Ray cluster."""
+    if service.settings.ray is None:
+        from cow_service.workers.pool import WorkerPool as Pool  # noqa: PLC0415
+    else:
+        from cow_service.workers.ray_cluster import RayCluster as Pool  # noqa: PLC0415
+    pool = Pool(service.settings, service.metrics, service.artifacts)
+    pool.start()
+    return pool
 
 
 @contextmanager

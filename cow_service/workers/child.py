@@ -1,4 +1,4 @@
-"""The main program of a worker process, on one end of a pipe.
+"""The main program of a worker, on one end of a pipe.
 
 It ends as soon as the pipe does, whatever it is doing: the process that started it is gone then, and another one takes
 its jobs.
@@ -91,7 +91,7 @@ class _Job:
 class WorkerProcess:
     """Computes the jobs that come over a pipe, each in a thread."""
 
-    def __init__(self, pipe: Connection, settings: Settings) -> None:
+    def __init__(self, pipe: messages.Pipe, settings: Settings) -> None:
         self._pipe = pipe
         self._sending = threading.Lock()
         self._service = Service(settings)
@@ -156,8 +156,14 @@ def main(descriptor: int) -> None:
     """Works on the pipe of a file descriptor until it ends."""
     leave_decisions_to_the_parent()
     return_large_blocks()
+    work(Connection(descriptor))
+    tracing.stop()
+    os._exit(0)  # threads may be at work; their results are not wanted
+
+
+def work(pipe: messages.Pipe) -> None:
+    """Works on a pipe until it ends. Jobs may still be at work then; their results are not wanted."""
     cv2.setNumThreads(1)  # a process for each core: threads of their own would take a quarter more time, all together
-    pipe = Connection(descriptor)
     try:
         first = messages.receive_by_worker(pipe)
         assert isinstance(first, messages.Begin)
@@ -167,5 +173,3 @@ def main(descriptor: int) -> None:
         WorkerProcess(pipe, settings).run()
     except (EOFError, OSError):
         pass
-    tracing.stop()
-    os._exit(0)  # threads may be at work; their results are not wanted

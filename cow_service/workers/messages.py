@@ -5,8 +5,7 @@ data: of a limited size, and checked.
 """
 
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import Field, TypeAdapter
 from pydantic_core import to_json
@@ -17,6 +16,17 @@ from cow_service.records import GpuMemory, WorkerLoad
 from cow_service.requests import Stage
 
 MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
+
+
+class Pipe(Protocol):
+    """What messages go through. Its methods raise `OSError` or `EOFError` once the other end is gone."""
+
+    def send_bytes(self, buf: bytes, /) -> None:
+        """Sends one message."""
+
+    def recv_bytes(self, maxlength: int | None = None, /) -> bytes:
+        """Waits for the next message. Raises `OSError` for one that is longer."""
+        ...
 
 
 # To the worker.
@@ -146,20 +156,20 @@ _TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(Annotated[ToWorker, Field(discri
 _FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])
 
 
-def send(connection: Connection, message: ToWorker | FromWorker) -> None:
+def send(pipe: Pipe, message: ToWorker | FromWorker) -> None:
     """Sends a message. Only one thread may do so at a time. Raises `OSError` if the other process has ended."""
-    connection.send_bytes(to_json(message))
+    pipe.send_bytes(to_json(message))
 
 
-def receive_by_worker(connection: Connection) -> ToWorker:
+def receive_by_worker(pipe: Pipe) -> ToWorker:
     """Waits for the next message to a worker. Raises `OSError` or `EOFError` if the server has ended."""
-    return _TO_WORKER.validate_json(connection.recv_bytes())
+    return _TO_WORKER.validate_json(pipe.recv_bytes())
 
 
-def receive_from_worker(connection: Connection) -> FromWorker:
+def receive_from_worker(pipe: Pipe) -> FromWorker:
     """Waits for the next message of a worker.
 
     Raises `OSError` or `EOFError` if it has ended, and for a message that is too long; `ValidationError` for what is
     no message.
     """
-    return _FROM_WORKER.validate_json(connection.recv_bytes(MAX_MESSAGE_BYTES))
+    return _FROM_WORKER.validate_json(pipe.recv_bytes(MAX_MESSAGE_BYTES))

@@ -146,10 +146,13 @@ class Group:
         name = next(name for number in count(1) if (name := f"{self.name}-{number}") not in names)
         if self._latest is not None and self._latest.is_loaded:
             self._failed_starts = 0
-        worker = self._latest = Worker(name, self._settings, self._note_end)
+        worker = self._latest = self._make(name)
         self.workers.append(worker)
         self._taken[worker] = 0
         return worker
+
+    def _make(self, name: str) -> Worker:
+        return Worker(name, self._settings, self._note_end)
 
     def _remove_dead(self) -> None:
         """Lets go of workers that ended without a job."""
@@ -185,7 +188,7 @@ class WorkerPool(Computer):
         self._groups: dict[str, Group] = {}
         self._closed = threading.Event()
         limit = settings.worker_memory_mb
-        self._memory_limit = limit * 1e6 if limit else settings.memory
+        self._memory_limit, self._memory_of_all = limit * 1e6 if limit else settings.memory, settings.memory
         self._watching: threading.Thread | None = None
 
     def start(self) -> None:
@@ -218,8 +221,8 @@ class WorkerPool(Computer):
         if self._settings.queues and name not in self._settings.queues:
             return 0
         manifest = find_manifest(name)
-        if manifest is not None and manifest.missing_modules():
-            return 0
+        if self._settings.ray is None and manifest is not None and manifest.missing_modules():
+            return 0  # nodes of a cluster may have what this machine lacks
         group = self._group(name)
         return group.size * group.jobs_each
 
@@ -278,7 +281,7 @@ class WorkerPool(Computer):
                     if crashes >= MAX_CRASHES:
                         raise
                 except WorkerGone as gone:
-                    if gone.never_began:  # no fault of the job, which waits for a worker that can start
+                    if gone.is_blameless:  # the job waits for another worker
                         continue
                     crashes += alone
                     log.warning("the worker of job %s %s", work.job.id, gone)
@@ -305,8 +308,11 @@ class WorkerPool(Computer):
     def _group(self, name: str) -> Group:
         with self._guard:
             if name not in self._groups:
-                self._groups[name] = Group(name, self._settings, self._metrics)
+                self._groups[name] = self._new_group(name)
             return self._groups[name]
+
+    def _new_group(self, name: str) -> Group:
+        return Group(name, self._settings, self._metrics)
 
     def _watch(self) -> None:
         """Ends workers that are frozen or too large, and starts others for those that could not start."""
@@ -336,7 +342,7 @@ class WorkerPool(Computer):
         """Ends the worker whose jobs take most, where all workers together take more than they may."""
         workers = [worker for group in self.groups for worker in group.alive()]
         together, idle = sum(one.memory_bytes for one in workers), sum(one.idle_bytes for one in workers)
-        if idle < self._settings.memory < together:
+        if idle < self._memory_of_all < together:
             largest = max(workers, key=lambda one: one.memory_bytes - one.idle_bytes)
             reason = f"was ended, as all workers used {together / 1e6:.0f} MB, and it took most of that for its jobs"
             largest.kill("memory", reason, is_final=True)

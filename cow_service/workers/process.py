@@ -1,4 +1,4 @@
-"""A worker process as seen by the process that started it."""
+"""A worker as seen by the process that started it: a process of this machine, or what another `Link` leads to."""
 
 import logging
 import math
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from queue import Empty, SimpleQueue
-from typing import Literal
+from typing import Literal, Protocol
 
 from pydantic import ValidationError
 
@@ -36,21 +36,71 @@ log = logging.getLogger("cow_service")
 class WorkerGone(Exception):
     """The process ended, or was ended, while it had the job. The text says why.
 
-    `is_final`: it would be the same in another process. `never_began`: the process was not done with loading, and had
-    not begun the job.
+    `is_final`: it would be the same in another process. `is_blameless`: the job has no part in it. The process was not
+    done with loading, and had not begun the job, or the way to it was lost.
     """
 
-    def __init__(self, reason: str, *, is_final: bool, never_began: bool) -> None:
+    def __init__(self, reason: str, *, is_final: bool, is_blameless: bool) -> None:
         super().__init__(reason)
-        self.is_final, self.never_began = is_final, never_began
+        self.is_final, self.is_blameless = is_final, is_blameless
+
+
+class Link(messages.Pipe, Protocol):
+    """The way to a worker: messages, and its end."""
+
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        ...
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether only the way to it has ended, whatever became of the worker."""
+        ...
+
+    def kill(self) -> None:
+        """Ends it at once."""
+
+    def wait(self, seconds: float | None = None) -> str:
+        """Waits until it has ended; returns how. Raises `TimeoutError`."""
+        ...
+
+    def close(self) -> None:
+        """Releases what leads to a worker that has ended."""
+
+
+class Child:
+    """The way to a child process, a `Link`."""
+
+    is_lost = False
+
+    def __init__(self) -> None:
+        spawned = spawn(MODULE)
+        self._process, self._pipe = spawned.process, spawned.pipe
+        self.pid, self.kill, self.close = self._process.pid, self._process.kill, self._pipe.close
+        self.send_bytes, self.recv_bytes = self._pipe.send_bytes, self._pipe.recv_bytes
+
+    def wait(self, seconds: float | None = None) -> str:
+        """As `Link` says."""
+        try:
+            code = self._process.wait(seconds)
+        except subprocess.TimeoutExpired as error:
+            raise TimeoutError from error
+        return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
 class Worker:
-    """One worker process, from its start to its end. Safe to use from every thread."""
+    """One worker, from its start to its end. Safe to use from every thread."""
 
-    def __init__(self, name: str, settings: Settings, on_end: Callable[["Worker", EndReason], None]) -> None:
-        """`on_end` is called once, when the process has ended."""
-        spawned = spawn(MODULE)
+    def __init__(
+        self,
+        name: str,
+        settings: Settings,
+        on_end: Callable[["Worker", EndReason], None],
+        link: Link | None = None,
+    ) -> None:
+        """`on_end` is called once, when it has ended. `link`: by default a new child process."""
+        self.link: Link = Child() if link is None else link
         self.name = name
         self.jobs_done = 0
         self.memory_bytes = self.idle_bytes = 0  # resident; when it last had no job
@@ -58,7 +108,6 @@ class Worker:
         self.load: WorkerLoad | None = None
         self.started = self.heard = time.monotonic()  # `heard`: when it last sent a heartbeat
         self._job_timeout = settings.job_timeout
-        self._process, self._pipe = spawned.process, spawned.pipe
         self._sending = threading.Lock()
         self._inboxes: dict[str, SimpleQueue[messages.OfJob | None]] = {}
         self._loaded = threading.Event()  # or failed to, or ended before
@@ -74,7 +123,7 @@ class Worker:
     @property
     def pid(self) -> int:
         """The process."""
-        return self._process.pid
+        return self.link.pid
 
     @property
     def is_alive(self) -> bool:
@@ -89,8 +138,7 @@ class Worker:
     @property
     def end_reason(self) -> str:
         """Why it ended, or how, in words that go on after "the process"."""
-        code = self._process.wait()
-        return f"{self._reason} ({f'signal {-code}' if code < 0 else f'exit code {code}'})"
+        return f"{self._reason} ({self.link.wait()})"
 
     def wait_loaded(self, seconds: float) -> bool:
         """Waits until the default backends are loaded; returns whether they are. Raises the error of loading them.
@@ -116,7 +164,7 @@ class Worker:
     def kill(self, end_reason: EndReason, reason: str, *, is_final: bool = False) -> None:
         """Ends the process at once, also one that is stopped. Its jobs raise `WorkerGone`, which says the reason."""
         self._end_reason, self._reason, self._is_final = end_reason, reason, is_final
-        self._process.kill()
+        self.link.kill()
 
     def close(self, end_reason: EndReason = "stopped") -> None:
         """Ends the process. It has no jobs."""
@@ -124,12 +172,11 @@ class Worker:
             self._end_reason = end_reason
         self._send(messages.End())
         try:
-            self._process.wait(END_SECONDS)
-        except subprocess.TimeoutExpired:
+            self.link.wait(END_SECONDS)
+        except TimeoutError:
             self.kill(end_reason, "did not end")
-            self._process.wait()
         self._ended.wait()
-        self._pipe.close()
+        self.link.close()
 
     def _follow(
         self, work: Work, inbox: SimpleQueue[messages.OfJob | None], locks: KeyLocks, keys: ExitStack
@@ -185,18 +232,18 @@ class Worker:
     def _check_alive(self, begun: bool) -> None:
         """Raises `WorkerGone`."""
         if self._ended.is_set():
-            never_began = not (begun or self.is_loaded)
-            raise WorkerGone(self.end_reason, is_final=self._is_final, never_began=never_began)
+            is_blameless = self.link.is_lost or not (begun or self.is_loaded)
+            raise WorkerGone(self.end_reason, is_final=self._is_final, is_blameless=is_blameless)
 
     def _send(self, message: messages.ToWorker) -> None:
         with self._sending, suppress(OSError):  # its end is noticed where its messages are read
-            messages.send(self._pipe, message)
+            messages.send(self.link, message)
 
     def _listen(self) -> None:
         """Hands each message to the job that it is about, until the process has ended."""
         try:
             while True:
-                match messages.receive_from_worker(self._pipe):
+                match messages.receive_from_worker(self.link):
                     case messages.Heartbeat(memory_bytes=memory_bytes, gpus=gpus, load=load):
                         self.heard, self.memory_bytes = time.monotonic(), memory_bytes
                         self.gpus, self.load = gpus, load
@@ -210,7 +257,7 @@ class Worker:
                         if (inbox := self._inboxes.get(message.job_id)) is not None:
                             inbox.put(message)
         except (EOFError, OSError):
-            self._process.kill()  # also where it sent a message that is too long
+            self.link.kill()  # also where it sent a message that is too long
         except ValidationError:
             log.exception("the worker %s sent an invalid message", self.name)
             self.kill("crashed", "sent an invalid message, and was ended")

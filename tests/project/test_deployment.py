@@ -29,7 +29,7 @@ def resources() -> list[dict[str, Any]]:
 
 
 RESOURCES = resources()
-BUILT_IN = [one for one in RESOURCES if not one["apiVersion"].startswith("keda.sh/")]
+BUILT_IN = [one for one in RESOURCES if not one["apiVersion"].startswith("ray.io/")]
 DEPLOYMENTS = {one["metadata"]["name"]: one for one in RESOURCES if one["kind"] == "Deployment"}
 
 
@@ -86,43 +86,81 @@ def test_jobs_are_commands_and_one_of_them_alone_creates_the_tables() -> None:
     assert migrating["envFrom"] == container_of(DEPLOYMENTS["cow-api"])["envFrom"]
 
 
-def test_every_deployment_is_scaled_by_one_thing_and_workers_by_the_jobs_of_their_queue() -> None:
-    scalers = of_kind("ScaledObject") + of_kind("HorizontalPodAutoscaler")
-    assert sorted(one["spec"]["scaleTargetRef"]["name"] for one in scalers) == sorted(DEPLOYMENTS)
-    for scaled in of_kind("ScaledObject"):
-        container = container_of(DEPLOYMENTS[scaled["spec"]["scaleTargetRef"]["name"]])
-        (trigger,) = scaled["spec"]["triggers"]
-        queue = container["args"][container["args"].index("--queues") + 1]
-        assert f"queue = '{queue}'" in trigger["metadata"]["query"]
-        given = {one["name"]: one["value"] for one in container["env"]}
-        assert trigger["metadata"]["targetQueryValue"] == given.get("COW_CONCURRENCY", "1")
+def ray_groups() -> dict[str, dict[str, Any]]:
+    """The groups of nodes of the Ray cluster, and its head."""
+    (cluster,) = of_kind("RayCluster")
+    return {"head": cluster["spec"]["headGroupSpec"]} | {
+        one["groupName"]: one for one in cluster["spec"]["workerGroupSpecs"]
+    }
+
+
+@pytest.mark.parametrize("name", ray_groups())
+def test_nodes_of_the_ray_cluster_are_pods(name: str) -> None:
+    group, version = ray_groups()[name], kubernetes_validate.latest_version()
+    pod = {"apiVersion": "v1", "kind": "Pod", **group["template"]}
+    kubernetes_validate.validate(pod, version, strict=True)
+    (container,) = pod["spec"]["containers"]
+    (volumes,) = texts(IMAGES[container["image"]], "VOLUME")
+    mounts = {one["mountPath"]: one["name"] for one in container["volumeMounts"]}
+    assert mounts.keys() == {*json.loads(volumes), "/tmp", "/dev/shm"}
+    assert set(mounts.values()) == {one["name"] for one in pod["spec"]["volumes"]}
+    assert "KUBERAY_GEN_RAY_START_CMD" in container["command"][-1]
+    assert group.get("minReplicas", 1) <= group.get("replicas", 1) <= group.get("maxReplicas", 1)
+
+
+def test_actors_are_those_that_the_nodes_have_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    groups, (shared,) = ray_groups(), of_kind("ConfigMap")
+    (container,) = groups["jobs"]["template"]["spec"]["containers"]
+    assert "cow worker" in container["command"][-1]
+    own = {one["name"]: one["value"] for one in container["env"]}
+    settings = check_settings(monkeypatch, shared["data"] | own)
+    assert settings.ray == "auto"
+    assert groups["jobs"]["template"]["spec"]["terminationGracePeriodSeconds"] > longest_stop(settings)
+    for name, (fewest, most) in settings.ray_actors.items():
+        started = groups[name]["rayStartParams"]
+        places = int(started["num-cpus"]) if name == "light" else int(started["num-gpus"])
+        assert (fewest, most) == (groups[name]["minReplicas"] * places, groups[name]["maxReplicas"] * places)
+    assert {groups[name]["rayStartParams"]["num-cpus"] for name in ("head", "jobs", "ati")} == {"0"}
+    (cluster,) = of_kind("RayCluster")
+    locked = re.findall(r"^ray==(\S+)", (ROOT / "docker" / "locks" / "cpu.txt").read_text(), re.MULTILINE)
+    assert locked == [cluster["spec"]["rayVersion"]]
+
+
+def test_servers_are_scaled_by_one_thing() -> None:
+    (servers,) = of_kind("HorizontalPodAutoscaler")
+    assert [servers["spec"]["scaleTargetRef"]["name"]] == [*DEPLOYMENTS]
     for name, workload in DEPLOYMENTS.items():
         assert "replicas" not in workload["spec"], f"{name}: each update would set the number back"
         assert container_of(workload)["resources"]["requests"]["cpu"], "a share of which the autoscaler looks at"
-    (servers,) = of_kind("HorizontalPodAutoscaler")
-    assert servers["spec"]["scaleTargetRef"]["name"] == "cow-api"
     (budget,) = (one for one in of_kind("PodDisruptionBudget") if one["metadata"]["name"] == "cow-api")
     assert budget["spec"]["minAvailable"] < servers["spec"]["minReplicas"], "else no node can be emptied"
 
 
 def selects(selector: dict[str, Any], labels: dict[str, str]) -> bool:
-    said = [labels.get(one["key"]) not in one["values"] for one in selector.get("matchExpressions", ())]
+    said = [
+        (labels.get(one["key"]) in one["values"]) == (one["operator"] == "In")
+        for one in selector.get("matchExpressions", ())
+    ]
     return selector["matchLabels"].items() <= labels.items() and all(said)
 
 
-@pytest.mark.parametrize("name", DEPLOYMENTS)
+@pytest.mark.parametrize("name", ["cow-api", *ray_groups()])
 def test_pods_are_reached_where_they_listen_and_reach_what_they_need(name: str) -> None:
-    template = DEPLOYMENTS[name]["spec"]["template"]
-    policies = [
-        one["spec"]
-        for one in of_kind("NetworkPolicy")
-        if selects(one["spec"]["podSelector"], template["metadata"]["labels"])
-    ]
+    template = DEPLOYMENTS[name]["spec"]["template"] if name in DEPLOYMENTS else ray_groups()[name]["template"]
+    labels = template["metadata"]["labels"]
+    policies = [one["spec"] for one in of_kind("NetworkPolicy") if selects(one["spec"]["podSelector"], labels)]
     (inward,) = (one for one in policies if one["policyTypes"] == ["Ingress"])
     (outward,) = (one for one in policies if one["policyTypes"] == ["Egress"])
-    assert [port["port"] for rule in inward["ingress"] for port in rule["ports"]] == [
-        port["name"] for port in container_of(DEPLOYMENTS[name])["ports"]
-    ]
+    among = [one for one in policies if one["policyTypes"] == ["Ingress", "Egress"]]
+    for rule in [rule for one in among for rule in (*one["ingress"], *one["egress"])]:
+        (peer,) = rule.get("from") or rule["to"]
+        assert all(selects(peer["podSelector"], one["template"]["metadata"]["labels"]) for one in ray_groups().values())
+    assert len(among) == (name != "cow-api"), "nodes of the Ray cluster reach each other, and nobody else does"
+    if name in ("cow-api", "jobs"):
+        (container,) = template["spec"]["containers"]
+        assert [port["port"] for rule in inward["ingress"] for port in rule["ports"]] == [
+            port["name"] for port in container["ports"]
+        ]
     assert all(rule.get("from") for rule in inward["ingress"]) == (name != "cow-api"), "only servers ask for keys"
     assert {port["port"] for rule in outward["egress"] for port in rule["ports"]} >= {53, 443, 5432}
 

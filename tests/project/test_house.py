@@ -30,7 +30,7 @@ MAX_PIPELINE_LINES, MAX_PIPELINE_FUNCTION_LINES, MAX_FUNCTION_LINES = 150, 40, 8
 
 HEAVY = ("torch", "transformers", "diffusers", "accelerate")
 OF_EXTRAS = (
-    *("json_repair", "pydantic_ai", "tenacity", "openai", "mcp", "obstore", "inspect_ai", "pyarrow", "scipy"),
+    *("json_repair", "pydantic_ai", "tenacity", "openai", "mcp", "obstore", "inspect_ai", "pyarrow", "scipy", "ray"),
     "opentelemetry.sdk",
 )
 
@@ -198,7 +198,7 @@ def imported_by(statement: str, suspects: tuple[str, ...]) -> list[str]:
 HEAVY_IN_TESTS = (
     *("torch", "transformers", "diffusers", "accelerate", "safetensors.torch", "peft", "inspect_ai", "matplotlib"),
     *("playwright", "axe_playwright_python", "schemathesis", "moto", "openai", "mcp", "pydantic_ai", "scipy"),
-    *("pyarrow", "dbos"),
+    *("pyarrow", "dbos", "ray"),
 )
 COLLECT = """
 import sys, pytest

@@ -10,14 +10,12 @@ from functools import cache
 from typing import Any
 
 import httpx
-import psycopg
 import pytest
-import yaml
 from callers import as_caller, new_keys
-from conftest import ROOT
 from postgres import PostgresServer, postgres
 from servers import ASYNC, BODY, Served, Worker, problem, slow
 from waiting import TIME_LIMIT, eventually
+from worker_contract import GIVES_UP_SOONER, Contract
 from worker_processes import workers_of
 
 from cow_service.errors import Canceled
@@ -29,19 +27,6 @@ from cow_service.workers.pool import Group
 pytestmark = pytest.mark.slow
 
 SETTINGS, KEYS = new_keys("root", "alice")
-# Each further try costs the start of a process.
-GIVES_UP_SOONER = """
-from cow_service.workers import pool
-pool.MAX_CRASHES = 2
-from cow_service.cli.main import app
-app(["serve"])
-"""
-
-
-def poison(how: str, seed: int = 0) -> dict[str, Any]:
-    """A request whose clip does something to the process that makes it, after a moment."""
-    body = slow(0.2, seed=seed)
-    return body | {"generator_options": {"seconds": 0.2, "end": how}}
 
 
 @pytest.fixture(scope="module")
@@ -105,55 +90,8 @@ def test_a_server_shows_its_workers_and_queues(served: Served) -> None:
     eventually(lambda: light(served)["jobs_per_minute"] == 0.2)  # one in five minutes: canceled ones do not count
 
 
-def test_a_crash_harms_the_job_that_caused_it_and_no_other(served: Served) -> None:
-    def told() -> list[tuple[str, int]]:
-        (process,) = told_by(served)["processes"]
-        return [(one["name"], one["pid"]) for one in process["workers"]]
-
-    (worker,) = workers_of(served)
-    for _ in range(2):
-        served.http.post("/simulate", json=BODY).raise_for_status()
-    eventually(lambda: told() == [("light-1", worker.pid)])
-    assert workers_of(served) == [worker], "it is kept for the next job"
-    innocents = [served.submit(slow(0.3, seed=seed))["id"] for seed in (1, 2)]
-    guilty = served.submit(poison("kill", seed=100))["id"]
-    innocents += [served.submit(slow(0.3, seed=seed))["id"] for seed in (3, 4)]
-    ended = served.ended(guilty)
-    assert ended["status"] == "failed"
-    assert ended["problem"]["type"] == "urn:cow:problem:worker-ended"
-    assert "signal 9" in ended["problem"]["detail"]
-    others = [served.ended(one) for one in innocents]
-    assert [one["problem"] for one in others if one["status"] != "succeeded"] == []
-    assert served.clips().count(100) == 2, "it is tried again: the crash may have been no fault of the job"
-    assert all(served.clips().count(seed) == 1 for seed in range(1, 5)), "nobody else was begun twice"
-
-
-def test_too_much_memory_ends_the_job_alone(served: Served) -> None:
-    told = problem(served.http.post("/simulate", json=poison("memory", seed=101)), 500, "worker-ended")
-    assert "MB" in told["detail"]
-    assert served.clips().count(101) == 1, "it would take as much again"
-    assert served.http.post("/simulate", json=slow(0.1, seed=102)).status_code == 200
-
-
-def test_a_worker_whose_device_fails_is_replaced(served: Served) -> None:
-    before = {one.pid for one in workers_of(served)}
-    problem(served.http.post("/simulate", json=poison("device", seed=120)), 503, "device-failed")
-    assert served.clips().count(120) == 2, "another process may be able to use it"
-    assert served.http.post("/simulate", json=slow(0.1, seed=121)).status_code == 200
-    assert not before & {one.pid for one in workers_of(served)}
-
-
-@pytest.mark.soak
-def test_a_job_that_never_ends_is_ended(served: Served) -> None:
-    problem(served.http.post("/simulate", json=poison("hang", seed=103)), 504, "job-timeout")
-    assert served.http.post("/simulate", json=slow(0.1, seed=104)).status_code == 200
-
-
-def test_a_job_that_cannot_be_stopped_is_canceled_all_the_same(served: Served) -> None:
-    job = served.submit(poison("hang", seed=105))
-    served.rendering(job["id"])
-    assert served.http.post(f"/jobs/{job['id']}/cancel").json()["status"] == "canceled"
-    assert served.http.post("/simulate", json=slow(0.1, seed=106)).status_code == 200
+class TestProcesses(Contract):
+    """Worker processes."""
 
 
 @pytest.fixture(scope="module")
@@ -185,13 +123,6 @@ def metrics_port() -> int:
         return probe.getsockname()[1]
 
 
-def queries() -> list[str]:
-    """Of jobs by which Kubernetes' workers are scaled, in the order of the file."""
-    scaling = (ROOT / "docker" / "kubernetes" / "scaling.yaml").read_text()
-    scaled = [one["spec"] for one in yaml.safe_load_all(scaling) if one["kind"] == "ScaledObject"]
-    return [spec["triggers"][0]["metadata"]["query"] for spec in scaled]
-
-
 def test_an_api_server_computes_nothing_and_hears_of_jobs_that_two_workers_share(
     fleet: tuple[Served, Worker, Worker], database: PostgresServer
 ) -> None:
@@ -214,9 +145,6 @@ def test_an_api_server_computes_nothing_and_hears_of_jobs_that_two_workers_share
     assert workers_of(api) == []
     metrics = httpx.get(f"http://127.0.0.1:{metrics_port()}/metrics", timeout=TIME_LIMIT).text
     assert 'cow_workers{queue="light",state="busy"} 1.0' in metrics
-    with psycopg.connect(database.url) as connection:  # what KEDA asks
-        numbers = [connection.execute(query).fetchone() for query in queries()]
-    assert numbers == [(3,), (0,)], "three jobs for light workers, none for GPU workers"
     began = api.rendering(jobs[0]["id"])["progress"]
     eventually(lambda: api.job(jobs[0]["id"])["progress"] > began)
     for job in jobs:
