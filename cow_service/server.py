@@ -109,7 +109,7 @@ def run_worker(service: Service, pool: WorkerPool) -> None:
         engine.start_when_possible(ended)
         if ended.is_set():
             return
-        log.info("this worker takes jobs from: %s", ", ".join(service.settings.queues) or "of all queues")
+        log.info("this worker takes jobs")
         ended.wait()
     finally:
         if engine.is_running:

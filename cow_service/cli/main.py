@@ -163,7 +163,7 @@ def openapi() -> None:
 
 for command, example in {
     server.serve: "cow serve --port 8000",
-    server.worker: "cow worker --queues light",
+    server.worker: "cow worker",
     server.migrate: "cow migrate",
     server.mcp: "cow mcp --transport http",
     batch.batch: "cow batch questions.jsonl --out results",

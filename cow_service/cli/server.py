@@ -52,17 +52,11 @@ def serve(
     run_server(service, pool)
 
 
-def worker(
-    queues: Annotated[
-        str | None,
-        option("Queues to take jobs from, with commas: light, or a backend such as ati.", shown="COW_QUEUES, all"),
-    ] = None,
-) -> None:
+def worker() -> None:
     """Compute jobs for the servers on the same job database."""
     end_well()
-    named = None if queues is None else tuple(name.strip() for name in queues.split(",") if name.strip())
     with quick_imports():
-        service = _served(queues=named)
+        service = _served()
         pool = _start_pool(service)
         from cow_service.observability import tracing  # noqa: PLC0415
         from cow_service.server import run_worker  # noqa: PLC0415
@@ -193,11 +187,9 @@ def open_service(*, ahead: bool = False, **overrides: Any) -> Service:
 def _served(**overrides: Any) -> Service:
     """The service of a long-running process, with its logs and traces."""
     service = open_service(ahead=True, **overrides)
-    from cow_service.jobs.queues import check_queues  # noqa: PLC0415
     from cow_service.observability import logging as logs  # noqa: PLC0415
     from cow_service.observability import tracing  # noqa: PLC0415
 
-    check_queues(service.settings)
     logs.set_up(service.settings)
     tracing.start()
     return service

@@ -183,7 +183,7 @@ def remedy(one: Unserved) -> str:
             "until they are finished, or cancel them."
         )
     return (
-        f"No process takes jobs of the queue {one.queue!r}: start `cow worker --queues {one.queue}` or a server on "
+        f"No process takes jobs of the queue {one.queue!r}: start a server or `cow worker` on "
         "this job database, where the backend of that queue is installed."
     )
 

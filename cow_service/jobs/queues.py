@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from cow_service.requests import PRIORITIES, Priority
-from cow_service.settings import Settings, SettingsError
+from cow_service.settings import Settings
 from cow_service.weights.manifests import find_manifest, load_manifests
 
 LIGHT = "light"
@@ -47,20 +47,6 @@ def known_queues(settings: Settings) -> tuple[str, ...]:
         if one.concurrency is not None and (settings.ray is not None or not one.missing_modules())  # on other nodes
     ]
     return LIGHT, *dict.fromkeys([*with_device, *settings.generator_concurrency])
-
-
-def check_queues(settings: Settings) -> None:
-    """Raises `SettingsError` if COW_QUEUES names an unknown queue."""
-    known = known_queues(settings)
-    for name in settings.queues:
-        if name in known:
-            continue
-        manifest = find_manifest(name)
-        if manifest is None or manifest.concurrency is None:
-            remedy = f"Known: {', '.join(known)}. Backends without a device of their own share {LIGHT}."
-        else:
-            remedy = f"{name} lacks {', '.join(manifest.missing_modules())}: {manifest.install_line()}."
-        raise SettingsError(f"Bad settings: COW_QUEUES has no queue {name[:64]!r} here. {remedy}")
 
 
 class Queued(Protocol):

@@ -218,8 +218,6 @@ class WorkerPool(Computer):
         """As many as its workers have places for; none of a queue whose backend cannot run here."""
         # Older versions had a queue for each generator.
         name = queue if places(queue) is not None else queue_of("", queue, self._settings)
-        if self._settings.queues and name not in self._settings.queues:
-            return 0
         manifest = find_manifest(name)
         if self._settings.ray is None and manifest is not None and manifest.missing_modules():
             return 0  # nodes of a cluster may have what this machine lacks
@@ -303,7 +301,7 @@ class WorkerPool(Computer):
 
     def _default_groups(self) -> list[Group]:
         default = queue_of(self._settings.reader, self._settings.generator, self._settings)
-        return [self._group(name) for name in self._settings.queues or (LIGHT, *({default} - {LIGHT}))]
+        return [self._group(name) for name in (LIGHT, *({default} - {LIGHT}))]
 
     def _group(self, name: str) -> Group:
         with self._guard:

@@ -262,7 +262,7 @@ def test_bad_settings_are_named(cow: Any) -> None:
         ({"COW_RATE_LIMIT": "many", "COW_PORT": "99999"}, ("COW_RATE_LIMIT='many'", "COW_PORT='99999'")),
         ({"COW_CHECKPOINTS": "nonsense"}, ("COW_CHECKPOINTS is not JSON",)),
         ({"COW_API_KEYS": "alice:sha256:00"}, ("COW_API_KEYS is not JSON", '{"alice": "sha256:', "cow keys new")),
-        ({"COW_QUEUES": "light"}, ("COW_QUEUES is not JSON", '["one", "another"]')),
+        ({"COW_ADMIN_KEYS": "light"}, ("COW_ADMIN_KEYS is not JSON", '["one", "another"]')),
         ({"COW_APIKEYS": "{}", "COW_API_KEY": "key"}, ("COW_APIKEYS is no setting; COW_API_KEYS is.",)),
     ):
         result = cow("models", **settings)

@@ -182,11 +182,3 @@ def test_a_job_whose_worker_ends_with_the_server_does_not_fail() -> None:
         group.take(lambda: None)
 
 
-def test_a_queue_that_no_worker_here_can_serve_is_told_before_one_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    check_queues(Settings(queues=("light", "tiny-ati")))
-    for name in ("lihgt", "cutout"):
-        with pytest.raises(SettingsError, match=f"COW_QUEUES.*'{name}'"):
-            check_queues(Settings(queues=("light", name)))
-    monkeypatch.setattr("cow_service.weights.manifests.find_spec", lambda name: None)
-    with pytest.raises(SettingsError, match=r"torch.*\[wan\]"):  # what to install
-        check_queues(Settings(queues=("ati",)))
