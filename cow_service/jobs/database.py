@@ -18,7 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs import schema
-from cow_service.jobs.packing import packed, packed_paths, unpacked
+from cow_service.jobs.packing import packed, unpacked
 from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES
 from cow_service.requests import Stage
 from cow_service.settings import SettingsError
@@ -248,7 +248,7 @@ class Database(ABC):
         self._add_references(cursor, job, [sha256 for each in results for sha256 in each.artifacts])
         for each in results:
             if each.trajectory is not None:
-                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, each.key, packed_paths(each.trajectory)))
+                cursor.execute(self._plain(_SAVE_TRAJECTORY), (job, each.key, packed(each.trajectory)))
             cursor.execute(self._plain(_SAVE), (each.key, job, each.stage, packed(each.result), time.time()))
             cursor.execute(self._plain(_DONE), (job, each.stage))
 

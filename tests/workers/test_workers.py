@@ -19,9 +19,8 @@ from worker_contract import GIVES_UP_SOONER, Contract
 from worker_processes import workers_of
 
 from cow_service.errors import Canceled
-from cow_service.jobs.queues import check_queues
 from cow_service.observability.metrics import Metrics
-from cow_service.settings import Settings, SettingsError
+from cow_service.settings import Settings
 from cow_service.workers.pool import Group
 
 pytestmark = pytest.mark.slow
@@ -180,5 +179,3 @@ def test_a_job_whose_worker_ends_with_the_server_does_not_fail() -> None:
     group.close()
     with pytest.raises(Canceled):
         group.take(lambda: None)
-
-
