@@ -138,6 +138,9 @@ class Settings(BaseSettings):
     same job database."""
     metrics_port: int | None = Field(default=None, ge=1, le=65535)
     """Port for the metrics of `cow worker`, at COW_HOST; by default none. Servers have GET /metrics."""
+    memory_mb: float | None = Field(default=None, gt=0)
+    """Most MB of memory for the server and its worker processes together; a job waits until what it will need is free.
+    By default 80% of what the machine, or the container, has."""
     worker_memory_mb: float | None = Field(default=None, gt=0)
     """Most MB of memory for one worker process, beyond which its job fails with worker-ended; by default only
     COW_MEMORY_MB limits it."""

@@ -27,6 +27,10 @@ INCREMENTAL = 2  # SQLite's number of that mode
 VACUUM_PAGES, KEPT_FREE_PAGES = 500, 500  # of 4 kB: given back at a time, and kept for what is written next
 
 
+class FolderHeld(SettingsError):
+    """Another server works on the job database in the folder."""
+
+
 class Sqlite(Database):
     """A file. Whoever holds its folder is the only process that takes jobs: those that others had are nobody's."""
 
@@ -55,7 +59,7 @@ class Sqlite(Database):
             fcntl.flock(self._held, fcntl.LOCK_EX | fcntl.LOCK_NB)  # on the folder: a file could be deleted
         except BlockingIOError as error:
             self.release()
-            raise SettingsError(
+            raise FolderHeld(
                 f"Another server works on the jobs in {self.file.parent}. Use that one, give this one another "
                 "COW_DATA_DIR, or share jobs by PostgreSQL (COW_DATABASE_URL)."
             ) from error

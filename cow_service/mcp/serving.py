@@ -11,6 +11,7 @@ import sys
 from collections.abc import AsyncGenerator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import asynccontextmanager, suppress
+from itertools import count
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import anyio
@@ -109,13 +110,11 @@ class LocalService:
     def _start(self) -> FastAPI:
         # These take longer to import than all else: clients need not wait for them to see the tools.
         from cow_service.api.app import create_app  # noqa: PLC0415
-        from cow_service.jobs.engine import JobEngine  # noqa: PLC0415
         from cow_service.observability import tracing  # noqa: PLC0415
 
         try:
             tracing.start()
-            engine = JobEngine(self._service)
-            engine.start()
+            engine = self._start_engine()
         except SettingsError as error:
             log.error("%s", error)
             raise StorageUnavailable(f"The service cannot be started here: {error}") from error
@@ -128,6 +127,26 @@ class LocalService:
         except CowError as error:  # calls may name another reader or generator
             log.error("%s: %s", error.code, error.detail)
         return create_app(engine)
+
+    def _start_engine(self) -> JobEngine:
+        """Agents start one of these each: where another process has the data folder, this one has a folder in it."""
+        from cow_service.jobs.engine import JobEngine  # noqa: PLC0415
+        from cow_service.jobs.sqlite import FolderHeld  # noqa: PLC0415
+
+        given = self._service.settings
+        for number in count(2):
+            engine = JobEngine(self._service)
+            try:
+                engine.start()
+            except FolderHeld:
+                if given.database_url is not None or given.artifacts is not None:
+                    raise
+                own = {"data_dir": given.data_dir / f"beside-{number}", "models_dir": given.weights_dir}
+                self._service.close()
+                self._service = Service(given.model_copy(update=own))
+            else:
+                return engine
+        raise AssertionError("numbers do not end")
 
     def _stop(self) -> None:
         from cow_service.observability import tracing  # noqa: PLC0415

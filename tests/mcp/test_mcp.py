@@ -148,6 +148,17 @@ def test_simulate_over_stdio_returns_pictures_words_and_data(here: tuple[Session
     assert base64.b64decode(video.blob)[4:8] == b"ftyp"
 
 
+def test_agents_that_start_one_each_do_not_wait_for_one_another(here: tuple[Session, Path], tmp_path: Path) -> None:
+    """A data folder is of one process: the others have folders in it."""
+    from sessions import lazy, over_stdio
+
+    _, folder = here
+    with over_stdio(tmp_path, COW_DATA_DIR=str(folder / "data"), **lazy(tmp_path)) as second:
+        simulation = second.data("simulate", second.call("simulate", image=str(SCENE), question=MOVES))
+        assert simulation["grounding"]["object"] == "yellow ball"
+        assert (folder / "data" / "beside-2" / "jobs.sqlite3").exists()
+
+
 def test_answer_over_stdio_and_the_same_image_again(here: tuple[Session, Path]) -> None:
     session, _ = here
     answer = checked_answer(session, str(SCENE), votes=2, baseline=True)
