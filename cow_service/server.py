@@ -124,7 +124,7 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
     Raises the `CowError` for which the default request cannot be served, and `SettingsError`.
     """
     server, engine, readiness = _server(service, pool)
-    failures: list[SettingsError] = []
+    failures: list[Exception] = []
 
     def failed() -> None:
         server.should_exit = True
@@ -132,7 +132,7 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
     def start() -> None:
         try:
             engine.start_when_possible(server.is_ending)
-        except SettingsError as error:
+        except Exception as error:  # noqa: BLE001 # raised where the server ends
             failures.append(error)
             failed()
 

@@ -211,7 +211,8 @@ class Settings(BaseSettings):
     @classmethod
     def _is_database(cls, url: SecretStr | None) -> SecretStr | None:
         parts = urlsplit("" if url is None else url.get_secret_value())
-        has_host = parts.hostname is not None and parts.port != 0  # or a ValueError
+        is_there = parts.hostname is not None or "host=" in parts.query  # a socket, for example
+        has_host = is_there and parts.port != 0  # or a ValueError
         known = {"sqlite": parts.path[1:], "postgresql": has_host, "postgres": has_host}
         if url is not None and not known.get(parts.scheme.partition("+")[0]):
             raise ValueError("no database")

@@ -13,6 +13,7 @@ from cow_service.requests import Stage
 
 STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
 QUIET_SECONDS = 30.0  # without a job that anybody runs or waits for, after which a process looks for some more rarely
+MAX_ELSEWHERE = 10_000  # jobs whose progress in other processes is remembered
 STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation the last is left out
 
 
@@ -136,6 +137,8 @@ class ActiveJobs:
         self.stir()
         if self.get(job) is None:
             self._elsewhere[job] = stage, done
+            if len(self._elsewhere) > MAX_ELSEWHERE:  # of some the end was not heard
+                del self._elsewhere[next(iter(self._elsewhere))]
             self._wake(job)
 
     def awaited_elsewhere(self) -> list[str]:

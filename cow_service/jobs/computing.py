@@ -237,7 +237,7 @@ class Computer:
         raise NotImplementedError
 
     def workers(self, active: ActiveJobs) -> tuple[WorkerInfo, ...]:
-        """Computes the jobs and reports their progress to `active`."""
+        """Those that are alive, with their jobs as `active` knows them."""
         return ()
 
 

@@ -107,8 +107,7 @@ class Database(ABC):
         Raises `SettingsError` where this process cannot have one on this database.
         """
 
-    @abstractmethod
-    def keep(self) -> None:
+    def keep(self) -> None:  # noqa: B027 # a lease that cannot be lost needs nothing
         """Verifies the lease, which is taken again after an outage. Called every few seconds."""
 
     @abstractmethod
@@ -119,12 +118,10 @@ class Database(ABC):
     def release(self) -> None:
         """Gives the lease back."""
 
-    @abstractmethod
-    def watch(self, receive: Receive) -> None:
+    def watch(self, receive: Receive) -> None:  # noqa: B027 # a file has no other processes
         """From now on `receive` is called with what other processes notify of, in a thread."""
 
-    @abstractmethod
-    def notify(self, connection: sa.Connection, *notifications: Notification) -> None:
+    def notify(self, connection: sa.Connection, *notifications: Notification) -> None:  # noqa: B027 # likewise
         """Notifies the other processes once the transaction of a connection is committed.
 
         This only makes things quick: what counts is in the tables.
@@ -146,8 +143,7 @@ class Database(ABC):
     def lock(self, connection: sa.Connection, number: int) -> None:
         """Holds a lock of this number until the transaction of the connection ends."""
 
-    @abstractmethod
-    def give_room_back(self, stop: Callable[[], bool]) -> None:
+    def give_room_back(self, stop: Callable[[], bool]) -> None:  # noqa: B027 # PostgreSQL does it by itself
         """Returns the room of removed rows to the disk, in steps between which others write, until `stop` says so."""
 
     @abstractmethod
@@ -311,6 +307,8 @@ def database_errors() -> Generator[None]:
         if "IntegrityError" in (kind.__name__ for kind in type(error).__mro__):
             raise Canceled("The job was deleted before it was finished.") from error
         told = getattr(error, "orig", None) or error
+        if "DataError" in (kind.__name__ for kind in type(told).__mro__):
+            raise  # what is to be stored is at fault: it would be the same tomorrow
         code = getattr(told, "sqlstate", None) or getattr(told, "sqlite_errorname", "") or ""
         raise unavailable(code, type(told).__name__) from error
 

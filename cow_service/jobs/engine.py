@@ -100,9 +100,10 @@ class JobEngine:
             self.database.release()
             raise
         self.database.watch(self._receive)
-        self._stopping, self.is_running = False, True
+        self._stopping = False
         for part in (self._computer, self._loop, self.processes, self._ticker):
             part.start()
+        self.is_running = True
 
     def drain(self) -> None:
         """Stops accepting jobs, and answers callers who wait for a job that does not run.

@@ -9,6 +9,7 @@ import hashlib
 import json
 import logging
 import time
+import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -21,7 +22,7 @@ import sqlalchemy as sa
 from pydantic import AwareDatetime, BaseModel, Field
 from pydantic_core import to_json
 
-from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds
+from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds, unforeseen
 from cow_service.jobs.active import At, share_done
 from cow_service.jobs.database import OPEN, Database, Notification
 from cow_service.jobs.packing import packed, unpacked
@@ -227,10 +228,16 @@ class JobTable:
             if limit_per_owner is not None:
                 self._database.lock(connection, CLAIM_LOCK)
             rows = connection.execute(taken).all()
-        return [
-            TakenJob(row.id, JobSpec.model_validate(unpacked(row.spec) | {"turn": row.turn}), row.owner, queue, row.run)
-            for row in sorted(rows, key=lambda row: (row.turn, row.created_at, row.id))
-        ]
+        found: list[TakenJob] = []
+        for row in sorted(rows, key=lambda row: (row.turn, row.created_at, row.id)):
+            try:  # a later version may have more fields
+                spec = JobSpec.model_validate(unpacked(row.spec) | {"turn": row.turn}, extra="ignore")
+            except (ValueError, zlib.error):  # what came with it must not wait for it
+                log.exception("job %s cannot be read", row.id)
+                self._end(row.id, "failed", row.run, error=json.dumps(error_as_json(unforeseen())))
+            else:
+                found.append(TakenJob(row.id, spec, row.owner, queue, row.run))
+        return found
 
     def begin(self, job: TakenJob, stage: Stage, done: float) -> bool:
         """Marks a job as running. False if it is no longer this process's: it was canceled, for example."""
@@ -406,11 +413,15 @@ class JobTable:
         return dict(self._database.read(counts))
 
     def delete(self, jobs: list[str]) -> set[str]:
-        """Deletes jobs with all that belongs to them; returns the artifacts that no other job needs."""
+        """Deletes jobs that have ended with all that belongs to them; returns the artifacts that no other job needs.
+
+        One that is open is another of the same id, which somebody has submitted meanwhile.
+        """
+        ended = sa.select(JOBS.c.id).where(JOBS.c.id.in_(jobs), JOBS.c.status.not_in(OPEN))
+        theirs = sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(ended)).distinct()
         with self._database.transaction(durable=True) as connection:  # their artifacts are removed next
-            theirs = sa.select(REFERENCES.c.sha256).where(REFERENCES.c.job_id.in_(jobs)).distinct()
             artifacts = set(connection.execute(theirs).scalars())
-            connection.execute(sa.delete(JOBS).where(JOBS.c.id.in_(jobs)))
+            connection.execute(sa.delete(JOBS).where(JOBS.c.id.in_(jobs), JOBS.c.status.not_in(OPEN)))
         return artifacts - self._database.referenced(artifacts)
 
     def _end(

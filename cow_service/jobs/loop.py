@@ -21,7 +21,7 @@ from cow_service.observability import logging as context
 from cow_service.observability import tracing
 from cow_service.requests import Stage
 
-LOOK_SECONDS = 20.0  # between two looks at the queues, besides whenever it is woken
+LOOK_SECONDS, WAITING_SECONDS = 20.0, 2.0  # between two looks besides whenever it is woken, and while jobs wait
 RETRY_SECONDS = 0.5  # after a look that failed
 STOP_SECONDS = 5.0  # a thread that waits for a database that is down does not keep the process
 
@@ -67,7 +67,7 @@ class JobLoop(BackgroundThread):
             self._some_wait, pause = True, RETRY_SECONDS
             try:
                 self._some_wait = sum(self._fill(queue) for queue in self._jobs.waiting_queues()) > 0
-                pause = LOOK_SECONDS
+                pause = WAITING_SECONDS if self._some_wait else LOOK_SECONDS  # a Ray cluster may grow
             except CowError as error:
                 log.warning("no jobs are taken: %s", error.detail)
             except Exception:
@@ -138,6 +138,10 @@ class JobLoop(BackgroundThread):
         try:
             try:
                 computed = self._computer.compute(Work(traced, progress, running.check, metrics.stage_cache))
+                for stage, seconds in computed.timings.items():
+                    metrics.stage_seconds.labels(stage).observe(seconds)
+                given = job, computed.result, computed.trajectory_key, computed.stages, computed.answer
+                status, stored = "succeeded", patient.wait_through(lambda: self._jobs.succeed(*given))
             except Canceled:
                 raise
             except Exception as error:
@@ -148,11 +152,6 @@ class JobLoop(BackgroundThread):
                     log.exception("job %s failed", job.id)
                     failure = unforeseen()
                 status, stored = "failed", patient.wait_through(lambda: self._jobs.fail(job, failure))
-            else:
-                for stage, seconds in computed.timings.items():
-                    metrics.stage_seconds.labels(stage).observe(seconds)
-                given = job, computed.result, computed.trajectory_key, computed.stages, computed.answer
-                status, stored = "succeeded", patient.wait_through(lambda: self._jobs.succeed(*given))
             if not stored:
                 raise Canceled("Another process has the job, or a stored stage of it is missing.")
         except Canceled as why:

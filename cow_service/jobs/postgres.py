@@ -41,6 +41,14 @@ POOLED = (
     "transaction mode: leases and notifications need sessions. Connect directly, or by a pool in session mode."
 )
 
+_OPTIONS: dict[str, Any] = {  # of every connection
+    "connect_timeout": CONNECT_SECONDS,
+    "keepalives_idle": 10,
+    "keepalives_interval": 3,
+    "keepalives_count": 3,
+    "tcp_user_timeout": int(1000 * STALLED_SECONDS),
+}
+
 log = logging.getLogger("cow_service")
 
 
@@ -56,11 +64,7 @@ class Postgres(Database):
         options = {
             # A commit outlives the end of this process at once, and is on the disk where that matters (`transaction`).
             "options": "-c synchronous_commit=off -c statement_timeout=60s -c lock_timeout=4s",
-            "connect_timeout": CONNECT_SECONDS,
-            "keepalives_idle": 10,
-            "keepalives_interval": 3,
-            "keepalives_count": 3,
-            "tcp_user_timeout": int(1000 * STALLED_SECONDS),
+            **_OPTIONS,
         }
         pool = {"pool_size": 16, "max_overflow": 32, "hide_parameters": True}
         super().__init__(sa.create_engine(url, connect_args=options, **pool))
@@ -161,9 +165,6 @@ class Postgres(Database):
         """As the base class says."""
         connection.execute(sa.select(sa.func.pg_advisory_xact_lock(number)))
 
-    def give_room_back(self, stop: Callable[[], bool]) -> None:
-        """Nothing: PostgreSQL does it by itself."""
-
     def close(self) -> None:
         """As the base class says."""
         if self._listener is not None:
@@ -195,7 +196,7 @@ class Postgres(Database):
 
     def _session(self) -> psycopg.Connection[Any]:
         """A connection apart from the pool. Raises `psycopg.Error`."""
-        return psycopg.connect(self._address, autocommit=True, connect_timeout=CONNECT_SECONDS)
+        return psycopg.connect(self._address, autocommit=True, **_OPTIONS)
 
     def _open_lease(self) -> None:
         session = self._session()
@@ -237,10 +238,12 @@ class Listener(BackgroundThread):
                     self._receive(Notification("queued", ""))  # perhaps, while nobody listened
                     while not self._stop.is_set():
                         for message in session.notifies(timeout=LISTEN_SECONDS):
-                            with suppress(ValueError, TypeError):  # of another version
+                            try:
                                 sender, values = json.loads(message.payload)
                                 if sender != self._executor:
                                     self._receive(Notification(**values))
+                            except Exception:  # of another version, for example
+                                log.exception("a notification was not understood")
             except psycopg.Error:
                 self._stop.wait(RECONNECT_SECONDS)
 

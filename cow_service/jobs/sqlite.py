@@ -17,7 +17,7 @@ from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import StorageUnavailable
-from cow_service.jobs.database import Database, Notification, Receive, database_errors
+from cow_service.jobs.database import Database, database_errors
 from cow_service.media.artifacts import PRIVATE, disk_errors, make_private
 from cow_service.settings import SettingsError
 
@@ -73,9 +73,6 @@ class Sqlite(Database):
             self.file.touch(PRIVATE)  # SQLite gives its other files the same mode
         super().create_tables()
 
-    def keep(self) -> None:
-        """Nothing: what the system has given, it does not take back."""
-
     @contextmanager
     def ended(self, executors: Iterable[str]) -> Generator[list[str]]:
         """All others: this process holds the folder."""
@@ -86,12 +83,6 @@ class Sqlite(Database):
         if self._held is not None:
             os.close(self._held)
             self._held = None
-
-    def watch(self, receive: Receive) -> None:
-        """Nothing: there are no others."""
-
-    def notify(self, connection: sa.Connection, *notifications: Notification) -> None:
-        """Nothing: there are no others."""
 
     @contextmanager
     def transaction(self, *, durable: bool = False) -> Generator[sa.Connection]:
@@ -108,15 +99,13 @@ class Sqlite(Database):
 
     def flush(self) -> None:
         """As the base class says."""
-        journal = self.file.with_name(self.file.name + "-wal")
         try:
-            descriptor = os.open(journal if journal.exists() else self.file, os.O_RDWR)
+            with self.file.with_name(self.file.name + "-wal").open("r+b") as journal:
+                os.fsync(journal)
+        except FileNotFoundError:
+            pass  # all of it is in the file, which is synced before the journal goes
         except OSError as error:
             raise StorageUnavailable("The job database cannot be written to the disk.") from error
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
     def lock(self, connection: sa.Connection, number: int) -> None:
         """Of everything: there is one writer at a time."""
@@ -164,7 +153,6 @@ class Sqlite(Database):
 
 
 def _prepare(connection: Any, _: object) -> None:
-    connection.isolation_level = "IMMEDIATE"  # writers wait instead of failing
     # The first one works only in a file without tables, and before the mode of its journal is set.
     for pragma in (
         "auto_vacuum=INCREMENTAL",

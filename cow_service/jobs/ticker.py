@@ -87,8 +87,8 @@ class Ticker(BackgroundThread):
         started, or the answer that the job is taken was lost.
         """
         active, jobs = self._parts.active, self._parts.jobs
+        running = active.runs()  # first: what is taken meanwhile is not at work by then
         taken = jobs.taken_by(self._parts.executor)
-        running = active.runs()
         for job_id, run in running.items():
             if taken.get(job_id) != run:
                 active.request_cancel(job_id)

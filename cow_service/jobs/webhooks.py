@@ -67,24 +67,28 @@ class Webhooks:
                 if not has_room or self._calling[row.receiver] >= MAX_CONCURRENT_CALLS_TO_ONE:
                     continue
                 self._calling[row.receiver] += 1
-            number = row.attempts + 1
-            if self._change(row.job_id, row.attempts, {"attempts": number, "due": database.now + ATTEMPT_SECONDS}):
-                call = row.job_id, row.url, number, row.receiver
-                threading.Thread(target=self._call, args=call, name="cow-webhook", daemon=True).start()
-            else:  # another process makes it
-                self._give_place_back(row.receiver)
+            number, begun = row.attempts + 1, False
+            try:
+                if self._change(row.job_id, row.attempts, {"attempts": number, "due": database.now + ATTEMPT_SECONDS}):
+                    call = row.job_id, row.url, number, row.receiver
+                    threading.Thread(target=self._call, args=call, name="cow-webhook", daemon=True).start()
+                    begun = True
+            finally:
+                if not begun:  # another process makes it, or it is tried again
+                    self._give_place_back(row.receiver)
 
     def _call(self, job_id: str, url: str, attempt: int, receiver: str) -> None:
         """Makes an attempt to call a webhook, and schedules another one if it failed."""
         database = self._parts.database
         try:
-            found = self._parts.jobs.find(job_id, None)
+            found = self._parts.jobs.find(job_id, None, full=False)
             wait = None if found is None else self.send(found.job, url, attempt)
             if wait is not None:
                 self._change(job_id, attempt, {"due": database.now + wait})
             else:
+                row = CALLS.c.job_id == job_id, CALLS.c.attempts == attempt
                 with database.transaction() as connection:
-                    connection.execute(sa.delete(CALLS).where(CALLS.c.job_id == job_id))
+                    connection.execute(sa.delete(CALLS).where(*row))
         except Exception:
             log.exception("webhook of job %s, attempt %d: it is made again", job_id, attempt)
         finally:
