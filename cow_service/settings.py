@@ -25,6 +25,7 @@ MAX_SECRETS = 2  # that sign at the same time, while a new secret replaces an ol
 OBJECT_STORE = re.compile(r"(s3|gs|az)://[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._-]+)*/?")
 ORIGIN = r"^(\*|[a-z][a-z0-9+.-]*://[^/\s?#@A-Z]+)$"  # as browsers write it: lower case, no path
 MAX_WORKERS = 256
+MIN_MEMORY_MB = 600  # for a server and one worker process
 WORKER_BYTES = 400e6  # of memory for each process that computes: 190 MB without a job, and what encodes a clip
 SHARE_OF_MEMORY = 0.8  # of the machine's, that a server may take
 
@@ -138,7 +139,7 @@ class Settings(BaseSettings):
     same job database."""
     metrics_port: int | None = Field(default=None, ge=1, le=65535)
     """Port for the metrics of `cow worker`, at COW_HOST; by default none. Servers have GET /metrics."""
-    memory_mb: float | None = Field(default=None, gt=0)
+    memory_mb: float | None = Field(default=None, ge=MIN_MEMORY_MB)
     """Most MB of memory for the server and its worker processes together; a job waits until what it will need is free.
     By default 80% of what the machine, or the container, has."""
     worker_memory_mb: float | None = Field(default=None, gt=0)
@@ -213,10 +214,17 @@ class Settings(BaseSettings):
         parts = urlsplit("" if url is None else url.get_secret_value())
         is_there = parts.hostname is not None or "host=" in parts.query  # a socket, for example
         has_host = is_there and parts.port != 0  # or a ValueError
-        known = {"sqlite": parts.path[1:], "postgresql": has_host, "postgres": has_host}
+        known = {"sqlite": parts.path[1:] not in ("", ":memory:"), "postgresql": has_host, "postgres": has_host}
         if url is not None and not known.get(parts.scheme.partition("+")[0]):
             raise ValueError("no database")
         return url
+
+    @field_validator("ray_actors")
+    @classmethod
+    def _in_order(cls, numbers: dict[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
+        if any(fewest > most for fewest, most in numbers.values()):
+            raise ValueError("the fewest are more than the most")
+        return numbers
 
     @field_validator("api_keys")
     @classmethod
@@ -288,19 +296,23 @@ class Settings(BaseSettings):
         return ("transformer", "base") if (checkpoint / "vae").is_dir() else ("transformer",)
 
 
-# Messages about settings that may hold a secret, without their value.
-SECRET_SETTINGS = {
+# Messages about settings that may hold a secret, or whose pattern says little, without their value.
+SETTINGS_IN_WORDS = {
+    "ray": "must be auto, or HOST:PORT of the head of a Ray cluster of which this machine is a node; ray:// is for clients",
+    "ray_actors": 'must be a JSON object of queues and the fewest and most actors of each, such as {"light": [2, 16]}',
+    "chat_fields": "must be names with commas between them, such as top_k, enable_thinking",
     "mllm_base_url": "must begin with http:// or https://",
     "artifacts": "must be a folder, or s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX, without "
     "credentials: set these by the provider's own variables, such as AWS_*",
-    "database_url": "must be sqlite:///FILE or postgresql://USER:PASSWORD@HOST:PORT/NAME, with a number for a port",
+    "database_url": "must be sqlite:///FILE or postgresql://USER:PASSWORD@HOST:PORT/NAME, with a number for a port and "
+    "percent signs for special characters, such as %40 for @ and %23 for #",
     "webhook_secret": "must be whsec_ and the base64 of 24 to 64 random bytes, or two of them",
     "api_keys": 'must be a JSON object of names (1 to 64 of A-Z, a-z, 0-9, ".", "_", "-") and hashes ("sha256:" and 64 '
     "hexadecimal digits), a different one for each; it takes no plain keys. `cow keys new NAME` makes both",
 }
 JSON_EXAMPLES = {  # of settings that are no lists
     "api_keys": '{"alice": "sha256:0123..."}, as `cow keys new alice` prints it',
-    "checkpoints": '{"ati": "/models/ati"}', "generator_concurrency": '{"ati": 2}', "key_weights": '{"alice": 2}',
+    "checkpoints": '{"ati": "/models/ati"}', "ray_actors": '{"light": [2, 16]}', "generator_concurrency": '{"ati": 2}', "key_weights": '{"alice": 2}',
 }  # fmt: skip
 
 
@@ -321,8 +333,8 @@ def load_settings(**overrides: Any) -> Settings:
         messages: list[str] = []
         for item in error.errors():
             name = str(item["loc"][0])
-            if name in SECRET_SETTINGS:
-                messages.append(f"COW_{name.upper()} {SECRET_SETTINGS[name]}")
+            if name in SETTINGS_IN_WORDS:
+                messages.append(f"COW_{name.upper()} {SETTINGS_IN_WORDS[name]}")
             elif item["type"] != "default_factory_not_called":
                 reason = item["msg"].removeprefix("Value error, ")
                 messages.append(f"COW_{name.upper()}={item['input']!r}: {reason}")

@@ -44,8 +44,10 @@ _SAVE_TRAJECTORY = (
 _DONE = "INSERT INTO cow_stages_of_jobs (job_id, stage) VALUES (?, ?) ON CONFLICT DO NOTHING"
 _ADD_REFERENCES = "INSERT INTO cow_references (sha256, job_id) VALUES {} ON CONFLICT DO NOTHING"
 
-# What the databases say, by SQLSTATE and by SQLite's names, in words that go on after "The job database".
+# What the databases say, by SQLSTATE, SQLite's names and classes of errors, in words after "The job database".
 _REASONS = {
+    "OperationalError": "cannot be reached",
+    "ConnectionTimeout": "cannot be reached",
     "25006": "is read-only, as a standby of PostgreSQL is",
     "55P03": "has tables that another session has locked",
     "57014": "took too long, perhaps as another session has locked its tables",
@@ -315,5 +317,5 @@ def database_errors() -> Generator[None]:
 
 def unavailable(code: str, name: str = "") -> StorageUnavailable:
     """Says why the database cannot be used, by SQLSTATE or SQLite's name, or else by that of the error's class."""
-    reason = _REASONS.get(code, f"cannot be used ({name})")
-    return StorageUnavailable(f"The job database {reason}: check COW_DATABASE_URL and its disk.")
+    reason = _REASONS.get(code or name, f"cannot be used ({name})")
+    return StorageUnavailable(f"The job database {reason}: check COW_DATABASE_URL, its server and its disk.")

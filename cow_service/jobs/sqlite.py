@@ -60,8 +60,8 @@ class Sqlite(Database):
         except BlockingIOError as error:
             self.release()
             raise FolderHeld(
-                f"Another server works on the jobs in {self.file.parent}. Use that one, give this one another "
-                "COW_DATA_DIR, or share jobs by PostgreSQL (COW_DATABASE_URL)."
+                f"Another server works on the jobs in {self.file.parent}. Use that one, give this one another folder "
+                "(COW_DATA_DIR, or COW_DATABASE_URL), or share jobs by PostgreSQL."
             ) from error
         self._executor = uuid4().hex
         return self._executor

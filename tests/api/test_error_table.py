@@ -333,11 +333,11 @@ TABLE: dict[str, list[tuple[Any, ...]]] = {
     "webhook-not-allowed": [(simulated(webhook="https://example.org/"),
          "This server calls no webhooks: COW_WEBHOOK_SECRET is not set. Poll the job instead.")],
     "queue-full": [(full_queue, "1000 jobs wait or run, and COW_QUEUE_LIMIT is 1000. Send the request again later.")],
-    "not-ready": [(not_started, "The server is waiting for its job database. Ask again later.")],
+    "not-ready": [(not_started, "The server is starting. Ask again later.")],
     "shutting-down": [(stopping, "The server is stopping and takes no more jobs. Send the request again later.")],
     "canceled": [(canceled, "The job was canceled before it was finished.")],
     "storage-unavailable": [(no_folder,
-         "The data folder cannot be used (Not a directory): give a folder that the server can read and write.")],
+         "The data folder cannot be used (File exists): give a folder that the server can read and write.")],
     "internal-error": [(broken, "An unexpected error happened in the server. Its log has the trace.")],
 }  # fmt: skip
 

@@ -291,7 +291,7 @@ def test_sigterm_ends_every_role_with_0_also_while_the_database_is_away(tmp_path
     program.launch()
     try:
         assert program.process is not None
-        eventually(lambda: "the job database cannot be reached" in program.log())
+        eventually(lambda: "The job database cannot be reached" in program.log())
         program.process.terminate()
         assert program.process.wait(TIME_LIMIT) == 0, program.log()
     finally:
@@ -308,8 +308,11 @@ def test_a_server_without_its_store_of_artifacts_says_why_it_does_not_start(tmp_
         bucket = "s3://no-such-bucket" if "bucket" in store else objects.url
         own = {"COW_ARTIFACTS": bucket, "COW_WORKERS": "false", **objects.environment}
         told = cow_from_nothing(tmp_path, "serve", "--port", "0", **own)
-    assert told.returncode == 1
-    assert told.stderr.count("storage-unavailable: ") == 1
+    if "bucket" in store:
+        assert told.returncode == 1
+        assert told.stderr.count("storage-unavailable: ") == 1
+    else:
+        assert told.returncode == 2
     assert ("no such bucket" if "bucket" in store else "folder-1") in told.stderr
     assert "Traceback" not in told.stderr
 

@@ -58,6 +58,7 @@ def test_what_belongs_to_a_job_is_deleted_with_it(database: Database) -> None:
         stored = StoredResult(job * 4, "trajectory", "{}", (job * 8, shared), '{"value":1}')
         database.store_results(job, [stored])
     assert database.referenced(["one" * 8, "5" * 64, "6" * 64]) == {"one" * 8, "5" * 64}
+    assert JobTable(database).cancel("one")
     assert JobTable(database).delete(["one"]) == {"one" * 8}, "the other artifacts are needed by another job"
     assert database.find_result("one" * 4) is None
     assert database.find_result("two" * 4) == ("two", {"value": {"value": 1}})

@@ -21,14 +21,16 @@ from job_rows import add_job, open_database, take_new_job, url_of
 from postgres import PostgresServer, postgres
 from pydantic import SecretStr
 from refusals import refused
+from sqlalchemy.exc import SQLAlchemyError
 from waiting import TIME_LIMIT, eventually
 
 from cow_service.errors import Canceled, InternalError
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, EngineParts, JobOutcome, Work
 from cow_service.jobs.database import Database, StoredResult
-from cow_service.jobs.job_table import MAX_DEATHS, MAX_LISTED, VERSION, JobFilters, JobTable
+from cow_service.jobs.job_table import MAX_DEATHS, MAX_LISTED, VERSION, JobFilters, JobSpec, JobTable
 from cow_service.jobs.loop import JobLoop
+from cow_service.jobs.packing import packed
 from cow_service.jobs.schema import CALLS, JOBS
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
@@ -47,6 +49,21 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
         yield database
         with database.transaction() as connection:
             connection.execute(sa.delete(JOBS))
+
+
+GIVEN_SPEC = {
+    "kind": "simulate",
+    "request": {"image": {"artifact": "0" * 64}, "question": "?"},
+    "reader": "embedded",
+    "generator": "cutout",
+    "created_at": "2026-01-01T00:00:00.000Z",
+}
+
+
+def delete(database: Database, job: str) -> None:
+    """As callers do, who cancel what they delete."""
+    JobTable(database).cancel(job)
+    JobTable(database).delete([job])
 
 
 def ids(jobs: list[Any]) -> list[str]:
@@ -301,7 +318,7 @@ def test_a_job_that_lost_a_stage_in_a_crash_of_the_database_does_not_succeed_wit
 def test_results_of_a_deleted_job_lock_nobody_out(database: Database, tmp_path: Path) -> None:
     """Not even while the error is kept, whose traceback holds the failed statement."""
     take_new_job(database, "job", "me")
-    JobTable(database).delete(["job"])
+    delete(database, "job")
     with pytest.raises(Canceled) as held:
         database.find_result("key", "job", [StoredResult("key", "grounding", "{}", ("a" * 64,))])
     with closing(open_database(tmp_path, url_of(database))) as another_process:
@@ -313,7 +330,7 @@ def test_a_job_of_the_same_id_is_not_ended_by_the_attempt_of_a_deleted_one(datab
     table = JobTable(database)
     old = take_new_job(database, "job", "me")
     assert not add_job(database, "job"), "the id is taken"
-    table.delete(["job"])
+    delete(database, "job")
     new = take_new_job(database, "job", "me")
     assert not table.succeed(old, "{}", None, ())
     assert table.taken_by("me") == {"job": new.run}
@@ -348,6 +365,39 @@ def test_what_only_seemed_an_end_and_what_was_given_back_count_for_nothing(
         assert table.release("job", taken.run, f"stop {number}")
     assert "job job goes back to its queue: its process has ended (number 1)" in caplog.text
     assert "job job goes back to its queue: stop 1" in caplog.text
+
+
+def test_a_job_that_cannot_be_read_fails_and_holds_up_nobody(database: Database) -> None:
+    table = JobTable(database)
+    for name in ("bad", "of a later version", "good"):
+        add_job(database, name)
+    spec = {**json.loads(JobSpec.model_validate(GIVEN_SPEC).model_dump_json()), "new": 1}
+    with database.transaction() as connection:
+        for name, kept in (("bad", b"?"), ("of a later version", packed(json.dumps(spec)))):
+            connection.execute(sa.update(JOBS).where(JOBS.c.id == name).values(spec=kept))
+    assert ids(table.take("light", "me", 9, None)) == ["of a later version", "good"]
+    found = table.find("bad", None)
+    assert found is not None
+    assert (found.job.status, type(found.error)) == ("failed", InternalError)
+
+
+def test_only_what_has_ended_is_deleted(database: Database) -> None:
+    """Another job may have the same id by now: its idempotency key was used again."""
+    table = JobTable(database)
+    add_job(database, "job")
+    assert table.delete(["job"]) == set()
+    assert table.find("job", None) is not None
+    assert table.cancel("job")
+    table.delete(["job"])
+    assert table.find("job", None) is None
+
+
+def test_what_cannot_be_stored_is_no_outage(database: Database) -> None:
+    if not database.is_shared:
+        pytest.skip("SQLite keeps every text")
+    job = take_new_job(database, "job", "me")
+    with pytest.raises(SQLAlchemyError):
+        JobTable(database).succeed(job, "{}", None, (), answer="nul \0")
 
 
 def test_long_answers_are_listed_in_short(database: Database) -> None:
@@ -401,6 +451,16 @@ def test_no_more_jobs_are_taken_than_there_are_places(database: Database) -> Non
         computer.may_end.set()
         eventually(lambda: not table.taken_by("me"))
     assert len(table.open_counts()) == 1, "all are back in the queue"
+
+
+def test_a_job_whose_outcome_cannot_be_stored_fails(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    computer = Places(1)
+    odd = JobOutcome("half of a pair: \ud800", None, {}, set(), "")
+    monkeypatch.setattr(computer, "compute", lambda work: odd)
+    add_job(database, "job")
+    with looping(database, computer):
+        found = eventually(lambda: one if (one := JobTable(database).find("job", None)) and one.error else None)
+    assert isinstance(found.error, InternalError)
 
 
 def test_a_job_that_the_system_gives_no_thread_for_leaves_its_place(

@@ -24,6 +24,7 @@ from fastapi.testclient import TestClient
 from servers import ASYNC, BODY, SLOW_GENERATOR, TERMINAL, events_of, problem, slow
 from waiting import TIME_LIMIT, eventually
 
+from cow_service.errors import StorageUnavailable
 from cow_service.jobs.schema import CALLS
 from cow_service.jobs.webhooks import ATTEMPT_SECONDS
 from cow_service.net import Egress
@@ -311,6 +312,24 @@ def test_an_attempt_whose_process_ended_is_made_again_in_time(http: TestClient, 
         attempts, seconds = eventually(lambda: left if (left := waiting(job)) and left[0] else None)
         assert (attempts, seconds > ATTEMPT_SECONDS - TIME_LIMIT) == (1, True)
         http.delete(f"/jobs/{job}")
+
+
+def test_a_disk_that_is_full_for_a_while_takes_no_places(
+    http: TestClient, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hooks, tries = calls(), list[int]()
+
+    def fail(*_: object) -> bool:
+        tries.append(1)
+        raise StorageUnavailable("The disk is full.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(hooks, "_change", fail)
+        job = submitted(http, {**BODY, "webhook": receiver.url})
+        eventually(lambda: len(tries) > 3)
+        assert not receiver.heard
+    verify(receiver.until(1)[0])
+    done(http, job)
 
 
 @pytest.mark.parametrize(
