@@ -75,10 +75,6 @@ class _Waiter:
     granted: threading.Event = field(compare=False, default_factory=threading.Event)
 
 
-def _never_canceled() -> None:
-    """Does nothing."""
-
-
 class PrioritySemaphore:
     """Lets threads in that hold `permits` together. Of those that wait, the lowest priority comes first, then FIFO.
 
@@ -98,47 +94,27 @@ class PrioritySemaphore:
         """How many threads wait."""
         return len(self._waiting)
 
-    def acquire(
-        self, priority: str = "", check_canceled: Callable[[], None] = _never_canceled, weight: int = 1
-    ) -> None:
-        """Waits for `weight` permits. What `check_canceled` raises meanwhile ends the wait."""
-        weight = min(weight, self._all)
+    @contextmanager
+    def held(
+        self, priority: str = "", check_canceled: Callable[[], None] = lambda: None, weight: int = 1
+    ) -> Generator[None]:
+        """Holds `weight` permits around the block. What `check_canceled` raises ends the wait for them. Not reentrant."""
+        waiter = _Waiter(priority, next(self._numbers), min(weight, self._all))
         with self._lock:
-            if weight <= self._permits and not self._waiting:
-                self._permits -= weight
-                return
-            waiter = _Waiter(priority, next(self._numbers), weight)
             bisect.insort(self._waiting, waiter)
             self._grant()
         try:
             while not waiter.granted.wait(CANCEL_POLL_SECONDS):
                 check_canceled()
             check_canceled()  # since the last look, or by the one who gave the permit back
-        except BaseException:
+            yield
+        finally:
             with self._lock:
                 if waiter.granted.is_set():
-                    self._permits += weight
+                    self._permits += waiter.weight
                 else:
                     self._waiting.remove(waiter)
                 self._grant()
-            raise
-
-    def release(self, weight: int = 1) -> None:
-        """Gives as many permits back as were waited for."""
-        with self._lock:
-            self._permits += min(weight, self._all)
-            self._grant()
-
-    @contextmanager
-    def held(
-        self, priority: str = "", check_canceled: Callable[[], None] = _never_canceled, weight: int = 1
-    ) -> Generator[None]:
-        """Holds `weight` permits around the block. Not reentrant."""
-        self.acquire(priority, check_canceled, weight)
-        try:
-            yield
-        finally:
-            self.release(weight)
 
     def _grant(self) -> None:
         passed_until = time.monotonic() - PASSED_SECONDS
