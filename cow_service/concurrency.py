@@ -98,7 +98,7 @@ class PrioritySemaphore:
     def held(
         self, priority: str = "", check_canceled: Callable[[], None] = lambda: None, weight: int = 1
     ) -> Generator[None]:
-        """Holds `weight` permits around the block. What `check_canceled` raises ends the wait for them. Not reentrant."""
+        """Holds `weight` permits around the block. What `check_canceled` raises ends the wait. Not reentrant."""
         waiter = _Waiter(priority, next(self._numbers), min(weight, self._all))
         with self._lock:
             bisect.insort(self._waiting, waiter)

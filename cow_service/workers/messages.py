@@ -29,15 +29,7 @@ class Pipe(Protocol):
         ...
 
 
-# To the worker.
-
-
-@dataclass(frozen=True)
-class Begin:
-    """The first message: the settings of the worker as JSON, with its own share of concurrency."""
-
-    settings: str
-    kind: Literal["begin"] = "begin"
+# To the worker, behind its settings.
 
 
 @dataclass(frozen=True)
@@ -49,19 +41,11 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Cancel:
-    """The result is no longer wanted."""
+class ToJob:
+    """The result of a job is no longer wanted, or the job holds the lock of the key that it asked for."""
 
     job_id: str
-    kind: Literal["cancel"] = "cancel"
-
-
-@dataclass(frozen=True)
-class KeyHeld:
-    """The job holds the lock of the key that it asked for."""
-
-    job_id: str
-    kind: Literal["key-held"] = "key-held"
+    kind: Literal["cancel", "key-held"]
 
 
 @dataclass(frozen=True)
@@ -114,20 +98,14 @@ class LookedFor:
 
 @dataclass(frozen=True)
 class HoldKey:
-    """A job wants the lock of a key: what one job computes, another one waits for, whatever worker it has."""
+    """A job wants the lock of a key: what one job computes, another one waits for, whatever worker it has.
+
+    It has one at a time. None gives it back.
+    """
 
     job_id: str
-    key: str
+    key: str | None
     kind: Literal["hold-key"] = "hold-key"
-
-
-@dataclass(frozen=True)
-class ReleaseKey:
-    """The job gives the lock of a key back."""
-
-    job_id: str
-    key: str
-    kind: Literal["release-key"] = "release-key"
 
 
 @dataclass(frozen=True)
@@ -148,28 +126,15 @@ class Failed:
     kind: Literal["failed"] = "failed"
 
 
-ToWorker = Begin | Start | Cancel | KeyHeld | End
-OfJob = Progressed | LookedFor | HoldKey | ReleaseKey | Succeeded | Failed
+ToWorker = Start | ToJob | End
+OfJob = Progressed | LookedFor | HoldKey | Succeeded | Failed
 FromWorker = Loaded | Heartbeat | OfJob
 
-_TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(Annotated[ToWorker, Field(discriminator="kind")])
-_FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])
+# Validating raises `ValidationError` for what is no message.
+TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(Annotated[ToWorker, Field(discriminator="kind")])
+FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])
 
 
 def send(pipe: Pipe, message: ToWorker | FromWorker) -> None:
     """Sends a message. Only one thread may do so at a time. Raises `OSError` if the other process has ended."""
     pipe.send_bytes(to_json(message))
-
-
-def receive_by_worker(pipe: Pipe) -> ToWorker:
-    """Waits for the next message to a worker. Raises `OSError` or `EOFError` if the server has ended."""
-    return _TO_WORKER.validate_json(pipe.recv_bytes())
-
-
-def receive_from_worker(pipe: Pipe) -> FromWorker:
-    """Waits for the next message of a worker.
-
-    Raises `OSError` or `EOFError` if it has ended, and for a message that is too long; `ValidationError` for what is
-    no message.
-    """
-    return _FROM_WORKER.validate_json(pipe.recv_bytes(MAX_MESSAGE_BYTES))

@@ -31,9 +31,8 @@ from cow_service.weights.manifests import find_manifest
 from cow_service.workers.messages import MAX_MESSAGE_BYTES
 from cow_service.workers.pool import POLL_SECONDS, Group, WorkerPool
 from cow_service.workers.process import Worker
-from cow_service.workers.ray_bridge import pack, unpack
+from cow_service.workers.ray_bridge import MODULE, pack, unpack
 
-MODULE = "cow_service.workers.ray_bridge"  # what the bridge runs
 SILENT_SECONDS = 5.0  # without such a report, after which the head is said to be away
 RECONNECT_SECONDS = 1.0  # between two tries to connect
 PLACE_SECONDS = 3.0  # that a job waits for a new actor where an actor that is at work could take it as well
@@ -239,7 +238,7 @@ class ActorGroup(Group):
         try:
             while True:
                 with self._lock:
-                    self._remove_dead()
+                    self._clean_up()
                     limit = 1 if fresh else self.jobs_each
                     placed = [one for one in self.workers if one.link.pid and one.is_alive]
                     free = [one for one in placed if self._taken[one] < limit]
@@ -260,12 +259,12 @@ class ActorGroup(Group):
     def fill(self) -> None:
         """Fits their number to the cluster and the jobs."""
         with self._lock:
-            self._remove_dead()
+            self._clean_up()
             self._fit()
             if self._cluster.fault is not None:
                 self.fault, self._failed_starts, self._next_start = None, 0, 0.0  # it is no fault of the backends
                 return
-            self._start_another(min(self.fewest, self.size))
+            self._start_another(min(self.fewest or int(self.fault is not None), self.size))
             now, crowded = time.monotonic(), bool(self._cluster.starved - {self.name})
             has_late = any(not one.link.pid and now - one.heard > PLACE_SECONDS for one in self.workers)
             (self._cluster.starved.add if self._waiting and has_late else self._cluster.starved.discard)(self.name)
