@@ -32,11 +32,8 @@ def on_one_core() -> Generator[None]:
     For work that a library hands to a thread of its own and waits for, many times a millisecond. Where the system has
     no such thing, or does not allow it, nothing changes.
     """
-    if sys.platform != "linux":
-        yield
-        return
     cores = set[int]()
-    with suppress(OSError, ValueError, AttributeError):
+    with suppress(OSError, ValueError, AttributeError, TypeError):
         running_on, cores = ctypes.CDLL(None).sched_getcpu(), os.sched_getaffinity(0)
         os.sched_setaffinity(0, {running_on})
     try:

@@ -115,7 +115,6 @@ def mcp(
 
     MCP is the Model Context Protocol, which agents use to call tools.
     """
-
     from cow_service.observability import logging as logs  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 

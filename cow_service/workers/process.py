@@ -227,9 +227,8 @@ class Worker:
         try:
             while True:
                 match messages.FROM_WORKER.validate_json(self.link.recv_bytes(messages.MAX_MESSAGE_BYTES)):
-                    case messages.Heartbeat(memory_bytes=memory_bytes, gpus=gpus, load=load):
-                        self.heard, self.memory_bytes = time.monotonic(), memory_bytes
-                        self.gpus, self.load = gpus, load
+                    case messages.Heartbeat(memory_bytes, gpus, load):
+                        self.heard, self.memory_bytes, self.gpus, self.load = time.monotonic(), memory_bytes, gpus, load
                         if not self._inboxes:
                             self.idle_bytes = memory_bytes
                     case messages.Loaded(error=error):

@@ -37,7 +37,6 @@ SILENT_SECONDS = 5.0  # without such a report, after which the head is said to b
 RECONNECT_SECONDS = 1.0  # between two tries to connect
 PLACE_SECONDS = 3.0  # that a job waits for a new actor where an actor that is at work could take it as well
 IDLE_SECONDS = 300.0  # after which an actor that is not among the fewest gives its share of the node back
-UNLIMITED = 1_000_000  # jobs that may ask for an actor at the same time: those that were taken wait for one there
 
 log = logging.getLogger("cow_service")
 
@@ -70,10 +69,8 @@ class ActorLink:
 
     def wait(self, seconds: float | None = None) -> str:
         """As `Link` says."""
-        if seconds is not None and not self.pid:
-            raise TimeoutError  # it has no place, and hears nothing
-        if not self._ended.wait(seconds):
-            raise TimeoutError
+        if (seconds is not None and not self.pid) or not self._ended.wait(seconds):
+            raise TimeoutError  # without a place it hears nothing
         return self._how
 
     def close(self) -> None:
@@ -216,7 +213,7 @@ class ActorGroup(Group):
         # Ray shows each actor its own GPU alone.
         own = {"device": "cuda"} if settings.device.startswith("cuda") else {}
         self._settings = self._settings.model_copy(update={"ray": None, **own})
-        self.places = PrioritySemaphore(UNLIMITED)
+        self.places = PrioritySemaphore(sys.maxsize)  # jobs that were taken wait in `take`
         self._cluster, self._waiting = cluster, 0
         self._idle: dict[Worker, float] = {}  # since when each has had nothing to do
         self._fit()
