@@ -69,6 +69,7 @@ class Group:
         self._settings, self._metrics = settings.model_copy(update=share), metrics
         self._lock = threading.Lock()
         self._taken: dict[Worker, int] = {}
+        self._waiting = 0  # jobs in `take`
         self._closed = False
         self._failed_starts, self._next_start = 0, 0.0  # in a row; the time before which none is started
         self._latest: Worker | None = None  # that was started
@@ -95,21 +96,20 @@ class Group:
 
         Where workers cannot start, it waits for the next try; what `check` raises ends the wait.
         """
-        while True:
+        with self._lock:
+            self._waiting += 1
+        try:
+            while True:
+                with self._lock:
+                    self._clean_up()
+                    if (chosen := self._choose(fresh=fresh)) is not None:
+                        self._taken[chosen] += 1
+                        return chosen
+                check()
+                time.sleep(POLL_SECONDS)
+        finally:
             with self._lock:
-                self._clean_up()
-                free = [one for one in self.workers if one.is_alive and self._taken[one] < self.jobs_each]
-                best = min(free, key=lambda one: self._taken[one], default=None)
-                wants_new = fresh or best is None or (self._taken[best] and len(self.workers) < self.size)
-                if wants_new and time.monotonic() >= self._next_start:
-                    best = self._start()
-                elif fresh:
-                    best = None  # the job may end the process that it is given to
-                if best is not None:
-                    self._taken[best] += 1
-                    return best
-            check()
-            time.sleep(POLL_SECONDS)
+                self._waiting -= 1
 
     def give_back(self, worker: Worker, *, renew: bool) -> None:
         """The job of a worker has ended. A worker due for renewal gets no more jobs, and ends once it has none."""
@@ -135,6 +135,14 @@ class Group:
             workers, self.workers = self.workers, []
         for worker in workers:
             worker.close()
+
+    def _choose(self, *, fresh: bool) -> Worker | None:
+        free = [one for one in self.workers if one.is_alive and self._taken[one] < self.jobs_each]
+        best = min(free, key=lambda one: self._taken[one], default=None)
+        wants_new = fresh or best is None or (self._taken[best] and len(self.workers) < self.size)
+        if wants_new and time.monotonic() >= self._next_start:
+            return self._start()
+        return None if fresh else best  # the job may end the process that it is given to
 
     def _start(self) -> Worker:
         if self._closed:  # no failure of a job whose worker just ended: it goes on after the next start

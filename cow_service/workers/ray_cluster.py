@@ -29,7 +29,7 @@ from cow_service.observability.metrics import Metrics
 from cow_service.settings import WORKER_BYTES, Settings, SettingsError
 from cow_service.weights.manifests import find_manifest
 from cow_service.workers.messages import MAX_MESSAGE_BYTES
-from cow_service.workers.pool import POLL_SECONDS, Group, WorkerPool
+from cow_service.workers.pool import Group, WorkerPool
 from cow_service.workers.process import Worker
 from cow_service.workers.ray_bridge import MODULE, pack, unpack
 
@@ -214,7 +214,7 @@ class ActorGroup(Group):
         own = {"device": "cuda"} if settings.device.startswith("cuda") else {}
         self._settings = self._settings.model_copy(update={"ray": None, **own})
         self.places = PrioritySemaphore(sys.maxsize)  # jobs that were taken wait in `take`
-        self._cluster, self._waiting = cluster, 0
+        self._cluster = cluster
         self._idle: dict[Worker, float] = {}  # since when each has had nothing to do
         self._fit()
 
@@ -225,33 +225,17 @@ class ActorGroup(Group):
         """Those that have a place."""
         return [one for one in super().alive() if one.link.pid]
 
-    def take(self, check: Callable[[], None], *, fresh: bool = False) -> Worker:
-        """The actor with the fewest jobs; with `fresh` one without any. Starts another one where all have some.
-
-        What `check` raises ends the wait.
-        """
-        with self._lock:
-            self._waiting += 1
-        try:
-            while True:
-                with self._lock:
-                    self._clean_up()
-                    limit = 1 if fresh else self.jobs_each
-                    placed = [one for one in self.workers if one.link.pid and one.is_alive]
-                    free = [one for one in placed if self._taken[one] < limit]
-                    best = min(free, key=lambda one: (self._taken[one], not one.is_loaded), default=None)
-                    coming = [one for one in self.workers if not one.link.pid]
-                    if (best is None or self._taken[best]) and len(coming) < self._waiting:
-                        self._start_another(self.size)
-                    asked = max((one.heard for one in coming), default=-math.inf)
-                    if best is not None and (not self._taken[best] or time.monotonic() - asked > PLACE_SECONDS):
-                        self._taken[best] += 1
-                        return best
-                check()
-                time.sleep(POLL_SECONDS)
-        finally:
-            with self._lock:
-                self._waiting -= 1
+    def _choose(self, *, fresh: bool) -> Worker | None:
+        """With `fresh` an actor without jobs. Starts another one where all have some."""
+        limit = 1 if fresh else self.jobs_each
+        free = [one for one in self.workers if one.link.pid and one.is_alive and self._taken[one] < limit]
+        best = min(free, key=lambda one: (self._taken[one], not one.is_loaded), default=None)
+        coming = [one for one in self.workers if not one.link.pid]
+        if (best is None or self._taken[best]) and len(coming) < self._waiting:
+            self._start_another(self.size)
+        asked = max((one.heard for one in coming), default=-math.inf)
+        is_taken = best is not None and (not self._taken[best] or time.monotonic() - asked > PLACE_SECONDS)
+        return best if is_taken else None
 
     def fill(self) -> None:
         """Fits their number to the cluster and the jobs."""
@@ -265,9 +249,8 @@ class ActorGroup(Group):
             now, crowded = time.monotonic(), bool(self._cluster.starved - {self.name})
             has_late = any(not one.link.pid and now - one.heard > PLACE_SECONDS for one in self.workers)
             (self._cluster.starved.add if self._waiting and has_late else self._cluster.starved.discard)(self.name)
-            free = [one for one in self.workers if not self._taken[one]]
-            free = [one for one in free if one.is_loaded or not (one.link.pid or self._waiting)]
-            self._idle = {one: self._idle.get(one, now) for one in free}
+            free = [one for one in self.workers if one.is_loaded or not (one.link.pid or self._waiting)]
+            self._idle = {one: self._idle.get(one, now) for one in free if not self._taken[one]}
             for one, since in self._idle.items():
                 limit = IDLE_SECONDS if one.is_loaded else PLACE_SECONDS
                 if (crowded and one.is_loaded) or (len(self.workers) > self.fewest and now - since > limit):
@@ -317,8 +300,7 @@ class RayCluster(WorkerPool):
         for group in self._default_groups():
             if self.cluster.fault is None and isinstance(group, ActorGroup) and group.size == 0:
                 needs = [f"{amount:g} {name}" for name, amount in group.needs.items() if name != "memory"]
-                memory = f"{group.needs['memory'] / 1e6:.0f} MB of memory"
-                told = ", ".join([*needs, memory])
+                told = ", ".join([*needs, f"{group.needs['memory'] / 1e6:.0f} MB of memory"])
                 return f"No node of the Ray cluster has what an actor of the queue {group.name!r} needs: {told}."
         return self.cluster.fault or super().fault()
 
