@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 CANCEL_POLL_SECONDS = 0.1  # how often a waiting thread checks whether it was canceled
 PASSED_SECONDS = 30.0  # that others may pass who waits for many permits
@@ -154,8 +154,7 @@ class BackgroundThread(ABC):
 OOM_SCORE = "500"  # the system ends such a process before the one that holds the jobs
 
 
-@dataclass(frozen=True)
-class Spawned:
+class Spawned(NamedTuple):
     """A process that waits for its first message, and the pipe to it."""
 
     process: subprocess.Popen[bytes]

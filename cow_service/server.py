@@ -120,18 +120,16 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
     """
     server, engine, readiness = _server(service, pool)
     failures: list[SettingsError] = []
-
-    def failed() -> None:
-        server.should_exit = True
+    end = partial(setattr, server, "should_exit", True)
 
     def start() -> None:
         try:
             engine.start_when_possible(server.is_ending)
         except SettingsError as error:
             failures.append(error)
-            failed()
+            end()
 
-    readiness.start(failed)
+    readiness.start(end)
     try:
         starting = threading.Thread(target=start, name="cow-starting", daemon=True)
         starting.start()  # probes are answered while it waits, and all other requests with 503

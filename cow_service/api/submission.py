@@ -48,8 +48,7 @@ Made = TypeVar("Made")
 
 def owner_of(request: Request) -> str | None:
     """Whose key the request came with; None if the server has no keys."""
-    owner: str | None = request.scope.get("state", {}).get("owner")
-    return owner
+    return request.scope.get("state", {}).get("owner")
 
 
 def from_app(name: str) -> Any:
@@ -259,13 +258,8 @@ class Submitter:
             return self.engine.find(submission.job_id, submission.owner)
 
         found = await to_thread.run_sync(durable)
-        headers = {
-            "Location": f"/jobs/{submission.job_id}",
-            "Preference-Applied": submission.prefer.applied,
-            **RETRY_AFTER,
-            **submission.headers,
-        }
-        return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers)
+        headers = {"Location": f"/jobs/{submission.job_id}", "Preference-Applied": submission.prefer.applied}
+        return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers | RETRY_AFTER | submission.headers)
 
     async def outcome(
         self,

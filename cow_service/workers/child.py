@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 
 import cv2
 import psutil
+from pydantic_core import to_json
 
 from cow_service.concurrency import free_memory, leave_decisions_to_the_parent, return_large_blocks
 from cow_service.errors import CowError, unforeseen
@@ -112,13 +113,13 @@ class WorkerProcess:
                 case messages.ToJob(job_id, kind):
                     if (job := self._jobs.get(job_id)) is not None:  # else it has just ended
                         (job.active.cancel_requested if kind == "cancel" else job.key_held).set()
-                case messages.End():
+                case None:
                     return
 
     def _send(self, message: FromWorker) -> None:
         """Does nothing once the pipe has ended, which `run` sees as well."""
         with self._sending, suppress(OSError):
-            messages.send(self._pipe, message)
+            self._pipe.send_bytes(to_json(message))
 
     def _beat(self) -> None:
         while True:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import Field, TypeAdapter
-from pydantic_core import to_json
 
 from cow_service.jobs.computing import JobOutcome
 from cow_service.jobs.job_table import TakenJob
@@ -19,7 +18,7 @@ MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
 
 
 class Pipe(Protocol):
-    """What messages go through. Its methods raise `OSError` or `EOFError` once the other end is gone."""
+    """What messages go through, of one thread at a time. Raises `OSError` or `EOFError` once the other end is gone."""
 
     def send_bytes(self, buf: bytes, /) -> None:
         """Sends one message."""
@@ -46,13 +45,6 @@ class ToJob:
 
     job_id: str
     kind: Literal["cancel", "key-held"]
-
-
-@dataclass(frozen=True)
-class End:
-    """The last message: the worker has no jobs, and ends."""
-
-    kind: Literal["end"] = "end"
 
 
 # From the worker.
@@ -126,15 +118,10 @@ class Failed:
     kind: Literal["failed"] = "failed"
 
 
-ToWorker = Start | ToJob | End
+ToWorker = Start | ToJob | None  # None is the last: the worker has no jobs, and ends
 OfJob = Progressed | LookedFor | HoldKey | Succeeded | Failed
 FromWorker = Loaded | Heartbeat | OfJob
 
 # Validating raises `ValidationError` for what is no message.
-TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(Annotated[ToWorker, Field(discriminator="kind")])
+TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(ToWorker)
 FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])
-
-
-def send(pipe: Pipe, message: ToWorker | FromWorker) -> None:
-    """Sends a message. Only one thread may do so at a time. Raises `OSError` if the other process has ended."""
-    pipe.send_bytes(to_json(message))

@@ -74,19 +74,14 @@ class Group:
         self._failed_starts, self._next_start = 0, 0.0  # in a row; the time before which none is started
         self._latest: Worker | None = None  # that was started
 
-    def start(self) -> None:
-        """Starts the first worker."""
-        with self._lock:
-            self._start()
-
-    def fill(self) -> None:
+    def fill(self, *, first: bool = False) -> None:
         """Starts the next worker of all that there may be, once those that were started have loaded.
 
-        Also one in the place of the first, after a pause, where that could not start.
+        The first one where that is wanted, and after a pause where it could not start.
         """
         with self._lock:
             self._clean_up()
-            is_wanted = len(self.workers) < self.size if self.workers else self.fault is not None
+            is_wanted = len(self.workers) < self.size if self.workers else first or self.fault is not None
             is_ready = all(one.is_loaded and one.is_alive for one in self.workers)
             if is_wanted and is_ready and not self._closed and time.monotonic() >= self._next_start:
                 self._start()
@@ -205,7 +200,7 @@ class WorkerPool(Computer):
         self._watching = threading.Thread(target=self._watch, name="cow-workers", daemon=True)
         self._watching.start()
         for group in self._default_groups():
-            group.start()
+            group.fill(first=True)
 
     def close(self) -> None:
         """Ends all workers."""

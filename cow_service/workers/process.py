@@ -11,6 +11,7 @@ from queue import Empty, SimpleQueue
 from typing import Literal, Protocol
 
 from pydantic import ValidationError
+from pydantic_core import to_json
 
 from cow_service.concurrency import spawn
 from cow_service.errors import Canceled, CowError, JobTimeout
@@ -75,8 +76,7 @@ class Child:
     is_lost = False
 
     def __init__(self) -> None:
-        spawned = spawn(MODULE)
-        self._process, self._pipe = spawned.process, spawned.pipe
+        self._process, self._pipe = spawn(MODULE)
         self.pid, self.kill, self.close = self._process.pid, self._process.kill, self._pipe.close
         self.send_bytes, self.recv_bytes = self._pipe.send_bytes, self._pipe.recv_bytes
 
@@ -137,11 +137,11 @@ class Worker:
 
     def run(self, work: Work, locks: KeyLocks) -> JobOutcome:
         """Computes a job. Raises the `CowError` that it fails with, `Canceled`, `JobTimeout`, `WorkerGone`."""
-        inbox = self._inboxes[work.job.id] = SimpleQueue()
+        self._inboxes[work.job.id] = SimpleQueue()
         try:
             with ExitStack() as keys:
                 self._send(messages.Start(work.job))
-                return self._follow(work, inbox, locks, keys)
+                return self._follow(work, locks, keys)
         finally:
             del self._inboxes[work.job.id]
             self.jobs_done += 1
@@ -155,7 +155,7 @@ class Worker:
         """Ends the process. It has no jobs."""
         if self.is_alive:
             self._end_reason = end_reason
-        self._send(messages.End())
+        self._send(None)
         try:
             self.link.wait(END_SECONDS)
         except TimeoutError:
@@ -163,11 +163,10 @@ class Worker:
         self._ended.wait()
         self.link.close()
 
-    def _follow(
-        self, work: Work, inbox: SimpleQueue[messages.OfJob | None], locks: KeyLocks, keys: ExitStack
-    ) -> JobOutcome:
+    def _follow(self, work: Work, locks: KeyLocks, keys: ExitStack) -> JobOutcome:
         """Does what the messages about a job ask for, until its outcome. `keys` holds the lock of its key, if any."""
         until, canceled, begun = math.inf, False, False  # its time does not begin while the process loads
+        inbox = self._inboxes[work.job.id]
 
         def check() -> None:
             self._check_alive(begun)
@@ -220,7 +219,7 @@ class Worker:
 
     def _send(self, message: messages.ToWorker) -> None:
         with self._sending, suppress(OSError):  # its end is noticed where its messages are read
-            messages.send(self.link, message)
+            self.link.send_bytes(to_json(message))
 
     def _listen(self) -> None:
         """Hands each message to the job that it is about, until the process has ended."""

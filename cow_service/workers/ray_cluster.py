@@ -218,9 +218,6 @@ class ActorGroup(Group):
         self._idle: dict[Worker, float] = {}  # since when each has had nothing to do
         self._fit()
 
-    def start(self) -> None:
-        """Does nothing: there are no nodes yet. `fill` starts the first actors."""
-
     def alive(self) -> list[Worker]:
         """Those that have a place."""
         return [one for one in super().alive() if one.link.pid]
@@ -237,8 +234,8 @@ class ActorGroup(Group):
         is_taken = best is not None and (not self._taken[best] or time.monotonic() - asked > PLACE_SECONDS)
         return best if is_taken else None
 
-    def fill(self) -> None:
-        """Fits their number to the cluster and the jobs."""
+    def fill(self, *, first: bool = False) -> None:
+        """Fits their number to the cluster and the jobs, from the first on."""
         with self._lock:
             self._clean_up()
             self._fit()
