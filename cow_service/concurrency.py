@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 CANCEL_POLL_SECONDS = 0.1  # how often a waiting thread checks whether it was canceled
 PASSED_SECONDS = 30.0  # that others may pass who waits for many permits
@@ -32,11 +32,8 @@ def on_one_core() -> Generator[None]:
     For work that a library hands to a thread of its own and waits for, many times a millisecond. Where the system has
     no such thing, or does not allow it, nothing changes.
     """
-    if sys.platform != "linux":
-        yield
-        return
     cores = set[int]()
-    with suppress(OSError, ValueError, AttributeError):
+    with suppress(OSError, ValueError, AttributeError, TypeError):
         running_on, cores = ctypes.CDLL(None).sched_getcpu(), os.sched_getaffinity(0)
         os.sched_setaffinity(0, {running_on})
     try:
@@ -75,10 +72,6 @@ class _Waiter:
     granted: threading.Event = field(compare=False, default_factory=threading.Event)
 
 
-def _never_canceled() -> None:
-    """Does nothing."""
-
-
 class PrioritySemaphore:
     """Lets threads in that hold `permits` together. Of those that wait, the lowest priority comes first, then FIFO.
 
@@ -98,47 +91,27 @@ class PrioritySemaphore:
         """How many threads wait."""
         return len(self._waiting)
 
-    def acquire(
-        self, priority: str = "", check_canceled: Callable[[], None] = _never_canceled, weight: int = 1
-    ) -> None:
-        """Waits for `weight` permits. What `check_canceled` raises meanwhile ends the wait."""
-        weight = min(weight, self._all)
+    @contextmanager
+    def held(
+        self, priority: str = "", check_canceled: Callable[[], None] = lambda: None, weight: int = 1
+    ) -> Generator[None]:
+        """Holds `weight` permits around the block. What `check_canceled` raises ends the wait. Not reentrant."""
+        waiter = _Waiter(priority, next(self._numbers), min(weight, self._all))
         with self._lock:
-            if weight <= self._permits and not self._waiting:
-                self._permits -= weight
-                return
-            waiter = _Waiter(priority, next(self._numbers), weight)
             bisect.insort(self._waiting, waiter)
             self._grant()
         try:
             while not waiter.granted.wait(CANCEL_POLL_SECONDS):
                 check_canceled()
             check_canceled()  # since the last look, or by the one who gave the permit back
-        except BaseException:
+            yield
+        finally:
             with self._lock:
                 if waiter.granted.is_set():
-                    self._permits += weight
+                    self._permits += waiter.weight
                 else:
                     self._waiting.remove(waiter)
                 self._grant()
-            raise
-
-    def release(self, weight: int = 1) -> None:
-        """Gives as many permits back as were waited for."""
-        with self._lock:
-            self._permits += min(weight, self._all)
-            self._grant()
-
-    @contextmanager
-    def held(
-        self, priority: str = "", check_canceled: Callable[[], None] = _never_canceled, weight: int = 1
-    ) -> Generator[None]:
-        """Holds `weight` permits around the block. Not reentrant."""
-        self.acquire(priority, check_canceled, weight)
-        try:
-            yield
-        finally:
-            self.release(weight)
 
     def _grant(self) -> None:
         passed_until = time.monotonic() - PASSED_SECONDS
@@ -181,8 +154,7 @@ class BackgroundThread(ABC):
 OOM_SCORE = "500"  # the system ends such a process before the one that holds the jobs
 
 
-@dataclass(frozen=True)
-class Spawned:
+class Spawned(NamedTuple):
     """A process that waits for its first message, and the pipe to it."""
 
     process: subprocess.Popen[bytes]

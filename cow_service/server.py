@@ -24,7 +24,6 @@ from cow_service.service import Service
 from cow_service.settings import SettingsError
 from cow_service.workers.pool import WorkerPool
 
-EVERYWHERE = ("0.0.0.0", "::")  # addresses to listen at, which callers cannot use
 # That the start waits for the job database, and for models; after that the server answers probes meanwhile.
 START_WAIT_SECONDS, LOAD_WAIT_SECONDS = 1.0, 0.5
 LOAD_SECONDS = 3600.0  # longest that models may take to load where nothing is asked before
@@ -77,7 +76,7 @@ class Server(uvicorn.Server):
     def address(self) -> str:
         """Where it listens, once it has started, as this machine reaches it."""
         host, port = self._engine.service.settings.host, self.servers[0].sockets[0].getsockname()[1]
-        name = "127.0.0.1" if host in EVERYWHERE else host
+        name = "127.0.0.1" if host in ("0.0.0.0", "::") else host
         return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
@@ -91,12 +90,8 @@ class Server(uvicorn.Server):
 def run_worker(service: Service, pool: WorkerPool) -> None:
     """Computes jobs of the queues until a signal ends it. Raises the `CowError` for which its backends do not load."""
     ended = threading.Event()
-
-    def end(number: int, frame: object) -> None:
-        ended.set()
-
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
+        signal.signal(number, lambda number, frame: ended.set())
     engine = JobEngine(service, pool, "worker")
     try:
         host, port = service.settings.host, service.settings.metrics_port
@@ -125,18 +120,16 @@ def run_server(service: Service, pool: WorkerPool | None = None) -> None:
     """
     server, engine, readiness = _server(service, pool)
     failures: list[Exception] = []
-
-    def failed() -> None:
-        server.should_exit = True
+    end = partial(setattr, server, "should_exit", True)
 
     def start() -> None:
         try:
             engine.start_when_possible(server.is_ending)
         except Exception as error:  # noqa: BLE001 # raised where the server ends
             failures.append(error)
-            failed()
+            end()
 
-    readiness.start(failed)
+    readiness.start(end)
     try:
         starting = threading.Thread(target=start, name="cow-starting", daemon=True)
         starting.start()  # probes are answered while it waits, and all other requests with 503

@@ -298,7 +298,7 @@ class Settings(BaseSettings):
 
 # Messages about settings that may hold a secret, or whose pattern says little, without their value.
 SETTINGS_IN_WORDS = {
-    "ray": "must be auto, or HOST:PORT of the head of a Ray cluster of which this machine is a node; ray:// is for clients",
+    "ray": "must be auto, or HOST:PORT of the head of a Ray cluster of which this machine is a node, without ray://",
     "ray_actors": 'must be a JSON object of queues and the fewest and most actors of each, such as {"light": [2, 16]}',
     "chat_fields": "must be names with commas between them, such as top_k, enable_thinking",
     "mllm_base_url": "must begin with http:// or https://",
@@ -312,7 +312,8 @@ SETTINGS_IN_WORDS = {
 }
 JSON_EXAMPLES = {  # of settings that are no lists
     "api_keys": '{"alice": "sha256:0123..."}, as `cow keys new alice` prints it',
-    "checkpoints": '{"ati": "/models/ati"}', "ray_actors": '{"light": [2, 16]}', "generator_concurrency": '{"ati": 2}', "key_weights": '{"alice": 2}',
+    "checkpoints": '{"ati": "/models/ati"}', "ray_actors": '{"light": [2, 16]}',
+    "generator_concurrency": '{"ati": 2}', "key_weights": '{"alice": 2}',
 }  # fmt: skip
 
 

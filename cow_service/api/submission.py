@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Any, TypeVar, get_args
@@ -42,15 +42,13 @@ MAX_CONCURRENT_BODIES = 4  # read at the same time
 MAX_CONCURRENT_LOOKS = 2  # they wait for the CPU with everything else
 MAX_CONCURRENT_FETCHES = 64  # of images given by URL
 RETRY_AFTER = {"Retry-After": "1"}
-REPLAYED = "Idempotent-Replayed"  # as Stripe names it
 
 Made = TypeVar("Made")
 
 
 def owner_of(request: Request) -> str | None:
     """Whose key the request came with; None if the server has no keys."""
-    owner: str | None = request.scope.get("state", {}).get("owner")
-    return owner
+    return request.scope.get("state", {}).get("owner")
 
 
 def from_app(name: str) -> Any:
@@ -119,12 +117,7 @@ class Submission:
     @property
     def headers(self) -> dict[str, str]:
         """Of the response to it, errors included."""
-        return {REPLAYED: "true"} if self.replayed else {}
-
-    @property
-    def may_return(self) -> bool:
-        """Whether a header says that the caller may ask for the job later."""
-        return self.prefer != Preferences(fresh=self.prefer.fresh, minimal=self.prefer.minimal)
+        return {"Idempotent-Replayed": "true"} if self.replayed else {}  # as Stripe names it
 
 
 class FairThreads:
@@ -164,7 +157,7 @@ class Submitter:
 
     def __init__(self, engine: JobEngine) -> None:
         self.engine = engine
-        self._bodies = FairThreads(MAX_CONCURRENT_BODIES)
+        self.in_thread = FairThreads(MAX_CONCURRENT_BODIES).run  # reads bodies of an owner
         self._fetches = FairThreads(MAX_CONCURRENT_FETCHES)
         self._looks = FairThreads(MAX_CONCURRENT_LOOKS)
 
@@ -221,10 +214,6 @@ class Submitter:
             self.engine.check_capacity(owner)  # before the body is read: a refusal comes at once
         return Submission(kind, owner, prefer, new_job_id(owner, prefer.key))
 
-    async def in_thread(self, owner: str | None, work: Callable[[], Made]) -> Made:
-        """Reads a body of an owner in a thread, a few at the same time."""
-        return await self._bodies.run(owner, work)
-
     async def fetch(self, owner: str | None, work: Callable[[], tuple[Made, int]]) -> Made:
         """What work that fetches images returns. The owner is charged for its second result, the bytes fetched."""
         made, size = await self._fetches.run(owner, work)
@@ -269,13 +258,8 @@ class Submitter:
             return self.engine.find(submission.job_id, submission.owner)
 
         found = await to_thread.run_sync(durable)
-        headers = {
-            "Location": f"/jobs/{submission.job_id}",
-            "Preference-Applied": submission.prefer.applied,
-            **RETRY_AFTER,
-            **submission.headers,
-        }
-        return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers)
+        headers = {"Location": f"/jobs/{submission.job_id}", "Preference-Applied": submission.prefer.applied}
+        return json_response(found.as_json(), HTTPStatus.ACCEPTED, headers | RETRY_AFTER | submission.headers)
 
     async def outcome(
         self,
@@ -307,15 +291,13 @@ class Submitter:
             look = True
 
     async def leave(self, submission: Submission, created_at: str | None) -> None:
-        """The caller has disconnected: cancels a new job whose id no caller knows."""
-        if created_at is not None and not submission.may_return:
+        """The caller has disconnected: cancels a new job, unless a header says that they may ask for it later."""
+        if created_at is not None and replace(submission.prefer, fresh=False, minimal=False) == Preferences():
             await to_thread.run_sync(self.engine.cancel, submission.job_id, submission.owner)
 
     def _precheck(self, submission: Submission, body: SimulateRequest) -> tuple[str, str]:
         """Checks a request, except its image; raises what is wrong, and returns its reader and generator."""
-        if isinstance(body.image, ImageArtifact) and submission.image is None:
-            self.engine.may_read(body.image.artifact, submission.owner)
-        for picture in body.attached:
+        for picture in body.attached if submission.image is not None else (body.image, *body.attached):
             if isinstance(picture, ImageArtifact):
                 self.engine.may_read(picture.artifact, submission.owner)
         backends = self.engine.service.precheck(body)
@@ -353,9 +335,9 @@ class Submitter:
         """The result of the job from the database; None if it has not ended. Raises what it failed with."""
         try:
             found = self.engine.find(submission.job_id, submission.owner)
-        except JobNotFound as error:
-            raise Canceled("The job was deleted before it was finished.") from error
-        if created_at not in (None, found.job.created_at):
+        except JobNotFound:
+            found = None
+        if found is None or created_at not in (None, found.job.created_at):
             raise Canceled("The job was deleted before it was finished.")
         if found.job.status not in TERMINAL:
             self.engine.storage.check()

@@ -9,17 +9,11 @@ import typer
 from typer.core import TyperGroup
 
 from cow_service.cli.batch import EXIT_INTERRUPTED, EXIT_SOME_FAILED
-from cow_service.cli.options import Texts, argument, option, printable, with_options
+from cow_service.cli.options import NotInstalled, Texts, argument, option, printable, with_options
 from cow_service.client.options import CONCURRENCY
-from cow_service.errors import CowError, InvalidRequest, install_line
+from cow_service.errors import InvalidRequest, install_line
 
 _OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair", "pydantic_ai", "tenacity")
-
-
-class EvalsNotInstalled(CowError):
-    """The Python packages for the evaluation are not installed."""
-
-    code, status = "evals-not-installed", 0
 
 
 class _RunByDefault(TyperGroup):
@@ -246,9 +240,9 @@ def _priced(path: Path | None) -> dict[str, Any]:
 
 
 def _check_installed() -> None:
-    """Raises `EvalsNotInstalled`."""
+    """Raises `NotInstalled`."""
     from importlib.util import find_spec  # noqa: PLC0415
 
     missing = [name for name in _OF_EXTRA if find_spec(name) is None]
     if missing:
-        raise EvalsNotInstalled(f"`cow eval` needs {', '.join(missing)}: {install_line('evals')}")
+        raise NotInstalled(f"`cow eval` needs {', '.join(missing)}: {install_line('evals')}")

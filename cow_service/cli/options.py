@@ -39,6 +39,12 @@ class FileUnreadable(CowError):
     code, status = "file-unreadable", 0  # never in a response
 
 
+class NotInstalled(CowError):
+    """A command needs Python packages that are not installed."""
+
+    code, status = "not-installed", 0
+
+
 class FolderNotWritable(CowError):
     """The results cannot be written."""
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from cow_service.cli.options import Texts, argument, option
-from cow_service.errors import CowError, InvalidRequest, install_line
+from cow_service.cli.options import NotInstalled, Texts, argument, option
+from cow_service.errors import InvalidRequest, install_line
 
 if TYPE_CHECKING:
     from cow_service.service import Service
@@ -79,12 +79,6 @@ def migrate() -> None:
     typer.echo("The job database is up to date.")
 
 
-class McpNotInstalled(CowError):
-    """The Python package that speaks the Model Context Protocol is not installed."""
-
-    code, status = "mcp-not-installed", 0
-
-
 def mcp(
     transport: Annotated[
         Literal["stdio", "http"],
@@ -109,7 +103,6 @@ def mcp(
 
     MCP is the Model Context Protocol, which agents use to call tools.
     """
-
     from cow_service.observability import logging as logs  # noqa: PLC0415
     from cow_service.settings import load_settings  # noqa: PLC0415
 
@@ -122,10 +115,7 @@ def mcp(
     except ImportError as error:
         if (error.name or "").partition(".")[0] not in ("mcp", "mcp_types"):
             raise
-        raise McpNotInstalled(
-            f"`cow mcp` needs the Python package `mcp`, 2.3 or later: {install_line('mcp')}"
-        ) from error
-
+        raise NotInstalled(f"`cow mcp` needs the Python package `mcp`, 2.3 or later: {install_line('mcp')}") from error
     if transport == "stdio":
         # The requests are the tools' own, and there is one caller.
         logging.getLogger(logs.ACCESS).setLevel(logging.WARNING)

@@ -78,10 +78,8 @@ class JobEngine:
                 self.start()
             except StorageUnavailable as error:
                 self._waits_for = error.detail
-                why = str(getattr(error.__cause__, "orig", error.__cause__) or "").partition("\n")[
-                    0
-                ]  # for the operator
-                log.warning("%s %s. Next try in %g s.", error.detail, why.rstrip("."), pause)
+                cause = str(getattr(error.__cause__, "orig", error.__cause__)).partition("\n")[0]  # for the operator
+                log.warning("%s (%s) Next try in %g s.", error.detail, cause, pause)
                 stop.wait(pause)
                 pause = min(2 * pause, LONGEST_WAIT)
             else:

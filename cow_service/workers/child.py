@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 
 import cv2
 import psutil
+from pydantic_core import to_json
 
 from cow_service.concurrency import free_memory, leave_decisions_to_the_parent, return_large_blocks
 from cow_service.errors import CowError, unforeseen
@@ -85,7 +86,7 @@ class _Job:
                 check_canceled()
             yield
         finally:
-            self._send(messages.ReleaseKey(self.job.id, key))
+            self._send(messages.HoldKey(self.job.id, None))
 
 
 class WorkerProcess:
@@ -105,23 +106,20 @@ class WorkerProcess:
         threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
         threading.Thread(target=self._load, name="load", daemon=True).start()
         while True:
-            match messages.receive_by_worker(self._pipe):
+            match messages.TO_WORKER.validate_json(self._pipe.recv_bytes()):
                 case messages.Start(job=job):
                     self._jobs[job.id] = _Job(job, self._send)
                     self._threads.submit(self._work, job.id)
-                case messages.Cancel(job_id) if job_id in self._jobs:
-                    self._jobs[job_id].active.cancel_requested.set()
-                case messages.KeyHeld(job_id) if job_id in self._jobs:
-                    self._jobs[job_id].key_held.set()
-                case messages.End():
+                case messages.ToJob(job_id, kind):
+                    if (job := self._jobs.get(job_id)) is not None:  # else it has just ended
+                        (job.active.cancel_requested if kind == "cancel" else job.key_held).set()
+                case None:
                     return
-                case _:
-                    pass  # about a job that has just ended
 
     def _send(self, message: FromWorker) -> None:
         """Does nothing once the pipe has ended, which `run` sees as well."""
         with self._sending, suppress(OSError):
-            messages.send(self._pipe, message)
+            self._pipe.send_bytes(to_json(message))
 
     def _beat(self) -> None:
         while True:
@@ -164,12 +162,8 @@ def main(descriptor: int) -> None:
 def work(pipe: messages.Pipe) -> None:
     """Works on a pipe until it ends. Jobs may still be at work then; their results are not wanted."""
     cv2.setNumThreads(1)  # a process for each core: threads of their own would take a quarter more time, all together
-    try:
-        first = messages.receive_by_worker(pipe)
-        assert isinstance(first, messages.Begin)
-        settings = Settings.model_validate_json(first.settings)
+    with suppress(EOFError, OSError):
+        settings = Settings.model_validate_json(pipe.recv_bytes())
         context.set_up(settings)
         tracing.start()
         WorkerProcess(pipe, settings).run()
-    except (EOFError, OSError):
-        pass

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import Field, TypeAdapter
-from pydantic_core import to_json
 
 from cow_service.jobs.computing import JobOutcome
 from cow_service.jobs.job_table import TakenJob
@@ -19,7 +18,7 @@ MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
 
 
 class Pipe(Protocol):
-    """What messages go through. Its methods raise `OSError` or `EOFError` once the other end is gone."""
+    """What messages go through, of one thread at a time. Raises `OSError` or `EOFError` once the other end is gone."""
 
     def send_bytes(self, buf: bytes, /) -> None:
         """Sends one message."""
@@ -29,15 +28,7 @@ class Pipe(Protocol):
         ...
 
 
-# To the worker.
-
-
-@dataclass(frozen=True)
-class Begin:
-    """The first message: the settings of the worker as JSON, with its own share of concurrency."""
-
-    settings: str
-    kind: Literal["begin"] = "begin"
+# To the worker, behind its settings.
 
 
 @dataclass(frozen=True)
@@ -49,26 +40,11 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Cancel:
-    """The result is no longer wanted."""
+class ToJob:
+    """The result of a job is no longer wanted, or the job holds the lock of the key that it asked for."""
 
     job_id: str
-    kind: Literal["cancel"] = "cancel"
-
-
-@dataclass(frozen=True)
-class KeyHeld:
-    """The job holds the lock of the key that it asked for."""
-
-    job_id: str
-    kind: Literal["key-held"] = "key-held"
-
-
-@dataclass(frozen=True)
-class End:
-    """The last message: the worker has no jobs, and ends."""
-
-    kind: Literal["end"] = "end"
+    kind: Literal["cancel", "key-held"]
 
 
 # From the worker.
@@ -114,20 +90,14 @@ class LookedFor:
 
 @dataclass(frozen=True)
 class HoldKey:
-    """A job wants the lock of a key: what one job computes, another one waits for, whatever worker it has."""
+    """A job wants the lock of a key: what one job computes, another one waits for, whatever worker it has.
+
+    It has one at a time. None gives it back.
+    """
 
     job_id: str
-    key: str
+    key: str | None
     kind: Literal["hold-key"] = "hold-key"
-
-
-@dataclass(frozen=True)
-class ReleaseKey:
-    """The job gives the lock of a key back."""
-
-    job_id: str
-    key: str
-    kind: Literal["release-key"] = "release-key"
 
 
 @dataclass(frozen=True)
@@ -148,28 +118,10 @@ class Failed:
     kind: Literal["failed"] = "failed"
 
 
-ToWorker = Begin | Start | Cancel | KeyHeld | End
-OfJob = Progressed | LookedFor | HoldKey | ReleaseKey | Succeeded | Failed
+ToWorker = Start | ToJob | None  # None is the last: the worker has no jobs, and ends
+OfJob = Progressed | LookedFor | HoldKey | Succeeded | Failed
 FromWorker = Loaded | Heartbeat | OfJob
 
-_TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(Annotated[ToWorker, Field(discriminator="kind")])
-_FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])
-
-
-def send(pipe: Pipe, message: ToWorker | FromWorker) -> None:
-    """Sends a message. Only one thread may do so at a time. Raises `OSError` if the other process has ended."""
-    pipe.send_bytes(to_json(message))
-
-
-def receive_by_worker(pipe: Pipe) -> ToWorker:
-    """Waits for the next message to a worker. Raises `OSError` or `EOFError` if the server has ended."""
-    return _TO_WORKER.validate_json(pipe.recv_bytes())
-
-
-def receive_from_worker(pipe: Pipe) -> FromWorker:
-    """Waits for the next message of a worker.
-
-    Raises `OSError` or `EOFError` if it has ended, and for a message that is too long; `ValidationError` for what is
-    no message.
-    """
-    return _FROM_WORKER.validate_json(pipe.recv_bytes(MAX_MESSAGE_BYTES))
+# Validating raises `ValidationError` for what is no message.
+TO_WORKER: TypeAdapter[ToWorker] = TypeAdapter(ToWorker)
+FROM_WORKER: TypeAdapter[FromWorker] = TypeAdapter(Annotated[FromWorker, Field(discriminator="kind")])

@@ -14,25 +14,30 @@ from itertools import count
 
 from cow_service.adaptive import FIRST
 from cow_service.concurrency import PrioritySemaphore
-from cow_service.errors import Canceled, DeviceFailed, WorkerEnded
+from cow_service.errors import Canceled, CowError, DeviceFailed, WorkerEnded
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, JobOutcome, KeyLocks, Work, waiting_jobs
 from cow_service.jobs.queues import LIGHT, clips, places, queue_of
 from cow_service.media.artifacts import ArtifactStore
+from cow_service.media.images import pixels_in
 from cow_service.observability.metrics import Metrics
 from cow_service.records import WorkerInfo
-from cow_service.settings import Settings
+from cow_service.settings import WORKER_BYTES, Settings
 from cow_service.stages.run import priority_of
 from cow_service.weights.manifests import find_manifest
-from cow_service.workers.memory import memory_for_jobs, memory_needed
 from cow_service.workers.process import EndReason, Worker, WorkerGone
 
 MAX_CRASHES = 3  # of workers that had nothing but the job, or of their device
 HEARTBEAT_TIMEOUT_SECONDS = 15.0  # after which a worker that says nothing is ended
 WATCH_SECONDS = 1.0  # between two looks at each worker
 FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS = 1.0, 60.0  # after a worker that could not start; doubled each time
+LOAD_POLL_SECONDS = 0.02  # between two looks whether a worker has loaded: the start of a server waits for it
 POLL_SECONDS = 0.1  # how often a job that waits for such a pause checks whether it was canceled
 RENEW_SHARE = 0.75  # of the memory that a worker may take, from which on one without a job is replaced
+# Of a job, beside what a worker takes for small images. `benchmarks/memory.py` measures the kinds of pictures: with a
+# depth map a job takes most, at 24 megapixels 450 MB.
+BYTES_PER_PIXEL, BYTES_PER_PIXEL_OF_A_MASK = 12, 2
+CLIP_SIDE = 1280  # px: frames are no larger
 
 log = logging.getLogger("cow_service")
 
@@ -64,33 +69,21 @@ class Group:
         self._settings, self._metrics = settings.model_copy(update=share), metrics
         self._lock = threading.Lock()
         self._taken: dict[Worker, int] = {}
+        self._waiting = 0  # jobs in `take`
         self._closed = False
         self._failed_starts, self._next_start = 0, 0.0  # in a row; the time before which none is started
         self._latest: Worker | None = None  # that was started
 
-    def start(self) -> None:
-        """Starts the first worker."""
-        with self._lock:
-            self._start()
+    def fill(self, *, first: bool = False) -> None:
+        """Starts the next worker of all that there may be, once those that were started have loaded.
 
-    def fill(self) -> None:
-        """Starts the next worker of all that there may be, once those that were started have loaded."""
+        The first one where that is wanted, and after a pause where it could not start.
+        """
         with self._lock:
-            self._remove_dead()
-            if self._closed or not all(worker.is_loaded and worker.is_alive for worker in self.workers):
-                return
-            if 0 < len(self.workers) < self.size and time.monotonic() >= self._next_start:
-                self._start()
-
-    def recover(self) -> None:
-        """Starts a worker, after a pause, in the place of one that could not start."""
-        with self._lock:
-            if self.fault is None or self._closed:
-                return
-            self._remove_dead()
-            if any(worker.is_loaded and worker.is_alive for worker in self.workers):
-                self.fault = None  # jobs do not wait
-            elif not self.workers and time.monotonic() >= self._next_start:
+            self._clean_up()
+            is_wanted = len(self.workers) < self.size if self.workers else first or self.fault is not None
+            is_ready = all(one.is_loaded and one.is_alive for one in self.workers)
+            if is_wanted and is_ready and not self._closed and time.monotonic() >= self._next_start:
                 self._start()
 
     def take(self, check: Callable[[], None], *, fresh: bool = False) -> Worker:
@@ -98,21 +91,20 @@ class Group:
 
         Where workers cannot start, it waits for the next try; what `check` raises ends the wait.
         """
-        while True:
+        with self._lock:
+            self._waiting += 1
+        try:
+            while True:
+                with self._lock:
+                    self._clean_up()
+                    if (chosen := self._choose(fresh=fresh)) is not None:
+                        self._taken[chosen] += 1
+                        return chosen
+                check()
+                time.sleep(POLL_SECONDS)
+        finally:
             with self._lock:
-                self._remove_dead()
-                free = [one for one in self.workers if one.is_alive and self._taken[one] < self.jobs_each]
-                best = min(free, key=lambda one: self._taken[one], default=None)
-                wants_new = fresh or best is None or (self._taken[best] and len(self.workers) < self.size)
-                if wants_new and time.monotonic() >= self._next_start:
-                    best = self._start()
-                elif fresh:
-                    best = None  # the job may end the process that it is given to
-                if best is not None:
-                    self._taken[best] += 1
-                    return best
-            check()
-            time.sleep(POLL_SECONDS)
+                self._waiting -= 1
 
     def give_back(self, worker: Worker, *, renew: bool) -> None:
         """The job of a worker has ended. A worker due for renewal gets no more jobs, and ends once it has none."""
@@ -139,6 +131,14 @@ class Group:
         for worker in workers:
             worker.close()
 
+    def _choose(self, *, fresh: bool) -> Worker | None:
+        free = [one for one in self.workers if one.is_alive and self._taken[one] < self.jobs_each]
+        best = min(free, key=lambda one: self._taken[one], default=None)
+        wants_new = fresh or best is None or (self._taken[best] and len(self.workers) < self.size)
+        if wants_new and time.monotonic() >= self._next_start:
+            return self._start()
+        return None if fresh else best  # the job may end the process that it is given to
+
     def _start(self) -> Worker:
         if self._closed:  # no failure of a job whose worker just ended: it goes on after the next start
             raise Canceled("The server is stopping.")
@@ -154,12 +154,14 @@ class Group:
     def _make(self, name: str) -> Worker:
         return Worker(name, self._settings, self._note_end)
 
-    def _remove_dead(self) -> None:
-        """Lets go of workers that ended without a job."""
+    def _clean_up(self) -> None:
+        """Lets go of workers that ended without a job, and of the fault where jobs do not wait."""
         for dead in [one for one in self.workers if not one.is_alive and not self._taken[one]]:
             self.workers.remove(dead)
             del self._taken[dead]
             dead.close()
+        if any(one.is_loaded and one.is_alive for one in self.workers):
+            self.fault = None
 
     def _note_end(self, worker: Worker, reason: EndReason) -> None:
         """Counts the end of a worker; after one that could not start, the next is started later and later."""
@@ -198,7 +200,7 @@ class WorkerPool(Computer):
         self._watching = threading.Thread(target=self._watch, name="cow-workers", daemon=True)
         self._watching.start()
         for group in self._default_groups():
-            group.start()
+            group.fill(first=True)
 
     def close(self) -> None:
         """Ends all workers."""
@@ -230,7 +232,7 @@ class WorkerPool(Computer):
             WorkerInfo(
                 name=one.name,
                 queue=group.name,
-                pid=one.pid,
+                pid=one.link.pid,
                 memory_mb=round(one.memory_bytes / 1e6, 1),
                 jobs_done=one.jobs_done,
                 jobs=active.describe(one.jobs),
@@ -249,9 +251,13 @@ class WorkerPool(Computer):
         """
         for group in self._default_groups():
             while not (group.was_loaded or self._closed.is_set() or (stop is not None and stop.is_set())):
-                group.was_loaded = any(worker.wait_loaded(POLL_SECONDS) for worker in tuple(group.workers))
+                for worker in tuple(group.workers):
+                    is_loaded = worker.is_loaded  # its error is set before
+                    if worker.load_error is not None:
+                        raise worker.load_error
+                    group.was_loaded |= is_loaded
                 if not group.was_loaded:
-                    self._closed.wait(POLL_SECONDS)
+                    self._closed.wait(LOAD_POLL_SECONDS)
 
     def fault(self) -> str | None:
         """Why jobs wait, where workers cannot start."""
@@ -323,7 +329,6 @@ class WorkerPool(Computer):
                     if slept:
                         worker.heard = looked
                     self._judge(worker, looked)
-                group.recover()
                 group.fill()
             self._judge_all()
 
@@ -334,7 +339,7 @@ class WorkerPool(Computer):
         elif worker.is_loaded and now - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:
             worker.kill("frozen", f"was ended, as it did not respond for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
         elif worker.memory_bytes > self._memory_limit:
-            worker.kill("memory", f"was ended, as it used {worker.memory_bytes / 1e6:.0f} MB", is_final=True)
+            worker.kill("memory", f"was ended, as it used {worker.memory_bytes / 1e6:.0f} MB")
 
     def _judge_all(self) -> None:
         """Ends the worker whose jobs take most, where all workers together take more than they may."""
@@ -343,4 +348,22 @@ class WorkerPool(Computer):
         if idle < self._memory_of_all < together:
             largest = max(workers, key=lambda one: one.memory_bytes - one.idle_bytes)
             reason = f"was ended, as all workers used {together / 1e6:.0f} MB, and it took most of that for its jobs"
-            largest.kill("memory", reason, is_final=True)
+            largest.kill("memory", reason)
+
+
+def memory_for_jobs(settings: Settings) -> int:
+    """Bytes that all jobs may take beside the server and its workers; at least 1, so that a job can run alone."""
+    return max(1, int(settings.memory - (settings.concurrency + 1) * WORKER_BYTES))
+
+
+def memory_needed(work: Work, artifacts: ArtifactStore, settings: Settings) -> int:
+    """Bytes that a job will take; those of the largest image where its own cannot be read."""
+    spec = work.job.spec
+    try:
+        pixels = pixels_in(artifacts.read(spec.image))
+    except CowError:  # as the worker will find
+        pixels = int(settings.max_image_megapixels * 1e6)
+    request, of_masks = spec.parsed(), BYTES_PER_PIXEL_OF_A_MASK * len(spec.attached)
+    frames = (len(request.frames.indices or ()) or request.frames.count) * (2 if request.interventions else 1)
+    side = min(request.frames.max_side or CLIP_SIDE, CLIP_SIDE)
+    return pixels * (BYTES_PER_PIXEL + of_masks) + frames * 3 * min(pixels, side**2)

@@ -11,6 +11,7 @@ from queue import Empty, SimpleQueue
 from typing import Literal, Protocol
 
 from pydantic import ValidationError
+from pydantic_core import to_json
 
 from cow_service.concurrency import spawn
 from cow_service.errors import Canceled, CowError, JobTimeout
@@ -75,8 +76,7 @@ class Child:
     is_lost = False
 
     def __init__(self) -> None:
-        spawned = spawn(MODULE)
-        self._process, self._pipe = spawned.process, spawned.pipe
+        self._process, self._pipe = spawn(MODULE)
         self.pid, self.kill, self.close = self._process.pid, self._process.kill, self._pipe.close
         self.send_bytes, self.recv_bytes = self._pipe.send_bytes, self._pipe.recv_bytes
 
@@ -110,20 +110,15 @@ class Worker:
         self._job_timeout = settings.job_timeout
         self._sending = threading.Lock()
         self._inboxes: dict[str, SimpleQueue[messages.OfJob | None]] = {}
-        self._loaded = threading.Event()  # or failed to, or ended before
-        self._load_error: CowError | None = None
+        self.load_error: CowError | None = None
         self.is_loaded = False  # or could not load them: it goes on with what needs others
         self._ended = threading.Event()
-        self._reason, self._is_final = "crashed", False
         self._end_reason: EndReason = "crashed"
+        self._reason: str = self._end_reason
         self._on_end = on_end
         threading.Thread(target=self._listen, name=f"cow-{name}", daemon=True).start()
-        self._send(messages.Begin(settings.dump_secrets()))
-
-    @property
-    def pid(self) -> int:
-        """The process."""
-        return self.link.pid
+        with suppress(OSError):
+            self.link.send_bytes(settings.dump_secrets().encode())
 
     @property
     def is_alive(self) -> bool:
@@ -140,37 +135,27 @@ class Worker:
         """Why it ended, or how, in words that go on after "the process"."""
         return f"{self._reason} ({self.link.wait()})"
 
-    def wait_loaded(self, seconds: float) -> bool:
-        """Waits until the default backends are loaded; returns whether they are. Raises the error of loading them.
-
-        Returns at once where the process has ended.
-        """
-        self._loaded.wait(seconds)
-        if self._load_error is not None:
-            raise self._load_error
-        return self.is_loaded
-
     def run(self, work: Work, locks: KeyLocks) -> JobOutcome:
         """Computes a job. Raises the `CowError` that it fails with, `Canceled`, `JobTimeout`, `WorkerGone`."""
-        inbox = self._inboxes[work.job.id] = SimpleQueue()
+        self._inboxes[work.job.id] = SimpleQueue()
         try:
             with ExitStack() as keys:
                 self._send(messages.Start(work.job))
-                return self._follow(work, inbox, locks, keys)
+                return self._follow(work, locks, keys)
         finally:
             del self._inboxes[work.job.id]
             self.jobs_done += 1
 
-    def kill(self, end_reason: EndReason, reason: str, *, is_final: bool = False) -> None:
+    def kill(self, end_reason: EndReason, reason: str) -> None:
         """Ends the process at once, also one that is stopped. Its jobs raise `WorkerGone`, which says the reason."""
-        self._end_reason, self._reason, self._is_final = end_reason, reason, is_final
+        self._end_reason, self._reason = end_reason, reason
         self.link.kill()
 
     def close(self, end_reason: EndReason = "stopped") -> None:
         """Ends the process. It has no jobs."""
         if self.is_alive:
             self._end_reason = end_reason
-        self._send(messages.End())
+        self._send(None)
         try:
             self.link.wait(END_SECONDS)
         except TimeoutError:
@@ -178,12 +163,10 @@ class Worker:
         self._ended.wait()
         self.link.close()
 
-    def _follow(
-        self, work: Work, inbox: SimpleQueue[messages.OfJob | None], locks: KeyLocks, keys: ExitStack
-    ) -> JobOutcome:
-        """Does what the messages about a job ask for, until its outcome. `keys` gives back those it still holds."""
+    def _follow(self, work: Work, locks: KeyLocks, keys: ExitStack) -> JobOutcome:
+        """Does what the messages about a job ask for, until its outcome. `keys` holds the lock of its key, if any."""
         until, canceled, begun = math.inf, False, False  # its time does not begin while the process loads
-        held: dict[str, ExitStack] = {}
+        inbox = self._inboxes[work.job.id]
 
         def check() -> None:
             self._check_alive(begun)
@@ -198,18 +181,17 @@ class Worker:
                     message = inbox.get(timeout=POLL_SECONDS)
                     begun |= message is not None
                 if isinstance(message, messages.HoldKey):
-                    held[message.key] = keys.enter_context(ExitStack())
-                    held[message.key].enter_context(locks.held(message.key, check))
-                    self._send(messages.KeyHeld(work.job.id))
+                    keys.close()
+                    if message.key is not None:
+                        keys.enter_context(locks.held(message.key, check))
+                        self._send(messages.ToJob(work.job.id, "key-held"))
                 elif isinstance(message, messages.Progressed) and not canceled:
                     work.progress(message.stage, message.done)
                 elif isinstance(message, messages.LookedFor):
                     work.looked_for(message.stage, message.found)
-                elif isinstance(message, messages.ReleaseKey) and message.key in held:
-                    held.pop(message.key).close()
             except Canceled:
                 canceled, until = True, time.monotonic() + (CANCEL_SECONDS if begun else 0.0)
-                self._send(messages.Cancel(work.job.id))
+                self._send(messages.ToJob(work.job.id, "cancel"))
             if isinstance(message, messages.Succeeded):
                 return message.outcome
             if isinstance(message, messages.Failed):
@@ -233,26 +215,24 @@ class Worker:
         """Raises `WorkerGone`."""
         if self._ended.is_set():
             is_blameless = self.link.is_lost or not (begun or self.is_loaded)
-            raise WorkerGone(self.end_reason, is_final=self._is_final, is_blameless=is_blameless)
+            raise WorkerGone(self.end_reason, is_final=self._end_reason == "memory", is_blameless=is_blameless)
 
     def _send(self, message: messages.ToWorker) -> None:
         with self._sending, suppress(OSError):  # its end is noticed where its messages are read
-            messages.send(self.link, message)
+            self.link.send_bytes(to_json(message))
 
     def _listen(self) -> None:
         """Hands each message to the job that it is about, until the process has ended."""
         try:
             while True:
-                match messages.receive_from_worker(self.link):
-                    case messages.Heartbeat(memory_bytes=memory_bytes, gpus=gpus, load=load):
-                        self.heard, self.memory_bytes = time.monotonic(), memory_bytes
-                        self.gpus, self.load = gpus, load
+                match messages.FROM_WORKER.validate_json(self.link.recv_bytes(messages.MAX_MESSAGE_BYTES)):
+                    case messages.Heartbeat(memory_bytes, gpus, load):
+                        self.heard, self.memory_bytes, self.gpus, self.load = time.monotonic(), memory_bytes, gpus, load
                         if not self._inboxes:
                             self.idle_bytes = memory_bytes
                     case messages.Loaded(error=error):
-                        self._load_error = None if error is None else error_from_json(error)
+                        self.load_error = None if error is None else error_from_json(error)
                         self.heard, self.is_loaded = time.monotonic(), True
-                        self._loaded.set()
                     case message:
                         if (inbox := self._inboxes.get(message.job_id)) is not None:
                             inbox.put(message)
@@ -262,7 +242,6 @@ class Worker:
             log.exception("the worker %s sent an invalid message", self.name)
             self.kill("crashed", "sent an invalid message, and was ended")
         self._ended.set()
-        self._loaded.set()
         for inbox in list(self._inboxes.values()):
             inbox.put(None)
         self._on_end(self, self._end_reason)

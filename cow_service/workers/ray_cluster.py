@@ -29,16 +29,14 @@ from cow_service.observability.metrics import Metrics
 from cow_service.settings import WORKER_BYTES, Settings, SettingsError
 from cow_service.weights.manifests import find_manifest
 from cow_service.workers.messages import MAX_MESSAGE_BYTES
-from cow_service.workers.pool import POLL_SECONDS, Group, WorkerPool
+from cow_service.workers.pool import Group, WorkerPool
 from cow_service.workers.process import Worker
-from cow_service.workers.ray_bridge import pack, unpack
+from cow_service.workers.ray_bridge import MODULE, pack, unpack
 
-MODULE = "cow_service.workers.ray_bridge"  # what the bridge runs
 SILENT_SECONDS = 5.0  # without such a report, after which the head is said to be away
 RECONNECT_SECONDS = 1.0  # between two tries to connect
 PLACE_SECONDS = 3.0  # that a job waits for a new actor where an actor that is at work could take it as well
 IDLE_SECONDS = 300.0  # after which an actor that is not among the fewest gives its share of the node back
-UNLIMITED = 1_000_000  # jobs that may ask for an actor at the same time: those that were taken wait for one there
 
 log = logging.getLogger("cow_service")
 
@@ -71,10 +69,8 @@ class ActorLink:
 
     def wait(self, seconds: float | None = None) -> str:
         """As `Link` says."""
-        if seconds is not None and not self.pid:
-            raise TimeoutError  # it has no place, and hears nothing
-        if not self._ended.wait(seconds):
-            raise TimeoutError
+        if (seconds is not None and not self.pid) or not self._ended.wait(seconds):
+            raise TimeoutError  # without a place it hears nothing
         return self._how
 
     def close(self) -> None:
@@ -217,61 +213,41 @@ class ActorGroup(Group):
         # Ray shows each actor its own GPU alone.
         own = {"device": "cuda"} if settings.device.startswith("cuda") else {}
         self._settings = self._settings.model_copy(update={"ray": None, **own})
-        self.places = PrioritySemaphore(UNLIMITED)
-        self._cluster, self._waiting = cluster, 0
+        self.places = PrioritySemaphore(sys.maxsize)  # jobs that were taken wait in `take`
+        self._cluster = cluster
         self._idle: dict[Worker, float] = {}  # since when each has had nothing to do
         self._fit()
-
-    def start(self) -> None:
-        """Does nothing: there are no nodes yet. `fill` starts the first actors."""
 
     def alive(self) -> list[Worker]:
         """Those that have a place."""
         return [one for one in super().alive() if one.link.pid]
 
-    def take(self, check: Callable[[], None], *, fresh: bool = False) -> Worker:
-        """The actor with the fewest jobs; with `fresh` one without any. Starts another one where all have some.
+    def _choose(self, *, fresh: bool) -> Worker | None:
+        """With `fresh` an actor without jobs. Starts another one where all have some."""
+        limit = 1 if fresh else self.jobs_each
+        free = [one for one in self.workers if one.link.pid and one.is_alive and self._taken[one] < limit]
+        best = min(free, key=lambda one: (self._taken[one], not one.is_loaded), default=None)
+        coming = [one for one in self.workers if not one.link.pid]
+        if (best is None or self._taken[best]) and len(coming) < self._waiting:
+            self._start_another(self.size)
+        asked = max((one.heard for one in coming), default=-math.inf)
+        is_taken = best is not None and (not self._taken[best] or time.monotonic() - asked > PLACE_SECONDS)
+        return best if is_taken else None
 
-        What `check` raises ends the wait.
-        """
+    def fill(self, *, first: bool = False) -> None:
+        """Fits their number to the cluster and the jobs, from the first on."""
         with self._lock:
-            self._waiting += 1
-        try:
-            while True:
-                with self._lock:
-                    self._remove_dead()
-                    limit = 1 if fresh else self.jobs_each
-                    placed = [one for one in self.workers if one.link.pid and one.is_alive]
-                    free = [one for one in placed if self._taken[one] < limit]
-                    best = min(free, key=lambda one: (self._taken[one], not one.is_loaded), default=None)
-                    coming = [one for one in self.workers if not one.link.pid]
-                    if (best is None or self._taken[best]) and len(coming) < self._waiting:
-                        self._start_another(self.size)
-                    asked = max((one.heard for one in coming), default=-math.inf)
-                    if best is not None and (not self._taken[best] or time.monotonic() - asked > PLACE_SECONDS):
-                        self._taken[best] += 1
-                        return best
-                check()
-                time.sleep(POLL_SECONDS)
-        finally:
-            with self._lock:
-                self._waiting -= 1
-
-    def fill(self) -> None:
-        """Fits their number to the cluster and the jobs."""
-        with self._lock:
-            self._remove_dead()
+            self._clean_up()
             self._fit()
             if self._cluster.fault is not None:
                 self.fault, self._failed_starts, self._next_start = None, 0, 0.0  # it is no fault of the backends
                 return
-            self._start_another(min(self.fewest, self.size))
+            self._start_another(min(self.fewest or int(self.fault is not None), self.size))
             now, crowded = time.monotonic(), bool(self._cluster.starved - {self.name})
             has_late = any(not one.link.pid and now - one.heard > PLACE_SECONDS for one in self.workers)
             (self._cluster.starved.add if self._waiting and has_late else self._cluster.starved.discard)(self.name)
-            free = [one for one in self.workers if not self._taken[one]]
-            free = [one for one in free if one.is_loaded or not (one.link.pid or self._waiting)]
-            self._idle = {one: self._idle.get(one, now) for one in free}
+            free = [one for one in self.workers if one.is_loaded or not (one.link.pid or self._waiting)]
+            self._idle = {one: self._idle.get(one, now) for one in free if not self._taken[one]}
             for one, since in self._idle.items():
                 limit = IDLE_SECONDS if one.is_loaded else PLACE_SECONDS
                 if (crowded and one.is_loaded) or (len(self.workers) > self.fewest and now - since > limit):
@@ -321,8 +297,7 @@ class RayCluster(WorkerPool):
         for group in self._default_groups():
             if self.cluster.fault is None and isinstance(group, ActorGroup) and group.size == 0:
                 needs = [f"{amount:g} {name}" for name, amount in group.needs.items() if name != "memory"]
-                memory = f"{group.needs['memory'] / 1e6:.0f} MB of memory"
-                told = ", ".join([*needs, memory])
+                told = ", ".join([*needs, f"{group.needs['memory'] / 1e6:.0f} MB of memory"])
                 return f"No node of the Ray cluster has what an actor of the queue {group.name!r} needs: {told}."
         return self.cluster.fault or super().fault()
 

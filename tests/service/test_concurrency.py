@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from types import SimpleNamespace
 
 import psutil
@@ -31,18 +31,25 @@ def waiting(semaphore: PrioritySemaphore, priority: str, order: list[str]) -> th
     return thread
 
 
+def take(semaphore: PrioritySemaphore, priority: str = "", weight: int = 1) -> ExitStack:
+    """Permits, held until the stack is closed."""
+    stack = ExitStack()
+    stack.enter_context(semaphore.held(priority, weight=weight))
+    return stack
+
+
 def until_waiting(semaphore: PrioritySemaphore, count: int) -> None:
     eventually(lambda: semaphore.waiting == count)
 
 
 def test_the_lowest_priority_comes_first_and_ties_in_their_order() -> None:
     semaphore, order = PrioritySemaphore(1), []
-    semaphore.acquire()
+    held = take(semaphore)
     threads = []
     for place, priority in enumerate(("c", "a", "b", "a")):
         threads.append(waiting(semaphore, priority, order))
         until_waiting(semaphore, place + 1)
-    semaphore.release()
+    held.close()
     for thread in threads:
         thread.join()
     assert order == ["a", "a", "b", "c"]
@@ -50,20 +57,19 @@ def test_the_lowest_priority_comes_first_and_ties_in_their_order() -> None:
 
 def test_a_released_permit_goes_to_a_waiter_and_not_to_a_later_thread() -> None:
     semaphore, order = PrioritySemaphore(1), []
-    semaphore.acquire("z")
+    held = take(semaphore, "z")
     thread = waiting(semaphore, "m", order)
     until_waiting(semaphore, 1)
-    semaphore.release()
-    semaphore.acquire("a")  # asked later: "m" was granted the permit already
-    assert order == ["m"]
-    semaphore.release()
+    held.close()
+    with semaphore.held("a"):  # asked later: "m" was granted the permit already
+        assert order == ["m"]
     thread.join()
 
 
 def test_a_canceled_wait_leaves_its_permit_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also of who was canceled just before the permit came, and has not looked since."""
     semaphore, canceled, began = PrioritySemaphore(1), threading.Event(), threading.Event()
-    semaphore.acquire()
+    held = take(semaphore)
 
     def check() -> None:
         if canceled.is_set():
@@ -82,15 +88,15 @@ def test_a_canceled_wait_leaves_its_permit_to_others(monkeypatch: pytest.MonkeyP
         canceled.set()
         if seconds < 1:
             thread.join()
-        semaphore.release()
+        held.close()
         thread.join()
         assert not began.is_set()
-        semaphore.acquire("b")
+        held = take(semaphore, "b")
 
 
 def test_who_waits_for_many_permits_is_passed_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     semaphore, order = PrioritySemaphore(3), []
-    semaphore.acquire()
+    held = take(semaphore)
 
     def heavy() -> None:
         with semaphore.held("a", weight=99):  # more than there are: it takes all
@@ -104,11 +110,11 @@ def test_who_waits_for_many_permits_is_passed_for_a_while(monkeypatch: pytest.Mo
     monkeypatch.setattr("cow_service.concurrency.PASSED_SECONDS", 0.0)
     last = waiting(semaphore, "c", order)
     until_waiting(semaphore, 2)
-    semaphore.release()
+    held.close()
     for each in (thread, last):
         each.join()
     assert order == ["b", "a", "c"]
-    semaphore.acquire(weight=3)  # no permit is lost
+    take(semaphore, weight=3)  # no permit is lost
 
 
 @pytest.mark.parametrize("permits", [1, 3])
@@ -135,11 +141,10 @@ def test_never_more_holders_than_permits(permits: int) -> None:
         thread.join()
     assert holders == 0
     assert 1 <= most <= permits
-    for _ in range(permits):
-        semaphore.acquire()  # none was lost
+    held = [take(semaphore) for _ in range(permits)]  # none was lost
     last = waiting(semaphore, "a", [])
     until_waiting(semaphore, 1)  # none was made
-    semaphore.release()
+    held[0].close()
     last.join()
 
 

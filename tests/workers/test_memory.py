@@ -18,7 +18,7 @@ from cow_service.media.images import encode_png
 from cow_service.records import Artifact
 from cow_service.requests import ImageArtifact
 from cow_service.settings import WORKER_BYTES, Settings
-from cow_service.workers.memory import BYTES_PER_PIXEL, memory_for_jobs, memory_needed
+from cow_service.workers.pool import BYTES_PER_PIXEL, memory_for_jobs, memory_needed
 
 
 def needed(store: DiskArtifacts, image: str, **request: Any) -> float:
