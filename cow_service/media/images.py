@@ -243,13 +243,13 @@ NEARLY = 0.75  # of a picture's size
 def fit_within(pixels: NDArray[np.uint8], max_side: int | None) -> NDArray[np.uint8]:
     """Scale [H, W, 3] or [H, W] down, never up, to `max_side` px at most; None: no limit."""
     height, width = pixels.shape[:2]
-    longer = max(height, width)
-    if max_side is None or longer <= max_side:
+    size = size_within(width, height, max_side)
+    if size == (width, height):
         return pixels
     # Near its own size, the means of areas differ from linear interpolation by less than one grey level, at five times
     # the cost.
-    how = cv2.INTER_LINEAR if max_side > NEARLY * longer else cv2.INTER_AREA
-    return np.asarray(cv2.resize(pixels, size_within(width, height, max_side), interpolation=how), dtype=np.uint8)
+    how = cv2.INTER_LINEAR if max(size) > NEARLY * max(width, height) else cv2.INTER_AREA
+    return np.asarray(cv2.resize(pixels, size, interpolation=how), dtype=np.uint8)
 
 
 def size_within(width: int, height: int, max_side: int | None) -> tuple[int, int]:
