@@ -6,15 +6,8 @@ from collections.abc import Collection, Iterator
 from functools import partial
 from typing import Annotated, Any, ClassVar, Self, get_args
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    ValidationError,
-    ValidationInfo,
-    WithJsonSchema,
-    field_validator,
-    model_validator,
-)
+import pydantic
+from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from cow_service import records
@@ -30,8 +23,8 @@ from cow_service.readers.options import plain
 
 MAX_NAMED = 12  # other objects that the question names
 _NUMBERS = ("speed", "distance", "duration")  # which only a question with a number can say
-_SAID_ALIKE = (*_NUMBERS, "until")  # fields of a reply and of `MotionHints`
-_MOTION = ("kind", *_SAID_ALIKE, "then", "also_moving")
+SAID_ALIKE = (*_NUMBERS, "until")  # fields of a reply and of `MotionHints`
+_MOTION = ("kind", *SAID_ALIKE, "then", "also_moving")
 # The reply to "With the vase gone, will the red car that drives left at 20 px/s miss the mug?"
 _EXAMPLE: dict[str, Any] = {
     "object": "red car", "others": ["mug", "vase"],
@@ -148,7 +141,7 @@ class Change(Reply):
     relation: Annotated[records.PlaceRelation | None, _PLACE_RELATION] = None
     targets: Annotated[tuple[str, ...], *_names(2)] = ()
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _check_place(self) -> Self:
         if self.kind == "place" and (self.relation is None or not self.targets):
             raise ValueError("says not where to")
@@ -178,7 +171,7 @@ class AlsoMoving(Reply):
         direction, depth = self.way if self.way is not None and self.kind in records.DIRECTED_KINDS else (None, 0.0)
         return OtherMotionHint(object=self.object, kind=self.kind, direction=direction, depth=depth)
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _check_way(self) -> Self:
         if self.kind == "place" or (self.kind in records.DIRECTED_KINDS and self.way is None):
             raise ValueError("says not which way")
@@ -247,7 +240,7 @@ class Identified(Reply):
             fields["within"] = positive(fields["within"], "s") or fields["within"]
         try:
             return records.Asked.model_validate(fields)
-        except ValidationError as error:
+        except pydantic.ValidationError as error:
             fault = ".".join(map(str, error.errors()[0]["loc"]))
             context_of(info).faults.append(f"`asked` is {replies.shown(written)}, of which `{fault}` cannot be read")
             return None
@@ -266,7 +259,7 @@ class Identified(Reply):
         """Fields of `MotionHints`, as far as the reply says them."""
         return {
             "kind": self.kind or "linear",
-            **{name: value for name in _SAID_ALIKE if (value := getattr(self, name)) is not None},
+            **{name: value for name in SAID_ALIKE if (value := getattr(self, name)) is not None},
             "then": tuple(StepReading(*each.way, each.distance, each.duration) for each in self.then),
             "also": tuple(each.hint for each in self.also_moving),
         }

@@ -277,11 +277,7 @@ def separate_objects(
 
 
 def _choose_place(
-    places: Sequence[WrittenPlace],
-    values: Sequence[object],
-    frame: CoordinateFrame,
-    wanted: str,
-    others: Sequence[str],
+    places: Sequence[WrittenPlace], values: Sequence[object], frame: CoordinateFrame, wanted: str, others: Sequence[str]
 ) -> WrittenPlace | None:
     """The place that the reply gives for the object; None if it says that it does not see it."""
     if not places:

@@ -17,7 +17,7 @@ from cow_service.readers.mllm.check import MllmCheck, check_model
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
 from cow_service.readers.mllm.hypothesis import pictures
-from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
+from cow_service.readers.mllm.identify import SAID_ALIKE, Identified, identified_by_words, identify_call
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
 from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import configure
@@ -102,8 +102,7 @@ class MllmReader:
         image, identified = self._identify(given)
         if identified is None:
             raise ObjectNotFound(
-                f"{self._subject} sees nothing in the image that the question could move.",
-                remedy=GIVE_PLACE,
+                f"{self._subject} sees nothing in the image that the question could move.", remedy=GIVE_PLACE
             )
         located, scale = self._locate(given, image, identified, identified.object)
         if located is None:
@@ -125,12 +124,12 @@ class MllmReader:
 
         interventions = tuple(
             records.Intervention(
-                kind=each.kind,
-                object=changed(each.object),
-                relation=each.relation,
-                targets=tuple(map(changed, each.targets)),
+                kind=one.kind,
+                object=changed(one.object),
+                relation=one.relation,
+                targets=tuple(map(changed, one.targets)),
             )
-            for each in identified.changes
+            for one in identified.changes
         )
         removed = {each.object.bbox for each in interventions if each.kind == "remove"}
         is_other = bool(located.label) and set(name_words(located.label)).isdisjoint(name_words(identified.object))
@@ -253,24 +252,15 @@ class MllmReader:
     def _directed(self, reading: MotionReading, hints: MotionHints) -> MotionReading:
         """The reading with its direction."""
         deviation = self._measured.direction_deviation
-        reading = replace(
-            reading,
-            speed=hints.speed,
-            distance=hints.distance,
-            duration=hints.duration,
-            until=hints.until,
-            steps=hints.then,
-            cue=hints.cue or "orientation",
-            direction_deviation=deviation,
-            along_arrow=hints.along_arrow,
-        )
+        said: dict[str, Any] = {name: getattr(hints, name) for name in SAID_ALIKE}
+        said |= {"steps": hints.then, "cue": hints.cue or "orientation", "direction_deviation": deviation}
         if hints.camera is not None:
-            direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
-            return replace(reading, direction=direction, depth=depth, depth_deviation=deviation)
-        if hints.ends is None:
-            return reading
-        (x0, y0), (x1, y1) = hints.ends
-        return replace(reading, direction=(x1 - x0, y1 - y0))
+            said["direction"], said["depth"] = depth_motion(CAMERA_SENSE[hints.camera])
+            said["depth_deviation"] = deviation
+        elif hints.ends is not None:
+            (x0, y0), (x1, y1) = hints.ends
+            said["direction"] = (x1 - x0, y1 - y0)
+        return replace(reading, along_arrow=hints.along_arrow, **said)
 
 
 def _hints(
