@@ -51,6 +51,7 @@ it never holds a path, a trace or a secret. The SDK raises the same classes for 
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
@@ -83,6 +84,12 @@ def field_of(pointer: str) -> str:
 def shortened(text: str, most: int) -> str:
     """The text, cut after `most` characters with its full length noted: callers may send megabytes."""
     return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"
+
+
+def listed(names: Sequence[str], most: int = 8, joint: str = ", ") -> str:
+    """The first `most` names, and how many more there are; for messages."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return joint.join(names[:most]) + more
 
 
 class CowError(Exception):
@@ -132,6 +139,11 @@ class CowError(Exception):
 
 class InvalidRequest(CowError, code="invalid-request", status=422):
     """The request is not valid."""
+
+
+def wrong(pointer: str, detail: str) -> InvalidRequest:
+    """The error for one field, by its JSON Pointer."""
+    return InvalidRequest(f"{pointer or 'The body'}: {detail}.", errors=(FieldError(pointer, detail),))
 
 
 class MalformedBody(InvalidRequest, code="malformed-body", status=400):

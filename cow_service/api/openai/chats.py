@@ -9,7 +9,7 @@ from typing import Any, Self, cast
 
 from pydantic import BaseModel, Field
 
-from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part, shortened
+from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part, shortened, wrong
 from cow_service.requests.values import SHOWN_CHARACTERS
 from cow_service.service import Service
 
@@ -22,11 +22,6 @@ EXTENSION = "cow"  # COW's own field of a request, and of a reply
 def as_json(value: Any) -> str:
     """A value as compact JSON. Only ASCII: replies of an MLLM may hold halves of surrogate pairs."""
     return json.dumps(value, separators=(",", ":"))
-
-
-def wrong(pointer: str, detail: str) -> InvalidRequest:
-    """The error for one field."""
-    return InvalidRequest(f"{pointer or 'The body'}: {detail}.", errors=(FieldError(pointer, detail),))
 
 
 @dataclass(frozen=True)
