@@ -60,7 +60,7 @@ from typing import Any
 TYPE_PREFIX = "urn:cow:problem:"  # a problem's type is this and its code: a name, not an address
 MAX_DETAIL = 2000  # characters
 MAX_FIELDS = 50  # of one error
-MAX_KEY = 80  # characters
+SHOWN_CHARACTERS = 80  # of what the caller sent
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class FieldError:
 
 
 def pointer_part(part: int | str) -> str:
-    """One step of a JSON Pointer, escaped (RFC 6901); a key of more than `MAX_KEY` characters is cut."""
-    return shortened(str(part), MAX_KEY).replace("~", "~0").replace("/", "~1")
+    """One step of a JSON Pointer, escaped (RFC 6901); a key of more than `SHOWN_CHARACTERS` is cut."""
+    return shortened(str(part)).replace("~", "~0").replace("/", "~1")
 
 
 def field_of(pointer: str) -> str:
@@ -81,7 +81,7 @@ def field_of(pointer: str) -> str:
     return pointer[1:].replace("/", ".")
 
 
-def shortened(text: str, most: int) -> str:
+def shortened(text: str, most: int = SHOWN_CHARACTERS) -> str:
     """The text, cut after `most` characters with its full length noted: callers may send megabytes."""
     return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"
 

@@ -10,8 +10,6 @@ httpcore, the lower half of httpx, takes its connections from a backend of ours:
 sends its headers byte by byte, and httpx's time limits begin anew with every read.
 """
 
-from __future__ import annotations
-
 import re
 import socket
 import ssl
@@ -170,6 +168,16 @@ class HostList:
         return any(name in ("*", host, *above) and port in ports for name, ports in self._entries)
 
 
+@dataclass(frozen=True)
+class _Target:
+    """A URL that passed every check that needs no look-up of its host."""
+
+    url: httpx.URL
+    host: str  # normalised: lower case, IDNA, no trailing dot, no brackets
+    port: int
+    what: str  # how messages call it
+
+
 @dataclass
 class Egress:
     """Sends requests to URLs of callers. Safe to use from several threads.
@@ -301,16 +309,6 @@ class Egress:
     def _tls(self) -> ssl.SSLContext:
         """Whose certificates are trusted: those of certifi, or of SSL_CERT_FILE. Slow to make, so made when needed."""
         return self.tls or httpx.create_ssl_context()
-
-
-@dataclass(frozen=True)
-class _Target:
-    """A URL that passed every check that needs no look-up of its host."""
-
-    url: httpx.URL
-    host: str  # normalised: lower case, IDNA, no trailing dot, no brackets
-    port: int
-    what: str  # how messages call it
 
 
 def _seconds_until(end: float) -> float:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.media.images import fit_within, tiled
-from cow_service.records import BBox, Grounding, Motion, Path, Trajectory
-from cow_service.records.world import MEETINGS
+from cow_service.records import MEETINGS, BBox, Grounding, Motion, Path, Trajectory
 
 LETTERS = 0.42  # size of the letters, in OpenCV's unit, for a picture whose unit is 1
 STEPS = 12  # places tried above each other, in heights of a label, before covering another one is accepted

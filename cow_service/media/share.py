@@ -3,8 +3,6 @@
 What has to decode a picture or a video runs in a process of its own (`make_apart`).
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import json
@@ -60,7 +58,7 @@ class Told:
     shown: int  # the frame of the still
 
     @staticmethod
-    def of(result: Simulation | Answer, simulation: Simulation, given: str) -> Told:
+    def of(result: Simulation | Answer, simulation: Simulation, given: str) -> "Told":
         """Of a job's result and its simulation; `given` is the direction in words, where not the question tells it."""
         trajectory, width = simulation.trajectory, simulation.image.width
         path, narration = trajectory.paths[0], simulation.narration

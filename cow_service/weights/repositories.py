@@ -12,8 +12,6 @@ huggingface_hub's `verify_repo_checksums` asks the hub for the digests and so ne
 the repository at each call: both are not used.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil
@@ -324,7 +322,7 @@ def download(
                 _download_file(hub, each.lock, file, weights_dir)
 
 
-def _download_file(hub: HfApi, lock: Lock, file: LockedFile, weights_dir: Path) -> None:
+def _download_file(hub: "HfApi", lock: Lock, file: LockedFile, weights_dir: Path) -> None:
     folder = folder_of(weights_dir, lock.repository)
     with _hub_errors(lock.repository, lock.revision):
         # The library trusts an existing file by its modification time; this one has a wrong digest.
@@ -370,7 +368,7 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
         return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=tuple(files))
 
 
-def _hub(endpoint: str | None) -> HfApi:
+def _hub(endpoint: str | None) -> "HfApi":
     try:
         from huggingface_hub import HfApi  # noqa: PLC0415
     except ImportError as error:

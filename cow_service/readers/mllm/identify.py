@@ -18,7 +18,6 @@ from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage
 from cow_service.readers.mllm.quantities import Distance, ReadingContext, Seconds, Speed, context_of, positive
-from cow_service.readers.mllm.replies import Reply, ReplyError
 from cow_service.readers.options import plain
 
 MAX_NAMED = 12  # other objects that the question names
@@ -132,7 +131,7 @@ _LANGUAGE = BeforeValidator(lambda said: code if (code := replies.text_of(said)[
 _WAY = BeforeValidator(_way), WithJsonSchema(replies.nullable(replies.one_of(*WAYS)))
 
 
-class Change(Reply):
+class Change(replies.Reply):
     """A change of the scene before anything moves, in words."""
 
     other_names: ClassVar = {"object": ("name", "label"), "targets": ("target",)}
@@ -148,7 +147,7 @@ class Change(Reply):
         return self
 
 
-class Leg(Reply):
+class Leg(replies.Reply):
     """A further leg of the motion."""
 
     other_names: ClassVar = {"way": ("direction",)}
@@ -157,7 +156,7 @@ class Leg(Reply):
     duration: Seconds = None
 
 
-class AlsoMoving(Reply):
+class AlsoMoving(replies.Reply):
     """Another thing that is set moving at the same time."""
 
     other_names: ClassVar = {"object": ("name", "label"), "way": ("direction",)}
@@ -178,7 +177,7 @@ class AlsoMoving(Reply):
         return self
 
 
-class Identified(Reply):
+class Identified(replies.Reply):
     """What is asked and what moves, in words; nothing about where it is. Null is what the reply does not say."""
 
     other_names: ClassVar = {"object": _NAMES}
@@ -201,13 +200,13 @@ class Identified(Reply):
     def _check_name(cls, written: Any) -> str:
         name = replies.text_of(written)
         if len(name) > replies.MAX_NAME:
-            raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
+            raise replies.ReplyError(f"`object` has {len(name)} characters; a few words are enough")
         if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
-            raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
+            raise replies.ReplyError(f"'{name}' answers the question; name the object that moves instead")
         if _DENIAL.search(name) or name.lower().strip(" .") in _POINTING:
-            raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
+            raise replies.ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
         if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
-            raise ReplyError(f"'{name}' names no object; say in words what moves")
+            raise replies.ReplyError(f"'{name}' names no object; say in words what moves")
         return name
 
     @field_validator("asked", mode="before")
@@ -329,9 +328,9 @@ def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked
     ):
         return None
     else:
-        raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
+        raise replies.ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
     if len(set(map(replies.name_words, names))) > 1:
-        raise ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
+        raise replies.ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
 
     # What contradicts the rest of the same reply is left out, and things have one name each.
     context = ReadingContext(faults=[] if objects else ["it is no JSON object, so that fields are missing"])
@@ -354,7 +353,7 @@ def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked
     update = {"others": others, "asked": asked, "kind": kind, "warnings": context.left_out}
     found = found.model_copy(update=update)
     if context.faults:
-        raise ReplyError("; ".join(context.faults), found)
+        raise replies.ReplyError("; ".join(context.faults), found)
     return found
 
 

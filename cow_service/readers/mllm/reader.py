@@ -23,7 +23,6 @@ from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_c
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import BBox, Grounding, LocatedObject, MllmMeasurement, ServerCapabilities
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
@@ -77,7 +76,7 @@ class MllmReader:
         """Asks small questions about pictures whose answers are known. Raises `MllmUnavailable`."""
         return check_model(self._client, self._reasoning)
 
-    def keep(self, measured: MllmMeasurement) -> None:
+    def keep(self, measured: records.MllmMeasurement) -> None:
         """Keeps what a check has measured, for readers that are made from now on. Raises `OSError`."""
         self._client.notes.keep(measured)
 
@@ -86,7 +85,7 @@ class MllmReader:
         self._client.close()
 
     @property
-    def takes(self) -> ServerCapabilities | None:
+    def takes(self) -> records.ServerCapabilities | None:
         """What was learned of its server, by this process or another."""
         return self._client.notes.takes or self._client.capabilities.proven
 
@@ -109,11 +108,11 @@ class MllmReader:
             raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image.", remedy=GIVE_PLACE)
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
-        mover = LocatedObject(object=identified.object, bbox=bbox, source="mllm")
+        mover = records.LocatedObject(object=identified.object, bbox=bbox, source="mllm")
         others, doubles = separate_objects(mover, located.others)
         known = {name_words(each.object): each for each in (mover, *others)}
 
-        def changed(name: str) -> LocatedObject:
+        def changed(name: str) -> records.LocatedObject:
             found = known.get(name_words(name))
             if found is None:
                 raise ObjectNotFound(
@@ -153,7 +152,7 @@ class MllmReader:
             language=identified.language,
         )
 
-    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
+    def read_motion(self, given: ReaderInput, grounding: records.Grounding, hints: MotionHints | None) -> MotionReading:
         """No call with hints, one where something speaks against them, else two.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
@@ -198,7 +197,7 @@ class MllmReader:
         self,
         given: ReaderInput,
         options: Sequence[records.AnswerOption],
-        grounding: Grounding | None,
+        grounding: records.Grounding | None,
         imagined: base.Imagined | None,
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
@@ -226,7 +225,7 @@ class MllmReader:
         image: EncodedImage,
         identified: Identified | None,
         name: str,
-        bbox: BBox | None = None,
+        bbox: records.BBox | None = None,
     ) -> tuple[Located | None, Scale | CowError | None]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
@@ -264,7 +263,7 @@ class MllmReader:
 
 
 def _hints(
-    identified: Identified | None, located: Located | None, scale: Scale | CowError | None, bbox: BBox
+    identified: Identified | None, located: Located | None, scale: Scale | CowError | None, bbox: records.BBox
 ) -> MotionHints:
     """What was read of the motion of the object in the box."""
     hints: dict[str, Any] = {"kind": DEFAULT_KIND} if identified is None else identified.hints
