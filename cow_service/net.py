@@ -70,7 +70,6 @@ TRANSLATED: tuple[tuple[tuple[type[Exception], ...], type[EgressError], str], ..
 
 @contextmanager
 def _translated(host: str) -> Generator[None]:
-    """Translates exceptions of others to ours, by the table."""
     try:
         yield
     except tuple(kind for foreign, _, _ in TRANSLATED for kind in foreign) as error:

@@ -216,12 +216,6 @@ def find_answerer(service: Service, model: str) -> Answerer:
     return found
 
 
-def usable_models(service: Service) -> tuple[str, ...]:
-    """The names of the models that can answer, as far as is known."""
-    unready = {reader.name for reader in service.models().readers if reader.ready is False}
-    return tuple(name for name, one in answerers(service).items() if one.reader not in unready)
-
-
 def _readers(service: Service) -> dict[str, str]:
     """Readers by the names of their models without suffixes."""
     settings = service.settings

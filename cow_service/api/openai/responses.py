@@ -138,7 +138,6 @@ def _without_type(value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_object(value: Any, pointer: str) -> dict[str, Any]:
-    """An object of the request."""
     if not isinstance(value, dict):
         raise wrong(pointer, "is no object")
     return cast("dict[str, Any]", value)

@@ -249,7 +249,6 @@ class MllmReader:
         return located, results.get("scale")
 
     def _directed(self, reading: MotionReading, hints: MotionHints) -> MotionReading:
-        """The reading with its direction."""
         deviation = self._measured.direction_deviation
         said: dict[str, Any] = {name: getattr(hints, name) for name in SAID_ALIKE}
         said |= {"steps": hints.then, "cue": hints.cue or "orientation", "direction_deviation": deviation}
@@ -265,7 +264,6 @@ class MllmReader:
 def _hints(
     identified: Identified | None, located: Located | None, scale: Scale | CowError | None, bbox: records.BBox
 ) -> MotionHints:
-    """What was read of the motion of the object in the box."""
     hints: dict[str, Any] = {"kind": DEFAULT_KIND} if identified is None else identified.hints
     if located is not None and located.line is not None:
         hints |= vars(located.line)
