@@ -51,6 +51,7 @@ it never holds a path, a trace or a secret. The SDK raises the same classes for 
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
@@ -59,7 +60,7 @@ from typing import Any
 TYPE_PREFIX = "urn:cow:problem:"  # a problem's type is this and its code: a name, not an address
 MAX_DETAIL = 2000  # characters
 MAX_FIELDS = 50  # of one error
-MAX_KEY = 80  # characters
+SHOWN_CHARACTERS = 80  # of what the caller sent
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,8 @@ class FieldError:
 
 
 def pointer_part(part: int | str) -> str:
-    """One step of a JSON Pointer, escaped (RFC 6901); a key of more than `MAX_KEY` characters is cut."""
-    return shortened(str(part), MAX_KEY).replace("~", "~0").replace("/", "~1")
+    """One step of a JSON Pointer, escaped (RFC 6901); a key of more than `SHOWN_CHARACTERS` is cut."""
+    return shortened(str(part)).replace("~", "~0").replace("/", "~1")
 
 
 def field_of(pointer: str) -> str:
@@ -80,9 +81,15 @@ def field_of(pointer: str) -> str:
     return pointer[1:].replace("/", ".")
 
 
-def shortened(text: str, most: int) -> str:
+def shortened(text: str, most: int = SHOWN_CHARACTERS) -> str:
     """The text, cut after `most` characters with its full length noted: callers may send megabytes."""
     return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"
+
+
+def listed(names: Sequence[str], most: int = 8, joint: str = ", ") -> str:
+    """The first `most` names, and how many more there are; for messages."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return joint.join(names[:most]) + more
 
 
 class CowError(Exception):
@@ -132,6 +139,11 @@ class CowError(Exception):
 
 class InvalidRequest(CowError, code="invalid-request", status=422):
     """The request is not valid."""
+
+
+def wrong(pointer: str, detail: str) -> InvalidRequest:
+    """The error for one field, by its JSON Pointer."""
+    return InvalidRequest(f"{pointer or 'The body'}: {detail}.", errors=(FieldError(pointer, detail),))
 
 
 class MalformedBody(InvalidRequest, code="malformed-body", status=400):

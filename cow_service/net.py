@@ -10,8 +10,6 @@ httpcore, the lower half of httpx, takes its connections from a backend of ours:
 sends its headers byte by byte, and httpx's time limits begin anew with every read.
 """
 
-from __future__ import annotations
-
 import re
 import socket
 import ssl
@@ -54,33 +52,27 @@ class Unreachable(EgressError):
 
 
 # What others raise, and what becomes of it. The first row that fits is taken.
-TRANSLATED: tuple[tuple[type[Exception], type[EgressError], str], ...] = (
-    (ssl.SSLCertVerificationError, Unreachable, "The TLS certificate of '{host}' is not trusted for that name."),
-    (ssl.SSLError, Unreachable, "The TLS connection to '{host}' failed."),
-    (socket.gaierror, Unreachable, "The host name '{host}' is unknown. Check its spelling."),
-    (socket.herror, Unreachable, "The host name '{host}' is unknown. Check its spelling."),
-    (TimeoutError, Unreachable, "'{host}' took too long."),
-    (httpcore.TimeoutException, Unreachable, "'{host}' took too long."),
-    (ConnectionRefusedError, Unreachable, "'{host}' refuses connections at that port."),
-    (OSError, Unreachable, "The connection to '{host}' failed."),
-    (httpcore.NetworkError, Unreachable, "The connection to '{host}' failed."),
-    (httpcore.ProxyError, Unreachable, "The connection to '{host}' failed."),
-    (httpcore.ConnectionNotAvailable, Unreachable, "The connection to '{host}' failed."),
-    (httpcore.LocalProtocolError, NotAllowed, "The request to '{host}' cannot be written as HTTP."),
-    (httpcore.ProtocolError, Unreachable, "'{host}' does not speak HTTP, or closed the connection early."),
-    (httpcore.UnsupportedProtocol, NotAllowed, "The URL of '{host}' is not HTTP. Give an http or https URL."),
-    (httpx.InvalidURL, NotAllowed, "{host} cannot be read. Give one like https://images.example.org/1.png."),
-    (UnicodeError, NotAllowed, "{host} contains characters that must be percent-encoded."),
-    (ValueError, NotAllowed, "{host} cannot be read. Give one like https://images.example.org/1.png."),
+_FAILED = (OSError, httpcore.NetworkError, httpcore.ProxyError, httpcore.ConnectionNotAvailable)
+TRANSLATED: tuple[tuple[tuple[type[Exception], ...], type[EgressError], str], ...] = (
+    ((ssl.SSLCertVerificationError,), Unreachable, "The TLS certificate of '{host}' is not trusted for that name."),
+    ((ssl.SSLError,), Unreachable, "The TLS connection to '{host}' failed."),
+    ((socket.gaierror, socket.herror), Unreachable, "The host name '{host}' is unknown. Check its spelling."),
+    ((TimeoutError, httpcore.TimeoutException), Unreachable, "'{host}' took too long."),
+    ((ConnectionRefusedError,), Unreachable, "'{host}' refuses connections at that port."),
+    (_FAILED, Unreachable, "The connection to '{host}' failed."),
+    ((httpcore.LocalProtocolError,), NotAllowed, "The request to '{host}' cannot be written as HTTP."),
+    ((httpcore.ProtocolError,), Unreachable, "'{host}' does not speak HTTP, or closed the connection early."),
+    ((httpcore.UnsupportedProtocol,), NotAllowed, "The URL of '{host}' is not HTTP. Give an http or https URL."),
+    ((UnicodeError,), NotAllowed, "{host} contains characters that must be percent-encoded."),
+    ((httpx.InvalidURL, ValueError), NotAllowed, "{host} cannot be read. Give one like https://example.org/1.png."),
 )
 
 
 @contextmanager
 def _translated(host: str) -> Generator[None]:
-    """Translates exceptions of others to ours, by the table."""
     try:
         yield
-    except tuple(foreign for foreign, _, _ in TRANSLATED) as error:
+    except tuple(kind for foreign, _, _ in TRANSLATED for kind in foreign) as error:
         ours, text = next((ours, text) for foreign, ours, text in TRANSLATED if isinstance(error, foreign))
         raise ours(text.format(host=host)) from error
 
@@ -175,6 +167,16 @@ class HostList:
         return any(name in ("*", host, *above) and port in ports for name, ports in self._entries)
 
 
+@dataclass(frozen=True)
+class _Target:
+    """A URL that passed every check that needs no look-up of its host."""
+
+    url: httpx.URL
+    host: str  # normalised: lower case, IDNA, no trailing dot, no brackets
+    port: int
+    what: str  # how messages call it
+
+
 @dataclass
 class Egress:
     """Sends requests to URLs of callers. Safe to use from several threads.
@@ -198,10 +200,9 @@ class Egress:
 
     def fetch(self, url: str, most_bytes: int) -> bytes:
         """The body at a URL, up to a maximum length. Raises `NotAllowed` or `Unreachable`."""
-        deadline = _Deadline(monotonic() + self.seconds)
-        target = self._target(url, "The URL")
+        target, end = self._target(url, "The URL"), monotonic() + self.seconds
         for _ in range(MAX_REDIRECTS + 1):
-            with _translated(target.host), self._exchange("GET", target, deadline) as response:
+            with _translated(target.host), self._exchange("GET", target, end) as response:
                 location = _headers(response, b"location")
                 if response.status not in REDIRECTS or not location:
                     return _body(response, target.host, most_bytes)
@@ -217,8 +218,8 @@ class Egress:
         `headers` says its type and whatever else; host, length and encoding are put in here. Raises `NotAllowed` or
         `Unreachable`.
         """
-        target, deadline = self._target(url, "The URL"), _Deadline(monotonic() + self.seconds)
-        with _translated(target.host), self._exchange("POST", target, deadline, body, headers) as response:
+        target, end = self._target(url, "The URL"), monotonic() + self.seconds
+        with _translated(target.host), self._exchange("POST", target, end, body, headers) as response:
             return response.status
 
     def check(self, url: str, *, look_up: bool = False) -> None:
@@ -229,7 +230,7 @@ class Egress:
         target = self._target(url, "The URL")
         with _translated(target.host):
             if look_up or is_address(target.host):
-                self._addresses(target, _Deadline(monotonic() + self.seconds))
+                self._addresses(target, monotonic() + self.seconds)
 
     def _target(self, text: str, what: str) -> _Target:
         """A URL taken apart, once; what is checked is what is used. Raises `NotAllowed`."""
@@ -257,11 +258,11 @@ class Egress:
         self,
         method: str,
         target: _Target,
-        deadline: _Deadline,
+        end: float,
         body: bytes | None = None,
         headers: Mapping[str, str] | None = None,
     ) -> Generator[httpcore.Response]:
-        """One request, and the beginning of its answer."""
+        """One request, and the beginning of its answer; all of it until `end`, by the monotonic clock."""
         host = f"[{target.host}]" if ":" in target.host else target.host
         ours = {
             "host": host if target.port == _DEFAULT_PORTS[target.url.scheme] else f"{host}:{target.port}",
@@ -275,14 +276,14 @@ class Egress:
             scheme=target.url.raw_scheme, host=target.host.encode(), port=target.port, target=target.url.raw_path
         )
         tls = self._tls if target.url.scheme == "https" else None
-        backend = _PinnedBackend(self._addresses(target, deadline), deadline, self.connect_seconds)
+        backend = _PinnedBackend(self._addresses(target, end), end, self.connect_seconds)
         with (
             httpcore.ConnectionPool(ssl_context=tls, network_backend=backend) as pool,
             pool.stream(method, url, headers=coded, content=body) as response,
         ):
             yield response
 
-    def _addresses(self, target: _Target, deadline: _Deadline) -> list[str]:
+    def _addresses(self, target: _Target, end: float) -> list[str]:
         """Where a host is now. Raises `NotAllowed` if any of it may not be connected to."""
         answer: Future[list[str]] = Future()
 
@@ -296,7 +297,7 @@ class Egress:
             answer.set_result([target.host])
         else:  # the system's resolver takes no time limit: where it is too slow, its thread is left to end by itself
             Thread(target=ask, name="cow-look-up", daemon=True).start()
-        addresses = answer.result(deadline.left())
+        addresses = answer.result(_seconds_until(end))
         if not addresses:
             raise Unreachable(f"The host name '{target.host}' has no address.")
         if not all(self.permitted(address) for address in addresses):
@@ -309,28 +310,12 @@ class Egress:
         return self.tls or httpx.create_ssl_context()
 
 
-@dataclass(frozen=True)
-class _Target:
-    """A URL that passed every check that needs no look-up of its host."""
-
-    url: httpx.URL
-    host: str  # normalised: lower case, IDNA, no trailing dot, no brackets
-    port: int
-    what: str  # how messages call it
-
-
-@dataclass(frozen=True)
-class _Deadline:
-    """The time limit of a whole exchange."""
-
-    end: float  # by the monotonic clock, s
-
-    def left(self) -> float:
-        """Seconds, more than none. Raises `TimeoutError` after the end."""
-        left = self.end - monotonic()
-        if left <= 0:
-            raise TimeoutError("the time limit of this exchange has passed")
-        return left
+def _seconds_until(end: float) -> float:
+    """Seconds left of an exchange, more than none. Raises `TimeoutError` after its end."""
+    left = end - monotonic()
+    if left <= 0:
+        raise TimeoutError("the time limit of this exchange has passed")
+    return left
 
 
 @dataclass(frozen=True)
@@ -338,7 +323,7 @@ class _PinnedBackend(httpcore.NetworkBackend):
     """Connects to addresses that were checked, whatever the host name."""
 
     addresses: list[str]
-    deadline: _Deadline
+    end: float  # of the exchange, by the monotonic clock, s
     seconds: float  # for one connection
 
     def connect_tcp(self, host: str, port: int, *_: Any, **__: Any) -> httpcore.NetworkStream:
@@ -346,12 +331,12 @@ class _PinnedBackend(httpcore.NetworkBackend):
         failed: OSError = OSError("no address")
         for address in self.addresses:
             try:
-                connection = socket.create_connection((address, port), min(self.seconds, self.deadline.left()))
+                connection = socket.create_connection((address, port), min(self.seconds, _seconds_until(self.end)))
             except OSError as error:  # the last one is raised
                 failed = error
             else:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                return _Stream(connection, self.deadline)
+                return _Stream(connection, self.end)
         raise failed
 
 
@@ -360,16 +345,16 @@ class _Stream(httpcore.NetworkStream):
     """A connection whose every operation ends with the deadline. Raises `OSError`."""
 
     connection: socket.socket
-    deadline: _Deadline
+    end: float  # of the exchange, by the monotonic clock, s
 
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
-        self.connection.settimeout(self.deadline.left())
+        self.connection.settimeout(_seconds_until(self.end))
         return self.connection.recv(max_bytes)
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
         rest = memoryview(buffer)
         while rest:  # not sendall, which with TLS begins its time limit anew for every piece
-            self.connection.settimeout(self.deadline.left())
+            self.connection.settimeout(_seconds_until(self.end))
             rest = rest[self.connection.send(rest) :]
 
     def close(self) -> None:
@@ -380,8 +365,8 @@ class _Stream(httpcore.NetworkStream):
     ) -> httpcore.NetworkStream:
         """The same connection with TLS, for the name in the URL. Raises `OSError`."""
         try:
-            self.connection.settimeout(self.deadline.left())
-            return _Stream(ssl_context.wrap_socket(self.connection, server_hostname=server_hostname), self.deadline)
+            self.connection.settimeout(_seconds_until(self.end))
+            return _Stream(ssl_context.wrap_socket(self.connection, server_hostname=server_hostname), self.end)
         except BaseException:
             self.connection.close()
             raise

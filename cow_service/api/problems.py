@@ -18,7 +18,7 @@ from starlette.types import Scope
 
 from cow_service import errors
 from cow_service.records import Problem, Record
-from cow_service.requests.values import SHOWN_CHARACTERS, field_errors
+from cow_service.requests.values import field_errors
 
 MEDIA_TYPE = "application/problem+json"
 OPENAI_ROOT = "/v1/"  # of the paths of operations that OpenAI's clients call
@@ -106,7 +106,7 @@ def install_problem_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def framework_error(request: Request, error: HTTPException) -> Response:
-        path, status = errors.shortened(request.url.path, SHOWN_CHARACTERS), error.status_code
+        path, status = errors.shortened(request.url.path), error.status_code
         if status == HTTPStatus.NOT_FOUND:
             ours = errors.NotFound(f"Nothing is served at {path}. GET /openapi.json lists the endpoints.")
         elif status == HTTPStatus.METHOD_NOT_ALLOWED:

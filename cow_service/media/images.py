@@ -243,13 +243,13 @@ NEARLY = 0.75  # of a picture's size
 def fit_within(pixels: NDArray[np.uint8], max_side: int | None) -> NDArray[np.uint8]:
     """Scale [H, W, 3] or [H, W] down, never up, to `max_side` px at most; None: no limit."""
     height, width = pixels.shape[:2]
-    longer = max(height, width)
-    if max_side is None or longer <= max_side:
+    size = size_within(width, height, max_side)
+    if size == (width, height):
         return pixels
     # Near its own size, the means of areas differ from linear interpolation by less than one grey level, at five times
     # the cost.
-    how = cv2.INTER_LINEAR if max_side > NEARLY * longer else cv2.INTER_AREA
-    return np.asarray(cv2.resize(pixels, size_within(width, height, max_side), interpolation=how), dtype=np.uint8)
+    how = cv2.INTER_LINEAR if max(size) > NEARLY * max(width, height) else cv2.INTER_AREA
+    return np.asarray(cv2.resize(pixels, size, interpolation=how), dtype=np.uint8)
 
 
 def size_within(width: int, height: int, max_side: int | None) -> tuple[int, int]:
@@ -426,7 +426,8 @@ def decode_data_url(url: str, pointer: str = "/image") -> bytes:
     field = errors.field_of(pointer)
     head = _DATA_URL.match(url[:256])
     if head is None or head["base64"] is None:
-        raise _bad_image(f"`{field}` must be a data URL with base64: data:image/png;base64,...", pointer)
+        fault = f"`{field}` must be a data URL with base64: data:image/png;base64,..."
+        raise errors.InvalidRequest(fault, errors=(errors.FieldError(pointer, fault),))
     declared = head["type"].lower()
     if not declared.startswith("image/") and declared not in ("", "application/octet-stream"):
         # The image type is detected from the bytes; the declared type is ignored.
@@ -437,11 +438,7 @@ def decode_data_url(url: str, pointer: str = "/image") -> bytes:
         # Tools that write base64 break it into lines.
         return base64.b64decode("".join(url[head.end() :].split()), validate=True)
     except ValueError as error:
-        raise _bad_image(
-            f"The base64 of `{field}` cannot be decoded ({error}): encode the file's bytes in the standard alphabet.",
-            pointer,
-        ) from error
-
-
-def _bad_image(detail: str, pointer: str) -> errors.CowError:
-    return errors.InvalidRequest(detail, errors=(errors.FieldError(pointer, detail),))
+        fault = (
+            f"The base64 of `{field}` cannot be decoded ({error}): encode the file's bytes in the standard alphabet."
+        )
+        raise errors.InvalidRequest(fault, errors=(errors.FieldError(pointer, fault),)) from error

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.media.images import fit_within, tiled
-from cow_service.records import BBox, Grounding, Motion, Path, Trajectory
-from cow_service.records.world import MEETINGS
+from cow_service.records import MEETINGS, BBox, Grounding, Motion, Path, Trajectory
 
 LETTERS = 0.42  # size of the letters, in OpenCV's unit, for a picture whose unit is 1
 STEPS = 12  # places tried above each other, in heights of a label, before covering another one is accepted
@@ -148,9 +147,7 @@ def draw_overlay(
     `mask` [H, W] is the mover's: its outline is drawn, and its box where there is none. What is `removed` is hatched;
     so is the old place of what is `placed`, whose outline is drawn at the new one.
     """
-    canvas = fit_within(image, max_side)
-    if canvas is image:
-        return _draw(np.ascontiguousarray(image).copy(), grounding, motion, trajectory, mask, removed, placed)
+    canvas = fit_within(image, max_side).copy()
     ratio = np.array([canvas.shape[1] / image.shape[1], canvas.shape[0] / image.shape[0]])
 
     def moved(places: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
@@ -170,32 +167,14 @@ def draw_overlay(
     paths = tuple(at(path, points=moved(path.points), band=moved(path.band)) for path in trajectory.paths)
     contacts = tuple(at(each, point=moved([each.point])[0]) for each in trajectory.contacts)
     encounters = tuple(at(each, bbox=box(each.bbox)) for each in trajectory.encounters)
-    return _draw(
-        canvas,
-        at(grounding, bbox=box(grounding.bbox), point=moved([grounding.point])[0]),
-        motion,
-        at(trajectory, paths=paths, contacts=contacts, encounters=encounters),
-        None if mask is None else shrunk(mask),
-        [(name, box(bbox), shrunk(gone)) for name, bbox, gone in removed],
-        [
-            Replaced(
-                each.name, each.place, box(each.old_bbox), shrunk(each.old_mask), box(each.bbox), shrunk(each.mask)
-            )
-            for each in placed
-        ],
-    )
+    removed = [(name, box(bbox), shrunk(gone)) for name, bbox, gone in removed]
+    placed = [
+        Replaced(each.name, each.place, box(each.old_bbox), shrunk(each.old_mask), box(each.bbox), shrunk(each.mask))
+        for each in placed
+    ]
+    grounding = at(grounding, bbox=box(grounding.bbox), point=moved([grounding.point])[0])
+    trajectory = at(trajectory, paths=paths, contacts=contacts, encounters=encounters)
 
-
-def _draw(
-    canvas: Image,
-    grounding: Grounding,
-    motion: Motion,
-    trajectory: Trajectory,
-    mask: Mask | None,
-    removed: Sequence[Removed],
-    placed: Sequence[Replaced],
-) -> Image:
-    """Draws records of the canvas's own pixels on it."""
     unit = max(1.0, max(canvas.shape[:2]) / 640)
     thin = max(1, round(unit))
     for _, _, gone in removed:
@@ -209,19 +188,28 @@ def _draw(
         _rectangle(canvas, encounter.bbox, ENCOUNTERS[encounter.kind], thin)
     for number, path in reversed(list(enumerate(trajectory.paths))):
         _draw_path(canvas, path, trajectory.fps, PUSHED if number else PATH, thin)
-    if mask is not None and mask.any():
-        _draw_outline(canvas, mask, OUTLINE, thin)
+    if mask is not None and (seen := shrunk(mask)).any():
+        _draw_outline(canvas, seen, OUTLINE, thin)
     else:
         _rectangle(canvas, grounding.bbox, OUTLINE, 2 * thin)
     for contact in trajectory.contacts:
         _draw_contact(canvas, contact.point, thin, of_floor=contact.b is None)
     if motion.direction is not None:
         start = np.array(grounding.point)
-        reach = 0.14 * max(canvas.shape[:2])
-        tip = start + np.array(motion.direction) * reach
+        tip = start + np.array(motion.direction) * 0.14 * max(canvas.shape[:2])
         for colour, width in ((DARK, 4 * thin), (ARROW, 2 * thin)):
             cv2.arrowedLine(canvas, _fixed(start), _fixed(tip), colour, width, cv2.LINE_AA, SUBPIXEL, 0.28)
     _dot(canvas, grounding.point, unit, LIGHT)
+    points = [grounding.point, *(contact.point for contact in trajectory.contacts)]
+    for path in trajectory.paths:
+        points += [point for point, visible in zip(path.points, path.visible, strict=True) if visible]
+    draw_labels(canvas, _labels(grounding, trajectory, removed, placed), unit, DARK, points)
+    return canvas
+
+
+def _labels(
+    grounding: Grounding, trajectory: Trajectory, removed: Sequence[Removed], placed: Sequence[Replaced]
+) -> list[Label]:
     labels = [Label(grounding.object, grounding.bbox, OUTLINE, below=False)]
     for encounter in trajectory.encounters:  # as in: hits white cube 1.1 s, 93%
         sure = "" if encounter.probability is None else f", {round(100 * encounter.probability)}%"
@@ -230,12 +218,7 @@ def _draw(
         labels.append(Label(text, encounter.bbox, ENCOUNTERS[encounter.kind], below=True))
     labels += [Label(f"{name}, taken away", bbox, REMOVED, below=False) for name, bbox, _ in removed]
     labels += [Label(f"{each.name}, as it is", each.old_bbox, PLACED, below=False) for each in placed]
-    labels += [Label(f"{each.name}, put {each.place}", each.bbox, PLACED, below=False) for each in placed]
-    points = [grounding.point, *(contact.point for contact in trajectory.contacts)]
-    for path in trajectory.paths:
-        points += [point for point, visible in zip(path.points, path.visible, strict=True) if visible]
-    draw_labels(canvas, labels, unit, DARK, points)
-    return canvas
+    return labels + [Label(f"{each.name}, put {each.place}", each.bbox, PLACED, below=False) for each in placed]
 
 
 def _draw_removed(canvas: Image, mask: Mask, colour: Colour, thin: int) -> None:

@@ -3,8 +3,6 @@
 What has to decode a picture or a video runs in a process of its own (`make_apart`).
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import json
@@ -60,7 +58,7 @@ class Told:
     shown: int  # the frame of the still
 
     @staticmethod
-    def of(result: Simulation | Answer, simulation: Simulation, given: str) -> Told:
+    def of(result: Simulation | Answer, simulation: Simulation, given: str) -> "Told":
         """Of a job's result and its simulation; `given` is the direction in words, where not the question tells it."""
         trajectory, width = simulation.trajectory, simulation.image.width
         path, narration = trajectory.paths[0], simulation.narration
@@ -90,7 +88,7 @@ def film(video: bytes, told: Told) -> bytes:
     made = b""
     for side in SIDES:
         first, fps = next(frames_in(video, side))
-        sheet = _Sheet.of(first, told)
+        sheet = _Sheet(first, told)
         height, width = sheet.shape
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
@@ -105,9 +103,9 @@ def film(video: bytes, told: Told) -> bytes:
 def card(video: bytes, told: Told) -> bytes:
     """A JPEG of `CARD`: one moment with the path and other futures, question and verdict."""
     frame, _ = deque(islice(frames_in(video, SIDES[0]), told.shown + 1), maxlen=1).pop()
-    sheet, canvas = _Sheet.of(frame, told), np.full((CARD[1], CARD[0], 3), DARK[0], np.uint8)
+    sheet, canvas = _Sheet(frame, told), np.full((CARD[1], CARD[0], 3), DARK[0], np.uint8)
     sheet.draw_futures(frame, 0.5)
-    sheet.draw_path(frame)
+    _line(frame, told.path, max(2, round(frame.shape[1] / 240)))
     picture = sheet.around(frame, True)
     scale = min(CARD[0] / picture.shape[1], CARD[1] / picture.shape[0])
     size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
@@ -116,37 +114,16 @@ def card(video: bytes, told: Told) -> bytes:
     return encode_jpeg(canvas)
 
 
-@dataclass(frozen=True)
 class _Sheet:
     """A frame with the question above it and the verdict below."""
 
-    told: Told
-    frame: tuple[int, int]  # px: height and width of the film
-    lines: tuple[str, ...]  # of the question
-
-    @staticmethod
-    def of(frame: Image, told: Told) -> _Sheet:
-        height, width = frame.shape[:2]
-        at_most = width * (1 - 2 * MARGIN)
-        lines = in_letters_thread(_wrapped, told.question, LETTER * width, at_most)
-        return _Sheet(told, (height, width), lines)
-
-    @property
-    def above(self) -> int:
-        """Height of the question, px."""
-        width = self.frame[1]
-        return round(2 * MARGIN * width + LINE * LETTER * width * len(self.lines))
-
-    @property
-    def below(self) -> int:
-        """Height of the verdict, px."""
-        width = self.frame[1]
-        return round(2.4 * MARGIN * width + LINE * (LARGE + LETTER) * width)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width, px."""
-        return self.above + self.frame[0] + self.below, self.frame[1]
+    def __init__(self, frame: Image, told: Told) -> None:
+        self.told, (self.height, self.width) = told, frame.shape[:2]
+        at_most = self.width * (1 - 2 * MARGIN)
+        self.lines = in_letters_thread(_wrapped, told.question, LETTER * self.width, at_most)
+        self.above = round(2 * MARGIN * self.width + LINE * LETTER * self.width * len(self.lines))  # px
+        below = round(2.4 * MARGIN * self.width + LINE * (LARGE + LETTER) * self.width)
+        self.shape = self.above + self.height + below, self.width
 
     def pictures(self, frames: Iterator[Image], fps: float) -> Iterator[Image]:
         """All of the film, one after another."""
@@ -166,16 +143,16 @@ class _Sheet:
     def around(self, frame: Image, is_told: bool) -> Image:
         """A frame with its words, including the verdict if it is shown."""
         canvas = np.full((*self.shape, 3), DARK[0], np.uint8)
-        canvas[self.above : self.above + self.frame[0]] = frame
+        canvas[self.above : self.above + self.height] = frame
         in_letters_thread(self._write, canvas, is_told)
         return canvas
 
     def _write(self, canvas: Image, is_told: bool) -> None:
-        told, width = self.told, self.frame[1]
+        told, width = self.told, self.width
         margin, letter, large = MARGIN * width, LETTER * width, LARGE * width
         for place, line in enumerate(self.lines):
             _put(canvas, line, margin, margin + (place + 0.8) * LINE * letter, letter, LIGHT)
-        top = self.above + self.frame[0] + margin
+        top = self.above + self.height + margin
         if not is_told:
             waiting = f"{told.worlds} imagined futures" if told.worlds else ""
             _put(canvas, waiting, margin, top + 0.8 * LINE * large, letter, GREY)
@@ -196,12 +173,8 @@ class _Sheet:
         """Other worlds' paths of the mover, translucent."""
         layer = frame.copy()
         for future in self.told.futures:
-            _line(layer, future, frame.shape[1], max(1, round(frame.shape[1] / 400)))
+            _line(layer, future, max(1, round(frame.shape[1] / 400)))
         cv2.addWeighted(layer, opacity, frame, 1 - opacity, 0, frame)
-
-    def draw_path(self, frame: Image) -> None:
-        """The path of the world that is shown."""
-        _line(frame, self.told.path, frame.shape[1], max(2, round(frame.shape[1] / 240)))
 
 
 # Of the page that is passed on as a file: each module after those that it imports.
@@ -239,8 +212,8 @@ def page(picture: bytes, world: str, simulation: Simulation, told: Told) -> byte
     ).encode()
 
 
-def _line(canvas: Image, points: Sequence[tuple[float, float]], width: int, thickness: int) -> None:
-    corners = np.clip(np.array(points) * width, -20_000, 20_000).round().astype(np.int32).reshape(-1, 1, 2)
+def _line(canvas: Image, points: Sequence[tuple[float, float]], thickness: int) -> None:
+    corners = np.clip(np.array(points) * canvas.shape[1], -20_000, 20_000).round().astype(np.int32).reshape(-1, 1, 2)
     cv2.polylines(canvas, [corners], False, PATH, thickness, cv2.LINE_AA)
 
 

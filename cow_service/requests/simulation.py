@@ -520,7 +520,7 @@ class SimulateRequest(Record):
         for name, value in fields.items():
             if name != "trajectory" and has_more_values(value, MAX_VALUES):
                 raise ValueError(
-                    f"holds more than {MAX_VALUES} values in `{shortened(name, 80)}`, more than any field needs"
+                    f"holds more than {MAX_VALUES} values in `{shortened(name)}`, more than any field needs"
                 )
         return given
 

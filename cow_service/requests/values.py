@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from cow_service.errors import FieldError, pointer_part, shortened
+from cow_service.errors import SHOWN_CHARACTERS, FieldError, pointer_part, shortened
 from cow_service.records import Record, Sha256
 
 MAX_NAME = 100  # characters of a backend's name
@@ -84,7 +84,6 @@ MaskRef = Annotated[
 
 
 _OURS = {"extra_forbidden": "there is no such field", "string_too_short": "is empty"}  # by pydantic's type
-SHOWN_CHARACTERS = 80  # of what the caller sent
 _HIDDEN = ("function-", "constrained-", "is-instance")
 _UNION_BRANCHES = frozenset({"ImageArtifact", "ImageUrl", "str", "texts", "pairs"})
 
@@ -113,4 +112,4 @@ def _with_value(message: str, value: Any) -> str:
     reason = message.partition(", got ")[0]  # pydantic says the kind of number there, we say the number
     if isinstance(value, str) and len(value) > SHOWN_CHARACTERS:
         return f"{reason}, got {len(value)} characters"
-    return f"{reason}, got {shortened(json.dumps(value), SHOWN_CHARACTERS)}"
+    return f"{reason}, got {shortened(json.dumps(value))}"

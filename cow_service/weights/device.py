@@ -1,7 +1,7 @@
 """Where weights run: the device that COW_DEVICE names, its CPU threads, and how PyTorch says that memory ran out."""
 
 import re
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from contextlib import contextmanager
 from threading import Lock
 
@@ -52,12 +52,6 @@ def is_out_of_memory(error: BaseException) -> bool:
 # Seeds, and what libraries patch while they initialise, are global to the process: two models built at once, be they of
 # a reader and of a generator, would mix up their weights.
 BUILD_LOCK = Lock()
-
-
-def listed(names: Sequence[str], most: int = 8) -> str:
-    """The first `most` names, and how many more there are; for error messages."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def reason_of(error: Exception) -> str:

@@ -67,8 +67,7 @@ class Source(Record):
     files: tuple[str, ...] = Field(min_length=1, description="Glob patterns of the files that are used.")
     licence: str
     pickled: bool = Field(
-        default=False,
-        description="Whether they are pickles. So only where their reader lets them run no code.",
+        default=False, description="Whether they are pickles. So only where their reader lets them run no code."
     )
 
 

@@ -12,8 +12,6 @@ huggingface_hub's `verify_repo_checksums` asks the hub for the digests and so ne
 the repository at each call: both are not used.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil
@@ -30,7 +28,7 @@ from filelock import FileLock, Timeout
 from pydantic import AfterValidator, Field, ValidationError
 
 from cow_service import __version__
-from cow_service.errors import CowError, WeightsUnavailable, install_line
+from cow_service.errors import CowError, WeightsUnavailable, install_line, listed
 from cow_service.records import Record
 from cow_service.settings import Settings
 from cow_service.weights.manifests import Manifest, Source
@@ -41,7 +39,6 @@ if TYPE_CHECKING:
 LOCK_NAME = "cow.lock.json"
 PICKLED = (".bin", ".ckpt", ".pickle", ".pkl", ".pt", ".pth")  # reading one of these can run code that it holds
 
-_MAX_LISTED = 10
 _LISTING_SECONDS = 30.0  # timeout
 _LOG_IN = "Log in with `hf auth login`, or set HF_TOKEN, for an account that may read it"
 _REACH = "Check the network, the proxy and HF_ENDPOINT, and run it again"
@@ -146,12 +143,9 @@ def verify(source: Source, weights_dir: Path, name: str) -> Path:
     """The folder of a source's files. Raises `WeightsUnavailable` if they are not as recorded, with the remedy."""
     findings = check(source, weights_dir)
     if findings:
-        messages = [finding.message for finding in findings[:_MAX_LISTED]]
-        if len(findings) > _MAX_LISTED:
-            messages.append(f"and {len(findings) - _MAX_LISTED} more")
+        told = listed([finding.message for finding in findings], 10, "; ")
         raise WeightsUnavailable(
-            f"'{name}' cannot use its weights of '{source.repository}': {'; '.join(messages)}. "
-            f"Run `cow models pull {name}`."
+            f"'{name}' cannot use its weights of '{source.repository}': {told}. Run `cow models pull {name}`."
         )
     return folder_of(weights_dir, source.repository)
 
@@ -328,7 +322,7 @@ def download(
                 _download_file(hub, each.lock, file, weights_dir)
 
 
-def _download_file(hub: HfApi, lock: Lock, file: LockedFile, weights_dir: Path) -> None:
+def _download_file(hub: "HfApi", lock: Lock, file: LockedFile, weights_dir: Path) -> None:
     folder = folder_of(weights_dir, lock.repository)
     with _hub_errors(lock.repository, lock.revision):
         # The library trusts an existing file by its modification time; this one has a wrong digest.
@@ -374,7 +368,7 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
         return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=tuple(files))
 
 
-def _hub(endpoint: str | None) -> HfApi:
+def _hub(endpoint: str | None) -> "HfApi":
     try:
         from huggingface_hub import HfApi  # noqa: PLC0415
     except ImportError as error:

@@ -548,7 +548,7 @@ def test_every_foreign_exception_is_translated_and_faults_of_our_own_are_not() -
             raising(kind(*arguments.get(kind, ("secret 10.0.0.1",))))
     with pytest.raises(KeyError):
         raising(KeyError("x"))
-    for (above, *_), (below, *_) in itertools.combinations(TRANSLATED, 2):
+    for above, below in itertools.combinations((kind for kinds, *_ in TRANSLATED for kind in kinds), 2):
         assert not issubclass(below, above), f"{below} is never reached"
 
 

@@ -56,7 +56,8 @@ def test_what_says_that_memory_ran_out() -> None:
 
 
 def test_names_and_reasons_for_messages() -> None:
-    from cow_service.weights.device import listed, reason_of
+    from cow_service.errors import listed
+    from cow_service.weights.device import reason_of
 
     assert listed(["a", "b"], 2) == "a, b"
     assert listed([str(i) for i in range(10)]) == "0, 1, 2, 3, 4, 5, 6, 7 and 2 more"

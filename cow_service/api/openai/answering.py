@@ -16,7 +16,7 @@ from cow_service.api.openai.records import Answerer
 from cow_service.api.openai.stream import LAST_EVENT, chunk_of, event_of, follow_job, job_head, progress_chunk
 from cow_service.api.problems import invalid
 from cow_service.api.submission import Submission, Submitter
-from cow_service.errors import FieldError, InvalidRequest
+from cow_service.errors import FieldError, InvalidRequest, listed, wrong
 from cow_service.readers.options import Reply, reply_text
 from cow_service.records import Job
 from cow_service.requests import AnswerRequest
@@ -45,25 +45,23 @@ class ParsedChat:
     chat: chats.Chat
     request: AnswerRequest
     pointers: dict[str, str]  # by field of the request: JSON Pointers into the chat
-    warnings: tuple[str, ...]  # what of it has no effect
-    max_tokens: int | None
 
 
 def parse_chat(chat: chats.Chat, model: Answerer) -> ParsedChat:
     """The answer that a chat asks for. Raises `InvalidRequest`."""
     if not chat.messages:
-        raise chats.wrong("/messages", "is missing: send the image and the question in one user message")
+        raise wrong("/messages", "is missing: send the image and the question in one user message")
     image = _image_of(chat.messages)
     place, question = chat.question()
     if not question.strip():
-        raise chats.wrong(f"/messages/{place}/content", "the last user message has no text: put the question there")
+        raise wrong(f"/messages/{place}/content", "the last user message has no text: put the question there")
     for name in FIELDS_OF_CHAT:
         if name in chat.cow:
-            raise chats.wrong(f"/cow/{name}", "is said by `messages` and `model`; leave it out")
+            raise wrong(f"/cow/{name}", "is said by `messages` and `model`; leave it out")
     seed = chat.fields.get("seed")
     seeds: dict[str, Any] = {} if seed is None else {"seed": seed}
     if seeds and "seed" in chat.cow:
-        raise chats.wrong("/cow/seed", "stands in `seed`, too; give it once")
+        raise wrong("/cow/seed", "stands in `seed`, too; give it once")
     pointers = {"/image": image.url_pointer, "/question": f"/messages/{place}/content", "/reader": "/model"}
     pointers |= {"/seed": "/seed"} if seeds else {}
     fields = {**chat.cow, **seeds, "question": question, "image": image.reference}
@@ -71,39 +69,34 @@ def parse_chat(chat: chats.Chat, model: Answerer) -> ParsedChat:
         request = AnswerRequest.model_validate({**fields, "reader": model.reader, "imagine": model.imagine})
     except ValidationError as error:
         raise invalid(error, lambda pointer: chats.point_into_chat(pointer, pointers)) from error
-    limits = [limit for name in ("max_tokens", "max_completion_tokens") if type(limit := chat.fields.get(name)) is int]
-    return ParsedChat(chat, request, pointers, tuple(_warnings(chat, place)), min(limits, default=None))
+    return ParsedChat(chat, request, pointers)
 
 
 def _image_of(messages: list[Any]) -> chats.ImagePart:
     """The only image. The same image may stand in several messages."""
     for pointer, kind in chats.other_parts(messages):
-        raise chats.wrong(f"{pointer}/type", f"is {kind}: only parts of the types `text` and `image_url` are read")
+        raise wrong(f"{pointer}/type", f"is {kind}: only parts of the types `text` and `image_url` are read")
     found: dict[str, chats.ImagePart] = {}
     for image in chats.images_of(messages):
         if image.role != "user":
-            raise chats.wrong(image.pointer, f"images are read in `user` messages only, got one of `{image.role}`")
+            raise wrong(image.pointer, f"images are read in `user` messages only, got one of `{image.role}`")
         found.setdefault(image.url, image)
     if not found:
-        raise chats.wrong(
-            f"/messages/{len(messages) - 1}/content",
-            "no user message has an image: add a part "
-            '{"type": "image_url", "image_url": {"url": "data:image/png;base64,..."}}',
-        )
+        part = '{"type": "image_url", "image_url": {"url": "data:image/png;base64,..."}}'
+        raise wrong(f"/messages/{len(messages) - 1}/content", f"no user message has an image: add a part {part}")
     if len(found) > 1:
         detail = f"a question is about one image, got {len(found)}: send one"
         places = tuple(FieldError(image.url_pointer, detail) for image in found.values())
         raise InvalidRequest(f"`messages`: {detail}.", errors=places)
     image = next(iter(found.values()))
     if not image.url[:8].lower().startswith(("data:", "http://", "https://")):
-        raise chats.wrong(
-            image.url_pointer, "is neither a data URL (data:image/png;base64,...) nor one of http or https"
-        )
+        raise wrong(image.url_pointer, "is neither a data URL (data:image/png;base64,...) nor one of http or https")
     return image
 
 
-def _warnings(chat: chats.Chat, question: int) -> Iterator[str]:
+def _warnings(chat: chats.Chat, answer: str) -> Iterator[str]:
     """What of the chat has no effect."""
+    question, _ = chat.question()
     unread = [
         f"{place} ({chats.role_of(message)})"
         for place, message in enumerate(chat.messages)
@@ -111,23 +104,21 @@ def _warnings(chat: chats.Chat, question: int) -> Iterator[str]:
     ]
     if unread:
         yield (
-            f"The text of these `messages` was not read: {_list_some(unread)}. This model takes one image and one "
+            f"The text of these `messages` was not read: {listed(unread, 10)}. This model takes one image and one "
             "question: all that matters must stand in the last user message."
         )
     fields = chat.fields.items()
     if unused := [f"`{name[:40]}`" for name, value in fields if name not in SILENT and _has_effect(name, value)]:
-        yield f"Not used: {_list_some(unused)}. This model has no MLLM behind it that could use them."
+        yield f"Not used: {listed(unused, 10)}. This model has no MLLM behind it that could use them."
+    limits = [limit for name in ("max_tokens", "max_completion_tokens") if type(limit := chat.fields.get(name)) is int]
+    if limits and len(answer.split()) > min(limits):
+        yield f"The answer is longer than {min(limits)} tokens: answers are not cut."
 
 
 def _has_effect(name: str, value: Any) -> bool:
-    """Whether the value of a field asks for something."""
     if value is None or value is False or value in ([], {}, ""):
         return False
     return isinstance(value, bool) or value not in NEUTRAL.get(name, ())
-
-
-def _list_some(names: list[str], most: int = 10) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def completion_of(parsed: ParsedChat, result: str) -> dict[str, Any]:
@@ -136,17 +127,13 @@ def completion_of(parsed: ParsedChat, result: str) -> dict[str, Any]:
     said = NOT_SURE if answer["answer"] is None else answer["answer"]
     reply = Reply(said, answer["option"], answer["reasoning"], answer["options_source"])
     content = reply_text(answer["question"], reply)  # a letter, a text, a line or JSON: as the question asks
-    warnings = list(parsed.warnings)
-    if parsed.max_tokens is not None and len(content.split()) > parsed.max_tokens:
-        warnings.append(f"The answer is longer than {parsed.max_tokens} tokens: answers are not cut.")
-    answer["warnings"] = [*warnings, *answer["warnings"]]
+    answer["warnings"] = [*_warnings(parsed.chat, content), *answer["warnings"]]
     message = {"content": content, "reasoning_content": answer["reasoning"] or None, "refusal": None}
     read, written = answer["usage"]["input_tokens"], answer["usage"]["output_tokens"]
+    choice = {"index": 0, "message": {"role": "assistant"} | message, "finish_reason": "stop", "logprobs": None}
     return job_head(answer["id"], answer["created_at"], parsed.chat.model) | {
         "object": "chat.completion",
-        "choices": [
-            {"index": 0, "message": {"role": "assistant"} | message, "finish_reason": "stop", "logprobs": None}
-        ],
+        "choices": [choice],
         "usage": {"prompt_tokens": read, "completion_tokens": written, "total_tokens": read + written},
         "cow": answer,
     }

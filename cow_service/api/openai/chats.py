@@ -9,8 +9,7 @@ from typing import Any, Self, cast
 
 from pydantic import BaseModel, Field
 
-from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part, shortened
-from cow_service.requests.values import SHOWN_CHARACTERS
+from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part, shortened, wrong
 from cow_service.service import Service
 
 MAX_URLS = 16  # of one chat: each may take 10 s to look up or to fetch
@@ -22,11 +21,6 @@ EXTENSION = "cow"  # COW's own field of a request, and of a reply
 def as_json(value: Any) -> str:
     """A value as compact JSON. Only ASCII: replies of an MLLM may hold halves of surrogate pairs."""
     return json.dumps(value, separators=(",", ":"))
-
-
-def wrong(pointer: str, detail: str) -> InvalidRequest:
-    """The error for one field."""
-    return InvalidRequest(f"{pointer or 'The body'}: {detail}.", errors=(FieldError(pointer, detail),))
 
 
 @dataclass(frozen=True)
@@ -190,7 +184,7 @@ def fetch_pictures(urls: Sequence[MediaUrl], service: Service) -> tuple[None, in
                 fetched[url] = f"data:{service.check_image(data)};base64,{base64.b64encode(data).decode()}"
             each.holder[each.key] = fetched[url]
         except CowError as error:
-            detail = f"'{shortened(url, SHOWN_CHARACTERS)}' is not sent on. {error.detail}"
+            detail = f"'{shortened(url)}' is not sent on. {error.detail}"
             raise type(error)(f"{each.pointer}: {detail}", errors=(FieldError(each.pointer, detail),)) from error
     return None, size
 

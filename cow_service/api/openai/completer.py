@@ -25,14 +25,12 @@ from cow_service.api.openai.answering import answer_events, completion_of, parse
 from cow_service.api.openai.chats import EXTENSION, Chat, check_passed_on, fetch_pictures, locate_in_chat, media_urls
 from cow_service.api.openai.forwarding import Events, Forwarder
 from cow_service.api.openai.imagining import EnrichedChat, WhatIf, find_what_if
-from cow_service.api.openai.records import Answerer
 from cow_service.jobs.engine import new_job_id
 from cow_service.readers.chat import ChatReader, ChatTurn
 from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.options import read_choices
 from cow_service.records import AnswerOption, Job
 from cow_service.requests import SimulateRequest
-from cow_service.requests.values import SHOWN_CHARACTERS
 
 DEFAULT_WAIT_SECONDS = 60.0  # from a chat's arrival; after it, no refused call of the imagination is repeated
 
@@ -54,7 +52,7 @@ class Completer:
         """The JSON object that a request holds. Raises `BodyTypeUnsupported`, `MalformedBody`."""
         media_type = request.headers.get("content-type", "none").partition(";")[0].strip().lower()
         if media_type != "application/json" and not media_type.endswith("+json"):
-            shown = errors.shortened(media_type, SHOWN_CHARACTERS)
+            shown = errors.shortened(media_type)
             raise errors.BodyTypeUnsupported(f"The body has the media type '{shown}'. Send application/json.")
         return await self._submitter.in_thread(
             submitting.owner_of(request), partial(read_object, await request.body(), "The body")
@@ -102,7 +100,7 @@ class Completer:
         return await self._forward(request, enriched, reader)
 
     async def _answer(
-        self, request: Request, chat: Chat, answerer: Answerer, *, stored: bool
+        self, request: Request, chat: Chat, answerer: records.Answerer, *, stored: bool
     ) -> ChatTurn | stream.Streamed | Response:
         """The reply of a model without an MLLM."""
         submitter = self._submitter

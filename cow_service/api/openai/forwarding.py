@@ -18,9 +18,9 @@ from sse_starlette import ServerSentEvent
 
 from cow_service import __version__
 from cow_service.adaptive import BUSY, AdaptivePlaces
-from cow_service.api.openai.chats import as_json, wrong
+from cow_service.api.openai.chats import as_json
 from cow_service.client.protocol import retry_after
-from cow_service.errors import MllmBadReply, MllmUnavailable
+from cow_service.errors import MllmBadReply, MllmUnavailable, wrong
 from cow_service.net import Unreachable, limit_replies
 from cow_service.readers.chat import ChatTurn, Upstream, log_refusal
 from cow_service.settings import Settings
@@ -153,11 +153,8 @@ def _whole(response: httpx.Response, key: str | None) -> ChatTurn:
             f"The server of the multimodal LLM answered with status {status}: its address or this server's own key for "
             "it is wrong (COW_MLLM_BASE_URL, COW_MLLM_API_KEY)."
         )
-    headers = {
-        name: value
-        for name, value in response.headers.items()
-        if name in PASSED_HEADERS or name.startswith(PASSED_PREFIX)
-    }
+    told = response.headers.items()
+    headers = {name: value for name, value in told if name in PASSED_HEADERS or name.startswith(PASSED_PREFIX)}
     return ChatTurn(error, status, headers=headers)
 
 

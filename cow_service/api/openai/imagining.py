@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from cow_service import errors
-from cow_service.api.openai.chats import EXTENSION, Chat, ImagePart, images_of, locate_in_chat, other_parts, wrong
+from cow_service.api.openai.chats import EXTENSION, Chat, ImagePart, images_of, locate_in_chat, other_parts
 from cow_service.api.openai.records import WITHOUT, Answerer, ChatImagination
 from cow_service.api.problems import invalid
 from cow_service.media.artifacts import ArtifactStore
@@ -216,7 +216,7 @@ def check_fields(chat: Chat, answerer: Answerer) -> None:
         refused["trajectory"] = "has no wrong direction: leave it out, or ask the model without :wrong-direction"
     for name in chat.cow:
         if name in refused:
-            raise wrong(f"/{EXTENSION}/{name}", refused[name])
+            raise errors.wrong(f"/{EXTENSION}/{name}", refused[name])
     try:
         SimulateRequest.model_validate({**chat.cow, "question": "?", "image": "data:"})
     except ValidationError as error:
@@ -229,11 +229,12 @@ def check_votable(chat: Chat, votes: int) -> None:
     if not read_choices(question, None):
         pointer = "/messages" if place < 0 else f"/messages/{place}/content"
         detail = "the last user message lists no answers to choose from, such as (A) Yes (B) No"
-        raise wrong(pointer, f"{detail}: list them, or ask the model without :vote-{votes}")
+        raise errors.wrong(pointer, f"{detail}: list them, or ask the model without :vote-{votes}")
+    remedy = f"leave it out, or ask the model without :vote-{votes}"
     if chat.fields.get("n") not in (None, 1):
-        raise wrong("/n", f"each vote is one reply: leave it out, or ask the model without :vote-{votes}")
+        raise errors.wrong("/n", f"each vote is one reply: {remedy}")
     if chat.fields.get("seed") is not None:
-        raise wrong("/seed", f"all votes would be the same reply: leave it out, or ask the model without :vote-{votes}")
+        raise errors.wrong("/seed", f"all votes would be the same reply: {remedy}")
 
 
 def _nothing_imagined(

@@ -12,7 +12,6 @@ from pydantic import BaseModel, Field
 from cow_service.errors import FieldError, ModelNotFound, shortened
 from cow_service.readers.mllm.contents import PLACEBOS, Content
 from cow_service.records import Answer, Frame, FramePolicy, JobStatus, Record, Usage
-from cow_service.requests.values import SHOWN_CHARACTERS
 from cow_service.service import Service
 
 
@@ -212,17 +211,9 @@ def find_answerer(service: Service, model: str) -> Answerer:
     if base is not None:
         found = _with_suffixes(readers[base], model.removeprefix(base).split(":")[1:])
     if found is None:
-        detail = (
-            f"There is no model '{shortened(model, SHOWN_CHARACTERS)}'. There are: {', '.join(answerers(service))}."
-        )
+        detail = f"There is no model '{shortened(model)}'. There are: {', '.join(answerers(service))}."
         raise ModelNotFound(detail, errors=(FieldError("/model", "no model has that name"),))
     return found
-
-
-def usable_models(service: Service) -> tuple[str, ...]:
-    """The names of the models that can answer, as far as is known."""
-    unready = {reader.name for reader in service.models().readers if reader.ready is False}
-    return tuple(name for name, one in answerers(service).items() if one.reader not in unready)
 
 
 def _readers(service: Service) -> dict[str, str]:

@@ -9,11 +9,11 @@ from typing import Any, cast
 
 from sse_starlette import ServerSentEvent
 
-from cow_service.api.openai.chats import EXTENSION, wrong
+from cow_service.api.openai.chats import EXTENSION
 from cow_service.api.openai.forwarding import Events
 from cow_service.api.openai.stream import Streamed, chunks_of, data_of, event_of
 from cow_service.api.problems import openai_error
-from cow_service.errors import CowError
+from cow_service.errors import CowError, wrong
 
 STATELESS = "this server keeps no state between responses"
 STATEFUL = {  # fields that ask for state, each with values that do not
@@ -138,7 +138,6 @@ def _without_type(value: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_object(value: Any, pointer: str) -> dict[str, Any]:
-    """An object of the request."""
     if not isinstance(value, dict):
         raise wrong(pointer, "is no object")
     return cast("dict[str, Any]", value)

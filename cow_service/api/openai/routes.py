@@ -54,7 +54,6 @@ def _body_of(record: type[BaseModel]) -> dict[str, Any]:
 
 
 def _reply(records: list[type[BaseModel]], data: str) -> dict[str, Any]:
-    """A reply, whole or streamed."""
     event = {
         "type": "object",
         "required": ["data"],
@@ -122,7 +121,9 @@ def models(completer: ChatCompleter) -> records.ChatModels:
     """Every reader, the server's default first: with imagination and without (`:no-imagination`).
 
     Models with an MLLM also have controls, such as `:still`; suffixes of different kinds can be combined."""
-    names = records.usable_models(completer.service)
+    unready = {reader.name for reader in completer.service.models().readers if reader.ready is False}
+    listed = records.answerers(completer.service).items()
+    names = [name for name, answerer in listed if answerer.reader not in unready]
     return records.ChatModels(data=tuple(records.ChatModel(id=name, created=completer.started) for name in names))
 
 

@@ -24,8 +24,7 @@ from diffusers.loaders.single_file_utils import convert_wan_transformer_to_diffu
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable
-from cow_service.weights.device import listed
+from cow_service.errors import CheckpointInvalid, GeneratorUnavailable, WeightsUnavailable, listed
 
 PREFIXES = ("model.diffusion_model.", "diffusion_model.")  # of names in one-file checkpoints
 SCALE = ".scale_weight"  # one number per fp8 weight: its scale

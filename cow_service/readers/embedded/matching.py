@@ -8,7 +8,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from cow_service.errors import CannotGround
+from cow_service.errors import CannotGround, listed
 from cow_service.physics.bodies import SeenBody, supports_of
 from cow_service.readers.base import SeenThing
 from cow_service.readers.embedded.english.lexicon import COLOURS, GENERIC, PLACES, SETS, TABLES, ObjectPhrase
@@ -136,9 +136,7 @@ def inside_drawn_box(scene: Scene, phrase: ObjectPhrase) -> BBox:
 
 def describe(regions: Sequence[Region]) -> str:
     """What was seen, in words, for an error message."""
-    named = [f"{region.colour} at ({region.centre[0]:.0f}, {region.centre[1]:.0f})" for region in regions[:8]]
-    more = len(regions) - len(named)
-    return (", ".join(named) or "nothing") + (f" and {more} more" if more > 0 else "")
+    return listed([f"{each.colour} at ({each.centre[0]:.0f}, {each.centre[1]:.0f})" for each in regions]) or "nothing"
 
 
 def things_of_kinds(

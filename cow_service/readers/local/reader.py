@@ -16,7 +16,7 @@ import transformers
 from pydantic_ai.settings import ModelSettings
 from transformers.models.auto.processing_auto import PROCESSOR_MAPPING
 
-from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable
+from cow_service.errors import CheckpointInvalid, CowError, ReaderUnavailable, listed
 from cow_service.readers.local.generation import BatchGenerator
 from cow_service.readers.local.model import LocalModel, LocalOptions
 from cow_service.readers.local.tiny import make_tiny, still
@@ -25,7 +25,7 @@ from cow_service.readers.mllm.known import mllm_manifests, resolve_model
 from cow_service.readers.mllm.models import ConfiguredModel
 from cow_service.readers.mllm.reader import MllmReader
 from cow_service.settings import Settings
-from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, listed, reason_of
+from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, reason_of
 from cow_service.weights.manifests import Manifest, load_families
 from cow_service.weights.repositories import verify, weights_identity
 

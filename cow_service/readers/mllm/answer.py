@@ -9,7 +9,6 @@ from cow_service.readers.base import AnswerReading, Imagined
 from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.hypothesis import hypothesis
-from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.options import MARKS, not_sure_option, option_named, plain, question_without, says_not_sure
 from cow_service.records import AnswerOption
 
@@ -73,9 +72,9 @@ def read_answer(reply: str, options: Sequence[AnswerOption]) -> AnswerReading:
     else:
         readings = _read_prose(said, options)
     if not readings:
-        raise ReplyError(f"`answer` is missing; {_remedy(options)}")
+        raise replies.ReplyError(f"`answer` is missing; {_remedy(options)}")
     if len({(reading.answer, reading.not_sure) for reading in readings}) > 1:
-        raise ReplyError(f"several answers are given; {_remedy(options)}")
+        raise replies.ReplyError(f"several answers are given; {_remedy(options)}")
     return readings[-1]
 
 
@@ -97,7 +96,7 @@ def _read_fields(fields: dict[str, Any], options: Sequence[AnswerOption]) -> Ite
         if option is None:
             meant = {option.letter: option for each in _announced(text) if (option := _option(each, options))}
             if len(meant) != 1:
-                raise ReplyError(f"the answer '{str(answer)[:80]}' is none of the options; {_remedy(options)}")
+                raise replies.ReplyError(f"the answer '{str(answer)[:80]}' is none of the options; {_remedy(options)}")
             (option,) = meant.values()
         yield _reading_of(option, reasoning)
 
@@ -114,7 +113,7 @@ def _read_prose(said: str, options: Sequence[AnswerOption]) -> list[AnswerReadin
     if options:
         found = [option for each in answers or lines if (option := _option(each, options))]
         if answers and not found:
-            raise ReplyError(f"the answer '{answers[-1][:80]}' is none of the options; {_remedy(options)}")
+            raise replies.ReplyError(f"the answer '{answers[-1][:80]}' is none of the options; {_remedy(options)}")
         return [_reading_of(option, "" if said == option.letter else said[:MAX_REASONING]) for option in found]
     if answers:
         return [_read_open(answer, said[:MAX_REASONING]) for answer in answers]
@@ -141,7 +140,7 @@ def _read_open(answer: Any, reasoning: str) -> AnswerReading:
         answer = "Yes" if answer else "No"
     if isinstance(answer, int | float):
         if not -1e15 < answer < 1e15 or math.isnan(answer):
-            raise ReplyError(f"the answer is no usable number; {_remedy(())}")
+            raise replies.ReplyError(f"the answer is no usable number; {_remedy(())}")
         answer = f"{answer:g}"
     if isinstance(answer, list):
         answer = ", ".join(replies.text_of(part) for part in replies.listed(answer))

@@ -18,7 +18,7 @@ from pydantic_ai.output import OutputObjectDefinition
 from pydantic_ai.settings import ModelSettings
 from pydantic_ai.tools import ToolDefinition
 
-from cow_service.errors import FieldError, InvalidRequest
+from cow_service.errors import wrong
 
 # OpenAI's names of settings, and pydantic-ai's. Of two names for one setting the later one counts.
 SETTINGS = {
@@ -75,7 +75,7 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
     for place, tool in enumerate(_list_of(body, "tools")):
         pointer = f"/tools/{place}"
         if not isinstance(tool, dict) or tool.get("type", "function") != "function":
-            raise _wrong(pointer, "only tools of the type `function` can be sent to this MLLM")
+            raise wrong(pointer, "only tools of the type `function` can be sent to this MLLM")
         function = _at(tool, pointer, "function")
         name = _at(function, pointer + "/function", "name")
         schema = function.get("parameters") or {"type": "object", "properties": {}}
@@ -127,7 +127,7 @@ def _messages(body: dict[str, Any]) -> Iterator[ai.ModelMessage]:
     for place, message in enumerate(_list_of(body, "messages")):
         pointer = f"/messages/{place}"
         if not isinstance(message, dict):
-            raise _wrong(pointer, "is no object")
+            raise wrong(pointer, "is no object")
         given = cast("dict[str, Any]", message)
         role, content = given.get("role"), list(_contents(given.get("content"), pointer + "/content"))
         if role in ("system", "developer"):
@@ -147,7 +147,7 @@ def _messages(body: dict[str, Any]) -> Iterator[ai.ModelMessage]:
             result = ai.ToolReturnPart(tools.get(call, "tool"), _text(content, pointer), call)
             yield ai.ModelRequest([result])
         else:
-            raise _wrong(pointer + "/role", f"messages of the role {str(role)[:40]!r} cannot be sent to this MLLM")
+            raise wrong(pointer + "/role", f"messages of the role {str(role)[:40]!r} cannot be sent to this MLLM")
 
 
 def _contents(content: Any, pointer: str) -> Iterator[ai.UserContent]:
@@ -163,26 +163,26 @@ def _contents(content: Any, pointer: str) -> Iterator[ai.UserContent]:
             url = given.get("url") if isinstance(given, dict) else given
             head, comma, data = str(url).partition(",")
             if not (comma and head.lower().startswith("data:image/") and head.lower().endswith(";base64")):
-                raise _wrong(place, "images are sent to this MLLM as data URLs (data:image/png;base64,...) only")
+                raise wrong(place, "images are sent to this MLLM as data URLs (data:image/png;base64,...) only")
             try:
                 yield ai.BinaryContent(base64.b64decode(data, validate=True), media_type=head[5:-7].lower())
             except binascii.Error as error:
-                raise _wrong(place, "the data URL is no base64") from error
+                raise wrong(place, "the data URL is no base64") from error
         else:
-            raise _wrong(place, "only texts and images can be sent to this MLLM")
+            raise wrong(place, "only texts and images can be sent to this MLLM")
 
 
 def _text(content: list[ai.UserContent], pointer: str) -> str:
     texts = [part for part in content if isinstance(part, str)]
     if len(texts) < len(content):
-        raise _wrong(pointer, "images can be sent to this MLLM in `user` messages only")
+        raise wrong(pointer, "images can be sent to this MLLM in `user` messages only")
     return "\n".join(texts)
 
 
 def _list_of(given: dict[str, Any], name: str) -> list[Any]:
     value = given.get(name)
     if value is not None and not isinstance(value, list):
-        raise _wrong(f"/{name}", "is no array")
+        raise wrong(f"/{name}", "is no array")
     return value or []
 
 
@@ -190,10 +190,6 @@ def _at(value: Any, pointer: str, *names: str) -> Any:
     """What stands below these names. Raises `InvalidRequest` if one is missing."""
     for name in names:
         if not isinstance(value, dict) or name not in value:
-            raise _wrong(pointer, f"`{name}` is missing")
+            raise wrong(pointer, f"`{name}` is missing")
         value = cast("dict[str, Any]", value)[name]
     return value
-
-
-def _wrong(pointer: str, detail: str) -> InvalidRequest:
-    return InvalidRequest(f"{pointer}: {detail}.", errors=(FieldError(pointer, detail),))

@@ -18,7 +18,7 @@ from pydantic_ai import Agent, BinaryContent, ModelRetry, TextOutput
 from pydantic_ai import exceptions as errors
 from pydantic_ai import messages as ai
 from pydantic_ai.direct import model_request
-from pydantic_ai.models import Model, ModelRequestParameters
+from pydantic_ai.models import ModelRequestParameters
 from pydantic_ai.models.wrapper import WrapperModel
 from pydantic_ai.output import OutputObjectDefinition
 from pydantic_ai.settings import ModelSettings
@@ -99,7 +99,7 @@ class MllmClient:
     def __init__(self, model: ConfiguredModel, settings: Settings) -> None:
         self.model = model
         self._name = f"The multimodal LLM '{model.name}'"
-        self._timeout, self._budget = settings.mllm_timeout, settings.mllm_budget
+        self.timeout, self.budget = settings.mllm_timeout, settings.mllm_budget
         self.places = AdaptivePlaces(settings.mllm_concurrency)
         self.notes = MllmNotes(settings.data_dir, model.server, model.name)
         self.capabilities = CapabilityStore(self.notes, model.first)
@@ -150,8 +150,8 @@ class MllmClient:
 
     async def _chat(self, body: dict[str, Any]) -> ChatTurn:
         chat = prepare_chat(body, self.model.model)
-        settings = self._supported(chat.settings | ModelSettings(timeout=self._timeout, max_retries=0))
-        once = RetryingModel(self.model.model, self.places, self._timeout, self._budget, retries=False)
+        settings = self._supported(chat.settings | ModelSettings(timeout=self.timeout, max_retries=0))
+        once = RetryingModel(self, self.budget, CallLog(), retries=False)
         try:
             response = await model_request(
                 once, chat.messages, model_settings=settings, model_request_parameters=chat.parameters
@@ -167,7 +167,7 @@ class MllmClient:
         except errors.ModelAPIError as error:
             raise MllmUnavailable(f"{self._name} could not be asked: {reason_of(error)}.") from error
         except TimeoutError as error:
-            detail = f"{self._name} accepted no chats for {self._budget:g} s (COW_MLLM_BUDGET)."
+            detail = f"{self._name} accepted no chats for {self.budget:g} s (COW_MLLM_BUDGET)."
             raise MllmUnavailable(detail) from error
         except errors.ContentFilterError as error:
             raise MllmBadReply(f"{self._name} refused to answer: its content filter held the reply back.") from error
@@ -176,14 +176,12 @@ class MllmClient:
     async def _complete(self, call: PromptCall[T], given: ReaderInput) -> T | CowError:
         """The parsed reply, or the error that the call came to: one failed vote must not lose the others."""
         prompt, parser, used = load_prompt(call.prompt), _ReplyParser(call.parse), RunUsage()
-        seconds = self._budget if given.until is None else min(self._budget, given.until - time.time())
-        model = LearningModel(
-            self.model, self.capabilities, call, self.places, self._timeout, seconds, given.calls, self._budget
-        )
+        seconds = self.budget if given.until is None else min(self.budget, given.until - time.time())
+        model = LearningModel(self, call, seconds, given.calls)
         defaults = self.model.manifest.defaults
         settings = ModelSettings(
             max_tokens=int(defaults.get("max_tokens", 4096)),
-            timeout=self._timeout,
+            timeout=self.timeout,
             max_retries=0,  # `RetryingModel` retries, and it knows the budget
             framing_announcement="never",
         )
@@ -193,7 +191,7 @@ class MllmClient:
             if given.seed is not None:
                 settings |= ModelSettings(seed=seed_of_vote(given.seed, call.vote))
         try:
-            with anyio.fail_after(self._budget):
+            with anyio.fail_after(self.budget):
                 run = await self._agent.run(
                     prompt.render(**call.inputs),
                     output_type=TextOutput(parser.read),
@@ -305,27 +303,16 @@ _MALFORMED = (IndexError, KeyError, TypeError, AttributeError, ValueError, Egres
 class RetryingModel(WrapperModel):
     """A model that repeats a failed request while that may help: no attempt begins when `seconds` are over.
 
-    Each attempt waits for one of `places`, then takes `timeout` seconds at most. `calls` counts the attempts, and
-    `failures` keeps the errors of those that failed.
+    Each attempt waits for one of the client's places, within its budget, then takes its `timeout` at most. `calls`
+    counts the attempts, and so does the `log`; `failures` keeps the errors of those that failed.
     """
 
-    def __init__(
-        self,
-        wrapped: Model,
-        places: AdaptivePlaces,
-        timeout: float,
-        seconds: float,
-        log: CallLog | None = None,
-        place_seconds: float | None = None,
-        *,
-        retries: bool = True,
-    ) -> None:
-        """`log` counts the calls. `place_seconds`: how long a place is waited for, where that is not `seconds`."""
-        super().__init__(wrapped)
-        self._places, self._timeout, self._retries = places, timeout, retries
+    def __init__(self, client: MllmClient, seconds: float, log: CallLog, *, retries: bool = True) -> None:
+        super().__init__(client.model.model)
+        self._places, self._timeout, self._retries = client.places, client.timeout, retries
         self.seconds, self._ends = max(0.0, seconds), time.monotonic() + seconds
-        self._place_ends = time.monotonic() + (seconds if place_seconds is None else place_seconds)
-        self.calls, self._log = 0, log or CallLog()
+        self._place_ends = time.monotonic() + client.budget
+        self.calls, self._log = 0, log
         self.failures: list[errors.ModelAPIError] = []
         self.truncated = False  # whether the last reply reached the limit of tokens
 
@@ -398,7 +385,12 @@ class RetryingModel(WrapperModel):
             except errors.ContentFilterError:
                 raise
             except (errors.AgentRunError, TimeoutError, *_MALFORMED) as error:
-                failure = self._failure(error)
+                if isinstance(error, errors.ModelAPIError):
+                    failure = error
+                elif isinstance(error, TimeoutError):
+                    failure = errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
+                else:
+                    failure = errors.ModelAPIError(self.model_name, "the reply was no chat completion")
                 self.failures.append(failure)
                 if is_busy(failure):
                     # With a longer pause every other call would fail without having been made.
@@ -410,32 +402,14 @@ class RetryingModel(WrapperModel):
         self.truncated = response.finish_reason == "length"
         return response
 
-    def _failure(self, error: Exception) -> errors.ModelAPIError:
-        if isinstance(error, errors.ModelAPIError):
-            return error
-        if isinstance(error, TimeoutError):
-            return errors.ModelTimeoutError(self.model_name, f"no reply within {self._timeout:g} s")
-        return errors.ModelAPIError(self.model_name, "the reply was no chat completion")
-
 
 class LearningModel(RetryingModel):
     """Asks in the way that the server takes, which its refusals teach."""
 
-    def __init__(
-        self,
-        model: ConfiguredModel,
-        capabilities: CapabilityStore,
-        call: PromptCall[Any],
-        places: AdaptivePlaces,
-        timeout: float,
-        seconds: float,
-        calls: CallLog,
-        place_seconds: float,
-    ) -> None:
-        super().__init__(model.model, places, timeout, seconds, calls, place_seconds)
-        self._variant, self._capabilities, self._call = model.variant, capabilities, call
-        self._takes, self._steps = capabilities.current, 0
-        self._key = model.key
+    def __init__(self, client: MllmClient, call: PromptCall[Any], seconds: float, log: CallLog) -> None:
+        super().__init__(client, seconds, log)
+        self._model, self._capabilities, self._call = client.model, client.capabilities, call
+        self._takes, self._steps = self._capabilities.current, 0
         self._note, self._is_longer = "", False
 
     async def _attempt(
@@ -448,7 +422,7 @@ class LearningModel(RetryingModel):
             except errors.ModelAPIError as error:
                 self._steps += 1
                 if isinstance(error, errors.ModelHTTPError):
-                    log_refusal(str(error), self._key)
+                    log_refusal(str(error), self._model.key)
                 # A first fault of a server may pass; a refusal of the call itself does not.
                 is_refusal = isinstance(error, errors.ModelHTTPError) and error.status_code in REFUSED
                 may_pass = not is_refusal and len(self.failures) == 1
@@ -492,7 +466,7 @@ class LearningModel(RetryingModel):
                 output_object=OutputObjectDefinition(self._call.schema, "reply"),
                 prompted_output_template=False,  # the prompt shows the shape
             )
-        model = self.wrapped if self._variant is None else self._variant(takes)
+        model = self.wrapped if self._model.variant is None else self._model.variant(takes)
         if takes.delivery == "declared":
             sent |= ModelSettings(extra_body={"stream": True})
         if takes.delivery != "streamed":

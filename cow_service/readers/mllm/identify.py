@@ -6,15 +6,8 @@ from collections.abc import Collection, Iterator
 from functools import partial
 from typing import Annotated, Any, ClassVar, Self, get_args
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    ValidationError,
-    ValidationInfo,
-    WithJsonSchema,
-    field_validator,
-    model_validator,
-)
+import pydantic
+from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from cow_service import records
@@ -25,13 +18,12 @@ from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage
 from cow_service.readers.mllm.quantities import Distance, ReadingContext, Seconds, Speed, context_of, positive
-from cow_service.readers.mllm.replies import Reply, ReplyError
 from cow_service.readers.options import plain
 
 MAX_NAMED = 12  # other objects that the question names
 _NUMBERS = ("speed", "distance", "duration")  # which only a question with a number can say
-_SAID_ALIKE = (*_NUMBERS, "until")  # fields of a reply and of `MotionHints`
-_MOTION = ("kind", *_SAID_ALIKE, "then", "also_moving")
+SAID_ALIKE = (*_NUMBERS, "until")  # fields of a reply and of `MotionHints`
+_MOTION = ("kind", *SAID_ALIKE, "then", "also_moving")
 # The reply to "With the vase gone, will the red car that drives left at 20 px/s miss the mug?"
 _EXAMPLE: dict[str, Any] = {
     "object": "red car", "others": ["mug", "vase"],
@@ -139,7 +131,7 @@ _LANGUAGE = BeforeValidator(lambda said: code if (code := replies.text_of(said)[
 _WAY = BeforeValidator(_way), WithJsonSchema(replies.nullable(replies.one_of(*WAYS)))
 
 
-class Change(Reply):
+class Change(replies.Reply):
     """A change of the scene before anything moves, in words."""
 
     other_names: ClassVar = {"object": ("name", "label"), "targets": ("target",)}
@@ -148,14 +140,14 @@ class Change(Reply):
     relation: Annotated[records.PlaceRelation | None, _PLACE_RELATION] = None
     targets: Annotated[tuple[str, ...], *_names(2)] = ()
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _check_place(self) -> Self:
         if self.kind == "place" and (self.relation is None or not self.targets):
             raise ValueError("says not where to")
         return self
 
 
-class Leg(Reply):
+class Leg(replies.Reply):
     """A further leg of the motion."""
 
     other_names: ClassVar = {"way": ("direction",)}
@@ -164,7 +156,7 @@ class Leg(Reply):
     duration: Seconds = None
 
 
-class AlsoMoving(Reply):
+class AlsoMoving(replies.Reply):
     """Another thing that is set moving at the same time."""
 
     other_names: ClassVar = {"object": ("name", "label"), "way": ("direction",)}
@@ -178,14 +170,14 @@ class AlsoMoving(Reply):
         direction, depth = self.way if self.way is not None and self.kind in records.DIRECTED_KINDS else (None, 0.0)
         return OtherMotionHint(object=self.object, kind=self.kind, direction=direction, depth=depth)
 
-    @model_validator(mode="after")
+    @pydantic.model_validator(mode="after")
     def _check_way(self) -> Self:
         if self.kind == "place" or (self.kind in records.DIRECTED_KINDS and self.way is None):
             raise ValueError("says not which way")
         return self
 
 
-class Identified(Reply):
+class Identified(replies.Reply):
     """What is asked and what moves, in words; nothing about where it is. Null is what the reply does not say."""
 
     other_names: ClassVar = {"object": _NAMES}
@@ -208,13 +200,13 @@ class Identified(Reply):
     def _check_name(cls, written: Any) -> str:
         name = replies.text_of(written)
         if len(name) > replies.MAX_NAME:
-            raise ReplyError(f"`object` has {len(name)} characters; a few words are enough")
+            raise replies.ReplyError(f"`object` has {len(name)} characters; a few words are enough")
         if _LETTERED.match(name) or (len(name.split()) <= 3 and plain(name) in _ANSWERS):
-            raise ReplyError(f"'{name}' answers the question; name the object that moves instead")
+            raise replies.ReplyError(f"'{name}' answers the question; name the object that moves instead")
         if _DENIAL.search(name) or name.lower().strip(" .") in _POINTING:
-            raise ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
+            raise replies.ReplyError(f"'{name[:80]}' names no one object; give a few words that single it out, or null")
         if not re.search(r"[^\W\d_]{2}|[^\W\d_\x00-\x7f]", name):
-            raise ReplyError(f"'{name}' names no object; say in words what moves")
+            raise replies.ReplyError(f"'{name}' names no object; say in words what moves")
         return name
 
     @field_validator("asked", mode="before")
@@ -247,7 +239,7 @@ class Identified(Reply):
             fields["within"] = positive(fields["within"], "s") or fields["within"]
         try:
             return records.Asked.model_validate(fields)
-        except ValidationError as error:
+        except pydantic.ValidationError as error:
             fault = ".".join(map(str, error.errors()[0]["loc"]))
             context_of(info).faults.append(f"`asked` is {replies.shown(written)}, of which `{fault}` cannot be read")
             return None
@@ -266,7 +258,7 @@ class Identified(Reply):
         """Fields of `MotionHints`, as far as the reply says them."""
         return {
             "kind": self.kind or "linear",
-            **{name: value for name in _SAID_ALIKE if (value := getattr(self, name)) is not None},
+            **{name: value for name in SAID_ALIKE if (value := getattr(self, name)) is not None},
             "then": tuple(StepReading(*each.way, each.distance, each.duration) for each in self.then),
             "also": tuple(each.hint for each in self.also_moving),
         }
@@ -336,9 +328,9 @@ def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked
     ):
         return None
     else:
-        raise ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
+        raise replies.ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
     if len(set(map(replies.name_words, names))) > 1:
-        raise ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
+        raise replies.ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
 
     # What contradicts the rest of the same reply is left out, and things have one name each.
     context = ReadingContext(faults=[] if objects else ["it is no JSON object, so that fields are missing"])
@@ -361,7 +353,7 @@ def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked
     update = {"others": others, "asked": asked, "kind": kind, "warnings": context.left_out}
     found = found.model_copy(update=update)
     if context.faults:
-        raise ReplyError("; ".join(context.faults), found)
+        raise replies.ReplyError("; ".join(context.faults), found)
     return found
 
 

@@ -17,7 +17,6 @@ from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, EncodedImage
 from cow_service.readers.mllm.quantities import ReadingContext, positive
 from cow_service.readers.mllm.replies import ReplyError
-from cow_service.records import BBox, LocatedObject, Point, Vector
 from cow_service.vision.masks import is_among, is_same_object
 
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
@@ -27,7 +26,7 @@ MIN_COMPLETE_LIST = 2  # things in a list that is taken for complete, as it was 
 MAX_LABEL = 80  # characters
 STRAIGHT = 60.0  # degrees from the image's vertical, within which a line can also lead towards or away
 LEAST_SIZE, LARGEST_SIZE = 0.001, 1000.0  # m: what is smaller or larger is not seen in a picture as one thing
-DOWN: dict[str, Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
+DOWN: dict[str, records.Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
 _SIDES = {side: side for side in DOWN} | {"down": "bottom", "below": "bottom", "up": "top", "above": "top"}
 _LISTS = ("objects", "others")  # `others`: without what moves
 _LABEL_KEYS = ("label", "object", "name", "class")
@@ -65,7 +64,7 @@ SENSES = {  # what `sense` may be, and words for it
     "away": {"away"},
 }
 CameraSense = Literal["towards", "away"]
-Ends = tuple[Point, Point]  # of a line, px of the upright image
+Ends = tuple[records.Point, records.Point]  # of a line, px of the upright image
 
 
 @dataclass(frozen=True)
@@ -85,10 +84,10 @@ class Located:
     A reply may give a point instead of a box. `label` is what the reply calls it.
     """
 
-    bbox: BBox | None = None
-    point: Point | None = None
+    bbox: records.BBox | None = None
+    point: records.Point | None = None
     label: str = ""
-    others: tuple[LocatedObject, ...] = ()
+    others: tuple[records.LocatedObject, ...] = ()
     objects_complete: bool = False  # the others are all that could be hit or hide something
     line: Line | None = None
     warnings: tuple[str, ...] = ()  # of what was left out
@@ -112,7 +111,7 @@ def locate_call(
     given: ReaderInput,
     image: EncodedImage,
     name: str,
-    bbox: BBox | None,
+    bbox: records.BBox | None,
     others: Sequence[str],
     wants_direction: bool,
     reasoning_length: int,
@@ -230,7 +229,7 @@ def _read_objects(
     bbox = None if replies.is_none(place.box) else frame.bbox(place.box)
     if bbox is not None and coordinates.covers_image(frame.width, frame.height, bbox):
         raise ReplyError(f"the box of '{wanted}' covers nearly the whole image; give that of the object alone")
-    objects: list[LocatedObject] = []
+    objects: list[records.LocatedObject] = []
     named = list(_named(rest, others, context))
     for name, role, other in named:
         try:
@@ -243,7 +242,7 @@ def _read_objects(
         elif role == "target" and bbox is not None and is_same_object(box, bbox):
             context.faults.append(f"'{wanted}' and '{name}' have the same box")
         else:
-            objects.append(LocatedObject(object=name, bbox=box, role=role, source="mllm"))
+            objects.append(records.LocatedObject(object=name, bbox=box, role=role, source="mllm"))
     told = [replies.truth_of(held["complete"]) for held in fields if "complete" in held]
     is_complete = told[-1] is True if told else len(objects) >= MIN_COMPLETE_LIST
     return Located(
@@ -256,13 +255,13 @@ def _read_objects(
 
 
 def separate_objects(
-    mover: LocatedObject, others: Sequence[LocatedObject]
-) -> tuple[tuple[LocatedObject, ...], tuple[str, ...]]:
+    mover: records.LocatedObject, others: Sequence[records.LocatedObject]
+) -> tuple[tuple[records.LocatedObject, ...], tuple[str, ...]]:
     """The others without those that have the box of the mover or of one before them, and with few obstacles.
 
     A warning reports each that is dropped, unless it is the mover under its own name.
     """
-    kept: list[LocatedObject] = []
+    kept: list[records.LocatedObject] = []
     warnings: list[str] = []
     for other in others:
         if is_same_object(other.bbox, mover.bbox) and same_name(other.object, mover.object):
@@ -277,11 +276,7 @@ def separate_objects(
 
 
 def _choose_place(
-    places: Sequence[WrittenPlace],
-    values: Sequence[object],
-    frame: CoordinateFrame,
-    wanted: str,
-    others: Sequence[str],
+    places: Sequence[WrittenPlace], values: Sequence[object], frame: CoordinateFrame, wanted: str, others: Sequence[str]
 ) -> WrittenPlace | None:
     """The place that the reply gives for the object; None if it says that it does not see it."""
     if not places:
@@ -457,7 +452,7 @@ class Scale:
     metres: float | None = None  # its longest side
     down: str = "bottom"
 
-    def metres_per_pixel(self, name: str, bbox: BBox) -> records.MetresPerPixel | None:
+    def metres_per_pixel(self, name: str, bbox: records.BBox) -> records.MetresPerPixel | None:
         """At the object of that name; null if its size is not known."""
         if self.metres is None:
             return None

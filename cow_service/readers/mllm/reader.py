@@ -17,13 +17,12 @@ from cow_service.readers.mllm.check import MllmCheck, check_model
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
 from cow_service.readers.mllm.hypothesis import pictures
-from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
+from cow_service.readers.mllm.identify import SAID_ALIKE, Identified, identified_by_words, identify_call
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
 from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import BBox, Grounding, LocatedObject, MllmMeasurement, ServerCapabilities
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
@@ -77,7 +76,7 @@ class MllmReader:
         """Asks small questions about pictures whose answers are known. Raises `MllmUnavailable`."""
         return check_model(self._client, self._reasoning)
 
-    def keep(self, measured: MllmMeasurement) -> None:
+    def keep(self, measured: records.MllmMeasurement) -> None:
         """Keeps what a check has measured, for readers that are made from now on. Raises `OSError`."""
         self._client.notes.keep(measured)
 
@@ -86,7 +85,7 @@ class MllmReader:
         self._client.close()
 
     @property
-    def takes(self) -> ServerCapabilities | None:
+    def takes(self) -> records.ServerCapabilities | None:
         """What was learned of its server, by this process or another."""
         return self._client.notes.takes or self._client.capabilities.proven
 
@@ -102,19 +101,18 @@ class MllmReader:
         image, identified = self._identify(given)
         if identified is None:
             raise ObjectNotFound(
-                f"{self._subject} sees nothing in the image that the question could move.",
-                remedy=GIVE_PLACE,
+                f"{self._subject} sees nothing in the image that the question could move.", remedy=GIVE_PLACE
             )
         located, scale = self._locate(given, image, identified, identified.object)
         if located is None:
             raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image.", remedy=GIVE_PLACE)
         with given.cpu():
             bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
-        mover = LocatedObject(object=identified.object, bbox=bbox, source="mllm")
+        mover = records.LocatedObject(object=identified.object, bbox=bbox, source="mllm")
         others, doubles = separate_objects(mover, located.others)
         known = {name_words(each.object): each for each in (mover, *others)}
 
-        def changed(name: str) -> LocatedObject:
+        def changed(name: str) -> records.LocatedObject:
             found = known.get(name_words(name))
             if found is None:
                 raise ObjectNotFound(
@@ -125,12 +123,12 @@ class MllmReader:
 
         interventions = tuple(
             records.Intervention(
-                kind=each.kind,
-                object=changed(each.object),
-                relation=each.relation,
-                targets=tuple(map(changed, each.targets)),
+                kind=one.kind,
+                object=changed(one.object),
+                relation=one.relation,
+                targets=tuple(map(changed, one.targets)),
             )
-            for each in identified.changes
+            for one in identified.changes
         )
         removed = {each.object.bbox for each in interventions if each.kind == "remove"}
         is_other = bool(located.label) and set(name_words(located.label)).isdisjoint(name_words(identified.object))
@@ -154,7 +152,7 @@ class MllmReader:
             language=identified.language,
         )
 
-    def read_motion(self, given: ReaderInput, grounding: Grounding, hints: MotionHints | None) -> MotionReading:
+    def read_motion(self, given: ReaderInput, grounding: records.Grounding, hints: MotionHints | None) -> MotionReading:
         """No call with hints, one where something speaks against them, else two.
 
         Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
@@ -199,7 +197,7 @@ class MllmReader:
         self,
         given: ReaderInput,
         options: Sequence[records.AnswerOption],
-        grounding: Grounding | None,
+        grounding: records.Grounding | None,
         imagined: base.Imagined | None,
         votes: int,
     ) -> tuple[base.AnswerReading, ...]:
@@ -227,7 +225,7 @@ class MllmReader:
         image: EncodedImage,
         identified: Identified | None,
         name: str,
-        bbox: BBox | None = None,
+        bbox: records.BBox | None = None,
     ) -> tuple[Located | None, Scale | CowError | None]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
@@ -251,32 +249,21 @@ class MllmReader:
         return located, results.get("scale")
 
     def _directed(self, reading: MotionReading, hints: MotionHints) -> MotionReading:
-        """The reading with its direction."""
         deviation = self._measured.direction_deviation
-        reading = replace(
-            reading,
-            speed=hints.speed,
-            distance=hints.distance,
-            duration=hints.duration,
-            until=hints.until,
-            steps=hints.then,
-            cue=hints.cue or "orientation",
-            direction_deviation=deviation,
-            along_arrow=hints.along_arrow,
-        )
+        said: dict[str, Any] = {name: getattr(hints, name) for name in SAID_ALIKE}
+        said |= {"steps": hints.then, "cue": hints.cue or "orientation", "direction_deviation": deviation}
         if hints.camera is not None:
-            direction, depth = depth_motion(CAMERA_SENSE[hints.camera])
-            return replace(reading, direction=direction, depth=depth, depth_deviation=deviation)
-        if hints.ends is None:
-            return reading
-        (x0, y0), (x1, y1) = hints.ends
-        return replace(reading, direction=(x1 - x0, y1 - y0))
+            said["direction"], said["depth"] = depth_motion(CAMERA_SENSE[hints.camera])
+            said["depth_deviation"] = deviation
+        elif hints.ends is not None:
+            (x0, y0), (x1, y1) = hints.ends
+            said["direction"] = (x1 - x0, y1 - y0)
+        return replace(reading, along_arrow=hints.along_arrow, **said)
 
 
 def _hints(
-    identified: Identified | None, located: Located | None, scale: Scale | CowError | None, bbox: BBox
+    identified: Identified | None, located: Located | None, scale: Scale | CowError | None, bbox: records.BBox
 ) -> MotionHints:
-    """What was read of the motion of the object in the box."""
     hints: dict[str, Any] = {"kind": DEFAULT_KIND} if identified is None else identified.hints
     if located is not None and located.line is not None:
         hints |= vars(located.line)
