@@ -52,41 +52,41 @@ class _Job:
 
     def compute(self, service: Service, database: Database) -> messages.Succeeded | messages.Failed:
         """Its end, to be sent."""
-        job_id, spec = self.job.id, self.job.spec
-        self._send(messages.Progressed(job_id, None, 0.0))  # from here on the job may be what ends the process
+        run, spec = self.job.run, self.job.spec
+        self._send(messages.Progressed(run, None, 0.0))  # from here on the job may be what ends the process
 
         def looked_for(stage: Stage, found: bool) -> None:
-            self._send(messages.LookedFor(job_id, stage, found))
+            self._send(messages.LookedFor(run, stage, found))
 
         work = Work(self.job, self._progress, self.active.check, looked_for)
         try:
             with (
-                context.bound(request=spec.request_id, job=job_id),
-                tracing.span("compute", parent=spec.traceparent, job_id=job_id),
+                context.bound(request=spec.request_id, job=self.job.id),
+                tracing.span("compute", parent=spec.traceparent, job_id=self.job.id),
             ):
-                return messages.Succeeded(job_id, compute(work, service, database, self._hold_key))
+                return messages.Succeeded(run, compute(work, service, database, self._hold_key))
         except CowError as error:
-            return messages.Failed(job_id, error_as_json(error))
+            return messages.Failed(run, error_as_json(error))
         except Exception:
-            log.exception("job %s failed", job_id)
-            return messages.Failed(job_id, error_as_json(unforeseen()))
+            log.exception("job %s failed", self.job.id)
+            return messages.Failed(run, error_as_json(unforeseen()))
 
     def _progress(self, stage: Stage | None, done: float) -> None:
         self.active.check()
         if stage is not None and (stage != self.active.at[0] or done >= min(1.0, self.active.at[1] + MIN_PROGRESS)):
             self.active.at = stage, done
-            self._send(messages.Progressed(self.job.id, stage, done))
+            self._send(messages.Progressed(self.job.run, stage, done))
 
     @contextmanager
     def _hold_key(self, key: str, check_canceled: Callable[[], None]) -> Generator[None]:
         self.key_held.clear()
-        self._send(messages.HoldKey(self.job.id, key))
+        self._send(messages.HoldKey(self.job.run, key))
         try:
             while not self.key_held.wait(CANCEL_POLL_SECONDS):
                 check_canceled()
             yield
         finally:
-            self._send(messages.HoldKey(self.job.id, None))
+            self._send(messages.HoldKey(self.job.run, None))
 
 
 class WorkerProcess:
@@ -108,10 +108,10 @@ class WorkerProcess:
         while True:
             match messages.TO_WORKER.validate_json(self._pipe.recv_bytes()):
                 case messages.Start(job=job):
-                    self._jobs[job.id] = _Job(job, self._send)
-                    self._threads.submit(self._work, job.id)
-                case messages.ToJob(job_id, kind):
-                    if (job := self._jobs.get(job_id)) is not None:  # else it has just ended
+                    self._jobs[job.run] = _Job(job, self._send)
+                    self._threads.submit(self._work, job.run)
+                case messages.ToJob(run, kind):
+                    if (job := self._jobs.get(run)) is not None:  # else it has just ended
                         (job.active.cancel_requested if kind == "cancel" else job.key_held).set()
                 case None:
                     return
@@ -141,9 +141,9 @@ class WorkerProcess:
         if failure is None and self._service.settings.warmup:
             warm_up(self._service.settings)
 
-    def _work(self, job_id: str) -> None:
-        end = self._jobs[job_id].compute(self._service, self._database)
-        del self._jobs[job_id]
+    def _work(self, run: str) -> None:
+        end = self._jobs[run].compute(self._service, self._database)
+        del self._jobs[run]
         self._busy_at = time.monotonic()
         self._send(end)
         if self._this.memory_info().rss > WORKER_BYTES:  # it takes 10 ms

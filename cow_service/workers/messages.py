@@ -1,7 +1,7 @@
 """Messages between a server and its worker processes: JSON, so that neither executes what the other one sends.
 
 A worker decodes images and runs models, and may be taken over by one of them. All that the server takes from it is
-data: of a limited size, and checked.
+data: of a limited size, and checked. `run` names an attempt (`TakenJob`): two of one job may be at work for a moment.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class Start:
 class ToJob:
     """The result of a job is no longer wanted, or the job holds the lock of the key that it asked for."""
 
-    job_id: str
+    run: str
     kind: Literal["cancel", "key-held"]
 
 
@@ -70,9 +70,9 @@ class Heartbeat:
 
 @dataclass(frozen=True)
 class Progressed:
-    """A job has come so far in a stage, 0 to 1. Without a stage: it has begun."""
+    """The job of an attempt has come so far in a stage, 0 to 1. Without a stage: it has begun."""
 
-    job_id: str
+    run: str
     stage: Stage | None
     done: float
     kind: Literal["progressed"] = "progressed"
@@ -82,7 +82,7 @@ class Progressed:
 class LookedFor:
     """A stage was looked for among stored results."""
 
-    job_id: str
+    run: str
     stage: Stage
     found: bool
     kind: Literal["looked-for"] = "looked-for"
@@ -95,7 +95,7 @@ class HoldKey:
     It has one at a time. None gives it back.
     """
 
-    job_id: str
+    run: str
     key: str | None
     kind: Literal["hold-key"] = "hold-key"
 
@@ -104,7 +104,7 @@ class HoldKey:
 class Succeeded:
     """The job is done."""
 
-    job_id: str
+    run: str
     outcome: JobOutcome
     kind: Literal["succeeded"] = "succeeded"
 
@@ -113,7 +113,7 @@ class Succeeded:
 class Failed:
     """The job failed with an error, as JSON; `Canceled` if it was canceled."""
 
-    job_id: str
+    run: str
     error: dict[str, Any]
     kind: Literal["failed"] = "failed"
 

@@ -139,14 +139,19 @@ class Group:
             return self._start()
         return None if fresh else best  # the job may end the process that it is given to
 
-    def _start(self) -> Worker:
+    def _start(self) -> Worker | None:
+        """A new worker; None where the system gives no process or thread for it."""
         if self._closed:  # no failure of a job whose worker just ended: it goes on after the next start
             raise Canceled("The server is stopping.")
         names = {one.name for one in self._taken}
         name = next(name for number in count(1) if (name := f"{self.name}-{number}") not in names)
         if self._latest is not None and self._latest.is_loaded:
             self._failed_starts = 0
-        worker = self._latest = self._make(name)
+        try:
+            worker = self._latest = self._make(name)
+        except (OSError, RuntimeError) as error:
+            self._note_failure(f"{name} could not be started ({error}).")
+            return None
         self.workers.append(worker)
         self._taken[worker] = 0
         return worker
@@ -168,13 +173,13 @@ class Group:
         self._metrics.worker_ends.labels(reason).inc()
         if worker.is_loaded or reason in ("renewed", "stopped"):
             return
+        self._note_failure(f"{worker.name} {worker.end_reason} before it had loaded its backends.")
+
+    def _note_failure(self, how: str) -> None:
         pause = min(FIRST_PAUSE_SECONDS * 2**self._failed_starts, LONGEST_PAUSE_SECONDS)
         self._failed_starts, self._next_start = self._failed_starts + 1, time.monotonic() + pause
         often = "" if self._failed_starts == 1 else f" {self._failed_starts} starts have failed."
-        fault = (
-            f"The worker process {worker.name} {worker.end_reason} before it had loaded its backends.{often} Another "
-            f"one is started {pause:g} s later; the log says more."
-        )
+        fault = f"The worker {how}{often} Another one is started {pause:g} s later; the log says more."
         log.warning("%s", fault)
         if not any(one.is_loaded and one.is_alive for one in tuple(self.workers)):  # else jobs do not wait
             self.fault = fault
@@ -324,13 +329,16 @@ class WorkerPool(Computer):
         while not self._closed.wait(WATCH_SECONDS):
             slept = time.monotonic() - looked > HEARTBEAT_TIMEOUT_SECONDS / 2  # this process was frozen itself
             looked = time.monotonic()
-            for group in self.groups:
-                for worker in [one for one in tuple(group.workers) if one.is_alive]:
-                    if slept:
-                        worker.heard = looked
-                    self._judge(worker, looked)
-                group.fill()
-            self._judge_all()
+            try:
+                for group in self.groups:
+                    for worker in [one for one in tuple(group.workers) if one.is_alive]:
+                        if slept:
+                            worker.heard = looked
+                        self._judge(worker, looked)
+                    group.fill()
+                self._judge_all()
+            except Exception:  # it goes on, whatever happens
+                log.exception("the workers could not be looked after")
 
     def _judge(self, worker: Worker, now: float) -> None:
         if not worker.is_loaded and now - worker.started > self._settings.load_timeout:

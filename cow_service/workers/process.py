@@ -109,7 +109,8 @@ class Worker:
         self.started = self.heard = time.monotonic()  # `heard`: when it last sent a heartbeat
         self._job_timeout = settings.job_timeout
         self._sending = threading.Lock()
-        self._inboxes: dict[str, SimpleQueue[messages.OfJob | None]] = {}
+        self._inboxes: dict[str, SimpleQueue[messages.OfJob | None]] = {}  # by attempt
+        self._jobs: dict[str, str] = {}  # likewise
         self.load_error: CowError | None = None
         self.is_loaded = False  # or could not load them: it goes on with what needs others
         self._ended = threading.Event()
@@ -128,7 +129,7 @@ class Worker:
     @property
     def jobs(self) -> tuple[str, ...]:
         """The jobs that it has."""
-        return tuple(self._inboxes)
+        return tuple(self._jobs.values())
 
     @property
     def end_reason(self) -> str:
@@ -137,13 +138,13 @@ class Worker:
 
     def run(self, work: Work, locks: KeyLocks) -> JobOutcome:
         """Computes a job. Raises the `CowError` that it fails with, `Canceled`, `JobTimeout`, `WorkerGone`."""
-        self._inboxes[work.job.id] = SimpleQueue()
+        self._inboxes[work.job.run], self._jobs[work.job.run] = SimpleQueue(), work.job.id
         try:
             with ExitStack() as keys:
                 self._send(messages.Start(work.job))
                 return self._follow(work, locks, keys)
         finally:
-            del self._inboxes[work.job.id]
+            del self._inboxes[work.job.run], self._jobs[work.job.run]
             self.jobs_done += 1
 
     def kill(self, end_reason: EndReason, reason: str) -> None:
@@ -166,7 +167,7 @@ class Worker:
     def _follow(self, work: Work, locks: KeyLocks, keys: ExitStack) -> JobOutcome:
         """Does what the messages about a job ask for, until its outcome. `keys` holds the lock of its key, if any."""
         until, canceled, begun = math.inf, False, False  # its time does not begin while the process loads
-        inbox = self._inboxes[work.job.id]
+        inbox = self._inboxes[work.job.run]
 
         def check() -> None:
             self._check_alive(begun)
@@ -184,14 +185,14 @@ class Worker:
                     keys.close()
                     if message.key is not None:
                         keys.enter_context(locks.held(message.key, check))
-                        self._send(messages.ToJob(work.job.id, "key-held"))
+                        self._send(messages.ToJob(work.job.run, "key-held"))
                 elif isinstance(message, messages.Progressed) and not canceled:
                     work.progress(message.stage, message.done)
                 elif isinstance(message, messages.LookedFor):
                     work.looked_for(message.stage, message.found)
             except Canceled:
                 canceled, until = True, time.monotonic() + (CANCEL_SECONDS if begun else 0.0)
-                self._send(messages.ToJob(work.job.id, "cancel"))
+                self._send(messages.ToJob(work.job.run, "cancel"))
             if isinstance(message, messages.Succeeded):
                 return message.outcome
             if isinstance(message, messages.Failed):
@@ -234,7 +235,7 @@ class Worker:
                         self.load_error = None if error is None else error_from_json(error)
                         self.heard, self.is_loaded = time.monotonic(), True
                     case message:
-                        if (inbox := self._inboxes.get(message.job_id)) is not None:
+                        if (inbox := self._inboxes.get(message.run)) is not None:
                             inbox.put(message)
         except (EOFError, OSError):
             self.link.kill()  # also where it sent a message that is too long

@@ -111,14 +111,15 @@ def main(descriptor: int) -> None:
     with suppress(EOFError, OSError):
         while True:
             kind, number, data = unpack(pipe.recv_bytes())
-            if kind == "start":
-                options = json.loads(data) | {"scheduling_strategy": "SPREAD"}
-                actors[number] = make.options(**options).remote()
-                threading.Thread(target=follow, args=(number, actors[number]), daemon=True).start()
-            elif (actor := actors.get(number)) is not None and kind == "message":
-                actor.tell.options(concurrency_group="tell").remote(data)
-            elif actor is not None:
-                ray.kill(actor)
+            with suppress(RayError):  # of one actor: whoever follows it hears of it
+                if kind == "start":
+                    options = json.loads(data) | {"scheduling_strategy": "SPREAD"}
+                    actors[number] = make.options(**options).remote()
+                    threading.Thread(target=follow, args=(number, actors[number]), daemon=True).start()
+                elif (actor := actors.get(number)) is not None and kind == "message":
+                    actor.tell.options(concurrency_group="tell").remote(data)
+                elif actor is not None:
+                    ray.kill(actor)
     ray.shutdown()
     os._exit(0)  # threads may wait for actors
 

@@ -34,7 +34,8 @@ from cow_service.workers.process import Worker
 from cow_service.workers.ray_bridge import MODULE, pack, unpack
 
 SILENT_SECONDS = 5.0  # without such a report, after which the head is said to be away
-RECONNECT_SECONDS = 1.0  # between two tries to connect
+RECONNECT_SECONDS, CONNECT_SECONDS = 1.0, 20.0  # between two tries to connect, and for one
+AWAY_SECONDS = 90.0  # without a report, after which it is tried anew: without a head Ray ends actors after a minute
 PLACE_SECONDS = 3.0  # that a job waits for a new actor where an actor that is at work could take it as well
 IDLE_SECONDS = 300.0  # after which an actor that is not among the fewest gives its share of the node back
 
@@ -136,22 +137,31 @@ class Cluster(BackgroundThread):
     def stop(self) -> None:
         """Ends the connection, and with it every actor."""
         self._stop.set()
-        with self._sending:
-            if self._bridge is not None:
-                self._bridge.process.kill()
+        if (bridge := self._bridge) is not None:  # whoever sends to it may hold the lock for as long as it is stuck
+            bridge.process.kill()
         super().stop()
 
     def run(self) -> None:
         """Connects, and hands each message to the actor's link that it is for."""
         while not self._stop.is_set():
-            with self._sending:
+            try:
                 bridge = self._bridge = spawn(MODULE)
-            why = "the connection ended"
+            except OSError as error:
+                log.warning("the connection to the Ray cluster could not be started: %s", error)
+                self._stop.wait(RECONNECT_SECONDS)
+                continue
+            why, patience = "the connection ended", CONNECT_SECONDS
             try:
                 self._send(self.address.encode())
                 while not self._stop.is_set():
+                    if not bridge.pipe.poll(patience):
+                        why = (
+                            "it does not respond; where a head ended without `ray stop`, run that and `ray start` again"
+                        )
+                        break
                     kind, number, data = unpack(bridge.pipe.recv_bytes(MAX_MESSAGE_BYTES))
                     if kind == "nodes":
+                        patience = AWAY_SECONDS
                         self.note_nodes(json.loads(data))
                     elif kind == "fault":
                         why = data.decode()
@@ -161,10 +171,10 @@ class Cluster(BackgroundThread):
                             del self._links[number]
             except (EOFError, OSError):
                 pass
-            with self._sending:
-                self._bridge = None
             bridge.process.kill()  # also where it sent a message that is too long
             bridge.process.wait()
+            with self._sending:
+                self._bridge = None
             bridge.pipe.close()
             self.nodes = ()
             self._fault = f"The Ray cluster COW_RAY={self.address} cannot be reached: {why}."

@@ -14,6 +14,7 @@ from cow_service.service import Service
 
 MAX_URLS = 16  # of one chat: each may take 10 s to look up or to fetch
 MAX_LEVELS = 20  # of a message
+DATA, _SCHEME = ("data", "uri"), re.compile(r"\s*[a-zA-Z][a-zA-Z0-9+.-]*:")  # base64 has no colon
 MEDIA = ("url", "image", "video", "audio")  # ends of the names that fields with URLs have in parts of a message
 EXTENSION = "cow"  # COW's own field of a request, and of a reply
 
@@ -142,8 +143,14 @@ def media_urls(value: Any, pointer: str = "/messages", name: str = "") -> Iterat
         kind = name if isinstance(key, int) or (key == "url" and "image" in name) else key
         if not isinstance(each, str) and key != "annotations":  # of earlier replies: pages that were cited
             yield from media_urls(each, below, kind)
-        elif isinstance(each, str) and kind.endswith(MEDIA) and each[:5].lower() != "data:":
+        elif isinstance(each, str) and _leads_elsewhere(kind, each):
             yield MediaUrl(value, key, below, "image" in kind)
+
+
+def _leads_elsewhere(kind: str, text: str) -> bool:
+    """Whether a field of a part has a URL that is none of data. Data of sounds and files may have one in its place."""
+    is_media = kind.endswith(MEDIA) or (kind.endswith(DATA) and _SCHEME.match(text) is not None)
+    return is_media and text[:5].lower() != "data:"
 
 
 def check_passed_on(chat: Chat, allowed: str) -> None:

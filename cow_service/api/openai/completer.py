@@ -78,7 +78,8 @@ class Completer:
         until = time.time() + (DEFAULT_WAIT_SECONDS if seconds is None else seconds)
         if reader.upstream is not None:
             check_passed_on(chat, self.service.settings.chat_fields)
-        if urls := list(media_urls(chat.messages)):
+        predicted = media_urls(chat.fields.get("prediction"), "/prediction")
+        if urls := [*media_urls(chat.messages), *predicted]:
             await submitter.fetch(owner, partial(fetch_pictures, urls, self.service))
         what_if = await submitter.in_thread(owner, partial(find_what_if, chat, answerer))
         if isinstance(what_if, records.ChatImagination):
