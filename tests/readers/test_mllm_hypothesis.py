@@ -79,7 +79,7 @@ def test_both_worlds_of_a_removal_are_told_and_named() -> None:
 
 
 def test_two_worlds_are_shown_as_two_strips_of_their_frames() -> None:
-    from cow_service.readers.mllm.hypothesis import pictures
+    from cow_service.readers.mllm.contents import pictures
 
     colours = np.array([(60, 0, 200), (120, 0, 200), (180, 0, 200), (240, 0, 200)], np.uint8)  # none is a grey
     frames = tuple(np.tile(colour, (40, 60, 1)) for colour in colours)

@@ -17,8 +17,7 @@ from cow_service.media.artifacts import ArtifactStore
 from cow_service.media.images import decode, decode_own, encode_png, fit_within
 from cow_service.readers.base import Imagined
 from cow_service.readers.chat import ChatReader, adapted
-from cow_service.readers.mllm.contents import as_large_as, facts_of, opposite_motion, other_item
-from cow_service.readers.mllm.hypothesis import hypothesis, pictures
+from cow_service.readers.mllm.contents import as_large_as, facts_of, hypothesis, opposite_motion, other_item, pictures
 from cow_service.readers.mllm.sheets import AFTER_FIRST, SHEET_NOTE, sheet_of
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import load_prompt

@@ -8,7 +8,7 @@ from typing import Any
 from cow_service.readers.base import AnswerReading, Imagined
 from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
-from cow_service.readers.mllm.hypothesis import hypothesis
+from cow_service.readers.mllm.contents import hypothesis
 from cow_service.readers.options import MARKS, not_sure_option, option_named, plain, question_without, says_not_sure
 from cow_service.records import AnswerOption
 

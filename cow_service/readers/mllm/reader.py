@@ -15,8 +15,8 @@ from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.check import MllmCheck, check_model
 from cow_service.readers.mllm.client import MllmClient, PromptCall
+from cow_service.readers.mllm.contents import pictures
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
-from cow_service.readers.mllm.hypothesis import pictures
 from cow_service.readers.mllm.identify import SAID_ALIKE, Identified, identified_by_words, identify_call
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
 from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
