@@ -153,8 +153,7 @@ def plan(
     mllm: Annotated[str, option("Multimodal LLM, as Inspect names it, such as openai/gpt-5.")],
     effect: Annotated[float, option("Gain to detect, in percentage points.", min=0.01, max=100)] = 2.4,
     pilot: Annotated[
-        Path | None,
-        option("Folder of a smaller run, from which variance and costs are estimated.", shown="none"),
+        Path | None, option("Folder of a smaller run, from which variance and costs are estimated.", shown="none")
     ] = None,
     *,
     shared: dict[str, Any],

@@ -90,9 +90,7 @@ def answer(
     choice: Annotated[
         Texts,
         option(
-            "An answer to choose from; may be repeated, for A, B, C...",
-            metavar="TEXT",
-            shown="those in the question",
+            "An answer to choose from; may be repeated, for A, B, C...", metavar="TEXT", shown="those in the question"
         ),
     ] = None,
     imagine: Annotated[

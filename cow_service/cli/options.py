@@ -196,8 +196,7 @@ def request_body(
     until: Annotated[Until | None, option("contact: stop the object at its first contact.")] = None,
     remove: Annotated[Texts, option("Object to take away before the motion; may be repeated.", metavar="NAME")] = None,
     place: Annotated[
-        Texts,
-        option('Put an object first: "apple into bowl"; may be repeated.', metavar="THING RELATION THING"),
+        Texts, option('Put an object first: "apple into bowl"; may be repeated.', metavar="THING RELATION THING")
     ] = None,
     law: Annotated[
         Law | None, option("Physics. contact: bounces, pushes; ballistic: through everything.", shown="contact")

@@ -95,8 +95,7 @@ def mcp(
         ),
     ] = None,
     allow_host: Annotated[
-        Texts,
-        option("Another host name that callers use, such as a proxy's; may be repeated.", metavar="NAME"),
+        Texts, option("Another host name that callers use, such as a proxy's; may be repeated.", metavar="NAME")
     ] = None,
 ) -> None:
     """Serve `simulate` and `answer` as tools for agents (MCP).

@@ -271,12 +271,7 @@ class JobTable:
         return is_mine
 
     def succeed(
-        self,
-        job: TakenJob,
-        result: str,
-        trajectory_key: str | None,
-        stages: Collection[str],
-        answer: str = "",
+        self, job: TakenJob, result: str, trajectory_key: str | None, stages: Collection[str], answer: str = ""
     ) -> bool:
         """Stores the result of a job, and its answer in words.
 

@@ -292,10 +292,7 @@ class StalledConnections(BackgroundThread):
                 for connection in [one for one, since in self._in_use.items() if since < late]:
                     del self._in_use[connection]
                     log.warning("a connection to the job database does not answer and is closed")
-                    with (
-                        suppress(OSError, psycopg.Error),
-                        socket.socket(fileno=os.dup(connection.fileno())) as stalled,
-                    ):
+                    with suppress(OSError, psycopg.Error), socket.socket(fileno=os.dup(connection.fileno())) as stalled:
                         stalled.shutdown(socket.SHUT_RDWR)
 
     def _begin(self, connection: psycopg.Connection[Any]) -> None:

@@ -94,10 +94,7 @@ REFERENCES = sa.Table(
 )
 # The finished stages of each job, even if another job computed their results.
 STAGES = sa.Table(
-    "cow_stages_of_jobs",
-    METADATA,
-    _of_job(primary_key=True),
-    sa.Column("stage", sa.String(32), primary_key=True),
+    "cow_stages_of_jobs", METADATA, _of_job(primary_key=True), sa.Column("stage", sa.String(32), primary_key=True)
 )
 # Webhooks to be called: one row for each job that has ended, until its receiver has heard of it or is given up.
 CALLS = sa.Table(

@@ -289,12 +289,7 @@ def along_floor(mover: LiftedBody, motion: Motion, cameras: Cameras, direction: 
 
 
 def _thrown(
-    mover: LiftedBody,
-    motion: Motion,
-    cameras: Cameras,
-    draws: Floats,
-    direction: Floats,
-    others: Sequence[LiftedBody],
+    mover: LiftedBody, motion: Motion, cameras: Cameras, draws: Floats, direction: Floats, others: Sequence[LiftedBody]
 ) -> Floats:
     """Unit vectors [K, 3] seen in directions [K, 2]: in a vertical plane, turned from that of the image by the depth.
 

@@ -377,8 +377,7 @@ class MllmStatus(Record):
     name: str = Field(description="As it is served.")
     family: str = Field(description="Which says how it writes places.")
     takes: ServerCapabilities | None = Field(
-        default=None,
-        description="What its server takes; null where nothing was learned of that in the last week.",
+        default=None, description="What its server takes; null where nothing was learned of that in the last week."
     )
     measured: MllmMeasurement | None = Field(default=None, description="Null before `cow models check --save`.")
 

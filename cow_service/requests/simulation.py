@@ -232,8 +232,7 @@ class MotionRequest(Record):
         default=None, description="Scale at the object; by default the image is assumed to be 3 m wide there."
     )
     depth_deviation: Annotated[Finite, Field(ge=0, le=90)] | None = Field(
-        default=None,
-        description="See `Motion.depth_deviation`; by default 20 for a throw without `depth`, else 0.",
+        default=None, description="See `Motion.depth_deviation`; by default 20 for a throw without `depth`, else 0."
     )
     speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(
         default=None, description="See `Motion.speed_deviation`; by default 0 for a given `speed`."
@@ -331,8 +330,7 @@ class DepthRequest(Record):
         description="16-bit grey PNG of the upright image's size: the depth in units of `scale`; 0: unknown."
     )
     scale: Annotated[Finite, Field(ge=1e-9, le=1e6)] | None = Field(
-        default=None,
-        description="Metres per unit of the map; null: unknown, values are proportional to depth.",
+        default=None, description="Metres per unit of the map; null: unknown, values are proportional to depth."
     )
     focal: Annotated[Finite, Field(ge=1, le=1_000_000)] | None = Field(
         default=None, description="Focal length of the map, px; by default the camera's."

@@ -10,14 +10,7 @@ from cow_service.media.images import decode, encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
 from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import (
-    GroundingReading,
-    MotionHints,
-    NamedChange,
-    ReaderInput,
-    SeenThing,
-    WordReader,
-)
+from cow_service.readers.base import GroundingReading, MotionHints, NamedChange, ReaderInput, SeenThing, WordReader
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, ObjectPrior
@@ -330,8 +323,7 @@ def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> Grounding
     if own is None or not own.is_sure:
         box = ", ".join(f"{value:.0f}" for value in reading.bbox)
         raise CannotGround(
-            f"'{reading.object}' was looked for in [{box}], but two attempts to outline it disagree.",
-            remedy=GIVE_PLACE,
+            f"'{reading.object}' was looked for in [{box}], but two attempts to outline it disagree.", remedy=GIVE_PLACE
         )
 
     def outlined(thing: LocatedObject) -> LocatedObject:

@@ -120,9 +120,7 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
     ways = [way if each.told.way is None else each.told.way for each in candidates]
     chosen = [
         CandidateOutcome(
-            object=names[each.body],
-            probability=each.probability,
-            sure=each.sure and not doubts_of(own, [its_way]),
+            object=names[each.body], probability=each.probability, sure=each.sure and not doubts_of(own, [its_way])
         )
         for each, own, its_way in zip(candidates, of_each, ways, strict=True)
     ]

@@ -93,11 +93,7 @@ class Worker:
     """One worker, from its start to its end. Safe to use from every thread."""
 
     def __init__(
-        self,
-        name: str,
-        settings: Settings,
-        on_end: Callable[["Worker", EndReason], None],
-        link: Link | None = None,
+        self, name: str, settings: Settings, on_end: Callable[["Worker", EndReason], None], link: Link | None = None
     ) -> None:
         """`on_end` is called once, when it has ended. `link`: by default a new child process."""
         self.link: Link = Child() if link is None else link

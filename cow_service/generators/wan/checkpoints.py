@@ -49,12 +49,7 @@ class Entry(NamedTuple):
 
 
 def load_transformer(
-    path: Path,
-    architecture: Architecture,
-    dtype: torch.dtype,
-    device: torch.device,
-    *,
-    keep_float8: str | None = None,
+    path: Path, architecture: Architecture, dtype: torch.dtype, device: torch.device, *, keep_float8: str | None = None
 ) -> WanTransformer3DModel:
     """The transformer of a folder or file, in `dtype` (norms and time embedding stay float32), on `device`.
 

@@ -89,9 +89,7 @@ def compose(**parts: Any) -> "WanTrackPipeline":
     """
     config = parts["transformer"].config
     return WanTrackPipeline(
-        scheduler=FlowMatchEulerDiscreteScheduler(),
-        expand_timesteps=config.in_channels == config.out_channels,
-        **parts,
+        scheduler=FlowMatchEulerDiscreteScheduler(), expand_timesteps=config.in_channels == config.out_channels, **parts
     )
 
 

@@ -109,12 +109,7 @@ def _from_folder(
         processor = transformers.AutoProcessor.from_pretrained(folder, **as_it_is)
     dtype: Any = options.dtype if options.dtype == "auto" else getattr(torch, options.dtype)
     loaded: Any = transformers.AutoModelForImageTextToText.from_pretrained(
-        folder,
-        dtype=dtype,
-        device_map=places,
-        use_safetensors=True,
-        output_loading_info=True,
-        **as_it_is,
+        folder, dtype=dtype, device_map=places, use_safetensors=True, output_loading_info=True, **as_it_is
     )
     model, found = loaded
     # transformers only warns of these, and fills what is missing with random numbers.
