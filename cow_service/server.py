@@ -2,9 +2,9 @@
 
 import asyncio
 import logging
+import resource
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Generator
@@ -278,10 +278,6 @@ class HttpConnection(H11Protocol):
 
 def allow_connections() -> None:
     """Raises the number of files that this process may open as far as the system lets it, and fits `most` to it."""
-    if sys.platform == "win32":
-        return  # it has no such limit on connections
-    import resource  # noqa: PLC0415 # of Unix
-
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_CONNECTIONS + RESERVED_FILES
     if soft != resource.RLIM_INFINITY and soft < wanted:

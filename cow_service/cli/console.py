@@ -20,8 +20,7 @@ from cow_service import __version__, records
 from cow_service.cli.options import HINTS, read_file, writable
 from cow_service.client import display
 from cow_service.errors import CowError, InvalidRequest
-from cow_service.jobs.processes import describe_unserved, remedy, unserved_jobs
-from cow_service.records import Answer, Simulation, Unserved, Verdict
+from cow_service.records import Answer, Simulation, Verdict
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.requests.values import field_errors
 from cow_service.service import Service
@@ -273,30 +272,18 @@ class Report(BaseModel):
     problem: str | None
     backends: list[records.BackendInfo]
     mllm: records.MllmStatus | None
-    unserved: list[Unserved]  # jobs that wait, and that no process takes
-    jobs_problem: str | None  # why the job database cannot be read
-
-    @property
-    def healthy(self) -> bool:
-        """Whether the default request can be served, and every queued job is taken."""
-        return self.problem is None and self.jobs_problem is None and not self.unserved
 
 
 def examine(service: Service) -> Report:
-    """Inspects this installation and its job database.
+    """Inspects this installation.
 
     Imports no model library, and writes only an empty file, which it removes.
     """
-    problem = jobs_problem = None
-    unserved: tuple[Unserved, ...] = ()
+    problem = None
     try:
         service.check()
     except CowError as error:
         problem = f"{error.code}: {error.detail}"
-    try:
-        unserved = unserved_jobs(service.settings)
-    except CowError as error:
-        jobs_problem = f"{error.code}: {error.detail}"
     models = service.models()
     installed = {distribution.name.lower(): distribution.version for distribution in distributions()}
     folder = service.settings.data_dir
@@ -312,8 +299,6 @@ def examine(service: Service) -> Report:
         problem=problem,
         backends=[*models.readers, *models.generators, *models.perception],
         mllm=models.mllm,
-        unserved=list(unserved),
-        jobs_problem=jobs_problem,
     )
 
 
@@ -338,8 +323,3 @@ def print_report(report: Report, *, as_json: bool) -> None:
         console.print(f"[red]{report.problem}[/]", highlight=False)
     else:
         console.print("[green]Everything that a default request needs is ready.[/]")
-    if report.jobs_problem:
-        console.print(f"[red]{escape(report.jobs_problem)}[/]", highlight=False, soft_wrap=True)
-    for one in report.unserved:
-        text = escape(f"{describe_unserved(one)} {remedy(one)}")
-        console.print(f"[yellow]{text}[/]", highlight=False, soft_wrap=True)

@@ -143,7 +143,7 @@ def doctor(as_json: AsJson = False) -> None:
     with open_service() as service:
         report = examine(service)
     print_report(report, as_json=as_json)
-    if not report.healthy:
+    if report.problem is not None:
         raise typer.Exit(1)
 
 

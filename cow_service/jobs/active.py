@@ -141,10 +141,10 @@ class ActiveJobs:
                 del self._elsewhere[next(iter(self._elsewhere))]
             self._wake(job)
 
-    def awaited_elsewhere(self) -> list[str]:
-        """The jobs that callers of this process wait for, but that it does not run."""
+    def awaited(self, *, elsewhere: bool = False) -> list[str]:
+        """The jobs that callers of this process wait for, or those of them that it does not run."""
         with self._lock:
-            return [job for job in self._waiters if job not in self._running]
+            return [job for job in self._waiters if not (elsewhere and job in self._running)]
 
     def runs(self) -> dict[str, str]:
         """The jobs that this process works on, and its attempts."""
@@ -170,11 +170,6 @@ class ActiveJobs:
                 self._waiters[job].remove(waiter)
                 if not self._waiters[job]:
                     del self._waiters[job]
-
-    def awaited(self) -> list[str]:
-        """The jobs that callers of this process wait for."""
-        with self._lock:
-            return list(self._waiters)
 
     def notify_ended(self, job: str, refusal: CowError | None = None) -> None:
         """Tells waiters that a job has ended, or why they may not wait for it here any longer."""

@@ -118,7 +118,7 @@ class JobEngine:
             self._grace = threading.Timer(self.service.settings.shutdown_grace, self._interrupt)
             self._grace.daemon = True
             self._grace.start()
-        self._notify_stopping(self.active.awaited_elsewhere())
+        self._notify_stopping(self.active.awaited(elsewhere=True))
 
     def close(self) -> None:
         """Waits for running jobs during the grace period, then interrupts them: they continue after the next start."""

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from typing import Any, Literal, TypeVar
 
 import sqlalchemy as sa
@@ -16,14 +16,11 @@ from cow_service import __version__
 from cow_service.errors import NotReady, StorageUnavailable
 from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import RATE_SECONDS, VERSION, JobTable, OpenCount
-from cow_service.jobs.opening import open_database
+from cow_service.jobs.job_table import RATE_SECONDS, VERSION, OpenCount
 from cow_service.jobs.queues import LIGHT, known_queues, queue_of
 from cow_service.jobs.schema import ALIVE_SECONDS, PROCESSES
-from cow_service.jobs.sqlite import Sqlite
 from cow_service.observability.logging import rfc3339
 from cow_service.records import ProcessInfo, ProcessRole, QueueInfo, Unserved, Workers
-from cow_service.settings import Settings
 
 FORGOTTEN_SECONDS = 3600.0  # after which a row is deleted
 MAX_AGE_SECONDS = 1.0  # of an overview that is given out again
@@ -152,20 +149,6 @@ def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> t
             reason: Literal["version", "queue"] = "queue" if version in versions else "version"
             found.append(Unserved(queue=queue, workflow_version=version, jobs=jobs, reason=reason))
     return tuple(found)
-
-
-def unserved_jobs(settings: Settings) -> tuple[Unserved, ...]:
-    """Queued jobs that no live process takes, of a database that is not changed. Raises `StorageUnavailable`.
-
-    In a file they wait for the next start of the server, but those of another version.
-    """
-    with closing(open_database(settings, read_only=True)) as database:
-        if (isinstance(database, Sqlite) and not database.file.exists()) or not database.schema():
-            return ()  # no server has used it
-        counts = JobTable(database).open_counts()
-        if not database.is_shared:
-            return unserved((), [one for one in counts if one.workflow_version != VERSION])
-        return unserved(alive(database), counts)
 
 
 def describe_unserved(one: Unserved) -> str:

@@ -18,7 +18,6 @@ SCHEMA = 4  # of our tables; 1 is that without `cow_schema`, 2 without answers o
 # The oldest version of COW, by its own `SCHEMA`, that can serve on these tables. It stays where a version only adds
 # tables, and columns that may be null: such a change is made while older servers run.
 OLDEST_SERVING = 1
-BEFORE_SCHEMA_1 = "cow_holds"  # a table of the versions that kept jobs elsewhere
 ALIVE_SECONDS = 10.0  # since a process last told of itself
 TABLES_LOCK, INDEXES_LOCK = 0x434F5701, 0x434F5703  # of PostgreSQL, held while these are made
 
@@ -150,11 +149,6 @@ def schema_of(connection: sa.Connection) -> int:
             )
         if found is not None:  # otherwise a restore has lost the row, and it is written again
             return found.version
-    if BEFORE_SCHEMA_1 in there and JOBS.name not in there:
-        raise SettingsError(
-            "The job database is of a version of COW whose jobs this one cannot take over: let that version end them, "
-            "and give this one an empty database (COW_DATABASE_URL)."
-        )
     return int(JOBS.name in there)
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from cow_service.errors import JobNotFound
 from cow_service.jobs.active import share_done
 from cow_service.jobs.engine import JobEngine
-from cow_service.jobs.job_table import JobState
 from cow_service.records import TERMINAL, Job
 
 NUMBERED_STAGES = ("gating", "grounding", "generation", "answering")  # motion and trajectory take milliseconds
@@ -34,15 +33,6 @@ class JobEvent:
         return "{}" if self.job is None else self.job.model_dump_json()
 
 
-@dataclass(frozen=True)
-class JobView:
-    """A job as it is, and its numbered events so far."""
-
-    found: JobState | None  # None: it was deleted
-    events: tuple[JobEvent, ...] = ()
-    progress: JobEvent | None = None
-
-
 async def follow(engine: JobEngine, job_id: str, after: int) -> AsyncGenerator[JobEvent]:
     """The events of a job after a number, until its end; `deleted` where there is none, or none any more.
 
@@ -52,32 +42,27 @@ async def follow(engine: JobEngine, job_id: str, after: int) -> AsyncGenerator[J
     with engine.active.waiting(job_id) as waiter:
         while True:
             waiter.changed.clear()
-            view = await asyncio.to_thread(view_of, engine, job_id)
-            if view.found is None:
-                yield JobEvent("deleted", END, None)
-                return
-            for event in view.events:
+            job, events = await asyncio.to_thread(_look, engine, job_id)
+            for event in events:
                 if event.number is not None and event.number > sent:
                     sent = event.number
                     yield event
-            job = view.found.job
-            if job.status in TERMINAL:
+            if job is None or job.status in TERMINAL:
                 return
             now = (job.stage, job.progress)
-            if now != reported and job.status == "running" and view.progress is not None:
+            if now != reported and job.status == "running":
                 reported = now
-                yield view.progress
+                yield JobEvent("progress", None, job)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(waiter.changed.wait(), POLL_SECONDS)
 
 
-def view_of(engine: JobEngine, job_id: str) -> JobView:
-    """A job as the database has it."""
+def _look(engine: JobEngine, job_id: str) -> tuple[Job | None, list[JobEvent]]:
+    """A job as the database has it, and its numbered events so far."""
     try:
-        found = engine.find(job_id, None, full=False)
+        job = engine.find(job_id, None, full=False).job
     except JobNotFound:
-        return JobView(None)
-    job = found.job
+        return None, [JobEvent("deleted", END, None)]
     begun = job.model_copy(
         update={"status": "running", "progress": 0.0, "stage": None, "problem": None, "finished_at": None}
     )
@@ -91,4 +76,4 @@ def view_of(engine: JobEngine, job_id: str) -> JobView:
         events.append(JobEvent("stage", FIRST_STAGE + place, done))
     if job.status in TERMINAL:
         events.append(JobEvent(job.status, END, job))
-    return JobView(found, tuple(events), JobEvent("progress", None, job))
+    return job, events

@@ -18,7 +18,7 @@ from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobTable
-from cow_service.jobs.processes import FORGOTTEN_SECONDS, Processes, unserved_jobs
+from cow_service.jobs.processes import FORGOTTEN_SECONDS, Processes
 from cow_service.jobs.schema import ALIVE_SECONDS
 from cow_service.records import WorkerInfo, WorkerJob
 from cow_service.settings import Settings
@@ -55,7 +55,6 @@ def test_processes_are_shown_while_they_tell_of_themselves(tmp_path: Path, monke
     with postgres() as server:
         url = SecretStr(server.url)
         settings = Settings(data_dir=tmp_path, role="api", database_url=url)
-        assert unserved_jobs(settings) == (), "no server has used it"
         with closing(open_database(tmp_path, url)) as database:
             api, other = processes_of(database, settings, "api"), processes_of(database, settings, "other", "light")
             with refused("not-ready"):
@@ -71,8 +70,7 @@ def test_processes_are_shown_while_they_tell_of_themselves(tmp_path: Path, monke
             assert (queue.name, queue.capacity, queue.queued, queue.oldest_seconds) == ("light", 3, 0, None)
             for name in ("light", "ati"):
                 add_job(database, name, queue=name)
-            assert [(one.queue, one.reason) for one in unserved_jobs(settings)] == [("ati", "queue")]
-            assert unserved_jobs(settings) == api.overview().unserved
+            assert [(one.queue, one.reason) for one in api.overview().unserved] == [("ati", "queue")]
             other.drain()
             other.tell()
             assert [one.queue for one in api.overview().unserved] == ["ati", "light"]
@@ -89,14 +87,13 @@ def test_processes_are_shown_while_they_tell_of_themselves(tmp_path: Path, monke
 
 def test_the_server_of_a_file_is_all_that_there_is(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    assert unserved_jobs(settings) == (), "no server has used it"
     with closing(open_database(tmp_path)) as database:
         for name in ("light", "ati"):
             add_job(database, name, queue=name)
-        assert unserved_jobs(settings) == (), "they wait for the next start"
         found = processes_of(database, settings, "me", "light").overview()
         assert [one.queues for one in found.processes] == [{"light": 3}]
         assert [(one.queue, one.reason) for one in found.unserved] == [("ati", "queue")]
         with database.transaction() as connection:
             connection.execute(sa.text("UPDATE cow_jobs SET version = '0' WHERE id = 'ati'"))
-        assert [(one.workflow_version, one.reason) for one in unserved_jobs(settings)] == [("0", "version")]
+        found = processes_of(database, settings, "me", "light").overview()
+        assert [(one.workflow_version, one.reason) for one in found.unserved] == [("0", "version")]

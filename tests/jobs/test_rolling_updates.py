@@ -254,15 +254,6 @@ def test_tables_of_another_version_stay_as_they_are(tmp_path: Path) -> None:
             assert "cow_stages_of_jobs" not in sa.inspect(database.engine).get_table_names()
 
 
-def test_tables_that_are_too_old_are_refused(tmp_path: Path) -> None:
-    with closing(opening.open_database(Settings(data_dir=tmp_path))) as database:
-        with database.transaction() as connection:
-            connection.execute(sa.text("CREATE TABLE cow_holds (sha256 TEXT)"))
-        with pytest.raises(SettingsError, match="cannot take over"):
-            database.create_tables()
-        assert sa.inspect(database.engine).get_table_names() == ["cow_holds"]
-
-
 def test_a_result_of_a_later_version_is_handed_on_as_it_is(tmp_path: Path) -> None:
     with closing(open_database(tmp_path)) as database:
         add_job(database, "job")

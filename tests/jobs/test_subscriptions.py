@@ -13,15 +13,14 @@ from servers import BODY, events_of
 from waiting import eventually_async
 
 from cow_service.jobs.active import ActiveJobs
-from cow_service.jobs.job_table import JobState
-from cow_service.jobs.subscriptions import JobView, follow
+from cow_service.jobs.subscriptions import follow
 from cow_service.records import Job
 from cow_service.service import Service
 
 
 def test_nobody_waits_for_a_follower_that_left(monkeypatch: pytest.MonkeyPatch) -> None:
     running = Job(id="job", kind="simulate", status="running", progress=0, created_at="", generator="cutout")
-    monkeypatch.setattr("cow_service.jobs.subscriptions.view_of", lambda *_: JobView(JobState(running, None)))
+    monkeypatch.setattr("cow_service.jobs.subscriptions._look", lambda *_: (running, []))
     engine: Any = SimpleNamespace(active=ActiveJobs())
 
     async def heard() -> None:
