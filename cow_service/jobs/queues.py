@@ -40,13 +40,9 @@ def places(name: str) -> int | None:
 
 def known_queues(settings: Settings) -> tuple[str, ...]:
     """The light queue, and those of backends that have a device or a limit of their own and can be imported here."""
-    manifests = load_manifests().values()
-    with_device = [
-        one.name
-        for one in manifests
-        if one.concurrency is not None and (settings.ray is not None or not one.missing_modules())  # on other nodes
-    ]
-    return LIGHT, *dict.fromkeys([*with_device, *settings.generator_concurrency])
+    with_device = [one for one in load_manifests().values() if one.concurrency is not None]
+    here = [one.name for one in with_device if settings.ray is not None or not one.missing_modules()]
+    return LIGHT, *dict.fromkeys([*here, *settings.generator_concurrency])
 
 
 class Queued(Protocol):

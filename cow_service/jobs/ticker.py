@@ -35,20 +35,11 @@ class Ticker(BackgroundThread):
         self._was_quiet = False
         self._cleaning: threading.Thread | None = None
         # What it does, and the seconds between two times.
-        self._duties: dict[Callable[[], None], float] = {
-            self.check_jobs: CHECK_SECONDS,
-            webhooks.send_due: 0.0,
-            self._close_idle_connections: 0.0,
-            self._clean_up: CLEAN_UP_SECONDS,
-        }
-        if parts.database.is_shared:
-            self._duties = {
-                parts.database.keep: 0.0,
-                self.recover: 0.0,
-                self._tell_progress: 0.0,
-                processes.tell: TELL_SECONDS,
-                **self._duties,
-            }
+        keep, tell = parts.database.keep, processes.tell
+        of_many = {keep: 0.0, self.recover: 0.0, self._tell_progress: 0.0, tell: TELL_SECONDS}
+        of_all = {self.check_jobs: CHECK_SECONDS, webhooks.send_due: 0.0, self._close_idle_connections: 0.0}
+        of_all[self._clean_up] = CLEAN_UP_SECONDS
+        self._duties = (of_many if parts.database.is_shared else {}) | of_all
 
     def run(self) -> None:
         """Does each duty when it is due. Errors are logged only: this goes on whatever happens."""
