@@ -42,7 +42,7 @@ async def follow(engine: JobEngine, job_id: str, after: int) -> AsyncGenerator[J
     with engine.active.waiting(job_id) as waiter:
         while True:
             waiter.changed.clear()
-            job, events = await asyncio.to_thread(_look, engine, job_id)
+            job, events = await asyncio.to_thread(state_of, engine, job_id)
             for event in events:
                 if event.number is not None and event.number > sent:
                     sent = event.number
@@ -57,7 +57,7 @@ async def follow(engine: JobEngine, job_id: str, after: int) -> AsyncGenerator[J
                 await asyncio.wait_for(waiter.changed.wait(), POLL_SECONDS)
 
 
-def _look(engine: JobEngine, job_id: str) -> tuple[Job | None, list[JobEvent]]:
+def state_of(engine: JobEngine, job_id: str) -> tuple[Job | None, list[JobEvent]]:
     """A job as the database has it, and its numbered events so far."""
     try:
         job = engine.find(job_id, None, full=False).job

@@ -69,7 +69,7 @@ class Webhooks:
                 self._calling[row.receiver] += 1
             number, begun = row.attempts + 1, False
             try:
-                if self._change(row.job_id, row.attempts, {"attempts": number, "due": database.now + ATTEMPT_SECONDS}):
+                if self.change(row.job_id, row.attempts, {"attempts": number, "due": database.now + ATTEMPT_SECONDS}):
                     call = row.job_id, row.url, number, row.receiver
                     threading.Thread(target=self._call, args=call, name="cow-webhook", daemon=True).start()
                     begun = True
@@ -84,7 +84,7 @@ class Webhooks:
             found = self._parts.jobs.find(job_id, None, full=False)
             wait = None if found is None else self.send(found.job, url, attempt)
             if wait is not None:
-                self._change(job_id, attempt, {"due": database.now + wait})
+                self.change(job_id, attempt, {"due": database.now + wait})
             else:
                 row = CALLS.c.job_id == job_id, CALLS.c.attempts == attempt
                 with database.transaction() as connection:
@@ -94,7 +94,7 @@ class Webhooks:
         finally:
             self._give_place_back(receiver)
 
-    def _change(self, job_id: str, attempts: int, values: dict[str, Any]) -> bool:
+    def change(self, job_id: str, attempts: int, values: dict[str, Any]) -> bool:
         """False where another process has begun an attempt since."""
         row = CALLS.c.job_id == job_id, CALLS.c.attempts == attempts
         with self._parts.database.transaction() as connection:

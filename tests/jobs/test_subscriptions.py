@@ -20,7 +20,7 @@ from cow_service.service import Service
 
 def test_nobody_waits_for_a_follower_that_left(monkeypatch: pytest.MonkeyPatch) -> None:
     running = Job(id="job", kind="simulate", status="running", progress=0, created_at="", generator="cutout")
-    monkeypatch.setattr("cow_service.jobs.subscriptions._look", lambda *_: (running, []))
+    monkeypatch.setattr("cow_service.jobs.subscriptions.state_of", lambda *_: (running, []))
     engine: Any = SimpleNamespace(active=ActiveJobs())
 
     async def heard() -> None:

@@ -324,7 +324,7 @@ def test_a_disk_that_is_full_for_a_while_takes_no_places(
         raise StorageUnavailable("The disk is full.")
 
     with monkeypatch.context() as patch:
-        patch.setattr(hooks, "_change", fail)
+        patch.setattr(hooks, "change", fail)
         job = submitted(http, {**BODY, "webhook": receiver.url})
         eventually(lambda: len(tries) > 3)
         assert not receiver.heard
