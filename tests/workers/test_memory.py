@@ -48,7 +48,7 @@ def test_what_a_job_needs_follows_its_pixels_masks_and_frames(tmp_path: Path) ->
 
 def test_what_is_left_for_jobs() -> None:
     assert memory_for_jobs(Settings(memory_mb=4000, concurrency=4)) == 4e9 - 5 * WORKER_BYTES
-    assert memory_for_jobs(Settings(memory_mb=100, concurrency=4)) == 1, "each runs alone"
+    assert memory_for_jobs(Settings(memory_mb=1000, concurrency=4)) == 1, "each runs alone"
 
 
 @pytest.fixture(scope="module")
