@@ -89,6 +89,11 @@ def test_no_url_that_leads_inside_is_sent_on(
             told = problem(response, 422, "image-url-not-allowed")
             assert url[:60] in told["detail"]
             assert told["error"]["param"].startswith("messages[1].content[1].")
+    in_place_of_data = {"input_audio": {"data": INSIDE[0], "format": "wav"}, "file": {"file_data": INSIDE[0]}}
+    for kind, held in in_place_of_data.items():
+        problem(post(one, messages=[user(part(kind, held))]), 422, "image-url-not-allowed")
+    predicted = {"type": "content", "content": [part("image_url", INSIDE[0])]}
+    problem(post(one, messages=HELLO, prediction=predicted), 422, "image-url-not-allowed")
     response = post(one, path="responses", input=[user({"type": "input_image", "image_url": INSIDE[0]})])
     problem(response, 422, "image-url-not-allowed")
     deep: Any = [URL]
@@ -175,9 +180,18 @@ def test_a_stream_may_be_longer_than_a_reply_but_no_event_of_it(app: Callable[..
     assert "mllm-bad-reply" in post(app(), messages=HELLO, stream=True).text
 
 
-def test_an_error_inside_a_stream_keeps_its_words_to_itself(app: Callable[..., FastAPI], mllm: MllmServer) -> None:
-    error = {"error": {"message": "organization org-77 at 10.0.0.7", "code": "rate_limit"}}
-    stream = f"data: {json.dumps(error)}\n\ndata: [DONE]\n\n".encode()
+@pytest.mark.parametrize(
+    ("name", "error"),
+    [
+        ("message", {"error": {"message": "organization org-77 at 10.0.0.7", "code": "rate_limit"}}),
+        ("message", {"object": "error", "message": "org-77 at 10.0.0.7", "type": "org-77", "code": "rate_limit"}),
+        ("error", {"message": "org-77 at 10.0.0.7", "param": "10.0.0.7", "code": "rate_limit"}),
+    ],
+)
+def test_an_error_inside_a_stream_keeps_its_words_to_itself(
+    app: Callable[..., FastAPI], mllm: MllmServer, name: str, error: dict[str, Any]
+) -> None:
+    stream = f"event: {name}\ndata: {json.dumps(error)}\n\ndata: [DONE]\n\n".encode()
     mllm.say(say.raw(stream, "text/event-stream"))
     said = post(app(), messages=HELLO, stream=True).text
     assert "org-77" not in said

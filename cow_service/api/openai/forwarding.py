@@ -31,7 +31,7 @@ PASSED_PREFIX = "x-ratelimit-"
 # These say that this server's own key, or address, is wrong: nothing that a caller could mend.
 NOT_THE_CALLERS = (HTTPStatus.UNAUTHORIZED, HTTPStatus.PROXY_AUTHENTICATION_REQUIRED)
 DONE = "[DONE]"  # the data of a stream's last event
-_CODE = re.compile(r"[\w.\[\]-]{1,64}", re.ASCII)  # what a code, a type or the name of a field looks like
+_CODE = re.compile(r"[A-Za-z_]{1,64}|\d{3}|[a-z_]{1,64}(?:\[\d+\]|\.[a-z_]{1,64}){1,4}")  # no keys, accounts, addresses
 
 Events: TypeAlias = AsyncGenerator[ServerSentEvent]
 
@@ -133,7 +133,8 @@ async def _events(response: httpx.Response, key: str | None) -> Events:
             async for event in events:
                 ended = ended or event.data.strip() == DONE
                 name = None if event.event == "message" else event.event  # that of an event without one
-                error = _error_of(event.data, None, key) if '"error"' in event.data else None
+                is_error = name == "error" or '"error"' in event.data
+                error = _error_of(event.data, None, key, is_error=name == "error") if is_error else None
                 yield ServerSentEvent(as_json(error) if error else event.data, event=name, sep="\n")
     if not ended:
         raise MllmUnavailable("The server of the multimodal LLM ended its stream before the reply was whole ([DONE]).")
@@ -158,16 +159,16 @@ def _whole(response: httpx.Response, key: str | None) -> ChatTurn:
     return ChatTurn(error, status, headers=headers)
 
 
-def _error_of(text: str, status: int | None, key: str | None) -> dict[str, Any] | None:
+def _error_of(text: str, status: int | None, key: str | None, *, is_error: bool = False) -> dict[str, Any] | None:
     """An error of the server in OpenAI's form, without its words, which are logged.
 
-    `status` is None for an event of a stream, which may be no error: then None is returned.
+    `status` is None for an event of a stream, which may be no error unless `is_error`: then None is returned.
     """
     value: Any = None
     with suppress(ValueError, RecursionError):
         value = json.loads(text)
     found = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
-    if status is None and not found.get("error"):
+    if status is None and not (is_error or found.get("error") or found.get("object") == "error"):
         return None
     log_refusal(text, key)
     found = found["error"] if isinstance(found.get("error"), dict) else found
