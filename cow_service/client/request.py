@@ -49,21 +49,10 @@ if TYPE_CHECKING:
     from cow_service.requests import ImageArtifact, ImageUrl
 
     # A text is a path, or a URL where it begins with http://, https:// or data:. Arrays are RGB, see `encoded_array`.
-    ImageLike: TypeAlias = (
-        str
-        | os.PathLike[str]
-        | bytes
-        | bytearray
-        | memoryview
-        | Image.Image
-        | NDArray[np.uint8]
-        | Artifact
-        | Frame
-        | ImageInfo
-        | ImageArtifact
-        | ImageUrl
-        | Mapping[str, str]  # as it stands in a request
-    )
+    # A mapping is an image as it stands in a request.
+    Pixels: TypeAlias = bytes | bytearray | memoryview | Image.Image | NDArray[np.uint8]
+    KnownImage: TypeAlias = Artifact | Frame | ImageInfo | ImageArtifact | ImageUrl
+    ImageLike: TypeAlias = str | os.PathLike[str] | Pixels | KnownImage | Mapping[str, str]
 else:
     ImageLike = Any
 

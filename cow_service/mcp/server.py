@@ -23,14 +23,13 @@ from cow_service.client import AsyncAnswer, AsyncClient, AsyncSimulation, CowErr
 from cow_service.client.progress import describe
 from cow_service.errors import InternalError
 from cow_service.mcp import arguments
-from cow_service.mcp.arguments import ToolName
 from cow_service.mcp.results import output_schema, tool_result
 from cow_service.media.artifacts import media_type_of
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Job
 from cow_service.weights.manifests import TOOL_PROMPTS
 
-TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
+TITLES: dict[arguments.ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
 # The tools only read. Repeating a call changes nothing, though a model that samples may answer differently. The world
 # is open: images may be fetched, and shown to a provider's model.
 HINTS = {"read_only_hint": True, "destructive_hint": False, "idempotent_hint": True, "open_world_hint": True}
@@ -161,7 +160,7 @@ def _caller(context: ServerRequestContext[Any]) -> Caller:
 
 
 async def result_of(
-    client: AsyncClient, tool: ToolName, image: ImageLike, fields: dict[str, Any], report: Report
+    client: AsyncClient, tool: arguments.ToolName, image: ImageLike, fields: dict[str, Any], report: Report
 ) -> AsyncSimulation | AsyncAnswer:
     """The result of a tool's job. Raises what it failed with. A call that is canceled cancels its job."""
     call: Callable[..., Awaitable[AsyncSimulation | AsyncAnswer]]
