@@ -81,9 +81,7 @@ def shared_options(
     base_url: Annotated[str | None, option("URL of the server of the multimodal LLM.", shown="the provider's")] = None,
     temperature: Annotated[float | None, option("Sampling temperature of its replies.", shown="the provider's")] = None,
     max_tokens: Annotated[int | None, option("Most tokens in a reply.", min=1, shown="8192")] = None,
-    skip_faulty: Annotated[
-        bool, option("Skip rows that cannot be asked, and unknown columns.", "--skip-faulty")
-    ] = False,
+    skip_faulty: Annotated[bool, option("Skip faulty rows, and unknown columns.", "--skip-faulty")] = False,
     prices: Prices = None,
 ) -> dict[str, Any]:
     """The options that `run` and `plan` have both."""

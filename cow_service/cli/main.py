@@ -38,9 +38,7 @@ def main(
 def simulate(
     image: options.Image,
     question: options.Question,
-    out: Annotated[
-        Path | None, option("Folder for the results.", "--out", "-o", shown="./<image>-cow, or -cow-2")
-    ] = None,
+    out: Annotated[Path | None, option("Folder for results.", "--out", "-o", shown="./<image>-cow, or -cow-2")] = None,
     video: Annotated[bool, option("Make a video (mp4) of the whole clip.")] = True,
     formats: Annotated[
         list[options.Format] | None,
@@ -88,9 +86,7 @@ def answer(
     question: options.Question,
     choice: Annotated[
         Texts,
-        option(
-            "An answer to choose from; may be repeated, for A, B, C...", metavar="TEXT", shown="those in the question"
-        ),
+        option("An answer to choose from; may be repeated: A, B, C...", metavar="TEXT", shown="those in the question"),
     ] = None,
     imagine: Annotated[
         Literal["always", "auto", "never"],
@@ -103,9 +99,7 @@ def answer(
     ] = 1.0,
     votes: Annotated[int, option("How often to ask; the most frequent answer wins.")] = 1,
     baseline: Annotated[bool, option("Also answer without frames, for comparison.", "--baseline")] = False,
-    out: Annotated[
-        Path | None, option("Folder for the simulation and answer.json.", "--out", "-o", shown="none")
-    ] = None,
+    out: Annotated[Path | None, option("Folder for simulation and answer.json.", "--out", "-o", shown="none")] = None,
     as_json: Annotated[bool, option("Print the answer as JSON, and nothing else.", "--json")] = False,
     *,
     request: dict[str, Any],

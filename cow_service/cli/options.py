@@ -248,9 +248,7 @@ def request_body(
     if body.get("grounding", {}).keys() == {"object"}:
         points = body.get("trajectory", {}).get("points")
         if not points:
-            raise InvalidRequest(
-                "--object needs --point, --box or --trajectory. Without them, name the object in the question."
-            )
+            raise InvalidRequest("--object needs --point, --box or --trajectory. Or name the object in the question.")
         body["grounding"]["point"] = points[0]
     more = object_in(fields or "{}", "--request")
     if isinstance(more.get("depth"), dict):  # such as focal length or deviation, in addition to the map

@@ -114,11 +114,10 @@ class Connection:
         """The bytes of an artifact, checked against their digest."""
         # A redirect leads to another host where the server keeps artifacts in an object store; it gets no API key.
         response = await self.exchange("GET", f"/artifacts/{quote(sha256, safe='')}", follow_redirects=True)
-        if hashlib.sha256(response.content).hexdigest() != sha256:
-            raise errors.BadResponse(
-                f"The artifact {sha256} came damaged ({len(response.content)} bytes): get it again."
-            )
-        return response.content
+        data = response.content
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise errors.BadResponse(f"The artifact {sha256} came damaged ({len(data)} bytes): get it again.")
+        return data
 
     # Jobs
 
@@ -323,9 +322,7 @@ class Files:
         """The bytes of an artifact, which are downloaded the first time."""
         if sha256 not in self.held:
             if self.connection is None:
-                raise ValueError(
-                    f"This result comes from a file or another process: get {sha256} by `Client.artifact`."
-                )
+                raise ValueError(f"This result is from a file or another process: get {sha256} by `Client.artifact`.")
             self.held[sha256] = await self.connection.artifact(sha256)
         return self.held[sha256]
 

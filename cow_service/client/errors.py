@@ -58,10 +58,8 @@ def unreachable(error: httpx.HTTPError, base_url: str | None = None) -> ServerUn
 
     With the server's address it says where a redirect pointed elsewhere.
     """
-    url = error.request.url
-    request = (
-        f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
-    )
+    sent, url = error.request, error.request.url
+    request = f"{sent.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
     if isinstance(error, httpx.DecodingError):
         return BadResponse(f"{request} Does a proxy stand between?")
     server = url if base_url is None else httpx.URL(base_url)

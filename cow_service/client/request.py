@@ -104,9 +104,7 @@ def encoded_array(array: NDArray[np.uint8]) -> bytes:
 
     shape, kind = tuple(array.shape), str(array.dtype)
     if kind != "uint8" or len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (3, 4)) or 0 in shape:
-        raise _wrong(
-            f"is an array {shape} of {kind}; give (height, width), or (height, width, 3 or 4), of uint8 in RGB"
-        )
+        raise _wrong(f"is an array {shape} of {kind}; give (height, width) or (height, width, 3 or 4), of uint8 in RGB")
     return _png(Image.fromarray(array))
 
 

@@ -162,9 +162,7 @@ def image_of(text: str, *, paths: bool) -> ImageLike:
     if scheme in _SENT_AS_IS:
         return scheme + text[len(scheme) :]
     if not paths:
-        raise _wrong(
-            f"{_shown(text)} is not a data URL, http(s) URL or SHA-256 digest; this server reads no local files"
-        )
+        raise _wrong(f"{_shown(text)} is not a data URL, http(s) URL or SHA-256 digest; this server reads no files")
     if scheme not in (None, "file://"):
         raise _wrong(f"{_shown(text)} cannot be opened: give a path, a data URL, an http(s) URL or a digest")
     path = Path(url2pathname(urlsplit(text).path)) if scheme else Path(text)

@@ -47,6 +47,7 @@ class Caller:
     forwarded: bool = False  # by a proxy, which may serve any client
 
 
+Context: TypeAlias = ServerRequestContext[Any]
 Connect: TypeAlias = Callable[[Caller], AbstractAsyncContextManager[AsyncClient]]
 Lifespan: TypeAlias = Callable[[Server[Any]], AbstractAsyncContextManager[Any]]
 Report: TypeAlias = Callable[[float, str], Coroutine[Any, Any, None]]  # the share that is done, 0 to 1, and the stage
@@ -93,9 +94,7 @@ class _Tools:
     async def list(self, *_: Any) -> types.ListToolsResult:
         return types.ListToolsResult(tools=self._listed)
 
-    async def call(
-        self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
-    ) -> types.CallToolResult:
+    async def call(self, context: Context, params: types.CallToolRequestParams) -> types.CallToolResult:
         """What a tool returns. An error is returned as text, since that is where a model looks."""
         tool = params.name
         if tool not in TITLES:
@@ -130,9 +129,7 @@ class _Tools:
         )
         return types.ListResourceTemplatesResult(resource_templates=[artifact])
 
-    async def read(
-        self, context: ServerRequestContext[Any], params: types.ReadResourceRequestParams
-    ) -> types.ReadResourceResult:
+    async def read(self, context: Context, params: types.ReadResourceRequestParams) -> types.ReadResourceResult:
         uri = str(params.uri)
         sha256 = arguments.digest_of(uri)
         if sha256 is None:
@@ -148,7 +145,7 @@ class _Tools:
         return types.ReadResourceResult(contents=[types.BlobResourceContents(uri=uri, mime_type=media_type, blob=blob)])
 
 
-def _caller(context: ServerRequestContext[Any]) -> Caller:
+def _caller(context: Context) -> Caller:
     """Who made the HTTP request that brought a message: each has its own headers, also within one session."""
     request = context.request
     if request is None:
