@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from cow_service.cli.options import EXISTING, Url, argument, object_in, open_client, option, printable
-from cow_service.client.options import CONCURRENCY
+from cow_service.client.options import CONCURRENCY, BatchSettings
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
@@ -56,7 +56,6 @@ def batch(
     """
     given = locals()
     from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
-    from cow_service.client.options import BatchSettings  # noqa: PLC0415
 
     asked = _read(questions, object_in(request or "{}", "--request"), kind)
     settings: dict[str, Any] = {name: given[name] for name in BatchSettings.__annotations__.keys() & given.keys()}

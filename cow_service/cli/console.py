@@ -4,8 +4,7 @@ import hashlib
 import platform
 import shutil
 import sys
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.metadata import distributions
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,9 +19,7 @@ from cow_service import __version__, records
 from cow_service.cli.options import HINTS, read_file, writable
 from cow_service.client import display
 from cow_service.errors import CowError, InvalidRequest
-from cow_service.records import Answer, Simulation, Verdict
-from cow_service.requests import AnswerRequest, SimulateRequest, Stage
-from cow_service.requests.values import field_errors
+from cow_service.requests import AnswerRequest, SimulateRequest, Stage, field_errors
 from cow_service.service import Service
 
 if TYPE_CHECKING:
@@ -38,7 +35,7 @@ def run_request(
     formats: Sequence[str] = (),
     *,
     as_json: bool = False,
-) -> Simulation | None:
+) -> records.Simulation | None:
     """Simulates or answers, shows the progress of each stage, prints a summary, and writes the results into a folder.
 
     Returns the simulation. `formats` are names of `video.FORMATS`. Raises `InvalidRequest`, which names the wrong
@@ -60,20 +57,28 @@ def run_request(
         faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
         remedy = f"--request takes these fields: {known}. The page /docs of a server describes them."
         raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy * ("no such field" in faults)) from error
-    result: Simulation | Answer
-    with stages_shown(console) as show:
-        if isinstance(request, AnswerRequest):
-            result = service.answer(request, show)
-        else:
-            result = service.simulate(request, show)
+    result: records.Simulation | records.Answer
+    with Progress(TextColumn("{task.description:<10}"), BarColumn(24), console=console, transient=True) as bars:
+        bar = bars.add_task("loading", total=1.0)  # loading a model takes a while before the first stage
+
+        def show(stage: Stage | None, done: float) -> None:
+            bars.update(bar, description=stage, completed=stage and done)
+
+        is_answer = isinstance(request, AnswerRequest)
+        result = service.answer(request, show) if is_answer else service.simulate(request, show)
     written = [] if out is None else save(service, result, out, formats)
     if as_json:
         print(result.model_dump_json(indent=2))
-    simulation = result.simulation if isinstance(result, Answer) else result
+    simulation = result.simulation if isinstance(result, records.Answer) else result
     if simulation is not None:
         print_stages(console, simulation)
-    print_answer(console, result)
-    problem = result.simulation_problem if isinstance(result, Answer) else None
+    if isinstance(result, records.Answer):
+        console.print(answer_table(result))
+        if result.reasoning:
+            console.print(f"[dim]reasoning[/]: {escape(result.reasoning)}")
+    elif result.narration.answer:
+        console.print(f"[bold]{escape(result.narration.summary)}[/]")
+    problem = result.simulation_problem if isinstance(result, records.Answer) else None
     hint = None if problem is None else HINTS.get(problem.code)
     for warning in result.warnings:
         told = warning.replace(problem.remedy, hint) if problem and problem.remedy and hint else warning
@@ -83,16 +88,7 @@ def run_request(
     return simulation
 
 
-@contextmanager
-def stages_shown(console: Console) -> Generator[Callable[[Stage | None, float], None]]:
-    """A progress bar with the name of the stage; yields the function that updates it."""
-    columns = TextColumn("{task.description:<10}"), BarColumn(bar_width=24)
-    with Progress(*columns, console=console, transient=True) as bars:
-        bar = bars.add_task("loading", total=1.0)  # loading a model takes a while before the first stage
-        yield lambda stage, done: bars.update(bar, description=stage, completed=stage and done)
-
-
-def print_stages(console: Console, simulation: Simulation) -> None:
+def print_stages(console: Console, simulation: records.Simulation) -> None:
     """Prints a line for each stage: its time and its result; then the contacts and what happens."""
     grounding, motion, trajectory = simulation.grounding, simulation.motion, simulation.trajectory
     x, y = grounding.point
@@ -114,20 +110,9 @@ def print_stages(console: Console, simulation: Simulation) -> None:
     console.print(f"[dim]story[/]: {escape(simulation.narration.story)}")
 
 
-def print_answer(console: Console, result: Simulation | Answer) -> None:
-    """Prints the answer with what it rests on, or the summary of a simulation."""
-    if isinstance(result, Simulation):
-        if result.narration.answer:
-            console.print(f"[bold]{escape(result.narration.summary)}[/]")
-        return
-    console.print(answer_table(result))
-    if result.reasoning:
-        console.print(f"[dim]reasoning[/]: {escape(result.reasoning)}")
-
-
-def _result_in(folder: Path) -> Simulation | None:
+def _result_in(folder: Path) -> records.Simulation | None:
     try:
-        return Simulation.model_validate_json((folder / "simulation.json").read_bytes())
+        return records.Simulation.model_validate_json((folder / "simulation.json").read_bytes())
     except (OSError, ValueError):
         return None
 
@@ -141,7 +126,7 @@ def default_folder(image: Path) -> Path:
     return folder
 
 
-def save(service: Service, result: Simulation | Answer, out: Path, formats: Sequence[str]) -> list[str]:
+def save(service: Service, result: records.Simulation | records.Answer, out: Path, formats: Sequence[str]) -> list[str]:
     """Writes frames, video, overlay, the result as JSON and the clip in other formats; returns the names of files."""
     artifacts, documents, made = records.artifacts_of(result), records.documents_of(result), dict[str, Any]()
     stale = ("simulation.json", "answer.json", "clip.gif", "clip.webp", "sheet.png")  # of an earlier run
@@ -227,7 +212,7 @@ def _readiness(backend: records.BackendInfo) -> str:
     return words if backend.ready is None else f"[{'green' if backend.ready else 'yellow'}]{words}[/]"
 
 
-def answer_table(answer: Answer) -> Table:
+def answer_table(answer: records.Answer) -> Table:
     """The answer, its votes, and what it cost."""
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(style="bold")
@@ -247,7 +232,7 @@ def answer_table(answer: Answer) -> Table:
     return table
 
 
-def _verdict(verdict: Verdict) -> str:
+def _verdict(verdict: records.Verdict) -> str:
     colour = "yellow" if verdict.not_sure or verdict.answer is None else "green"
     return f"[{colour}]{escape(display.describe_answer(verdict))}[/]"
 

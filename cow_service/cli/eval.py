@@ -2,6 +2,7 @@
 
 import sys
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -80,9 +81,7 @@ def shared_options(
     base_url: Annotated[str | None, option("URL of the server of the multimodal LLM.", shown="the provider's")] = None,
     temperature: Annotated[float | None, option("Sampling temperature of its replies.", shown="the provider's")] = None,
     max_tokens: Annotated[int | None, option("Most tokens in a reply.", min=1, shown="8192")] = None,
-    skip_faulty: Annotated[
-        bool, option("Skip rows that cannot be asked, and unknown columns.", "--skip-faulty")
-    ] = False,
+    skip_faulty: Annotated[bool, option("Skip faulty rows, and unknown columns.", "--skip-faulty")] = False,
     prices: Prices = None,
 ) -> dict[str, Any]:
     """The options that `run` and `plan` have both."""
@@ -173,27 +172,24 @@ def plan(
 
 def _request(given: dict[str, Any]) -> Any:
     """The request in the options, completed from the plan or the preset. Raises `InvalidRequest`."""
-    from cow_service.evals.design import PRESETS  # noqa: PLC0415
-    from cow_service.evals.plan import read_plan  # noqa: PLC0415
-    from cow_service.evals.request import EvalRequest  # noqa: PLC0415
+    from cow_service.evals import design, plan, request  # noqa: PLC0415
 
-    fields: dict[str, Any] = {name: given[name] for name in EvalRequest.__dataclass_fields__.keys() & given.keys()}
+    names = request.EvalRequest.__dataclass_fields__.keys() & given.keys()
+    fields: dict[str, Any] = {name: given[name] for name in names}
     if given["plan"] is not None:
-        plan = read_plan(given["plan"])
-        names = [name for name in (*plan.options, "arm", "preset", "repeats") if name in given]
+        fixed = plan.read_plan(given["plan"])
+        names = [name for name in (*fixed.options, "arm", "preset", "repeats") if name in given]
         changed = [name for name in names if given[name] is not None and given[name] is not False]
         if changed:
             raise InvalidRequest(f"The plan already sets --{changed[0].replace('_', '-')}: leave that option out.")
-        fields |= {name: plan.options[name] for name in fields.keys() & plan.options.keys()}
-        subsets = tuple(plan.options["subset"])
-        fields |= {"plan": plan, "arms": tuple(plan.arms), "repeats": plan.repeats, "subsets": subsets}
-        return EvalRequest(**fields)
+        fields |= {name: fixed.options[name] for name in fields.keys() & fixed.options.keys()}
+        subsets = tuple(fixed.options["subset"])
+        fields |= {"plan": fixed, "arms": tuple(fixed.arms), "repeats": fixed.repeats, "subsets": subsets}
+        return request.EvalRequest(**fields)
     if given["data"] is None:
         raise InvalidRequest("Give the data to ask about, or a plan with --plan.")
-    preset, ask = (
-        PRESETS[given["preset"] or "default"],
-        given["ask"] or ("answer" if given["mllm"] is None else "prompt"),
-    )
+    preset = design.PRESETS[given["preset"] or "default"]
+    ask = given["ask"] or ("answer" if given["mllm"] is None else "prompt")
     # An arm given by factors contains commas.
     named = [name for text in given["arm"] or () for name in ([text] if "=" in text else text.split(","))]
     own = preset.arms if given["preset"] or not named else ()
@@ -207,7 +203,7 @@ def _request(given: dict[str, Any]) -> Any:
         "order": given["order"] or preset.order,
         "subsets": tuple(given["subset"] or ()),
     }
-    return EvalRequest(**fields)
+    return request.EvalRequest(**fields)
 
 
 @app.command(epilog="Example: cow eval report run-a run-b --out comparison")
@@ -240,8 +236,6 @@ def _priced(path: Path | None) -> dict[str, Any]:
 
 def _check_installed() -> None:
     """Raises `NotInstalled`."""
-    from importlib.util import find_spec  # noqa: PLC0415
-
     missing = [name for name in _OF_EXTRA if find_spec(name) is None]
     if missing:
         raise NotInstalled(f"`cow eval` needs {', '.join(missing)}: {install_line('evals')}")

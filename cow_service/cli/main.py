@@ -10,7 +10,6 @@ import typer
 from cow_service import __version__
 from cow_service.cli import batch, eval, models, options, server
 from cow_service.cli.options import AsJson, Commands, Grouped, Texts, option, with_options
-from cow_service.cli.server import open_service
 
 app = typer.Typer(
     cls=Commands,
@@ -39,9 +38,7 @@ def main(
 def simulate(
     image: options.Image,
     question: options.Question,
-    out: Annotated[
-        Path | None, option("Folder for the results.", "--out", "-o", shown="./<image>-cow, or -cow-2")
-    ] = None,
+    out: Annotated[Path | None, option("Folder for results.", "--out", "-o", shown="./<image>-cow, or -cow-2")] = None,
     video: Annotated[bool, option("Make a video (mp4) of the whole clip.")] = True,
     formats: Annotated[
         list[options.Format] | None,
@@ -60,7 +57,7 @@ def simulate(
 
     body = {**request, "question": question, "video": video}
     out = out or default_folder(image)
-    with open_service() as service:
+    with server.open_service() as service:
         simulation = run_request(service, "simulate", image, body, out, formats or (), as_json=as_json)
     if open_it and simulation is not None:
         typer.launch(str(out / ("video.mp4" if video else simulation.overlay_name)))
@@ -76,7 +73,7 @@ def demo(
     from cow_service.weights.manifests import EXAMPLES  # noqa: PLC0415
 
     question = "If the yellow ball moves opposite to the direction of the arrow, will it hit the blue mug?"
-    with open_service() as service, as_file(EXAMPLES["ball-and-mug"].file("image")) as image:
+    with server.open_service() as service, as_file(EXAMPLES["ball-and-mug"].file("image")) as image:
         run_request(service, "simulate", image, {"question": question}, out)
     if open_it:
         typer.launch(str(out / "video.mp4"))
@@ -89,9 +86,7 @@ def answer(
     question: options.Question,
     choice: Annotated[
         Texts,
-        option(
-            "An answer to choose from; may be repeated, for A, B, C...", metavar="TEXT", shown="those in the question"
-        ),
+        option("An answer to choose from; may be repeated: A, B, C...", metavar="TEXT", shown="those in the question"),
     ] = None,
     imagine: Annotated[
         Literal["always", "auto", "never"],
@@ -104,9 +99,7 @@ def answer(
     ] = 1.0,
     votes: Annotated[int, option("How often to ask; the most frequent answer wins.")] = 1,
     baseline: Annotated[bool, option("Also answer without frames, for comparison.", "--baseline")] = False,
-    out: Annotated[
-        Path | None, option("Folder for the simulation and answer.json.", "--out", "-o", shown="none")
-    ] = None,
+    out: Annotated[Path | None, option("Folder for simulation and answer.json.", "--out", "-o", shown="none")] = None,
     as_json: Annotated[bool, option("Print the answer as JSON, and nothing else.", "--json")] = False,
     *,
     request: dict[str, Any],
@@ -128,7 +121,7 @@ def answer(
         "baseline": baseline,
         "video": out is not None,
     }
-    with open_service() as service:
+    with server.open_service() as service:
         run_request(service, "answer", image, body, out, as_json=as_json)
 
 
@@ -140,7 +133,7 @@ def doctor(as_json: AsJson = False) -> None:
     """
     from cow_service.cli.console import examine, print_report  # noqa: PLC0415
 
-    with open_service() as service:
+    with server.open_service() as service:
         report = examine(service)
     print_report(report, as_json=as_json)
     if report.problem is not None:
@@ -155,7 +148,7 @@ def openapi() -> None:
     from cow_service.api.app import create_app  # noqa: PLC0415
     from cow_service.jobs.engine import JobEngine  # noqa: PLC0415
 
-    document = create_app(JobEngine(open_service())).openapi()
+    document = create_app(JobEngine(server.open_service())).openapi()
     typer.echo(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120), nl=False)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cow_service.cli.options import EXISTING, AsJson, FolderNotWritable, Texts, argument, option, writable
+from cow_service.cli.server import open_service
 from cow_service.errors import InvalidRequest
 
 if TYPE_CHECKING:
@@ -31,10 +33,8 @@ def models(context: typer.Context, as_json: AsJson = False) -> None:
             raise typer.BadParameter("--json goes after the command.")
         return
     from cow_service.cli.console import print_models  # noqa: PLC0415
-    from cow_service.service import Service  # noqa: PLC0415
-    from cow_service.settings import load_settings  # noqa: PLC0415
 
-    print_models(Service(load_settings()).models(), as_json=as_json)
+    print_models(open_service().models(), as_json=as_json)
 
 
 @app.command(epilog="Example: cow models pull ati")
@@ -65,23 +65,21 @@ def _pull(name: str, revision: list[str] | None) -> None:
     if not manifest.sources:
         typer.echo(f"{name} needs no weights.")
         return
-    from rich.console import Console  # noqa: PLC0415
     from rich.filesize import decimal  # noqa: PLC0415
 
     from cow_service.weights.repositories import download, folder_of  # noqa: PLC0415
 
     weights_dir = _weights_dir()
-    console = Console(highlight=False, soft_wrap=True, markup=False)
-    console.print("Comparing the repository with the files that are here ...")
+    typer.echo("Comparing the repository with the files that are here ...")
     downloads = _downloads(manifest, weights_dir, revisions)
     files = [file for each in downloads for file in each.files]
     pending = [file for each in downloads for file in each.pending]
     size, missing = (decimal(sum(file.size for file in some)) for some in (files, pending))
-    console.print(f"{name}: {len(files)} files, {size}; to download: {len(pending)} files, {missing}.")
-    download(downloads, weights_dir, lambda repo, file: console.print(f"{repo}: {file.path}, {decimal(file.size)}"))
+    typer.echo(f"{name}: {len(files)} files, {size}; to download: {len(pending)} files, {missing}.")
+    download(downloads, weights_dir, lambda repo, file: typer.echo(f"{repo}: {file.path}, {decimal(file.size)}"))
     for each in downloads:
         folder = folder_of(weights_dir, each.lock.repository)
-        console.print(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
+        typer.echo(f"{each.lock.repository} at {each.lock.revision[:12]} is in {folder}")
 
 
 @app.command(epilog="Example: cow models check --save")
@@ -100,8 +98,6 @@ def check(
         return
     if save:
         raise InvalidRequest("--save is for the check of COW_MLLM: leave the name out.")
-    import json  # noqa: PLC0415
-
     from cow_service.weights import repositories as weights  # noqa: PLC0415
 
     manifest, weights_dir = _manifest(name), _weights_dir()
@@ -129,10 +125,8 @@ def _check_mllm(*, save: bool, as_json: bool) -> None:
     """Raises `ReaderUnavailable` where none is set up."""
     from cow_service.cli.console import print_check  # noqa: PLC0415
     from cow_service.readers.mllm.reader import MllmReader  # noqa: PLC0415
-    from cow_service.service import Service  # noqa: PLC0415
-    from cow_service.settings import load_settings  # noqa: PLC0415
 
-    with Service(load_settings()) as service:
+    with open_service() as service:
         reader = service.chat_reader("local" if service.settings.reader == "local" else "mllm")
         if not isinstance(reader, MllmReader):
             raise InvalidRequest("The configured reader is not one of COW's own: only those can be checked.")

@@ -26,8 +26,7 @@ _GIVE_PLACE = (
     "--other NAME=X0,Y0,X1,Y1 for the other objects."
 )
 HINTS = {  # the remedy in terms of options, by the error's code
-    "cannot-ground": _GIVE_PLACE,
-    "object-not-found": _GIVE_PLACE,
+    **dict.fromkeys(("cannot-ground", "object-not-found"), _GIVE_PLACE),
     "cannot-read-direction": "Use --direction DX,DY (x right, y down).",
     "generator-unavailable": "Or use --generator cutout (or COW_GENERATOR=cutout), which needs no GPU and no weights.",
 }
@@ -151,7 +150,6 @@ Texts = list[str] | None
 Policy = Literal["initial", "uniform", "events"]
 Kind = Literal["linear", "projectile", "fall", "static"]
 Law = Literal["contact", "ballistic"]
-Until = Literal["contact"]
 Language = Literal["en", "de", "es", "fr", "zh", "ja"]
 
 
@@ -166,19 +164,9 @@ class Format(StrEnum):
 # The request field of each option. The options below repeat the fields' defaults, because importing pydantic would
 # slow down `--help`; a test checks that they agree.
 FIELDS = {
-    "point": "grounding/point",
-    "box": "grounding/bbox",
-    "name": "grounding/object",
-    "direction": "motion/direction",
-    "kind": "motion/kind",
-    "speed": "motion/speed",
-    "distance": "motion/distance",
-    "duration": "motion/duration",
-    "until": "motion/until",
-    "law": "motion/law",
-    "frames": "frames/policy",
-    "count": "frames/count",
-    "max_side": "frames/max_side",
+    **{"point": "grounding/point", "box": "grounding/bbox", "name": "grounding/object"},
+    **{name: f"motion/{name}" for name in ("direction", "kind", "speed", "distance", "duration", "until", "law")},
+    **{"frames": "frames/policy", "count": "frames/count", "max_side": "frames/max_side"},
 }
 _NUMBERS = {"point": 2, "box": 4, "direction": 2}  # how many comma-separated numbers an option takes
 _SAME_NAME = ("language", "ensemble", "reader", "generator", "num_frames", "fps", "seed")
@@ -193,7 +181,7 @@ def request_body(
     speed: Annotated[float | None, option("Speed, px/s.", shown="0.26 image widths/s")] = None,
     distance: Annotated[float | None, option("Stop the object after this distance, px.")] = None,
     duration: Annotated[float | None, option("Stop the object after this time, s.")] = None,
-    until: Annotated[Until | None, option("contact: stop the object at its first contact.")] = None,
+    until: Annotated[Literal["contact"] | None, option("contact: stop the object at its first contact.")] = None,
     remove: Annotated[Texts, option("Object to take away before the motion; may be repeated.", metavar="NAME")] = None,
     place: Annotated[
         Texts, option('Put an object first: "apple into bowl"; may be repeated.', metavar="THING RELATION THING")
@@ -260,9 +248,7 @@ def request_body(
     if body.get("grounding", {}).keys() == {"object"}:
         points = body.get("trajectory", {}).get("points")
         if not points:
-            raise InvalidRequest(
-                "--object needs --point, --box or --trajectory. Without them, name the object in the question."
-            )
+            raise InvalidRequest("--object needs --point, --box or --trajectory. Or name the object in the question.")
         body["grounding"]["point"] = points[0]
     more = object_in(fields or "{}", "--request")
     if isinstance(more.get("depth"), dict):  # such as focal length or deviation, in addition to the map

@@ -147,9 +147,7 @@ def new(name: Annotated[str, argument("Owner of the key, as logs and rate limits
         raise InvalidRequest(f"{name!r} cannot be the name of a key: use 1 to 64 letters, digits, '.', '-' or '_'.")
     known = load_settings().api_keys
     if name in known:
-        raise InvalidRequest(
-            f"COW_API_KEYS already has a key named '{name}'. Choose another name, or remove that key first."
-        )
+        raise InvalidRequest(f"COW_API_KEYS already has a key named '{name}'. Choose another name, or remove that key.")
     key = new_key()
     typer.echo(f"The key of {name}, shown only once; send it in the header `Authorization: Bearer <key>`:")
     typer.echo(f"\n    {key}\n")

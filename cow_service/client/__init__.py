@@ -13,22 +13,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cow_service.client import errors as errors
-    from cow_service.client.async_client import AsyncClient as AsyncClient
-    from cow_service.client.async_results import AsyncAnswer as AsyncAnswer
-    from cow_service.client.async_results import AsyncJobHandle as AsyncJobHandle
-    from cow_service.client.async_results import AsyncSimulation as AsyncSimulation
-    from cow_service.client.batches import BatchResult as BatchResult
-    from cow_service.client.display import Models as Models
-    from cow_service.client.errors import CowError as CowError
-    from cow_service.client.journal import Question as Question
-    from cow_service.client.journal import QuestionLike as QuestionLike
-    from cow_service.client.protocol import Event as Event
-    from cow_service.client.request import ImageLike as ImageLike
-    from cow_service.client.sync_client import Client as Client
-    from cow_service.client.sync_results import Answer as Answer
-    from cow_service.client.sync_results import JobHandle as JobHandle
-    from cow_service.client.sync_results import Simulation as Simulation
+    from cow_service.client import errors
+    from cow_service.client.async_client import AsyncClient
+    from cow_service.client.async_results import AsyncAnswer, AsyncJobHandle, AsyncSimulation
+    from cow_service.client.batches import BatchResult
+    from cow_service.client.display import Models
+    from cow_service.client.errors import CowError
+    from cow_service.client.journal import Question, QuestionLike
+    from cow_service.client.protocol import Event
+    from cow_service.client.request import ImageLike
+    from cow_service.client.sync_client import Client
+    from cow_service.client.sync_results import Answer, JobHandle, Simulation
+
+__all__ = ["Answer", "AsyncAnswer", "AsyncClient", "AsyncJobHandle", "AsyncSimulation", "BatchResult", "Client"]
+__all__ += ["CowError", "Event", "ImageLike", "JobHandle", "Models", "Question", "QuestionLike", "Simulation", "errors"]
 
 # Each is imported on first use, so that a program with one client does not wait for the rest.
 _MODULES = {
@@ -44,7 +42,6 @@ _MODULES = {
     "sync_results": ("Answer", "JobHandle", "Simulation"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-__all__ = ["errors", *_MODULE_OF]  # noqa: PLE0604 # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -8,14 +8,7 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, overload
 
-from cow_service.client.options import (
-    DEFAULT_TIMEOUT,
-    RETRIES,
-    AnswerBatchOptions,
-    AnswerOptions,
-    SimulateBatchOptions,
-    SimulateOptions,
-)
+from cow_service.client.options import DEFAULT_TIMEOUT, RETRIES
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -26,6 +19,7 @@ if TYPE_CHECKING:
     from cow_service.client.batches import BatchResult
     from cow_service.client.display import Models
     from cow_service.client.journal import QuestionLike
+    from cow_service.client.options import AnswerBatchOptions, AnswerOptions, SimulateBatchOptions, SimulateOptions
     from cow_service.client.progress import ProgressLike
     from cow_service.client.request import ImageLike
     from cow_service.records import JobKind, JobStatus, Workers

@@ -18,7 +18,6 @@ from cow_service.client.async_io import AsyncIO, iterate, picture_bytes, run
 from cow_service.client.connection import Connection, Files
 from cow_service.client.display import AnswerView, SimulationView, answer_html, picture_of, simulation_html, stacked
 from cow_service.client.progress import ProgressLike, reporting
-from cow_service.client.protocol import Event
 from cow_service.records import AcceptedRequest, Job
 
 if TYPE_CHECKING:
@@ -169,7 +168,7 @@ class AsyncJobHandle(Generic[R_co]):
         """Cancels the job and removes it, with artifacts that no other job holds."""
         await run(self._connection.exchange("DELETE", protocol.job_path(self.id)))
 
-    def events(self, after: int = 0) -> AsyncIterator[Event]:
+    def events(self, after: int = 0) -> AsyncIterator[protocol.Event]:
         """What happens to the job until its end, through broken connections.
 
         `after` leaves out events up to that number.

@@ -11,19 +11,17 @@ from typing import Any, Generic, Literal, Self, TypeVar
 
 from cow_service import records
 from cow_service.adaptive import AdaptiveLimit
-from cow_service.client import errors
+from cow_service.client import errors, protocol
 from cow_service.client.journal import Journal, Question, QuestionLike, questions
 from cow_service.client.options import CONCURRENCY
 from cow_service.client.progress import BatchProgress, describe_load, progress_shown
-from cow_service.client.protocol import RETRYABLE
 from cow_service.client.request import JobRequest, job_request
-from cow_service.records import JobKind
 
 MAX_OUTAGE_SECONDS = 300.0  # without any response, after which a batch ends; it can be resumed
 RETRY_SECONDS = 2.0  # before a question is sent again that the server could not accept
 # Every other question would meet these, too.
 _FATAL = (errors.Unauthorized, errors.OriginNotAllowed, errors.MethodNotAllowed, errors.NotFound)
-TRANSIENT = (*RETRYABLE, errors.ServerUnreachable, errors.StorageUnavailable)
+TRANSIENT = (*protocol.RETRYABLE, errors.ServerUnreachable, errors.StorageUnavailable)
 
 R_co = TypeVar("R_co", bound=records.Simulation | records.Answer, covariant=True)
 
@@ -130,7 +128,7 @@ class BatchOptions:
 class Batch:
     """One batch: its questions, how each is asked, and its results. A context that holds the folder."""
 
-    def __init__(self, items: Iterable[QuestionLike], kind: JobKind, options: Mapping[str, Any]) -> None:
+    def __init__(self, items: Iterable[QuestionLike], kind: records.JobKind, options: Mapping[str, Any]) -> None:
         """`options` has fields of `BatchOptions`; the others are fields of the request for questions without them."""
         own = {field.name for field in fields(BatchOptions)}
         self.options = BatchOptions(**{name: value for name, value in options.items() if name in own})
@@ -138,7 +136,7 @@ class Batch:
         self.pace = AdaptiveLimit(self.options.concurrency)
         self.outage = OutageTimer(on_change=self._show_outage)
         self._items = items
-        self._kind: JobKind = kind
+        self._kind: records.JobKind = kind
         self._defaults = {name: value for name, value in options.items() if name not in own}
         self._known: dict[str, Question] = {}  # questions with an earlier result that is to be yielded, by id
         self._progress = BatchProgress(len(items) if isinstance(items, Sized) else None)
@@ -212,7 +210,7 @@ class Batch:
         """Shows what the server's jobs wait for."""
         self._progress.load = describe_load(workers)
 
-    def earlier_results(self, read: Callable[[JobKind, Any], R_co]) -> Iterator[BatchResult[R_co]]:
+    def earlier_results(self, read: Callable[[records.JobKind, Any], R_co]) -> Iterator[BatchResult[R_co]]:
         """The results of earlier runs, each read from its JSON."""
         for line in self.journal.lines() if self.journal is not None and self._known else ():
             if (question := self._known.get(line["id"])) is None:

@@ -22,7 +22,6 @@ from pydantic import BaseModel
 from cow_service import records
 from cow_service.client import errors, protocol
 from cow_service.client.progress import ProgressLike, reporting
-from cow_service.client.protocol import Event, job_in, job_path, object_in, read
 from cow_service.client.request import MINIMAL, JobRequest, job_request, plain
 
 if TYPE_CHECKING:
@@ -109,23 +108,22 @@ class Connection:
 
     async def get(self, model: type[M], path: str, **arguments: Any) -> M:
         """The record at a path."""
-        return read(model, object_in(await self.exchange("GET", path, **arguments)))
+        return protocol.read(model, protocol.object_in(await self.exchange("GET", path, **arguments)))
 
     async def artifact(self, sha256: str) -> bytes:
         """The bytes of an artifact, checked against their digest."""
         # A redirect leads to another host where the server keeps artifacts in an object store; it gets no API key.
         response = await self.exchange("GET", f"/artifacts/{quote(sha256, safe='')}", follow_redirects=True)
-        if hashlib.sha256(response.content).hexdigest() != sha256:
-            raise errors.BadResponse(
-                f"The artifact {sha256} came damaged ({len(response.content)} bytes): get it again."
-            )
-        return response.content
+        data = response.content
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise errors.BadResponse(f"The artifact {sha256} came damaged ({len(data)} bytes): get it again.")
+        return data
 
     # Jobs
 
     async def submit(self, *arguments: Any) -> Any:
         """The handle of a new job; the arguments are those of `job_request`."""
-        return self._handle(self, job_in(await self._post(job_request(*arguments), "respond-async")))
+        return self._handle(self, protocol.job_in(await self._post(job_request(*arguments), "respond-async")))
 
     async def _post(self, request: JobRequest, prefer: str, **arguments: Any) -> httpx.Response:
         headers = request.headers(prefer)
@@ -137,11 +135,11 @@ class Connection:
 
     async def refresh(self, job_id: str) -> records.Job:
         """The state of a job."""
-        return job_in(await self.exchange("GET", job_path(job_id)))
+        return protocol.job_in(await self.exchange("GET", protocol.job_path(job_id)))
 
     async def cancel(self, job_id: str, **arguments: Any) -> records.Job:
         """Cancels a job; returns its state."""
-        return job_in(await self.exchange("POST", f"{job_path(job_id)}/cancel", **arguments))
+        return protocol.job_in(await self.exchange("POST", f"{protocol.job_path(job_id)}/cancel", **arguments))
 
     async def simulate_or_answer(self, timeout: float | None, progress: ProgressLike, *arguments: Any) -> Any:
         """The result of a request, with its progress shown; the arguments are those of `job_request`."""
@@ -171,8 +169,8 @@ class Connection:
             prefer = f"wait={server_wait}" if server_wait else "respond-async"
             response = await self._post(request, prefer, until=until, pace=pace)
             if response.status_code != protocol.ACCEPTED:
-                return self.result(request.kind, object_in(response))
-            job_id = job_in(response).id
+                return self.result(request.kind, protocol.object_in(response))
+            job_id = protocol.job_in(response).id
             return await self.poll(job_id, timeout, until, on_update, request.minimal, pace)
         except (errors.CowError, GeneratorExit):
             raise
@@ -187,7 +185,7 @@ class Connection:
         with suppress(Exception):
             if job_id is None:
                 # Sent once more under the same key, the request returns the job that it has become, or becomes one now.
-                job_id = job_in(await self._post(request, "respond-async", **once)).id
+                job_id = protocol.job_in(await self._post(request, "respond-async", **once)).id
             await self.cancel(job_id, **once)
 
     async def poll(
@@ -203,8 +201,8 @@ class Connection:
         pause = protocol.FIRST_POLL_SECONDS
         headers = {"Prefer": MINIMAL} if minimal else {}
         while True:
-            response = await self.exchange("GET", job_path(job_id), headers, until=until, pace=pace)
-            job = job_in(response)
+            response = await self.exchange("GET", protocol.job_path(job_id), headers, until=until, pace=pace)
+            job = protocol.job_in(response)
             if on_update is not None:
                 on_update(job)
             if job.status in records.TERMINAL:
@@ -217,7 +215,7 @@ class Connection:
 
     def result(self, kind: records.JobKind, body: Any) -> Any:
         """The result that is this JSON; it downloads its pictures from here."""
-        result = read(self._kinds[kind], body)
+        result = protocol.read(self._kinds[kind], body)
         result.files.connection = self
         return result
 
@@ -232,10 +230,10 @@ class Connection:
                 return
             params["cursor"] = page.next
 
-    async def events(self, handle: Any, after: int) -> AsyncGenerator[Event]:
+    async def events(self, handle: Any, after: int) -> AsyncGenerator[protocol.Event]:
         """The events of a job after a number, through broken connections."""
         position, attempts, ended = after, 0, False
-        url = f"{self.endpoint.base_url}{job_path(handle.id)}/events"
+        url = f"{self.endpoint.base_url}{protocol.job_path(handle.id)}/events"
         while not ended:
             resume = {"Last-Event-ID": str(position)} if position else {}
             headers = self.endpoint.headers({"Accept": "text/event-stream", **resume})
@@ -324,9 +322,7 @@ class Files:
         """The bytes of an artifact, which are downloaded the first time."""
         if sha256 not in self.held:
             if self.connection is None:
-                raise ValueError(
-                    f"This result comes from a file or another process: get {sha256} by `Client.artifact`."
-                )
+                raise ValueError(f"This result is from a file or another process: get {sha256} by `Client.artifact`.")
             self.held[sha256] = await self.connection.artifact(sha256)
         return self.held[sha256]
 

@@ -58,10 +58,8 @@ def unreachable(error: httpx.HTTPError, base_url: str | None = None) -> ServerUn
 
     With the server's address it says where a redirect pointed elsewhere.
     """
-    url = error.request.url
-    request = (
-        f"{error.request.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
-    )
+    sent, url = error.request, error.request.url
+    request = f"{sent.method} {url.scheme}://{url.netloc.decode()}{url.path}: {str(error) or type(error).__name__}."
     if isinstance(error, httpx.DecodingError):
         return BadResponse(f"{request} Does a proxy stand between?")
     server = url if base_url is None else httpx.URL(base_url)
@@ -101,22 +99,18 @@ def with_request_id(error: CowError, response: httpx.Response) -> CowError:
 def error_from(problem: dict[str, Any], headers: httpx.Headers | None = None) -> CowError:
     """The error that a problem (RFC 9457) is. A code of a later version than this comes as a plain `CowError`."""
     code = _code(problem)
-    kind = (kinds() | _OWN).get(code, CowError)
     given = problem.get("errors")
     fields = [field for field in given if isinstance(field, dict)] if isinstance(given, list) else []
-    error = kind(
+    error = (kinds() | _OWN).get(code, CowError)(
         str(problem.get("detail") or problem.get("title") or ""),
         remedy=str(problem.get("remedy") or ""),
         errors=tuple(FieldError(str(field.get("pointer", "")), str(field.get("detail", ""))) for field in fields),
         headers=dict(headers or {}),
     )
     error.code = code or error.code
-    if isinstance(usage := problem.get("usage"), dict):
-        error.usage = usage
-    if isinstance(refusal := problem.get("refusal"), dict):
-        error.refusal = refusal
-    if isinstance(status := problem.get("status"), int):
-        error.status = status
+    for name, kind in (("usage", dict), ("refusal", dict), ("status", int)):
+        if isinstance(value := problem.get(name), kind):
+            setattr(error, name, value)
     return error
 
 

@@ -158,9 +158,7 @@ class Journal:
         try:
             self._lock.acquire(timeout=0)
         except Timeout as error:
-            raise InvalidRequest(
-                f"'{folder}' is in use by another batch: wait for it, or use another folder."
-            ) from error
+            raise InvalidRequest(f"'{folder}' is in use by another batch: wait, or use another folder.") from error
         try:
             self._secret = self._begin(kind)
             for path in (self.results, self._retried):  # cuts off a last line that was not written to its end

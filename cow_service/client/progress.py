@@ -49,9 +49,8 @@ def describe_load(workers: Workers) -> str:
     cpu, calls = sum(one.cpu_waiting for one in loads), sum(one.mllm_calls for one in loads)
     at_mllm, queued = calls + sum(one.mllm_waiting for one in loads), sum(queue.queued for queue in workers.queues)
     if at_mllm and at_mllm >= cpu:
-        return (
-            f"limited by the server's MLLM: {at_mllm} calls wait for it, of {sum(x.mllm_limit for x in loads)} at once"
-        )
+        limit = sum(one.mllm_limit for one in loads)
+        return f"limited by the server's MLLM: {at_mllm} calls wait for it, of {limit} at once"
     if cpu:
         return f"limited by the server's CPU: {cpu} jobs wait for it"
     return f"limited by the server: {queued} jobs are queued" if queued else ""

@@ -49,21 +49,10 @@ if TYPE_CHECKING:
     from cow_service.requests import ImageArtifact, ImageUrl
 
     # A text is a path, or a URL where it begins with http://, https:// or data:. Arrays are RGB, see `encoded_array`.
-    ImageLike: TypeAlias = (
-        str
-        | os.PathLike[str]
-        | bytes
-        | bytearray
-        | memoryview
-        | Image.Image
-        | NDArray[np.uint8]
-        | Artifact
-        | Frame
-        | ImageInfo
-        | ImageArtifact
-        | ImageUrl
-        | Mapping[str, str]  # as it stands in a request
-    )
+    # A mapping is an image as it stands in a request.
+    Pixels: TypeAlias = bytes | bytearray | memoryview | Image.Image | NDArray[np.uint8]
+    KnownImage: TypeAlias = Artifact | Frame | ImageInfo | ImageArtifact | ImageUrl
+    ImageLike: TypeAlias = str | os.PathLike[str] | Pixels | KnownImage | Mapping[str, str]
 else:
     ImageLike = Any
 
@@ -115,9 +104,7 @@ def encoded_array(array: NDArray[np.uint8]) -> bytes:
 
     shape, kind = tuple(array.shape), str(array.dtype)
     if kind != "uint8" or len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (3, 4)) or 0 in shape:
-        raise _wrong(
-            f"is an array {shape} of {kind}; give (height, width), or (height, width, 3 or 4), of uint8 in RGB"
-        )
+        raise _wrong(f"is an array {shape} of {kind}; give (height, width) or (height, width, 3 or 4), of uint8 in RGB")
     return _png(Image.fromarray(array))
 
 

@@ -21,16 +21,10 @@ ToolName = Literal["simulate", "answer"]
 REQUESTS: dict[ToolName, type[SimulateRequest]] = {"simulate": SimulateRequest, "answer": AnswerRequest}
 # Arguments that stand deeper in a request. Every other argument is the field of its name.
 NESTED = {
-    "object": "grounding/object",
-    "bbox": "grounding/bbox",
-    "point": "grounding/point",
+    **{name: f"grounding/{name}" for name in ("object", "bbox", "point")},
     "direction": "motion/direction",
     "motion_kind": "motion/kind",
-    "speed": "motion/speed",
-    "distance": "motion/distance",
-    "duration": "motion/duration",
-    "until": "motion/until",
-    "law": "motion/law",
+    **{name: f"motion/{name}" for name in ("speed", "distance", "duration", "until", "law")},
     "frames_policy": "frames/policy",
     "frames_count": "frames/count",
 }
@@ -168,9 +162,7 @@ def image_of(text: str, *, paths: bool) -> ImageLike:
     if scheme in _SENT_AS_IS:
         return scheme + text[len(scheme) :]
     if not paths:
-        raise _wrong(
-            f"{_shown(text)} is not a data URL, http(s) URL or SHA-256 digest; this server reads no local files"
-        )
+        raise _wrong(f"{_shown(text)} is not a data URL, http(s) URL or SHA-256 digest; this server reads no files")
     if scheme not in (None, "file://"):
         raise _wrong(f"{_shown(text)} cannot be opened: give a path, a data URL, an http(s) URL or a digest")
     path = Path(url2pathname(urlsplit(text).path)) if scheme else Path(text)
@@ -212,8 +204,7 @@ _GIVE_PLACE = (
 )
 _RETRY_LATER = "Call again in a while, with the same arguments."
 REMEDIES = {
-    "cannot-ground": _GIVE_PLACE,
-    "object-not-found": _GIVE_PLACE,
+    **dict.fromkeys(("cannot-ground", "object-not-found"), _GIVE_PLACE),
     "cannot-read-direction": "Call again with `direction` [dx, dy] (x right, y down; [-1, 0] is to the left), or with "
     '`motion_kind` "fall" if the object is dropped.',
     "artifact-not-found": "Send the image itself: the server has no image with that digest for you.",
@@ -222,10 +213,7 @@ REMEDIES = {
     "image-url-unreachable": "Check the URL, or give the image itself.",
     "unauthorized": "Whoever set up this tool must give it a valid key: COW_API_KEY in the environment of `cow mcp`, "
     "or the header `Authorization: Bearer <key>` for MCP over HTTP.",
-    "queue-full": _RETRY_LATER,
-    "rate-limited": _RETRY_LATER,
-    "shutting-down": _RETRY_LATER,
-    "not-ready": _RETRY_LATER,
+    **dict.fromkeys(("queue-full", "rate-limited", "shutting-down", "not-ready"), _RETRY_LATER),
     "mllm-unavailable": "Call again in a while, or with another `reader` ('embedded' needs no model).",
     "mllm-refused": "The same call would be rejected again: change the image or the question, or name another "
     "`reader`.",

@@ -23,14 +23,13 @@ from cow_service.client import AsyncAnswer, AsyncClient, AsyncSimulation, CowErr
 from cow_service.client.progress import describe
 from cow_service.errors import InternalError
 from cow_service.mcp import arguments
-from cow_service.mcp.arguments import ToolName
 from cow_service.mcp.results import output_schema, tool_result
 from cow_service.media.artifacts import media_type_of
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Job
 from cow_service.weights.manifests import TOOL_PROMPTS
 
-TITLES: dict[ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
+TITLES: dict[arguments.ToolName, str] = {"simulate": "Imagine the future of an image", "answer": "Imagine, then answer"}
 # The tools only read. Repeating a call changes nothing, though a model that samples may answer differently. The world
 # is open: images may be fetched, and shown to a provider's model.
 HINTS = {"read_only_hint": True, "destructive_hint": False, "idempotent_hint": True, "open_world_hint": True}
@@ -48,6 +47,7 @@ class Caller:
     forwarded: bool = False  # by a proxy, which may serve any client
 
 
+Context: TypeAlias = ServerRequestContext[Any]
 Connect: TypeAlias = Callable[[Caller], AbstractAsyncContextManager[AsyncClient]]
 Lifespan: TypeAlias = Callable[[Server[Any]], AbstractAsyncContextManager[Any]]
 Report: TypeAlias = Callable[[float, str], Coroutine[Any, Any, None]]  # the share that is done, 0 to 1, and the stage
@@ -94,9 +94,7 @@ class _Tools:
     async def list(self, *_: Any) -> types.ListToolsResult:
         return types.ListToolsResult(tools=self._listed)
 
-    async def call(
-        self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
-    ) -> types.CallToolResult:
+    async def call(self, context: Context, params: types.CallToolRequestParams) -> types.CallToolResult:
         """What a tool returns. An error is returned as text, since that is where a model looks."""
         tool = params.name
         if tool not in TITLES:
@@ -131,9 +129,7 @@ class _Tools:
         )
         return types.ListResourceTemplatesResult(resource_templates=[artifact])
 
-    async def read(
-        self, context: ServerRequestContext[Any], params: types.ReadResourceRequestParams
-    ) -> types.ReadResourceResult:
+    async def read(self, context: Context, params: types.ReadResourceRequestParams) -> types.ReadResourceResult:
         uri = str(params.uri)
         sha256 = arguments.digest_of(uri)
         if sha256 is None:
@@ -149,7 +145,7 @@ class _Tools:
         return types.ReadResourceResult(contents=[types.BlobResourceContents(uri=uri, mime_type=media_type, blob=blob)])
 
 
-def _caller(context: ServerRequestContext[Any]) -> Caller:
+def _caller(context: Context) -> Caller:
     """Who made the HTTP request that brought a message: each has its own headers, also within one session."""
     request = context.request
     if request is None:
@@ -161,7 +157,7 @@ def _caller(context: ServerRequestContext[Any]) -> Caller:
 
 
 async def result_of(
-    client: AsyncClient, tool: ToolName, image: ImageLike, fields: dict[str, Any], report: Report
+    client: AsyncClient, tool: arguments.ToolName, image: ImageLike, fields: dict[str, Any], report: Report
 ) -> AsyncSimulation | AsyncAnswer:
     """The result of a tool's job. Raises what it failed with. A call that is canceled cancels its job."""
     call: Callable[..., Awaitable[AsyncSimulation | AsyncAnswer]]

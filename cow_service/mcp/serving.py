@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import anyio
 import httpx
 import uvicorn
-from anyio import to_thread
-from mcp.server.lowlevel import Server
 from mcp.server.stdio import stdio_server
 from mcp.server.transport_security import TransportSecuritySettings
 
@@ -60,7 +58,7 @@ class RemoteServer:
             yield client
 
     @asynccontextmanager
-    async def lifespan(self, server: Server[Any]) -> AsyncGenerator[None]:
+    async def lifespan(self, _: Any) -> AsyncGenerator[None]:
         """Open while the tools are served."""
         self._http = httpx.AsyncClient(limits=httpx.Limits(max_connections=None))
         async with self._http:
@@ -92,7 +90,7 @@ class LocalService:
             yield client
 
     @asynccontextmanager
-    async def lifespan(self, server: Server[Any]) -> AsyncGenerator[None]:
+    async def lifespan(self, _: Any) -> AsyncGenerator[None]:
         """Open while the tools are served."""
         thread = ThreadPoolExecutor(1, "cow-start")
         self._app = thread.submit(self._start)
@@ -105,7 +103,7 @@ class LocalService:
 
     async def close(self) -> None:
         """Stops the service, after the grace period of the settings; unfinished jobs go on at the next start."""
-        await to_thread.run_sync(self._stop)
+        await anyio.to_thread.run_sync(self._stop)
 
     def _start(self) -> FastAPI:
         # These take longer to import than all else: clients need not wait for them to see the tools.

@@ -119,9 +119,7 @@ class JsonFormatter(logging.Formatter):
         if exception or stack:
             fields["exception"] = "\n".join(filter(None, (exception, stack)))
         extra = {name: value for name, value in vars(record).items() if name not in _NOT_EXTRA and value is not None}
-        shown = {
-            name: _shortened(value) if isinstance(value, str) else value for name, value in (extra | fields).items()
-        }
+        shown = {key: _shortened(value) if isinstance(value, str) else value for key, value in (extra | fields).items()}
         return json.dumps(shown, default=str, ensure_ascii=False)
 
 

@@ -84,9 +84,7 @@ class Metrics(Collector):
         self._stage_cache = counter("cow_stage_cache", "Cache lookups of stages, by result.", ("stage", "result"))
         self.worker_ends = counter("cow_worker_ends", "Worker processes that ended, by reason.", ("reason",))
         self.webhooks = counter("cow_webhook_attempts", "Attempts to call a webhook, by outcome.", ("outcome",))
-        self.webhooks_given_up = counter(
-            "cow_webhooks_given_up", "Webhooks that were not delivered after the last attempt."
-        )
+        self.webhooks_given_up = counter("cow_webhooks_given_up", "Webhooks not delivered after the last attempt.")
         prometheus.ProcessCollector(registry=registry)
         registry.register(self)
 

@@ -39,9 +39,8 @@ def start(environment: Mapping[str, str] = os.environ) -> bool:
     """
     global _provider  # noqa: PLW0603  one process, one exporter
     named = next((name for name in ENDPOINTS if environment.get(name)), None)
-    off = (
-        environment.get("OTEL_SDK_DISABLED", "").lower() == "true" or environment.get("OTEL_TRACES_EXPORTER") == "none"
-    )
+    off = environment.get("OTEL_SDK_DISABLED", "").lower() == "true"
+    off |= environment.get("OTEL_TRACES_EXPORTER") == "none"
     if named is None or off or _provider is not None:
         return _provider is not None
     if not environment[named].startswith(("http://", "https://")):

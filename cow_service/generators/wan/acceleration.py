@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from typing import Any, cast
 
 import torch
-from torch import nn
 
 from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
@@ -136,7 +135,7 @@ def reset_cache(transformer: Any, steps: int | None = None, first: int = 0) -> N
     transformer._reset_stateful_cache()  # removing and adding them again would change the order of the hooks
 
 
-def pin(module: nn.Module) -> None:
+def pin(module: torch.nn.Module) -> None:
     """Puts weights into pinned memory, one by one: the memory of each is free again before the next one is pinned.
 
     diffusers pins copies of all weights before it releases any; those that are pinned already it takes as they are.

@@ -16,27 +16,16 @@ from typing import TypeAlias, cast
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
-from torch.nn.functional import adaptive_max_pool2d
 
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.generator import compose, moving_mask
 from cow_service.generators.cutout.layers import CutoutOptions, take_apart
+from cow_service.generators.wan import checkpoints, memory, ranks
+from cow_service.generators.wan import pipeline as wan
 from cow_service.generators.wan.conditioning import CELL, TrackConditioning
-from cow_service.generators.wan.memory import within_memory
-from cow_service.generators.wan.pipeline import (
-    TEXT_LENGTH,
-    Conditioning,
-    Denoise,
-    EmbeddingCache,
-    WanTrackPipeline,
-    image_token_count,
-    latent_shape,
-)
 from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, WanOptions
-from cow_service.generators.wan.ranks import RankGroup
 from cow_service.generators.wan.tracks import STRIDE, Tracks, clip_length, tracks_of
 from cow_service.narration.story import shown
 from cow_service.physics.tracks import Density, at_rate, with_tracks
@@ -88,8 +77,8 @@ class WanGenerator(WanLimits):
     settings: Settings
     revisions: dict[str, str]  # of the parts that were pulled
     weights_identity: str  # as `weights_identity`, taken before the weights were loaded
-    pipeline: WanTrackPipeline
-    group: RankGroup | None  # of processes that denoise with this one
+    pipeline: wan.WanTrackPipeline
+    group: ranks.RankGroup | None  # of processes that denoise with this one
     device: torch.device
     profile: Profile  # that of the settings, with the attention backend that was chosen
     conditioning: TrackConditioning | None  # of a model that takes tracks
@@ -100,7 +89,7 @@ class WanGenerator(WanLimits):
         defaults = self.manifest.defaults
         self._max_area, self._fps = int(defaults["max_area"]), float(defaults["fps"])  # px per frame; of the model's
         self._cell, self._channels = self.pipeline.vae_scale_factor_spatial, self.pipeline.vae.config.z_dim
-        self._embeddings = EmbeddingCache(self.pipeline)
+        self._embeddings = wan.EmbeddingCache(self.pipeline)
         self._negative_prompt = str(self.manifest.defaults.get("negative_prompt", ""))
         threads = self.manifest.defaults.get("threads")
         self.threads = None if threads is None else int(threads)  # of the CPU; None keeps PyTorch's own number
@@ -112,7 +101,7 @@ class WanGenerator(WanLimits):
         self.fingerprint = sha256(repr(parts).encode()).hexdigest()
 
     @property
-    def denoise(self) -> Denoise:
+    def denoise(self) -> wan.Denoise:
         """Of this process, or of several."""
         return (self.group or self.pipeline).denoise
 
@@ -139,7 +128,7 @@ class WanGenerator(WanLimits):
         with (
             _DEVICES.setdefault(str(self.device), PrioritySemaphore(1)).held(check_canceled=check_canceled),
             cpu_threads(self.threads),
-            within_memory(self.device, self._embeddings.clear, what),
+            memory.within_memory(self.device, self._embeddings.clear, what),
         ):
             yield
 
@@ -240,7 +229,7 @@ class WanGenerator(WanLimits):
         """All frames [F, height, width, 3] of a trajectory at the model's frame rate."""
         # Drawn on the CPU: a seed gives the same noise whatever the device.
         random, length = torch.Generator().manual_seed(given.seed), given.trajectory.num_frames
-        noise = torch.randn(latent_shape(width, height, length, self._channels, self._cell), generator=random)
+        noise = torch.randn(wan.latent_shape(width, height, length, self._channels, self._cell), generator=random)
         progress(0.0)
         try:
             # Before the texts: with their encoder loaded there may be no room for the VAE.
@@ -252,7 +241,7 @@ class WanGenerator(WanLimits):
             condition = unconditional = image.condition
             if self.conditioning is not None and tracks is not None:
                 condition, unconditional = self.conditioning(condition, tracks, width, height)
-            conditioning = Conditioning(
+            conditioning = wan.Conditioning(
                 prompt=self._embeddings.text(prompt),
                 negative_prompt=None if negative is None else self._embeddings.text(negative),
                 image=image.embeds,
@@ -303,14 +292,16 @@ def coarse_clip(given: GeneratorInput, width: int, height: int, progress: Callab
     return CoarseClip(np.stack(frames), np.stack(masks))
 
 
-def latent_mask(moving: Mask, shape: Sequence[int]) -> Tensor:
+def latent_mask(moving: Mask, shape: Sequence[int]) -> torch.Tensor:
     """Which latent cells of `shape` [1, C, T, h, w] hold a part of a mask [F, height, width]: [1, 1, T, h, w]."""
     frames = torch.from_numpy(moving)
     grouped = torch.cat([frames[:1], frames[1:].unflatten(0, (-1, STRIDE)).any(dim=1)]).float()
-    return adaptive_max_pool2d(grouped, tuple(shape[3:]))[None, None] > 0
+    return torch.nn.functional.adaptive_max_pool2d(grouped, tuple(shape[3:]))[None, None] > 0
 
 
-def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling, sizes: Iterable[ClipSize]) -> None:
+def compile_for(
+    pipeline: wan.WanTrackPipeline, denoise: wan.Denoise, sampling: Sampling, sizes: Iterable[ClipSize]
+) -> None:
     """One denoising step for a clip of each size, with zeros in place of text, image and noise; logs what it takes.
 
     PyTorch compiles a block for the first size that it meets, and once more, for any size, when it meets a second one.
@@ -318,14 +309,14 @@ def compile_for(pipeline: WanTrackPipeline, denoise: Denoise, sampling: Sampling
     """
     step = sampling.model_copy(update={"steps": 1})
     config, device = pipeline.transformer.config, pipeline.compute_device
-    text, image = torch.zeros(1, TEXT_LENGTH, config.text_dim, device=device), None
+    text, image = torch.zeros(1, checkpoints.TEXT_LENGTH, config.text_dim, device=device), None
     if pipeline.image_encoder is not None:
-        image = torch.zeros(1, image_token_count(pipeline.image_encoder), config.image_dim, device=device)
+        image = torch.zeros(1, wan.image_token_count(pipeline.image_encoder), config.image_dim, device=device)
     for size in sizes:
         begun = time.perf_counter()
-        noise = torch.zeros(latent_shape(*size, config.out_channels, pipeline.vae_scale_factor_spatial))
+        noise = torch.zeros(wan.latent_shape(*size, config.out_channels, pipeline.vae_scale_factor_spatial))
         more = config.in_channels - config.out_channels
         condition = torch.zeros(more, *noise.shape[2:]) if more else noise[0, :, :1]
-        given = Conditioning(text, text if step.is_guided else None, image, condition, condition)
+        given = wan.Conditioning(text, text if step.is_guided else None, image, condition, condition)
         denoise(noise, given, step, lambda done, total: None)
         log.info("compiled for %d x %d px and %d frames in %.1f s", *size, time.perf_counter() - begun)

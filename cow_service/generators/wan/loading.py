@@ -15,17 +15,14 @@ from typing import Any, cast
 import torch
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
 from safetensors import SafetensorError
-from torch import distributed, nn
 from transformers import AutoTokenizer, CLIPImageProcessor, CLIPVisionModel, UMT5EncoderModel
 
 from cow_service.errors import CheckpointInvalid, GeneratorOutOfMemory, GeneratorUnavailable
-from cow_service.generators.wan import acceleration, checkpoints, conditioning
+from cow_service.generators.wan import acceleration, checkpoints, conditioning, memory, tiny
 from cow_service.generators.wan.generator import WanGenerator
-from cow_service.generators.wan.memory import check_machine, within_memory
 from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.generators.wan.ranks import RankGroup
-from cow_service.generators.wan.tiny import make_tiny
 from cow_service.settings import Settings
 from cow_service.weights.device import BUILD_LOCK, choose_device
 from cow_service.weights.manifests import Manifest, Source, load_manifests
@@ -51,10 +48,10 @@ def load(name: str, track_conditioning: conditioning.TrackConditioning | None, s
         checkpoints.checkpoint_files(settings.checkpoints[name])
     weights = Weights(manifest, profile, settings)
     folders = {part: weights.folder(part) for part in manifest.sources}
-    check_machine(manifest, settings.profile, folders, device)
+    memory.check_machine(manifest, settings.profile, folders, device)
     acceleration.check_device(profile.acceleration, device)
     identity = weights_identity(manifest, settings)  # before loading: files that change later are not those loaded
-    with BUILD_LOCK, within_memory(device, lambda: None, f"'{name}'"):
+    with BUILD_LOCK, memory.within_memory(device, lambda: None, f"'{name}'"):
         pipeline, group = weights.load_pipeline(device)
     generator = WanGenerator(
         manifest, settings, weights.revisions(), identity, pipeline, group, device, profile, track_conditioning
@@ -85,13 +82,13 @@ def load_rank(name: str, profile: Profile, settings: Settings, device: torch.dev
     """The transformer alone, for one more process that shares clips; rank 0 has checked it. Raises as `load` does."""
     os.environ.setdefault(CODE_FOLDER, str(settings.data_dir / "compiled"))
     manifest = load_manifests()[name]
-    with within_memory(device, lambda: None, f"'{name}' on {device}"):
+    with memory.within_memory(device, lambda: None, f"'{name}' on {device}"):
         if manifest.sources:
             transformer = Weights(manifest, profile, settings).load_transformer(device)
         else:
-            transformer = make_tiny(manifest.architecture).transformer
+            transformer = tiny.make_tiny(manifest.architecture).transformer
         acceleration.accelerate_transformer(transformer, profile.acceleration, device)
-        cast(nn.Module, transformer).to(device)
+        cast(torch.nn.Module, transformer).to(device)
         return transformer
 
 
@@ -145,7 +142,7 @@ class Weights:
         if manifest.sources:
             for source in self.pulled().values():
                 verify(source, settings.weights_dir, manifest.name)
-        if ranks > 1 and distributed.is_initialized():
+        if ranks > 1 and torch.distributed.is_initialized():
             raise GeneratorUnavailable(
                 f"'{manifest.name}': another model of this process shares the GPUs. Use one of them."
             )
@@ -155,7 +152,7 @@ class Weights:
                 dtype, vae_dtype = (getattr(torch, name) for name in (profile.dtype, profile.vae_dtype))
                 pipeline = assemble(self.load_transformer(device), self.folder("base"), dtype, vae_dtype)
             else:
-                pipeline = make_tiny(manifest.architecture)
+                pipeline = tiny.make_tiny(manifest.architecture)
             pipeline.set_progress_bar_config(disable=True)
             acceleration.accelerate(pipeline, profile.acceleration, device)
             if group is not None:

@@ -12,9 +12,8 @@ from pathlib import Path
 import torch
 
 from cow_service.errors import CheckpointInvalid, DeviceFailed, GeneratorOutOfMemory, GeneratorUnavailable
-from cow_service.generators.wan.acceleration import naming_option
+from cow_service.generators.wan import acceleration, checkpoints
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
-from cow_service.generators.wan.checkpoints import FLOAT8, checkpoint_files, read_headers
 from cow_service.generators.wan.profiles import IMAGE_ENCODER_DTYPE, Profile, profile_of
 from cow_service.weights.device import is_out_of_memory
 from cow_service.weights.manifests import Manifest
@@ -63,7 +62,7 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
 
     Whether weights fit is read from the headers in `folders` (`transformer` and `base`), once all are here.
     """
-    with naming_option(f"device: {device}"):
+    with acceleration.naming_option(f"device: {device}"):
         machine = detect_capabilities(device)
     parameters, has_float8 = _read_headers(folders, tuple(manifest.parameters))
 
@@ -105,11 +104,11 @@ def _read_headers(folders: Mapping[str, Path], parts: Sequence[str]) -> tuple[di
     counts: dict[str, int] = {}
     has_float8 = False
     with suppress(CheckpointInvalid, OSError, KeyError):  # loading says why
-        files = {"transformer": checkpoint_files(folders["transformer"])[1]}
+        files = {"transformer": checkpoints.checkpoint_files(folders["transformer"])[1]}
         files |= {part: tuple((folders["base"] / part).glob("*.safetensors")) for part in parts if part not in files}
         for part, some in files.items():
-            entries = [each for file in some for each in read_headers([file]).values()]
-            has_float8 = has_float8 or any(each.dtype in FLOAT8 for each in entries)
+            entries = [each for file in some for each in checkpoints.read_headers([file]).values()]
+            has_float8 = has_float8 or any(each.dtype in checkpoints.FLOAT8 for each in entries)
             counts[part] = sum(math.prod(each.shape) for each in entries)
     return counts if len(counts) == len(parts) and all(counts.values()) else {}, has_float8
 

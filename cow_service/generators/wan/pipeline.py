@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from cow_service.generators.wan.acceleration import cached_pass, reset_cache
+from cow_service.generators.wan import acceleration, memory
 from cow_service.generators.wan.checkpoints import TEXT_LENGTH
-from cow_service.generators.wan.memory import wait_until_done
 from cow_service.generators.wan.profiles import Sampling
 
 LATENT_CHANNELS = 16
@@ -245,7 +244,7 @@ def denoise(
 
         def compute() -> Tensor:
             states, times = _with_condition(latents, condition, time)
-            with cached_pass(transformer, branch):
+            with acceleration.cached_pass(transformer, branch):
                 return transformer(
                     hidden_states=states.to(dtype),
                     timestep=times,
@@ -257,7 +256,7 @@ def denoise(
         return share(branch, compute, latents)
 
     total = sampling.steps - first
-    reset_cache(transformer, sampling.steps, first)
+    acceleration.reset_cache(transformer, sampling.steps, first)
     try:
         for step, time in enumerate(schedule.timesteps[first:], first):
             velocity = velocity_of("cond", guided, time, prompt)
@@ -267,10 +266,10 @@ def denoise(
             latents = schedule.step(velocity, time, latents, return_dict=False)[0]
             if coarse is not None and moving is not None and step < held:
                 latents = torch.where(moving, torch.lerp(coarse, noise, float(schedule.sigmas[step + 1])), latents)
-            wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
+            memory.wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
             on_step(step + 1 - first, total)
     finally:  # what was kept for the next step would lie in memory while the clip is decoded
-        reset_cache(transformer, sampling.steps, first)
+        acceleration.reset_cache(transformer, sampling.steps, first)
     return torch.cat([guided, latents[:, :, 1:]], dim=2) if _is_first_frame(guided, latents) else latents
 
 

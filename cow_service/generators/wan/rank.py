@@ -15,13 +15,10 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 
 import torch
-from torch import distributed
 
 from cow_service.concurrency import leave_decisions_to_the_parent
 from cow_service.errors import CowError, unforeseen
-from cow_service.generators.wan.loading import load_rank
-from cow_service.generators.wan.memory import within_memory
-from cow_service.generators.wan.pipeline import denoise
+from cow_service.generators.wan import loading, memory, pipeline
 from cow_service.generators.wan.ranks import HOST, FromRank, Load, Share, Sharing, ToRank
 from cow_service.observability import logging as logs
 from cow_service.weights.device import cpu_threads
@@ -54,12 +51,12 @@ def work(pipe: Connection[FromRank, ToRank]) -> None:
         torch.cuda.set_device(device)
     threads = load_manifests()[given.name].defaults.get("threads")
     with cpu_threads(None if threads is None else int(threads)):
-        transformer = load_rank(given.name, given.profile, given.settings, device)
+        transformer = loading.load_rank(given.name, given.profile, given.settings, device)
         pipe.send("loaded")
         port = messages.get()
         assert isinstance(port, int)
         wanted = given.profile.acceleration
-        store = distributed.TCPStore(HOST, port, wanted.ranks, is_master=False)
+        store = torch.distributed.TCPStore(HOST, port, wanted.ranks, is_master=False)
         sharing = Sharing(transformer, wanted, given.rank, device, store)
 
         def on_step(done: int, total: int) -> None:
@@ -67,10 +64,10 @@ def work(pipe: Connection[FromRank, ToRank]) -> None:
                 raise _Stopped
 
         while isinstance(clip := messages.get(), Share):
-            with within_memory(device, lambda: None, f"A share of a clip on {device}"), suppress(_Stopped):
+            with memory.within_memory(device, lambda: None, f"A share of a clip on {device}"), suppress(_Stopped):
                 noise, conditioning = clip.unpack()
                 sharing.prepare(noise)
-                denoise(transformer, device, noise, conditioning, clip.sampling, on_step, sharing)
+                pipeline.denoise(transformer, device, noise, conditioning, clip.sampling, on_step, sharing)
 
 
 def main(descriptor: int) -> None:

@@ -21,8 +21,6 @@ import diffusers
 import torch
 from safetensors.torch import load, save
 from torch import Tensor, distributed
-from torch.distributed import distributed_c10d
-from torch.distributed.device_mesh import init_device_mesh
 
 from cow_service.concurrency import spawn
 from cow_service.errors import CowError, DeviceFailed, GeneratorOutOfMemory, InternalError, WorkerEnded
@@ -258,7 +256,7 @@ class Sharing:
         self._context: Any = None
         if (parts := wanted.context_parallel) > 1:
             size = 2 if wanted.guidance_parallel else 1, 1, parts
-            mesh = init_device_mesh(device.type, size, mesh_dim_names=("guidance", "ring", "ulysses"))
+            mesh = distributed.init_device_mesh(device.type, size, mesh_dim_names=("guidance", "ring", "ulysses"))
             self._context = cast(Any, diffusers).ContextParallelConfig(ulysses_degree=parts, mesh=mesh)
             self._transformer.enable_parallelism(config=self._context)
 
@@ -291,7 +289,7 @@ class Sharing:
         with self._leaving:
             if distributed.is_initialized():
                 # The only call that ends a wait for another rank, also in subgroups.
-                distributed_c10d._abort_process_group()  # pyright: ignore[reportPrivateUsage]
+                distributed.distributed_c10d._abort_process_group()  # pyright: ignore[reportPrivateUsage]
 
     def _use_device(self) -> None:
         """Of this thread: diffusers makes some tensors on the current device."""

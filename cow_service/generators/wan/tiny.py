@@ -11,13 +11,12 @@ import transformers
 from diffusers import AutoencoderKLWan, WanTransformer3DModel
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors
 
-from cow_service.generators.wan.checkpoints import diffusers_config
-from cow_service.generators.wan.pipeline import WanTrackPipeline, compose
+from cow_service.generators.wan import checkpoints, pipeline
 
 TINY_SEED = 0
 
 
-def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
+def make_tiny(architecture: Mapping[str, Any]) -> pipeline.WanTrackPipeline:
     """A pipeline of these sizes (as in a manifest); the same sizes give the same weights."""
     # Every byte is a token; 0 pads and 1 ends, as in T5.
     alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
@@ -37,7 +36,7 @@ def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(TINY_SEED)
         parts = {  # in this order, by which the seed gives the same weights
-            "transformer": WanTransformer3DModel(**diffusers_config(architecture)),
+            "transformer": WanTransformer3DModel(**checkpoints.diffusers_config(architecture)),
             "vae": AutoencoderKLWan(
                 base_dim=4,
                 z_dim=architecture["out_dim"],
@@ -52,7 +51,7 @@ def make_tiny(architecture: Mapping[str, Any]) -> WanTrackPipeline:
     for part in filter(None, parts.values()):
         part.eval().requires_grad_(False)
     square: Any = {"size": {"shortest_edge": 32}, "crop_size": {"height": 32, "width": 32}}
-    return compose(
+    return pipeline.compose(
         tokenizer=transformers.PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", eos_token="</s>"),
         image_processor=transformers.CLIPImageProcessor(**square) if image_width else None,
         **parts,
