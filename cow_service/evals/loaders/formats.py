@@ -18,9 +18,32 @@ from cow_service.errors import InvalidRequest
 from cow_service.evals.items import LETTERS, REAL, Pictures, Truth
 from cow_service.evals.loaders.rows import Collected, Known, Row, RowFault, Unread, collect
 
+META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
+SCENE_TEXTS = ("question", "answer", "task", "level")
+SAMPLES_PER_SECOND = 30.0  # of scenes that do not say
+Subset = Literal["collision", "physics", "compatibility", "occlusion", "realworld"]
+SUBSETS: tuple[Subset, ...] = ("collision", "physics", "compatibility", "occlusion", "realworld")
+TRUTH = "truth"  # of sets that are made with it
+_LEVEL = re.compile(r"_Level_(\d+)")
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
 # Where a row stands, and what reads its fields, which raises `RowFault`.
 Numbered = tuple[str, Callable[[], dict[str, Any]]]
+# What a column means, by its names; those of VLMEvalKit are among them.
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "id": ("id", "index"),
+    "image": ("image", "image_path"),
+    "question": ("question",),
+    "options": ("options", "choices"),
+    "answer": ("answer",),
+    "task": ("task", "category", "type"),
+    "level": ("level", "difficulty"),
+    "scene": ("scene",),
+}
+IGNORED = ("split", "l2-category", "source", "meta", "not_sure", "hint")
+REQUIRED = ("image", "question", "answer")
+_URL = ("http://", "https://")
+_NAMES = {name: column for column, names in COLUMNS.items() for name in names}
+_LONGEST_PATH = 1024  # characters; what is longer is base64
 
 
 def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
@@ -36,11 +59,6 @@ def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InvalidRequest(f"{name}: not a complete Parquet file ({reason}); download it again.") from error
-
-
-META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
-SCENE_TEXTS = ("question", "answer", "task", "level")
-SAMPLES_PER_SECOND = 30.0  # of scenes that do not say
 
 
 def scene_folders(folder: Path) -> list[Path]:
@@ -93,24 +111,6 @@ def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
     if truth.scale and len(truth.scale) != len(truth.track):
         raise RowFault(f"`boxes` has {len(truth.scale)} of '{moved}' for {len(truth.track)} points of `track`")
     return Known(truth, pictures)
-
-
-# What a column means, by its names; those of VLMEvalKit are among them.
-COLUMNS: dict[str, tuple[str, ...]] = {
-    "id": ("id", "index"),
-    "image": ("image", "image_path"),
-    "question": ("question",),
-    "options": ("options", "choices"),
-    "answer": ("answer",),
-    "task": ("task", "category", "type"),
-    "level": ("level", "difficulty"),
-    "scene": ("scene",),
-}
-IGNORED = ("split", "l2-category", "source", "meta", "not_sure", "hint")
-REQUIRED = ("image", "question", "answer")
-_URL = ("http://", "https://")
-_NAMES = {name: column for column, names in COLUMNS.items() for name in names}
-_LONGEST_PATH = 1024  # characters; what is longer is base64
 
 
 def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Unread]:
@@ -226,12 +226,6 @@ READERS: dict[str, Callable[[Path], Iterator[Numbered]]] = {
     ".tsv": partial(_separated, delimiter="\t"),
     ".parquet": lambda path: parquet_rows(path, path.name),
 }
-
-
-Subset = Literal["collision", "physics", "compatibility", "occlusion", "realworld"]
-SUBSETS: tuple[Subset, ...] = ("collision", "physics", "compatibility", "occlusion", "realworld")
-TRUTH = "truth"  # of sets that are made with it
-_LEVEL = re.compile(r"_Level_(\d+)")
 
 
 def subset_shards(folder: Path, subsets: Sequence[str]) -> dict[str, list[Path]]:
