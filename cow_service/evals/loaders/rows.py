@@ -88,8 +88,8 @@ def item_of(place: str, row: Row, pictures: Pictures) -> Item:
 
 def task_of(name: str | None) -> Task:
     """The task that a data set's name means; `other` if it is unknown."""
-    words = re.findall(r"[a-z]+", (name or "").lower())
-    return next((_TASKS[word] for word in words if word in _TASKS), None) or "other"
+    known: list[Task] = [_TASKS[word] for word in re.findall(r"[a-z]+", (name or "").lower()) if word in _TASKS]
+    return known[0] if known else "other"
 
 
 def _answer(given: str, options: Sequence[AnswerOption]) -> str:

@@ -9,13 +9,11 @@ import json
 import os
 from collections import defaultdict
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from cow_service.evals.design import BASELINE
 from cow_service.evals.items import Item, Observation
@@ -65,16 +63,14 @@ def write_page(
         "form-action": "'none'",
     }
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template.filters["percent"] = _percent
-    template.filters["points"] = points
-    template.filters["p"] = p_text
+    template.filters |= {"percent": _percent, "points": points, "p": p_text}
     drawn = [path for path in plots if path.suffix == ".svg"]
     text = template.from_string(_source("template.html")).render(
         policy="; ".join(f"{name} {value}" for name, value in allowed.items()),
-        style=Markup(style),
-        script=Markup(script),
-        core=Markup(script_json(core)),
-        replies=[Markup(script_json(block)) for block in replies],
+        style=style,
+        script=script,
+        core=script_json(core),
+        replies=map(script_json, replies),
         runs=runs,
         items=len(core["items"]),
         findings=findings,
@@ -90,7 +86,7 @@ def write_page(
 
 
 def _source(name: str) -> str:
-    return (files("cow_service.evals.report") / "page" / name).read_text(encoding="utf-8")
+    return (Path(__file__).with_suffix("") / name).read_text(encoding="utf-8")
 
 
 def _percent(share: float | None, digits: int = 1) -> str:

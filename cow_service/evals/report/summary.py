@@ -4,7 +4,6 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import yaml
 from pydantic import Field, TypeAdapter, ValidationError
@@ -239,20 +238,16 @@ def _cells(observations: Sequence[Observation]) -> dict[tuple[str, str | None], 
 
 
 def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation]]:
-    found: dict[Task, list[Observation]] = defaultdict(list)
-    for each in observations:
-        found[each.task].append(each)
-    return {task: found[task] for task in TASKS if task in found}
-
-
-_TABLE: TypeAdapter[dict[str, Price]] = TypeAdapter(dict[str, Price])
+    found: dict[Task, list[Observation]] = {
+        task: [each for each in observations if each.task == task] for task in TASKS
+    }
+    return {task: of_task for task, of_task in found.items() if of_task}
 
 
 def read_prices(path: Path) -> dict[str, Price]:
     """The prices of models, by their names. Raises `InvalidRequest` for a file that is none."""
     try:
-        told: Any = yaml.safe_load(path.read_bytes())
-        return _TABLE.validate_python(told)
+        return TypeAdapter(dict[str, Price]).validate_python(yaml.safe_load(path.read_bytes()))
     except OSError as error:
         raise InvalidRequest(f"The prices '{path}' cannot be read: {error.strerror or error}.") from error
     except (yaml.YAMLError, ValidationError) as error:
