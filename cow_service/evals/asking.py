@@ -11,7 +11,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import permutations
 from typing import Any, Literal
 
@@ -276,9 +275,10 @@ class AnswerAsker:
         seed = trial + case.arm.votes * (case.repeat - 1)  # an MLLM that takes seeds must not repeat itself
         options: Any = {**self.options, "frames": case.arm.frames_request, **({"seed": seed} if trial else {})}
         image = self.pictures.path(case.item.image)
-        ask = partial(self.client.answer, image, case.question, imagine=imagine, **options)
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
-        answer = await asked_once(self.places, ask, *parts)
+        answer = await asked_once(
+            self.places, parts, self.client.answer, image, case.question, imagine=imagine, **options
+        )
         found = Evidence()
         if answer.simulation_problem is not None:
             problem = errors.error_from(answer.simulation_problem.model_dump())

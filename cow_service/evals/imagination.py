@@ -6,7 +6,6 @@ import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,8 +30,10 @@ REFUSALS = (CannotGround, CannotReadDirection, MllmBadReply)
 Result = TypeVar("Result")
 
 
-async def asked_once(places: AdaptivePlaces, ask: Callable[..., Awaitable[Result]], *parts: str) -> Result:
-    """What `ask` returns for an `idempotency_key` of these parts; it holds one of the places meanwhile.
+async def asked_once(
+    places: AdaptivePlaces, parts: Sequence[str], ask: Callable[..., Awaitable[Result]], *given: Any, **options: Any
+) -> Result:
+    """What `ask` returns for these arguments and an `idempotency_key` of these parts; it holds a place meanwhile.
 
     A job that an interrupt has canceled stays so under its key: then there is another key. Raises what `ask` raises.
     """
@@ -40,7 +41,7 @@ async def asked_once(places: AdaptivePlaces, ask: Callable[..., Awaitable[Result
         key = hashlib.sha256("\n".join((*parts, str(attempt))).encode()).hexdigest()
         try:
             async with places.held() as call:
-                result = await ask(idempotency_key=key)
+                result = await ask(*given, idempotency_key=key, **options)
                 call.succeeded = True
                 return result
         except Canceled:
@@ -109,10 +110,9 @@ class Imagination:
         found = evidence_of(simulation)
         if arm.content == "simulated":
             track = () if item.truth is None else item.truth.track
-            known = len(track) > 1
-            return (
-                replace(found, path_error=self._share(_offsets(np.array(track), simulation), item)) if known else found
-            )
+            if len(track) < 2:
+                return found
+            return replace(found, path_error=self._share(_offsets(np.array(track), simulation), item))
         if arm.content == "text":
             return replace(found, frames=(), facts=facts_of(simulation), event_shown=None)
         found = replace(found, probability=None, event_shown=None, overlay=None)
@@ -212,8 +212,8 @@ class Imagination:
         seed = {"seed": trial} if trial else {}
         options: Any = {**self.options, "frames": arm.frames_request, **seed, **changes}
         image, question = self.pictures.path(item.image), question_text(item)
-        ask = partial(self.client.simulate, image, question, video=False, **options)
-        return await asked_once(self.places, ask, self.key, item.id, item.image, str(sorted(options.items())))
+        parts = self.key, item.id, item.image, str(sorted(options.items()))
+        return await asked_once(self.places, parts, self.client.simulate, image, question, video=False, **options)
 
 
 async def kept(found: Evidence, client: AsyncClient, pictures: Pictures) -> Evidence:

@@ -1,7 +1,6 @@
 """The forms of data sets: CausalSpatial as published, scenes with truth, and JSON Lines, CSV, TSV or Parquet tables."""
 
 import base64
-import binascii
 import csv
 import difflib
 import json
@@ -48,15 +47,14 @@ _LONGEST_PATH = 1024  # characters; what is longer is base64
 
 def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
     """The rows of a file that is shown by this name. Raises `InvalidRequest` if it is none, or is not whole."""
-    import pyarrow as pa  # noqa: PLC0415
-    import pyarrow.parquet as pq  # noqa: PLC0415
+    from pyarrow import ArrowException, parquet  # noqa: PLC0415
 
     try:
-        with pq.ParquetFile(path) as file:
+        with parquet.ParquetFile(path) as file:
             rows = (row for batch in file.iter_batches(batch_size=_AT_ONCE) for row in batch.to_pylist())
             for number, row in enumerate(rows):
                 yield f"{name}, row {number}", partial(dict, row)
-    except (pa.ArrowException, OSError) as error:
+    except (ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InvalidRequest(f"{name}: not a complete Parquet file ({reason}); download it again.") from error
 
@@ -179,7 +177,7 @@ def _image(given: Any, folder: Path) -> bytes:
     text = given.partition(",")[2] if given.startswith("data:") else given
     try:
         return base64.b64decode("".join(text.split()), validate=True)
-    except (binascii.Error, ValueError) as error:
+    except ValueError as error:
         raise RowFault(f"`image` is no file and no whole base64: {given[:40]!r}... ({error})") from error
 
 

@@ -7,7 +7,6 @@ import base64
 import hashlib
 import json
 import os
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -111,13 +110,13 @@ def page_data(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> tuple
     """What the page needs at once, pictures by their digests, and the texts of the replies in blocks of items."""
     places = {(each.run, each.arm): place for place, each in enumerate(summaries)}
     asked: dict[tuple[str, str], Item] = {}  # by the digest of the data, and id
-    seen: dict[tuple[str, str, int], list[Observation]] = defaultdict(list)
+    seen: dict[tuple[str, str, int], list[Observation]] = {}
     for number, run in enumerate(runs):
         for item in run.items.values():
             asked.setdefault((run.info.data_digest, item.id), item)
         for each in run.observations:
             if (number, each.arm) in places:
-                seen[run.info.data_digest, each.item, places[number, each.arm]].append(each)
+                seen.setdefault((run.info.data_digest, each.item, places[number, each.arm]), []).append(each)
 
     names = {run.info.data_digest: run.info.data for run in reversed(runs)}
     pictures: dict[str, int] = {}
@@ -134,7 +133,7 @@ def page_data(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> tuple
     for place, (key, item) in enumerate(asked.items()):
         if place % ITEMS_PER_BLOCK == 0:
             blocks.append({})
-        replied = [sorted(seen[*key, arm], key=lambda each: each.repeat) for arm in range(len(summaries))]
+        replied = [sorted(seen.get((*key, arm), ()), key=lambda each: each.repeat) for arm in range(len(summaries))]
         packed_item = {
             "data": names[key[0]],
             "image": _place(pictures, item.image),
