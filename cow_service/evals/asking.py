@@ -11,15 +11,13 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import permutations
 from typing import Any, Literal
 
 from inspect_ai import model as inspect_model
 
 from cow_service.adaptive import AdaptivePlaces
-from cow_service.client import AsyncClient
-from cow_service.client.errors import error_from
+from cow_service.client import AsyncClient, errors
 from cow_service.errors import MllmUnavailable
 from cow_service.evals.design import GATE_VOTES, Arm, Order
 from cow_service.evals.imagination import NO_USAGE, REFUSALS, Evidence, Imagination, asked_once, evidence_of, kept
@@ -30,8 +28,7 @@ from cow_service.readers.mllm.replies import ReplyError
 from cow_service.readers.options import plain
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import AnswerOption, Usage, Verdict
-from cow_service.stages.answering import gate_of
-from cow_service.stages.keys import FirstAnswers
+from cow_service.stages import answering, keys
 
 GATE_THRESHOLD = 1.0
 PROMPT = "eval-question"
@@ -162,9 +159,7 @@ def observation_of(case: Case, asked: CaseReplies) -> Observation:
         reply=BETWEEN_REPLIES.join(reply.text for reply in asked.replies),
         read=chosen,
         read_as_paper=leading([case.read_as_paper(reply.text) for reply in deciding]),
-        calls=usage.calls,
-        input_tokens=usage.input_tokens,
-        output_tokens=usage.output_tokens,
+        **usage.model_dump(),
         seconds=sum(part.seconds for part in (*asked.replies, *asked.evidence)),
         imaginations=sum(each.simulated for each in asked.evidence),
         refusal=None if refusal is None else refusal.code,
@@ -180,18 +175,9 @@ def observation_of(case: Case, asked: CaseReplies) -> Observation:
 
 def place_of(case: Case) -> dict[str, Any]:
     """The fields of an observation that do not depend on what came of it."""
-    item = case.item
-    return {
-        "item": item.id,
-        "task": item.task,
-        "level": item.level,
-        "scene": item.scene,
-        "arm": case.arm.name,
-        "repeat": case.repeat,
-        "options": tuple(item.options[place].letter for place in case.order),
-        "truth": item.answer,
-        "abstain": item.abstain,
-    }
+    item, shown = case.item, tuple(case.item.options[place].letter for place in case.order)
+    asked = {"item": item.id, "arm": case.arm.name, "repeat": case.repeat, "options": shown, "truth": item.answer}
+    return asked | item.model_dump(include={"task", "level", "scene", "abstain"})
 
 
 def leading(letters: Sequence[str | None]) -> str | None:
@@ -228,7 +214,7 @@ class PromptAsker:
                 votes = dict(Counter(letters).most_common())
                 verdict = Verdict(answer=leader, not_sure=leader == case.item.abstain, votes=votes)
             # Whether to imagine is decided by the rule of `/answer`.
-            if not gate_of(FirstAnswers(verdict=verdict, asked=len(first)), GATE_THRESHOLD).imagined:
+            if not answering.gate_of(keys.FirstAnswers(verdict=verdict, asked=len(first)), GATE_THRESHOLD).imagined:
                 return CaseReplies(first)
         evidence = tuple(
             [await self.imagination.evidence(case.item, case.arm, trial) for trial in range(case.arm.votes)]
@@ -289,12 +275,13 @@ class AnswerAsker:
         seed = trial + case.arm.votes * (case.repeat - 1)  # an MLLM that takes seeds must not repeat itself
         options: Any = {**self.options, "frames": case.arm.frames_request, **({"seed": seed} if trial else {})}
         image = self.pictures.path(case.item.image)
-        ask = partial(self.client.answer, image, case.question, imagine=imagine, **options)
         parts = (self.key, case.item.id, case.arm.name, str(case.repeat), str(trial), str(sorted(options.items())))
-        answer = await asked_once(self.places, ask, *parts)
+        answer = await asked_once(
+            self.places, parts, self.client.answer, image, case.question, imagine=imagine, **options
+        )
         found = Evidence()
         if answer.simulation_problem is not None:
-            problem = error_from(answer.simulation_problem.model_dump())
+            problem = errors.error_from(answer.simulation_problem.model_dump())
             if not isinstance(problem, REFUSALS):
                 raise problem
             found = Evidence(refusal=problem)

@@ -5,9 +5,7 @@ and whether the answers from the image alone decide if anything is shown. Arms t
 what that content is worth.
 """
 
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
 from pydantic import Field, ValidationError, model_validator
@@ -34,12 +32,7 @@ class Arm(Record):
     votes: int = Field(default=1, ge=1, le=16, description="Replies, each with a simulation of its own seed.")
     gate: bool = Field(default=False, description="Shown only where answers from the image alone do not agree.")
     image: bool = Field(default=True, description="The image is shown beside the frames.")
-    error: float | None = Field(
-        default=None,
-        ge=0,
-        le=100,
-        description="Of `true`: how far the path is off, in units of the simulation's error.",
-    )
+    error: float | None = Field(default=None, ge=0, le=100, description="Of `true`: the path's, by the simulation's.")
 
     @model_validator(mode="after")
     def _shows_what_it_chooses(self) -> Self:
@@ -106,11 +99,9 @@ NAMED: dict[str, Arm] = {
 BASELINE = "never"
 _SUFFIXES = {"count": "count", "size": "size", "vote": "votes", "error": "error"}  # of a name, and their factors
 _WORDS: dict[str, tuple[str, Any]] = {"gate": ("gate", True), "no-image": ("image", False)}
-_BEST_OF = re.compile(r"best-of-(\d+)")
 
 
-@dataclass(frozen=True)
-class Preset:
+class Preset(Record):
     """Arms that belong together, and how they are asked."""
 
     arms: tuple[str, ...]
@@ -119,18 +110,15 @@ class Preset:
 
 
 _MATCHED = ("never", "always", "placebo-still", "placebo-direction", "placebo-item")
+_VOTED = ("never:vote-3", "always:vote-3", "gate", "auto")
+_CONTROLS = (*_MATCHED, "always:initial", "placebo-still:initial", "encounters", *_VOTED)
 PRESETS: dict[str, Preset] = {
-    "default": Preset(_MATCHED),
+    "default": Preset(arms=_MATCHED),
     # Frames 1, 3 and 5 of 512 px, options as the data has them, five repeats; of COW the paper made three.
-    "paper": Preset(("never", "always:initial"), repeats=5, order="data"),
-    "controls": Preset(
-        (
-            *(*_MATCHED, "always:initial", "placebo-still:initial", "encounters"),
-            *("never:vote-3", "always:vote-3", "gate", "auto"),
-        )
-    ),
+    "paper": Preset(arms=("never", "always:initial"), repeats=5, order="data"),
+    "controls": Preset(arms=_CONTROLS),
     # What frames are worth whose path is off by so much: for data with truth.
-    "dose": Preset(("never", "always", "placebo-still", *(f"oracle:error-{error:g}" for error in (0, 0.5, 1, 2, 4)))),
+    "dose": Preset(arms=(*_MATCHED[:3], *(f"oracle:error-{error:g}" for error in (0, 0.5, 1, 2, 4)))),
 }
 
 
@@ -140,8 +128,8 @@ def arm_of(text: str) -> Arm:
     `best-of-K` is `always:vote-K`. Raises `InvalidRequest` for what is neither.
     """
     base, *suffixes = text.strip().split(":")
-    if best := _BEST_OF.fullmatch(base):
-        base, suffixes = "always", [f"vote-{best[1]}", *suffixes]
+    if base.startswith("best-of-"):
+        base, suffixes = "always", [f"vote-{base.removeprefix('best-of-')}", *suffixes]
     given: dict[str, Any] = {}
     if "=" in base:
         for part in text.split(","):
@@ -212,9 +200,6 @@ def references(arm: Arm, asked: Sequence[Arm]) -> tuple[Arm, ...]:
 
 def primary(asked: Sequence[Arm]) -> tuple[Arm, tuple[Arm, ...]] | None:
     """The primary question: the first arm of simulated frames that has placebos, and these; None without one."""
-    for arm in asked:
-        if arm.content == "simulated" and not arm.gate:
-            placebos = tuple(each for each in references(arm, asked) if each.content in PLACEBOS)
-            if placebos:
-                return arm, placebos
-    return None
+    shown = (arm for arm in asked if arm.content == "simulated" and not arm.gate)
+    found = ((arm, tuple(each for each in references(arm, asked) if each.content in PLACEBOS)) for arm in shown)
+    return next((question for question in found if question[1]), None)

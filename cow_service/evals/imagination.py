@@ -5,8 +5,7 @@ import hashlib
 import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,8 +30,10 @@ REFUSALS = (CannotGround, CannotReadDirection, MllmBadReply)
 Result = TypeVar("Result")
 
 
-async def asked_once(places: AdaptivePlaces, ask: Callable[..., Awaitable[Result]], *parts: str) -> Result:
-    """What `ask` returns for an `idempotency_key` of these parts; it holds one of the places meanwhile.
+async def asked_once(
+    places: AdaptivePlaces, parts: Sequence[str], ask: Callable[..., Awaitable[Result]], *given: Any, **options: Any
+) -> Result:
+    """What `ask` returns for these arguments and an `idempotency_key` of these parts; it holds a place meanwhile.
 
     A job that an interrupt has canceled stays so under its key: then there is another key. Raises what `ask` raises.
     """
@@ -40,7 +41,7 @@ async def asked_once(places: AdaptivePlaces, ask: Callable[..., Awaitable[Result
         key = hashlib.sha256("\n".join((*parts, str(attempt))).encode()).hexdigest()
         try:
             async with places.held() as call:
-                result = await ask(idempotency_key=key)
+                result = await ask(*given, idempotency_key=key, **options)
                 call.succeeded = True
                 return result
         except Canceled:
@@ -64,30 +65,17 @@ class Evidence:
     simulated: bool = False
 
 
+@dataclass
 class Imagination:
     """Simulations of items, from one server. For one event loop."""
 
-    def __init__(
-        self,
-        client: AsyncClient,
-        places: AdaptivePlaces,
-        pictures: Pictures,
-        options: Mapping[str, Any],
-        key: str,
-        items: Sequence[Item],
-    ) -> None:
-        """`places` are for requests of the client, `options` are fields of these.
-
-        `key` names the run: the same run never asks the same twice. `items` are those of the run, of which some may
-        lend their frames to others.
-        """
-        self._client = client
-        self.places = places
-        self._pictures = pictures
-        self._options = dict(options)
-        self._key = key
-        self._items = items
-        self._found: dict[tuple[str, Arm, int], asyncio.Task[Evidence]] = {}
+    client: AsyncClient
+    places: AdaptivePlaces  # for requests of the client
+    pictures: Pictures
+    options: Mapping[str, Any]  # fields of the requests
+    key: str  # of the run: the same run never asks the same twice
+    items: Sequence[Item]  # of the run; some may lend their frames to others
+    _found: dict[tuple[str, Arm, int], asyncio.Task[Evidence]] = field(default_factory=dict)
 
     async def evidence(self, item: Item, arm: Arm, trial: int = 0) -> Evidence:
         """What to show of an item. `trial` counts simulations of the same, which differ by their seed.
@@ -109,7 +97,7 @@ class Imagination:
             return Evidence()
         begun = time.monotonic()
         try:
-            return await kept(await self._shown(arm, trial, item), self._client, self._pictures)
+            return await kept(await self._shown(arm, trial, item), self.client, self.pictures)
         except REFUSALS as refusal:
             usage = Usage.model_validate(refusal.usage or {})
             return Evidence(refusal=refusal, usage=usage, seconds=time.monotonic() - begun)
@@ -121,16 +109,16 @@ class Imagination:
         simulation = await self._simulate(item, arm, trial)
         found = evidence_of(simulation)
         if arm.content == "simulated":
-            truth = item.truth
-            if truth is None or len(truth.track) < 2:
+            track = () if item.truth is None else item.truth.track
+            if len(track) < 2:
                 return found
-            return replace(found, path_error=self._share(_offsets(np.array(truth.track), simulation), item))
+            return replace(found, path_error=self._share(_offsets(np.array(track), simulation), item))
         if arm.content == "text":
             return replace(found, frames=(), facts=facts_of(simulation), event_shown=None)
         found = replace(found, probability=None, event_shown=None, overlay=None)
         if arm.content == "still":
-            pixels = decode(self._pictures.read(item.image)).pixels
-            still = self._pictures.add_made(_sized(pixels, simulation))
+            pixels = decode(self.pictures.read(item.image)).pixels
+            still = self.pictures.add_made(_sized(pixels, simulation))
             return replace(found, frames=(still,) * len(found.frames), simulated=False)
         # Of a placebo the same moments are shown: other moments would be another difference.
         moments = {"max_side": arm.size, "indices": [frame.index for frame in simulation.frames]}
@@ -156,14 +144,12 @@ class Imagination:
         def rank(other: Item) -> bytes:
             return hashlib.sha256(f"{item.id}\n{trial}\n{other.id}".encode()).digest()
 
-        for other in sorted((each for each in self._items if each.scene != item.scene), key=rank)[:MAX_DONORS]:
+        for other in sorted((each for each in self.items if each.scene != item.scene), key=rank)[:MAX_DONORS]:
             with suppress(*REFUSALS):
                 lent = await self._simulate(other, arm, 0, frames=moments)
-                found = await kept(replace(evidence_of(lent), overlay=None), self._client, self._pictures)
-                pixels = (decode_own(self._pictures.read(frame)) for frame in found.frames)
-                return replace(
-                    found, frames=tuple(self._pictures.add_made(_sized(each, simulation)) for each in pixels)
-                )
+                found = await kept(replace(evidence_of(lent), overlay=None), self.client, self.pictures)
+                pixels = (decode_own(self.pictures.read(frame)) for frame in found.frames)
+                return replace(found, frames=tuple(self.pictures.add_made(_sized(each, simulation)) for each in pixels))
         raise CannotGround(f"None of {MAX_DONORS} other scenes could be simulated.")
 
     async def _truth(self, arm: Arm, trial: int, item: Item) -> Evidence:
@@ -171,7 +157,7 @@ class Imagination:
 
         Drawn along the true path, or of the true pictures those that are nearest to the simulation's moments.
         """
-        truth, simulation = _truth_of(item), None
+        truth, simulation = item.truth or Truth(), None
         with suppress(*REFUSALS):
             simulation = await self._simulate(item, arm, trial)
         try:
@@ -180,8 +166,8 @@ class Imagination:
             if simulation is None or not truth.pictures:
                 raise
         nearest = [min(truth.pictures, key=lambda known: abs(known[0] - frame.time)) for frame in simulation.frames]
-        pixels = (decode(self._pictures.read(digest)).pixels for _, digest in nearest)
-        shown = tuple(self._pictures.add_made(_sized(each, simulation)) for each in pixels)
+        pixels = (decode(self.pictures.read(digest)).pixels for _, digest in nearest)
+        shown = tuple(self.pictures.add_made(_sized(each, simulation)) for each in pixels)
         found = replace(evidence_of(simulation), probability=None, event_shown=None, overlay=None)
         return replace(found, frames=shown, path_error=0.0)
 
@@ -191,7 +177,7 @@ class Imagination:
         They show the moments of the simulation's frames; after the end of what is known, that end. Raises
         `CannotGround` where no true path is known.
         """
-        truth, indices = _truth_of(item), None
+        truth, indices = item.truth or Truth(), None
         if len(truth.track) < 2:
             raise CannotGround("No true path is known.")
         fps, points, off, frames = truth.fps, np.array(truth.track), np.zeros((1, 2)), arm.frames_request
@@ -219,15 +205,15 @@ class Imagination:
 
     def _share(self, offsets: NDArray[np.float64], item: Item) -> float:
         """The mean length of offsets (points, 2), px, as a share of the image's width."""
-        width = decode(self._pictures.read(item.image)).pixels.shape[1]
+        width = decode(self.pictures.read(item.image)).pixels.shape[1]
         return float(np.linalg.norm(offsets, axis=1).mean() / width)
 
     async def _simulate(self, item: Item, arm: Arm, trial: int, **changes: Any) -> AsyncSimulation:
         seed = {"seed": trial} if trial else {}
-        options: Any = {**self._options, "frames": arm.frames_request, **seed, **changes}
-        image, question = self._pictures.path(item.image), question_text(item)
-        ask = partial(self._client.simulate, image, question, video=False, **options)
-        return await asked_once(self.places, ask, self._key, item.id, item.image, str(sorted(options.items())))
+        options: Any = {**self.options, "frames": arm.frames_request, **seed, **changes}
+        image, question = self.pictures.path(item.image), question_text(item)
+        parts = self.key, item.id, item.image, str(sorted(options.items()))
+        return await asked_once(self.places, parts, self.client.simulate, image, question, video=False, **options)
 
 
 async def kept(found: Evidence, client: AsyncClient, pictures: Pictures) -> Evidence:
@@ -251,12 +237,6 @@ def evidence_of(simulation: AsyncSimulation) -> Evidence:
         seconds=sum(simulation.timings.values()),
         simulated=True,
     )
-
-
-def _truth_of(item: Item) -> Truth:
-    """What is known of an item of which `check_arms` found that something is."""
-    assert item.truth is not None
-    return item.truth
 
 
 def _at_rate(values: NDArray[np.float64], fps: float, wanted: float) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +19,9 @@ Task = Literal["collision", "trajectory", "compatibility", "occlusion", "other"]
 TASKS: tuple[Task, ...] = ("collision", "trajectory", "compatibility", "occlusion", "other")
 REAL = "real"  # the level of photographs
 UNKNOWN_LEVEL = "?"
+LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+Ask = Literal["prompt", "answer"]
+Wording = tuple[tuple[str, ...], tuple[AnswerOption, ...]]
 
 
 class Truth(Record):
@@ -42,9 +46,7 @@ class Item(Record):
     row: str = Field(description="Where it stands in the data, for people: file and row.")
     source_id: str = Field(description="As the data names it; need not be unique.")
     image: Sha256
-    question: tuple[str, ...] = Field(
-        description="The text around the options, one part more than there are options: see `question_text`."
-    )
+    question: tuple[str, ...] = Field(description="The text around the options, as `question_text` joins them.")
     options: tuple[AnswerOption, ...] = Field(description="In the data's order.")
     answer: str = Field(description="Letter of the right option, in the data's order.")
     abstain: str | None = Field(description="Letter of the option that says that it is not sure, found by its text.")
@@ -59,10 +61,6 @@ def question_text(item: Item, order: tuple[int, ...] | None = None) -> str:
     places = range(len(item.options)) if order is None else order
     between = [item.options[place].text for place in places]
     return item.question[0] + "".join(option + part for option, part in zip(between, item.question[1:], strict=True))
-
-
-LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-Wording = tuple[tuple[str, ...], tuple[AnswerOption, ...]]
 
 
 def listed_wording(question: str) -> Wording | None:
@@ -102,11 +100,9 @@ class Pictures(DiskArtifacts):
 
     def has(self, digest: str) -> bool:
         """Whether a picture is kept."""
-        try:
-            self.get(digest)
-        except ArtifactNotFound:
-            return False
-        return True
+        with suppress(ArtifactNotFound):
+            return bool(self.get(digest))
+        return False
 
     def add_made(self, data: bytes) -> str:
         """The same for a picture that the service made."""
@@ -116,9 +112,6 @@ class Pictures(DiskArtifacts):
         """The file of a picture. Raises `ArtifactNotFound`."""
         with self.local_file(digest) as path:
             return path
-
-
-Ask = Literal["prompt", "answer"]
 
 
 class Observation(Record):
@@ -146,12 +139,8 @@ class Observation(Record):
     overlay: Sha256 | None = None
     probability: float | None = Field(default=None, description="That it happens, by the simulation, if it tells.")
     happens: bool | None = Field(default=None, description="Whether it does, by the truth; null: not a yes or no.")
-    event_shown: bool | None = Field(
-        default=None, description="Whether a frame shows the moment at which the simulation says that it happens."
-    )
-    path_error: float | None = Field(
-        default=None, description="Mean distance at which the path shown passes the true one, by the image's width."
-    )
+    event_shown: bool | None = Field(default=None, description="Whether a frame shows when it happens, if simulated.")
+    path_error: float | None = Field(default=None, description="Mean error of the path shown, by the image's width.")
     model: str | None = Field(default=None, description="What replied, as its provider names it.")
     failure: str | None = Field(default=None, description="Why there is no reply; such a question counts nowhere.")
 

@@ -18,6 +18,7 @@ from cow_service.records.grounding import Sha256
 
 FORMAT: Literal[2] = 2
 DISCORDANT = 0.2  # share of pairs of replies with exactly one right, without a pilot
+_OF_DESIGN = {"data_digest", "mllm", "ask", "arms", "repeats", "order", "seed", "options"}
 METHOD = (
     "The difference in the share of right replies between the primary arm and each placebo with the same frames and "
     "votes, paired by question and repeat. Two-sided permutation test of the signs of whole scenes; p is the largest "
@@ -49,16 +50,13 @@ class RunRecord(Record):
     def design_digest(self) -> str:
         """Of all that decides the replies but the versions of the packages."""
         prompts = {name: value for name, value in self.versions.items() if name.startswith("prompts/")}
-        fixed = self.model_dump(mode="json", include=set(_OF_DESIGN)) | prompts
+        fixed = self.model_dump(mode="json", include=_OF_DESIGN) | prompts
         return hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()
 
     @property
     def points(self) -> tuple[Arm, ...]:
         """The arms."""
         return tuple(map(Arm.model_validate, self.arms.values()))
-
-
-_OF_DESIGN = ("data_digest", "mllm", "ask", "arms", "repeats", "order", "seed", "options")
 
 
 class AnalysisPlan(RunRecord):
@@ -85,10 +83,7 @@ class RunInfo(RunRecord):
     rounds: int = Field(default=0, description="How often what had failed was asked again.")
     token: str = Field(default="", description="Random: names the requests and replies of the run.")
     plan: AnalysisPlan | None = Field(default=None, description="The analysis that was fixed before the run.")
-    replied_as: tuple[str, ...] = Field(
-        default=(),
-        description="The models that replied, as their provider names them: dated versions, where it has any.",
-    )
+    replied_as: tuple[str, ...] = Field(default=(), description="Models, dated if they are, by their provider's names.")
 
     @property
     def baseline_key(self) -> tuple[Any, ...]:

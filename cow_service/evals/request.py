@@ -7,6 +7,7 @@ import secrets
 import subprocess
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -148,22 +149,16 @@ def merged(before: RunInfo | None, wanted: RunInfo) -> RunInfo:
         )
     newer = [f"{name} {version}" for name, version in wanted.versions.items() if before.versions.get(name) != version]
     notes = (f"Continued with {', '.join(newer)}.",) if newer else ()
-    changes = {
-        "arms": {**before.arms, **wanted.arms},
-        "repeats": max(before.repeats, wanted.repeats),
-        "notes": tuple(dict.fromkeys((*before.notes, *notes))),
-    }
-    return before.model_copy(update=changes)
+    changes = {"arms": before.arms | wanted.arms, "repeats": max(before.repeats, wanted.repeats)}
+    return before.model_copy(update={**changes, "notes": tuple(dict.fromkeys((*before.notes, *notes)))})
 
 
 def versions() -> dict[str, str]:
     """Versions of this service and its commit, of Python, of the installed packages, and of the prompts."""
     found = {"cow-service": __version__, "commit": _commit(), "python": platform.python_version()}
     for name in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     for name in PROMPTS:
         prompt = load_prompt(name)
         digest = hashlib.sha256(prompt.body.encode()).hexdigest()
@@ -173,8 +168,7 @@ def versions() -> dict[str, str]:
 
 def _commit() -> str:
     """Of the checkout that this package is imported from; `unknown` where it is installed without one."""
-    here = Path(__file__).parent
-    git = ("git", "-C", str(here))
+    git = ("git", "-C", str(Path(__file__).parent))
     try:
         for command in (("ls-files", "--error-unmatch", Path(__file__).name), ("rev-parse", "HEAD")):
             done = subprocess.run([*git, *command], capture_output=True, text=True, check=True, timeout=10)

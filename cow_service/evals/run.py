@@ -13,14 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import rich
-from inspect_ai import Epochs, Task, eval_set, task
-from inspect_ai.dataset import MemoryDataset, Sample
+import rich.text
+from inspect_ai import Epochs, Task, dataset, eval_set, scorer, solver, task, util
 from inspect_ai.model import GenerateConfig, Model, ModelOutput, get_model
-from inspect_ai.scorer import Score, Scorer, Target, mean, scorer, std
-from inspect_ai.solver import Generate, Solver, TaskState, solver
-from inspect_ai.util import AdaptiveConcurrency
-from rich.text import Text
 
 from cow_service.adaptive import FIRST
 from cow_service.client import Client
@@ -71,7 +66,7 @@ def causalspatial(
     check_arms([arm], ask, items)
     shared.lenders = items
     samples = [
-        Sample(
+        dataset.Sample(
             id=item.id,
             input=question_text(item),
             target=item.answer,
@@ -81,7 +76,7 @@ def causalspatial(
         for item in items
     ]
     return Task(
-        dataset=MemoryDataset(samples, name=arm),
+        dataset=dataset.MemoryDataset(samples, name=arm),
         solver=look_and_ask(arm, ask, seed, order),
         scorer=chosen_option(),
         epochs=Epochs(repeats, "mean"),
@@ -91,11 +86,11 @@ def causalspatial(
     )
 
 
-@solver
-def look_and_ask(arm: str, ask: Ask, seed: int, order: Order = "shuffled") -> Solver:
+@solver.solver
+def look_and_ask(arm: str, ask: Ask, seed: int, order: Order = "shuffled") -> solver.Solver:
     """Asks one question in one arm, with its options in the order of the repeat."""
 
-    async def solve(state: TaskState, generate: Generate) -> TaskState:
+    async def solve(state: solver.TaskState, generate: solver.Generate) -> solver.TaskState:
         item = Item.model_validate(state.metadata[runs.ITEM])
         case = asking.Case(item, arm_of(arm), state.epoch, asking.order_of(item, order, seed, state.epoch))
         shared = active_session()
@@ -123,13 +118,15 @@ def look_and_ask(arm: str, ask: Ask, seed: int, order: Order = "shuffled") -> So
     return solve
 
 
-@scorer(metrics={"right": [mean(), std()], "abstained": [mean()], "unreadable": [mean()]})
-def chosen_option() -> Scorer:
+@scorer.scorer(
+    metrics={"right": [scorer.mean(), scorer.std()], "abstained": [scorer.mean()], "unreadable": [scorer.mean()]}
+)
+def chosen_option() -> scorer.Scorer:
     """Whether the reply chooses the right option, abstains, or cannot be read."""
 
-    async def score(state: TaskState, target: Target) -> Score:
+    async def score(state: solver.TaskState, target: scorer.Target) -> scorer.Score:
         seen = Observation.model_validate(state.store.get(runs.OBSERVATION))
-        return Score(
+        return scorer.Score(
             value={"right": int(seen.right), "abstained": int(seen.abstained), "unreadable": int(seen.unreadable)},
             answer=seen.read,
             explanation=seen.reply,
@@ -200,7 +197,7 @@ def evaluate(wanted: request.EvalRequest, tell: Callable[[str], None]) -> runs.E
         model = get_model("none/none") if wanted.ask == "answer" else get_model(wanted.mllm, base_url=wanted.base_url)
     except Exception as error:
         # Inspect's providers raise what they like: a missing package, key or name.
-        told = Text.from_markup(str(error)).plain
+        told = rich.text.Text.from_markup(str(error)).plain
         raise InvalidRequest(f"--mllm {wanted.mllm} cannot be used: {told}") from error
     # Inspect keeps replies in the folder: a reply that has come is never asked for again.
     os.environ["INSPECT_CACHE_DIR"] = str((wanted.out / runs.CACHE).resolve())
@@ -249,6 +246,8 @@ def _ask(
             shared.items, shared.on_reply, shared.concurrency = items, on_reply, wanted.concurrency
             shared.progress = progress
             asked: dict[str, Any] = {"data": info.data_digest, "ask": info.ask, "seed": info.seed, "order": info.order}
+            most = wanted.concurrency
+            connections = util.AdaptiveConcurrency(min=1, start=min(FIRST, most), max=most)
             _, ended = eval_set(
                 tasks=[causalspatial(arm=arm, **asked) for arm in info.arms],
                 epochs=Epochs(info.repeats, "mean"),
@@ -257,10 +256,8 @@ def _ask(
                 retry_attempts=0,
                 retry_immediate=False,
                 fail_on_error=False,
-                max_samples=wanted.concurrency,
-                adaptive_connections=AdaptiveConcurrency(
-                    min=1, start=min(FIRST, wanted.concurrency), max=wanted.concurrency
-                ),
+                max_samples=most,
+                adaptive_connections=connections,
                 max_tasks=len(info.arms),
                 max_tokens=wanted.max_tokens,
                 max_retries=MAX_RETRIES,

@@ -12,10 +12,8 @@ from typing import Any
 import httpx
 
 from cow_service.adaptive import AdaptiveLimit, AdaptivePlaces
-from cow_service.client import AsyncClient
+from cow_service.client import AsyncClient, progress, protocol
 from cow_service.client.options import CONCURRENCY
-from cow_service.client.progress import BatchProgress, describe_load
-from cow_service.client.protocol import is_refusal, retry_after
 from cow_service.errors import CowError
 from cow_service.evals.imagination import Imagination
 from cow_service.evals.items import Item, Observation, Pictures
@@ -26,6 +24,7 @@ from cow_service.settings import load_settings
 
 LOG, ARTIFACTS = "server.log", "artifacts"  # in the folder of the server in the process
 TIMEOUT = 600.0  # seconds that a server may say nothing: an MLLM of its own may think for long
+_active: list["Session"] = []
 
 
 @dataclass
@@ -66,7 +65,7 @@ class Session:
             self.progress.load = f"limited by the MLLM: {of_mllm} calls wait for it"
         else:
             with suppress(CowError):
-                self.progress.load = describe_load(await client.workers())
+                self.progress.load = progress.describe_load(await client.workers())
 
 
 def _observed(limit: AdaptiveLimit) -> httpx.AsyncClient:
@@ -78,14 +77,11 @@ def _observed(limit: AdaptiveLimit) -> httpx.AsyncClient:
     async def note_refusal(response: httpx.Response) -> None:
         if not response.is_success:
             await response.aread()
-            if is_refusal(response):
-                limit.refuse(response.request.extensions["begun"], retry_after(response))
+            if protocol.is_refusal(response):
+                limit.refuse(response.request.extensions["begun"], protocol.retry_after(response))
 
     hooks: dict[str, list[Any]] = {"request": [note_begin], "response": [note_refusal]}
     return httpx.AsyncClient(limits=httpx.Limits(max_connections=None), event_hooks=hooks)
-
-
-_active: list[Session] = []
 
 
 @contextmanager
@@ -140,7 +136,7 @@ def _share_files(pictures: Path, artifacts: Path) -> None:
 
 
 @dataclass
-class EvalProgress(BatchProgress):
+class EvalProgress(progress.BatchProgress):
     """Rate, time left and accuracy so far. Questions of an earlier process count as done, but not for the rate."""
 
     arms: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter[str]))

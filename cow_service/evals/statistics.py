@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.stats import chi2, norm
-from scipy.stats import t as student_t
+from scipy import stats
 
 from cow_service.evals.items import Observation
 from cow_service.records import Record
 
 ALPHA, POWER = 0.05, 0.8
+Pairs = NDArray[np.float64]  # (scenes, 3): pairs of replies in which the arm alone is right, the baseline alone; all
 
 
 class Spread(Record):
@@ -114,12 +114,8 @@ def _spread(observations: Sequence[Observation], is_one: Callable[[Observation],
     for each in observations:
         by_repeat[each.repeat].append(is_one(each))
     shares = [statistics.fmean(values) for values in by_repeat.values()]
-    return Spread(
-        mean=statistics.fmean(map(is_one, observations)), sd=statistics.stdev(shares) if len(shares) > 1 else None
-    )
-
-
-Pairs = NDArray[np.float64]  # (scenes, 3): pairs of replies in which the arm alone is right, the baseline alone; all
+    sd = statistics.stdev(shares) if len(shares) > 1 else None
+    return Spread(mean=statistics.fmean(map(is_one, observations)), sd=sd)
 
 
 def pairs_of(arm: Sequence[Observation], baseline: Sequence[Observation]) -> tuple[Pairs, int]:
@@ -127,12 +123,10 @@ def pairs_of(arm: Sequence[Observation], baseline: Sequence[Observation]) -> tup
     there = {(each.item, each.repeat): each for each in baseline if each.failure is None}
     replied = [each for each in arm if each.failure is None]
     both = [(each, there[place]) for each in replied if (place := (each.item, each.repeat)) in there]
-    sums: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
+    sums: dict[str, Pairs] = defaultdict(lambda: np.zeros(3))
     for one, other in both:
-        sums[one.scene][0] += one.right and not other.right
-        sums[one.scene][1] += other.right and not one.right
-        sums[one.scene][2] += 1
-    table = np.array([sums[scene] for scene in sorted(sums)], dtype=np.float64).reshape(-1, 3)
+        sums[one.scene] += (one.right and not other.right, other.right and not one.right, 1)
+    table = np.array([sums[scene] for scene in sorted(sums)]).reshape(-1, 3)
     return table, len({one.item for one, _ in both})
 
 
@@ -170,10 +164,7 @@ def sign_flip_p(differences: NDArray[np.float64]) -> float:
     steps = np.abs(differences[differences != 0]).astype(np.int64)
     law = np.ones(1)  # of the sum of those before, from its least value in steps of 2
     for step in steps.tolist():
-        longer = np.zeros(len(law) + step)
-        longer[: len(law)] += law / 2
-        longer[step:] += law / 2
-        law = longer
+        law = (np.pad(law, (0, step)) + np.pad(law, (step, 0))) / 2
     sums = 2 * np.arange(len(law)) - len(law) + 1
     return min(1.0, float(law[np.abs(sums) >= abs(differences.sum()) - 0.5].sum()))
 
@@ -202,7 +193,7 @@ def primary_gain(placebos: Mapping[str, tuple[Pairs, int]]) -> PrimaryGain | Non
 
 def _quantiles(placebos: int) -> float:
     """The sum of the normal quantiles of level and power: each placebo may fail to be beaten in its share of cases."""
-    return float(norm.ppf(1 - ALPHA / 2) + norm.ppf(1 - (1 - POWER) / placebos))
+    return float(stats.norm.ppf(1 - ALPHA / 2) + stats.norm.ppf(1 - (1 - POWER) / placebos))
 
 
 def scenes_needed(effect: float, variance: float, placebos: int) -> int:
@@ -221,13 +212,13 @@ def effect_shown(scenes: int, variance: float, placebos: int) -> float:
 
 def power_of(effect: float, variance: float, scenes: int, placebos: int) -> float:
     """A lower bound of the probability that a number of scenes shows a gain; see `scenes_needed`."""
-    missed = norm.sf(effect * math.sqrt(scenes / variance) - norm.ppf(1 - ALPHA / 2))
+    missed = stats.norm.sf(effect * math.sqrt(scenes / variance) - stats.norm.ppf(1 - ALPHA / 2))
     return max(0.0, float(1 - placebos * missed))
 
 
 def upper_variance(sd: float, scenes: int) -> float:
     """A variance that is exceeded in one of five cases, from the standard deviation of a number of scenes."""
-    return sd**2 * (scenes - 1) / float(chi2.ppf(0.2, scenes - 1))
+    return sd**2 * (scenes - 1) / float(stats.chi2.ppf(0.2, scenes - 1))
 
 
 def cluster_interval(pairs: Pairs, alpha: float = ALPHA) -> tuple[float, float]:
@@ -249,7 +240,7 @@ def cluster_interval(pairs: Pairs, alpha: float = ALPHA) -> tuple[float, float]:
     effect = min(max(_standard_error(values, ratio) ** 2 / alone, 1.0), size) if alone > 0 else size
     more = np.vstack([values, [[effect, effect], [-effect, effect]]])
     middle = more[:, 0].sum() / more[:, 1].sum()
-    reach = float(student_t.ppf(1 - alpha / 2, scenes - 1)) * _standard_error(more, middle)
+    reach = float(stats.t.ppf(1 - alpha / 2, scenes - 1)) * _standard_error(more, middle)
     return max(-1.0, float(middle - reach)), min(1.0, float(middle + reach))
 
 
@@ -284,11 +275,8 @@ def calibration_of(told: Sequence[tuple[float, bool]], bins: int = 10) -> Calibr
     table = np.array(told, dtype=np.float64)
     base = table[:, 1].mean()
     places = np.minimum((table[:, 0] * bins).astype(int), bins - 1)
-    found: list[Bin] = []
-    for place in np.unique(places).tolist():
-        rows = table[places == place]
-        mean, happened = map(float, rows.mean(axis=0))
-        found.append(Bin(count=len(rows), told=mean, happened=happened))
+    binned = (table[places == place] for place in np.unique(places))
+    found = [Bin(count=len(rows), told=rows[:, 0].mean(), happened=rows[:, 1].mean()) for rows in binned]
     return Calibration(
         count=len(table),
         brier=float(np.mean((table[:, 0] - table[:, 1]) ** 2)),

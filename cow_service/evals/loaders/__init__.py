@@ -61,12 +61,11 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
 
 def _download(name: str) -> Path:
     """The folder of a data set, from the hub (HF_ENDPOINT) or the cache of its library (HF_HOME)."""
-    from huggingface_hub import snapshot_download  # noqa: PLC0415
-    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError  # noqa: PLC0415
+    from huggingface_hub import errors, snapshot_download  # noqa: PLC0415
 
     try:
         return Path(snapshot_download(name, repo_type="dataset", allow_patterns=["*.parquet", "**/*.parquet"]))
-    except (HfHubHTTPError, LocalEntryNotFoundError, OSError, ValueError) as error:
+    except (errors.HfHubHTTPError, errors.LocalEntryNotFoundError, OSError, ValueError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise InvalidRequest(
             f"The data set '{name}' is not a folder, and could not be downloaded from the hub: {reason}. "

@@ -1,7 +1,6 @@
 """The forms of data sets: CausalSpatial as published, scenes with truth, and JSON Lines, CSV, TSV or Parquet tables."""
 
 import base64
-import binascii
 import csv
 import difflib
 import json
@@ -18,29 +17,46 @@ from cow_service.errors import InvalidRequest
 from cow_service.evals.items import LETTERS, REAL, Pictures, Truth
 from cow_service.evals.loaders.rows import Collected, Known, Row, RowFault, Unread, collect
 
+META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
+SCENE_TEXTS = ("question", "answer", "task", "level")
+SAMPLES_PER_SECOND = 30.0  # of scenes that do not say
+Subset = Literal["collision", "physics", "compatibility", "occlusion", "realworld"]
+SUBSETS: tuple[Subset, ...] = ("collision", "physics", "compatibility", "occlusion", "realworld")
+TRUTH = "truth"  # of sets that are made with it
+_LEVEL = re.compile(r"_Level_(\d+)")
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
 # Where a row stands, and what reads its fields, which raises `RowFault`.
 Numbered = tuple[str, Callable[[], dict[str, Any]]]
+# What a column means, by its names; those of VLMEvalKit are among them.
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "id": ("id", "index"),
+    "image": ("image", "image_path"),
+    "question": ("question",),
+    "options": ("options", "choices"),
+    "answer": ("answer",),
+    "task": ("task", "category", "type"),
+    "level": ("level", "difficulty"),
+    "scene": ("scene",),
+}
+IGNORED = ("split", "l2-category", "source", "meta", "not_sure", "hint")
+REQUIRED = ("image", "question", "answer")
+_URL = ("http://", "https://")
+_NAMES = {name: column for column, names in COLUMNS.items() for name in names}
+_LONGEST_PATH = 1024  # characters; what is longer is base64
 
 
 def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
     """The rows of a file that is shown by this name. Raises `InvalidRequest` if it is none, or is not whole."""
-    import pyarrow as pa  # noqa: PLC0415
-    import pyarrow.parquet as pq  # noqa: PLC0415
+    from pyarrow import ArrowException, parquet  # noqa: PLC0415
 
     try:
-        with pq.ParquetFile(path) as file:
+        with parquet.ParquetFile(path) as file:
             rows = (row for batch in file.iter_batches(batch_size=_AT_ONCE) for row in batch.to_pylist())
             for number, row in enumerate(rows):
                 yield f"{name}, row {number}", partial(dict, row)
-    except (pa.ArrowException, OSError) as error:
+    except (ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise InvalidRequest(f"{name}: not a complete Parquet file ({reason}); download it again.") from error
-
-
-META, IMAGE, FUTURE = "meta.json", "image.jpg", "future_*.jpg"
-SCENE_TEXTS = ("question", "answer", "task", "level")
-SAMPLES_PER_SECOND = 30.0  # of scenes that do not say
 
 
 def scene_folders(folder: Path) -> list[Path]:
@@ -93,24 +109,6 @@ def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
     if truth.scale and len(truth.scale) != len(truth.track):
         raise RowFault(f"`boxes` has {len(truth.scale)} of '{moved}' for {len(truth.track)} points of `track`")
     return Known(truth, pictures)
-
-
-# What a column means, by its names; those of VLMEvalKit are among them.
-COLUMNS: dict[str, tuple[str, ...]] = {
-    "id": ("id", "index"),
-    "image": ("image", "image_path"),
-    "question": ("question",),
-    "options": ("options", "choices"),
-    "answer": ("answer",),
-    "task": ("task", "category", "type"),
-    "level": ("level", "difficulty"),
-    "scene": ("scene",),
-}
-IGNORED = ("split", "l2-category", "source", "meta", "not_sure", "hint")
-REQUIRED = ("image", "question", "answer")
-_URL = ("http://", "https://")
-_NAMES = {name: column for column, names in COLUMNS.items() for name in names}
-_LONGEST_PATH = 1024  # characters; what is longer is base64
 
 
 def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Unread]:
@@ -179,7 +177,7 @@ def _image(given: Any, folder: Path) -> bytes:
     text = given.partition(",")[2] if given.startswith("data:") else given
     try:
         return base64.b64decode("".join(text.split()), validate=True)
-    except (binascii.Error, ValueError) as error:
+    except ValueError as error:
         raise RowFault(f"`image` is no file and no whole base64: {given[:40]!r}... ({error})") from error
 
 
@@ -226,12 +224,6 @@ READERS: dict[str, Callable[[Path], Iterator[Numbered]]] = {
     ".tsv": partial(_separated, delimiter="\t"),
     ".parquet": lambda path: parquet_rows(path, path.name),
 }
-
-
-Subset = Literal["collision", "physics", "compatibility", "occlusion", "realworld"]
-SUBSETS: tuple[Subset, ...] = ("collision", "physics", "compatibility", "occlusion", "realworld")
-TRUTH = "truth"  # of sets that are made with it
-_LEVEL = re.compile(r"_Level_(\d+)")
 
 
 def subset_shards(folder: Path, subsets: Sequence[str]) -> dict[str, list[Path]]:

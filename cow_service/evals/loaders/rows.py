@@ -13,6 +13,7 @@ from cow_service.evals.items import Item, Pictures, Task, Truth
 from cow_service.readers.options import not_sure_option, option_named
 from cow_service.records import AnswerOption
 
+Unread = tuple[str, Callable[[], "Row"]]  # where a row stands (for people), and what reads it, which raises `RowFault`
 MAX_SHOWN = 20  # faults in an error
 _TASKS: dict[str, Task] = {"physics": "trajectory", "physical": "trajectory", **{task: task for task in items.TASKS}}
 
@@ -43,9 +44,6 @@ class Row:
     level: str | None = None
     scene: str | None = None
     truth: Known | None = None
-
-
-Unread = tuple[str, Callable[[], Row]]  # where a row stands (for people), and what reads it, which raises `RowFault`
 
 
 def item_of(place: str, row: Row, pictures: Pictures) -> Item:
@@ -90,10 +88,8 @@ def item_of(place: str, row: Row, pictures: Pictures) -> Item:
 
 def task_of(name: str | None) -> Task:
     """The task that a data set's name means; `other` if it is unknown."""
-    for word in re.findall(r"[a-z]+", (name or "").lower()):
-        if word in _TASKS:
-            return _TASKS[word]
-    return "other"
+    known: list[Task] = [_TASKS[word] for word in re.findall(r"[a-z]+", (name or "").lower()) if word in _TASKS]
+    return known[0] if known else "other"
 
 
 def _answer(given: str, options: Sequence[AnswerOption]) -> str:

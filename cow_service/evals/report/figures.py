@@ -34,6 +34,13 @@ LARGEST = 420.0  # area of the marker of the fullest bin, points²
 SMALLEST = 14.0
 COST_PANEL, COST_WIDTH = 2.9, 7.5  # inches
 RANGE_FOR_LOG = 12.0  # between the dearest and the cheapest arm
+# Points that stand together: the rates of the arms that have any, by what they are of and by arm.
+Groups = dict[str, dict[str, Rates]]
+MEASURES: dict[str, tuple[str, Callable[[Cost], float | None]]] = {  # by title: axis, and a sum over all replies
+    "time": ("Seconds per question", lambda cost: cost.seconds),
+    "tokens": ("Tokens per question (input and output)", lambda cost: float(cost.input_tokens + cost.output_tokens)),
+    "money": ("Money per question (currency of the price table)", lambda cost: cost.money),
+}
 STYLE = Path(__file__).with_suffix(".mplstyle")
 
 
@@ -101,11 +108,8 @@ def _percent_axis(axes: Axes, low: float, high: float) -> None:
     axes.grid(axis="y")
 
 
-# Gains: a forest plot, on all questions and on each task
-
-
 def draw_gains(findings: Findings) -> Figure | None:
-    """What every arm gains over the image alone; None if no arm has a gain."""
+    """A forest plot of what every arm gains over the image alone, in all and by task; None if no arm has a gain."""
     summaries, styles = findings.arms, arm_styles(findings.arms)
     groups = {"All questions": [(each.name, each.gain) for each in summaries if each.gain is not None]}
     for task in TASKS:
@@ -156,9 +160,6 @@ def draw_gains(findings: Findings) -> Figure | None:
     return figure
 
 
-# Dose and response: what frames are worth that are off by so much
-
-
 def draw_doses(findings: Findings) -> Figure | None:
     """The gain over the error of the path that is shown; None if frames of no two errors were shown."""
     by_run: dict[str, list[Dose]] = {}
@@ -190,15 +191,8 @@ def draw_doses(findings: Findings) -> Figure | None:
     return figure
 
 
-# Rates: how many questions each arm answers rightly, by task, and by the levels of each task
-
-
-# Points that stand together: the rates of the arms that have any, by what they are of and by arm.
-Groups = dict[str, dict[str, Rates]]
-
-
 def draw_rates(findings: Findings) -> Figure | None:
-    """Right answers of every arm; None if nothing was replied to."""
+    """Right answers of every arm, by task and by the levels of each; None if nothing was replied to."""
     summaries = findings.arms
     if not summaries:
         return None
@@ -261,9 +255,6 @@ def _draw_rate_panel(axes: Axes, groups: Groups, styles: dict[str, ArmStyle], sp
     axes.axhline(100, color=DIM, linewidth=0.5)
 
 
-# Calibration: whether what the simulation tells with 70% happens in 70% of the cases
-
-
 def draw_calibration(findings: Findings) -> Figure | None:
     """Predicted probabilities against what happened; None if there are none."""
     curves: list[tuple[list[str], Calibration]] = []
@@ -303,16 +294,6 @@ def draw_curves(curves: Sequence[tuple[list[str], Calibration]]) -> Figure:
     axes.set_title("Predicted probability against what happened\n(bins of 10 points; marker area: number of questions)")
     figure.legend(lines, names, loc="outside lower left", fontsize=8, handlelength=3)
     return figure
-
-
-# Cost: what right answers cost in seconds, tokens and money per question
-
-
-MEASURES: dict[str, tuple[str, Callable[[Cost], float | None]]] = {  # by title: axis, and a sum over all replies
-    "time": ("Seconds per question", lambda cost: cost.seconds),
-    "tokens": ("Tokens per question (input and output)", lambda cost: float(cost.input_tokens + cost.output_tokens)),
-    "money": ("Money per question (currency of the price table)", lambda cost: cost.money),
-}
 
 
 def draw_cost(findings: Findings) -> Figure | None:

@@ -7,15 +7,12 @@ import base64
 import hashlib
 import json
 import os
-from collections import defaultdict
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from cow_service.evals.design import BASELINE
 from cow_service.evals.items import Item, Observation
@@ -65,16 +62,14 @@ def write_page(
         "form-action": "'none'",
     }
     template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    template.filters["percent"] = _percent
-    template.filters["points"] = points
-    template.filters["p"] = p_text
+    template.filters |= {"percent": _percent, "points": points, "p": p_text}
     drawn = [path for path in plots if path.suffix == ".svg"]
     text = template.from_string(_source("template.html")).render(
         policy="; ".join(f"{name} {value}" for name, value in allowed.items()),
-        style=Markup(style),
-        script=Markup(script),
-        core=Markup(script_json(core)),
-        replies=[Markup(script_json(block)) for block in replies],
+        style=style,
+        script=script,
+        core=script_json(core),
+        replies=map(script_json, replies),
         runs=runs,
         items=len(core["items"]),
         findings=findings,
@@ -90,7 +85,7 @@ def write_page(
 
 
 def _source(name: str) -> str:
-    return (files("cow_service.evals.report") / "page" / name).read_text(encoding="utf-8")
+    return (Path(__file__).with_suffix("") / name).read_text(encoding="utf-8")
 
 
 def _percent(share: float | None, digits: int = 1) -> str:
@@ -115,13 +110,13 @@ def page_data(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> tuple
     """What the page needs at once, pictures by their digests, and the texts of the replies in blocks of items."""
     places = {(each.run, each.arm): place for place, each in enumerate(summaries)}
     asked: dict[tuple[str, str], Item] = {}  # by the digest of the data, and id
-    seen: dict[tuple[str, str, int], list[Observation]] = defaultdict(list)
+    seen: dict[tuple[str, str, int], list[Observation]] = {}
     for number, run in enumerate(runs):
         for item in run.items.values():
             asked.setdefault((run.info.data_digest, item.id), item)
         for each in run.observations:
             if (number, each.arm) in places:
-                seen[run.info.data_digest, each.item, places[number, each.arm]].append(each)
+                seen.setdefault((run.info.data_digest, each.item, places[number, each.arm]), []).append(each)
 
     names = {run.info.data_digest: run.info.data for run in reversed(runs)}
     pictures: dict[str, int] = {}
@@ -138,7 +133,7 @@ def page_data(runs: Sequence[EvalRun], summaries: Sequence[ArmSummary]) -> tuple
     for place, (key, item) in enumerate(asked.items()):
         if place % ITEMS_PER_BLOCK == 0:
             blocks.append({})
-        replied = [sorted(seen[*key, arm], key=lambda each: each.repeat) for arm in range(len(summaries))]
+        replied = [sorted(seen.get((*key, arm), ()), key=lambda each: each.repeat) for arm in range(len(summaries))]
         packed_item = {
             "data": names[key[0]],
             "image": _place(pictures, item.image),

@@ -1,10 +1,7 @@
 """What a report says of runs, computed once for all its forms: rates, contrasts, and why looking helps or hurts."""
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
-from typing import Any
 
 import yaml
 from pydantic import Field, TypeAdapter, ValidationError
@@ -118,7 +115,7 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
             of_arm = {each.task: each.gain for each in contrasts if (each.name, each.reference) == (name, BASELINE)}
             if arm.error is not None and None in of_arm:
                 errors = [each.path_error for each in observations if each.path_error is not None]
-                mean = fmean(errors) if errors else None
+                mean = sum(errors) / len(errors) if errors else None
                 doses.append(Dose(name=name, error=arm.error, path_error=mean, gain=of_arm[None]))
             price = (prices or {}).get(run.info.mllm)
             arms.append(
@@ -208,15 +205,16 @@ def _splits(name: str, seen: Sequence[Observation], baseline: Sequence[Observati
     """
     errors = sorted(each.path_error for each in seen if each.path_error is not None)
     middle = errors[len(errors) // 2] if errors else 0.0
-    groups: dict[tuple[str, str], list[Observation]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[Observation]] = {}
     for each in seen:
         if each.simulation_right is not None:
-            groups["simulation", "right" if each.simulation_right else "wrong"].append(each)
+            groups.setdefault(("simulation", "right" if each.simulation_right else "wrong"), []).append(each)
         if each.path_error is not None:
             by = f"path error ({100 * middle:.1f}% of the width in the middle)"
-            groups[by, "smaller" if each.path_error < middle else "larger"].append(each)
+            groups.setdefault((by, "smaller" if each.path_error < middle else "larger"), []).append(each)
         if each.event_shown is not None:
-            groups["frames", "reach the moment" if each.event_shown else "end before the moment"].append(each)
+            reached = "reach the moment" if each.event_shown else "end before the moment"
+            groups.setdefault(("frames", reached), []).append(each)
     found = [(*place, statistics.gain(group, baseline)) for place, group in sorted(groups.items())]
     return [Split(name=name, by=by, value=value, gain=gain) for by, value, gain in found if gain is not None]
 
@@ -239,20 +237,16 @@ def _cells(observations: Sequence[Observation]) -> dict[tuple[str, str | None], 
 
 
 def _by_task(observations: Sequence[Observation]) -> dict[Task, list[Observation]]:
-    found: dict[Task, list[Observation]] = defaultdict(list)
-    for each in observations:
-        found[each.task].append(each)
-    return {task: found[task] for task in TASKS if task in found}
-
-
-_TABLE: TypeAdapter[dict[str, Price]] = TypeAdapter(dict[str, Price])
+    found: dict[Task, list[Observation]] = {
+        task: [each for each in observations if each.task == task] for task in TASKS
+    }
+    return {task: of_task for task, of_task in found.items() if of_task}
 
 
 def read_prices(path: Path) -> dict[str, Price]:
     """The prices of models, by their names. Raises `InvalidRequest` for a file that is none."""
     try:
-        told: Any = yaml.safe_load(path.read_bytes())
-        return _TABLE.validate_python(told)
+        return TypeAdapter(dict[str, Price]).validate_python(yaml.safe_load(path.read_bytes()))
     except OSError as error:
         raise InvalidRequest(f"The prices '{path}' cannot be read: {error.strerror or error}.") from error
     except (yaml.YAMLError, ValidationError) as error:

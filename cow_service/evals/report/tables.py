@@ -44,6 +44,14 @@ DATA = (
 DIFFERENCES = {"Protocol": PROTOCOL, "Reading replies": READING, "Data": DATA}  # from the paper, by what they are about
 ALL = "all"
 NONE = ""  # a cell without a value
+_GAIN: dict[str, Callable[[Gain], str]] = {
+    "questions": lambda gain: str(gain.questions),
+    "scenes": lambda gain: str(gain.scenes),
+    "gain, points": lambda gain: f"{100 * gain.gain:+.2f}",
+    "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}" if gain.scenes > 1 else "one scene",
+    "helped": lambda gain: str(gain.helped),
+    "hurt": lambda gain: str(gain.hurt),
+}
 
 
 @dataclass(frozen=True)
@@ -118,16 +126,6 @@ def overview(summaries: Sequence[ArmSummary]) -> Table:
     return Table("arms", "Replies by arm", ("arm", *columns), rows)
 
 
-_GAIN: dict[str, Callable[[Gain], str]] = {
-    "questions": lambda gain: str(gain.questions),
-    "scenes": lambda gain: str(gain.scenes),
-    "gain, points": lambda gain: f"{100 * gain.gain:+.2f}",
-    "95% interval": lambda gain: f"{100 * gain.low:+.2f} to {100 * gain.high:+.2f}" if gain.scenes > 1 else "one scene",
-    "helped": lambda gain: str(gain.helped),
-    "hurt": lambda gain: str(gain.hurt),
-}
-
-
 def _gain(gain: Gain) -> tuple[str, ...]:
     return tuple(cell(gain) for cell in _GAIN.values())
 
@@ -165,15 +163,9 @@ def splits(findings: Findings) -> Table:
 
 def doses(findings: Findings) -> Table:
     """The gain of frames by the error of their path."""
-    rows = tuple(
-        (
-            each.name,
-            f"{each.error:g}",
-            NONE if each.path_error is None else f"{100 * each.path_error:.2f}",
-            *_gain(each.gain),
-        )
-        for each in findings.doses
-    )
+    errors = [NONE if each.path_error is None else f"{100 * each.path_error:.2f}" for each in findings.doses]
+    paired = zip(findings.doses, errors, strict=True)
+    rows = tuple((each.name, f"{each.error:g}", error, *_gain(each.gain)) for each, error in paired)
     title = f"Gain over `{BASELINE}` of frames off the true path by so many times the simulation's own error"
     return Table("doses", title, ("arm", "times", "path error, % of width", *_GAIN), rows)
 
