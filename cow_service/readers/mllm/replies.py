@@ -212,9 +212,7 @@ def text_of(value: object) -> str:
     """A field that should hold words, as one line, without what no text may hold; empty if it holds something else."""
     if not isinstance(value, str):
         return ""
-    return " ".join(
-        value.encode(errors="replace").decode().replace("\0", " ").split()
-    )
+    return " ".join(value.encode(errors="replace").decode().replace("\0", " ").split())
 
 
 def name_of(value: object) -> str:
