@@ -122,7 +122,7 @@ def measure(engine: JobEngine, counts: list[int]) -> list[dict[str, Any]]:
     good = run_job(engine, image, {"direction": [1, 0]})
     bad = run_job(engine, image, {})  # the question tells no direction
     rows: list[dict[str, Any]] = []
-    own = sa.create_engine(engine.database.url)  # the engine's own connections are ended after seconds
+    own = sa.create_engine(engine.database.engine.url)  # the engine's own connections are ended after seconds
     made = 2
     for count in counts:
         more = max(0, count - made)

@@ -20,10 +20,11 @@ from typing import Any, cast
 
 import psutil
 import sqlalchemy as sa
-from cow_service.jobs.maintenance import UNREFERENCED_GRACE_SECONDS, collect_artifacts
 
+from cow_service.jobs.cleaning import UNREFERENCED_GRACE_SECONDS, collect_artifacts
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobSpec, JobTable
+from cow_service.jobs.opening import open_database
 from cow_service.media.artifacts import DiskArtifacts, ListedArtifact
 from cow_service.service import Service
 from cow_service.settings import Settings
@@ -118,7 +119,7 @@ def main() -> None:
     url: dict[str, Any] = {"database_url": given.database} if given.database else {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        database = Database(Settings(data_dir=folder, **url))
+        database = open_database(Settings(data_dir=folder, **url))
         fill(database, given.names)
         kept = 1 - 1 / LOOSE_EVERY
         budgets = None, given.names * SIZE * (kept - 0.1) / 1e9

@@ -104,7 +104,7 @@ def test_options_that_make_no_sense_are_refused(bad: dict[str, Any]) -> None:
 
 def test_progress_is_told_when_the_device_has_done_a_step(ati, scene, monkeypatch) -> None:
     heard: list[float | str] = []
-    monkeypatch.setattr("cow_service.generators.wan.pipeline.wait_until_done", lambda device: heard.append("done"))
+    monkeypatch.setattr("cow_service.generators.wan.memory.wait_until_done", lambda device: heard.append("done"))
     clip(ati, scene, lambda done: heard.append(round(done, 3)) if done else None)
     assert heard == ["done", 0.225, "done", 0.45, "done", 0.675, "done", 0.9, 1]
     heard.clear()

@@ -210,6 +210,8 @@ def test_the_file_of_the_database_gives_room_back(tmp_path: Path):
         file = tmp_path / "jobs.sqlite3"
         full = file.stat().st_size
         assert full > 3_500_000
+        for job in jobs:
+            JobTable(database).cancel(job)
         JobTable(database).delete(jobs)
         database.give_room_back(lambda: True)
         assert file.stat().st_size == full, "it was stopped"

@@ -138,12 +138,10 @@ def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
         # Work of another workflow version is left to servers that have it, and told of.
         foreign = write_old(old, image, version="1")
         unready = eventually(lambda: None if (answer := new.http.get("/readyz")).is_success else answer)
-        assert "version 1" in problem(unready, 503, "storage-unavailable")["detail"]
+        assert "version 1" in problem(unready, 503, "not-ready")["detail"]
         told = new.http.get("/workers").json()["unserved"]
         assert told == [{"queue": "light", "workflow_version": "1", "jobs": 1, "reason": "version"}]
         assert 'cow_queue_unserved{queue="light",reason="version"} 1.0' in new.http.get("/metrics").text
-        report = cow_from_nothing(tmp_path, "doctor", COW_DATABASE_URL=url_of(old).get_secret_value())
-        assert (report.returncode, "workflow version 1" in report.stdout) == (1, True)
         assert new.job(foreign)["status"] == "queued"
 
 

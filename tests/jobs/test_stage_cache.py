@@ -127,6 +127,7 @@ def test_nothing_is_stored_for_a_job_that_was_canceled_or_deleted_meanwhile(data
         speed_of(database, "one", SHARED, 1, check=canceled)
     assert database.finished_stages("one") == set()
     store = step(database, "two")
+    JobTable(database).cancel("two")
     JobTable(database).delete(["two"])
     with pytest.raises(Canceled):
         stored(store, SHARED, lambda: result(1))
