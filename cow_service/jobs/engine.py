@@ -78,8 +78,9 @@ class JobEngine:
                 self.start()
             except StorageUnavailable as error:
                 self._waits_for = error.detail
-                cause = str(getattr(error.__cause__, "orig", error.__cause__)).partition("\n")[0]  # for the operator
-                log.warning("%s (%s) Next try in %g s.", error.detail, cause, pause)
+                cause = str(getattr(error.__cause__, "orig", error.__cause__) or "").partition("\n")[0]
+                told = f"{error.detail} ({cause})" if cause else error.detail  # the operator may see addresses
+                log.warning("%s Next try in %g s.", told, pause)
                 stop.wait(pause)
                 pause = min(2 * pause, LONGEST_WAIT)
             else:

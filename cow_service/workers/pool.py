@@ -347,7 +347,7 @@ class WorkerPool(Computer):
         elif worker.is_loaded and now - worker.heard > HEARTBEAT_TIMEOUT_SECONDS:
             worker.kill("frozen", f"was ended, as it did not respond for {HEARTBEAT_TIMEOUT_SECONDS:g} s")
         elif worker.memory_bytes > self._memory_limit:
-            worker.kill("memory", f"was ended, as it used {worker.memory_bytes / 1e6:.0f} MB")
+            worker.kill("memory", f"was ended, as it used {worker.memory_bytes / 1e6:.0f} MB, more than it may")
 
     def _judge_all(self) -> None:
         """Ends the worker whose jobs take most, where all workers together take more than they may."""
@@ -355,7 +355,8 @@ class WorkerPool(Computer):
         together, idle = sum(one.memory_bytes for one in workers), sum(one.idle_bytes for one in workers)
         if idle < self._memory_of_all < together:
             largest = max(workers, key=lambda one: one.memory_bytes - one.idle_bytes)
-            reason = f"was ended, as all workers used {together / 1e6:.0f} MB, and it took most of that for its jobs"
+            used = f"all workers used {together / 1e6:.0f} MB, more than COW_MEMORY_MB allows"
+            reason = f"was ended, as {used}, and it took most of that for its jobs"
             largest.kill("memory", reason)
 
 

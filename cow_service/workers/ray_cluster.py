@@ -155,9 +155,7 @@ class Cluster(BackgroundThread):
                 self._send(self.address.encode())
                 while not self._stop.is_set():
                     if not bridge.pipe.poll(patience):
-                        why = (
-                            "it does not respond; where a head ended without `ray stop`, run that and `ray start` again"
-                        )
+                        why = "it does not respond (if its head crashed, run `ray stop` and `ray start` again)"
                         break
                     kind, number, data = unpack(bridge.pipe.recv_bytes(MAX_MESSAGE_BYTES))
                     if kind == "nodes":
