@@ -11,7 +11,7 @@ from cow_service.stages.answering import answer_question, ask_baseline, ask_firs
 from cow_service.stages.depth import estimate_depth
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
 
@@ -28,7 +28,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     grounding = run.stage("grounding", ground)
     if run.wants_depth:
         run.take_depth(run.stage("depth", estimate_depth).depth)
-    motion = run.stage("motion", read_motion, grounding, run.hints)
+    motion = run.stage("motion", settle_motion, grounding, run.read_motion)
     trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
     clip = run.stage("generation", generate, grounding, motion, trajectory)
     return Simulation(

@@ -7,7 +7,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
-    from cow_service import requests
+    from cow_service import records, requests
     from cow_service.records import Language, Law
 
 DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
@@ -32,7 +32,7 @@ class SimulateOptions(TypedDict, total=False):
     objects: Sequence[requests.ObjectRequest | Given] | None
     objects_complete: bool
     interventions: Sequence[requests.InterventionRequest | Given] | None
-    asked: requests.AskedRequest | Given | None
+    asked: records.Asked | Given | None
     camera: requests.CameraRequest | Given | None
     depth: requests.DepthRequest | Given | None
     law: Law | None

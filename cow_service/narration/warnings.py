@@ -60,7 +60,7 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
             "an empty list does not mean that nothing is hit."
         )
     # Where a given path goes beside the motion, the object or the clip that were given with it.
-    if given is not None and request.stated_motion is not None:
+    if given is not None and request.whole_motion is not None:
         found.append(
             "Both `motion` and `trajectory` were given: the object follows the trajectory; the motion only words it."
         )

@@ -1,24 +1,15 @@
-"""Records of stage 1: what moves and where it is, what else matters, and what is asked. The base of all records."""
+"""Records of stage 1: what moves and where it is, what else matters, and what is asked."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-Point = tuple[float, float]
-BBox = tuple[float, float, float, float]
-Vector = tuple[float, float]
+from cow_service.records.values import BBox, Finite, ObjectWords, Point, Record, Sha256
+
 Position = tuple[float, float, float]
 State = tuple[float, float, float, float, float, float]
-Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class Record(BaseModel):
-    """A frozen record; unknown fields are an error, so that a misspelt one is never ignored."""
-
-    # Validators are built at first use, so that importing the SDK or the command line stays quick.
-    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class Artifact(Record):
@@ -52,6 +43,7 @@ Until = Literal["contact", "out-of-view"]
 Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
 Opening = Literal["round", "square", "none"]
 Language = Literal["en", "de", "es", "fr", "zh", "ja"]
+MAX_OBJECTS = 64
 
 
 AskedRelation = Literal["touches", "covers", "covered", "inside", "tips", "moves", "leaves", "lands"]
@@ -61,7 +53,7 @@ AskedForm = Literal[
 
 
 class Asked(Record):
-    """The event that a question asks about, and what it wants to know of it."""
+    """The event that a question asks about, and what it wants to know of it. Objects are named in words."""
 
     form: AskedForm = Field(
         default="whether",
@@ -74,18 +66,16 @@ class Asked(Record):
         "`moves`: the target is set in motion; `leaves`: the subject leaves the image; `lands`: the subject "
         "comes down on the floor."
     )
-    subject: str | None = Field(
-        default=None, description="The acting object, in the question's words; null: the moving object."
-    )
-    target: str | None = Field(default=None, description="The object in question, in its words; null: any.")
+    subject: ObjectWords | None = Field(default=None, description="The acting object; null: the moving object.")
+    target: ObjectWords | None = Field(default=None, description="The object in question; null: any.")
     negated: bool = Field(default=False, description="The event is that it does not happen: to miss, to stay visible.")
-    among: tuple[str, ...] = Field(
-        default=(), description="The objects in question, if it names several or a kind of objects; empty: any."
+    among: tuple[ObjectWords, ...] = Field(
+        default=(), max_length=MAX_OBJECTS, description="The objects in question, if several; empty: any."
     )
     every: bool = Field(default=False, description="It counts only if it happens with each of `among`.")
     partly: bool = Field(default=False, description="For `covers` and `covered`: any hidden part counts.")
-    within: float | None = Field(
-        default=None, gt=0, description="Time limit for the event, s; null: until everything is at rest or out of view."
+    within: Annotated[Finite, Field(gt=0, le=1e6)] | None = Field(
+        default=None, description="Time limit for the event, s; null: until everything is at rest or out of view."
     )
 
 

@@ -9,20 +9,17 @@ from pydantic import Field, model_validator
 from cow_service.records.grounding import (
     Artifact,
     Asked,
-    BBox,
     Cue,
     Law,
     LocatedObject,
     MotionKind,
-    Point,
     Position,
-    Record,
     Shape,
     Source,
     State,
     Until,
-    Vector,
 )
+from cow_service.records.values import BBox, Point, Record, Vector
 
 
 class MetresPerPixel(Record):

@@ -1,4 +1,4 @@
-"""The bodies of `POST /simulate` and `POST /answer`: places of objects, motions, and finally the requests."""
+"""The bodies of `POST /simulate` and `POST /answer`: what is said of the scene, and how to simulate and show it."""
 
 from __future__ import annotations
 
@@ -6,73 +6,29 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from cow_service import records
 from cow_service.errors import shortened
-from cow_service.records import Language, Record
-from cow_service.requests.values import (
+from cow_service.records import (
     WHOLE,
+    Box,
     Finite,
     Flag,
     Flags,
+    GroundingRequest,
     ImageRef,
     MaskRef,
+    MotionRequest,
     Name,
     Points,
+    Reading,
+    Record,
     Whole,
     Words,
-    has_more_values,
     writable,
 )
-
-MAX_OBJECTS = 64
-
-ObjectWords = Annotated[Words, Field(min_length=1, max_length=200)]
-
-
-def _with_area(bbox: records.BBox) -> records.BBox:
-    if bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2:
-        raise ValueError(f"[x0, y0, x1, y1] must have x1 and y1 at least 2 px beyond x0 and y0, got {list(bbox)}")
-    return bbox
-
-
-Box = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_with_area)]
-
-
-class PlaceRequest(Record):
-    """An object's place in the image, and what the caller knows about it. Omitted values are estimated."""
-
-    bbox: Box | None = Field(default=None, description="[x0, y0, x1, y1], px of the upright image, x right, y down.")
-    point: tuple[Finite, Finite] | None = Field(
-        default=None, description="[x, y], px: a point on the object, from which its outline is found."
-    )
-    mask: MaskRef | None = Field(
-        default=None, description="PNG of the upright image's size, white on the object and black elsewhere."
-    )
-    shape: records.Shape | None = None
-    size: Annotated[Finite, Field(ge=1e-4, le=1000)] | None = Field(default=None, description="Its longest side, m.")
-    stands_on: ObjectWords | None = Field(default=None, description="`floor`, `air`, or another object in words.")
-
-    @property
-    def prior(self) -> records.ObjectPrior | None:
-        """What it says about the object besides its place, taken as exact."""
-        if self.shape is None and self.size is None and self.stands_on is None:
-            return None
-        size = None if self.size is None else records.Estimate(value=self.size, deviation=0.0)
-        return records.ObjectPrior(shape=self.shape, size=size, stands_on=self.stands_on)
-
-    @model_validator(mode="after")
-    def _one_place(self) -> PlaceRequest:
-        if (self.bbox is not None) + (self.point is not None) + (self.mask is not None) != 1:
-            raise ValueError("give exactly one of `bbox`, `point` and `mask`")
-        return self
-
-
-class GroundingRequest(PlaceRequest):
-    """Where the moving object is: a box, a mask or a point on it. Skips stage 1, grounding (finding the object)."""
-
-    object: ObjectWords | None = Field(default=None, description="Name of the object.")
+from cow_service.requests.checks import has_more_values
 
 
 class LookRequest(Record):
@@ -93,170 +49,8 @@ class LookRequest(Record):
         return self
 
 
-class ObjectRequest(PlaceRequest):
-    """Another object of the image, by its box, its mask, or a point on it."""
-
-    object: ObjectWords
-    role: records.ObjectRole = Field(
-        default="target", description="target: the question asks about it; obstacle: it could be in the way."
-    )
-
-
-class AskedRequest(records.Asked):
-    """What the question wants to know. Objects are named as in `objects`, or as in the question."""
-
-    subject: ObjectWords | None = Field(default=None, description="The acting object; null: the moving object.")
-    target: ObjectWords | None = Field(default=None, description="The object in question; null: any.")
-    among: tuple[ObjectWords, ...] = Field(
-        default=(), max_length=MAX_OBJECTS, description="The objects in question, if several; empty: any."
-    )
-    within: Annotated[Finite, Field(gt=0, le=3600)] | None = Field(
-        default=None, description="Time limit for the event, s; null: until everything is at rest or out of view."
-    )
-
-
-class InterventionRequest(Record):
-    """A change of the scene before anything moves. Objects are named as in `objects`, or in words to look for."""
-
-    kind: records.InterventionKind
-    object: ObjectWords
-    relation: records.PlaceRelation | None = Field(
-        default=None, description="With `place`: where the object goes, relative to the `targets`."
-    )
-    targets: tuple[ObjectWords, ...] = Field(
-        default=(), max_length=2, description="With `place`: the object or place it refers to; two for `between`."
-    )
-
-    @model_validator(mode="after")
-    def _is_whole(self) -> InterventionRequest:
-        if self.kind == "remove" and (self.relation is not None or self.targets):
-            raise ValueError("`remove` takes only an `object`; `relation` and `targets` belong to `place`")
-        if self.kind == "place":
-            wanted = 2 if self.relation == "between" else 1
-            if self.relation is None or len(self.targets) != wanted:
-                raise ValueError(f"`place` needs a `relation`, and `targets` of length {wanted}")
-            if len({" ".join(name.lower().split()) for name in (self.object, *self.targets)}) <= wanted:
-                raise ValueError("`object` and `targets` must be different objects")
-        return self
-
-
 MAX_TRACKS = 1024
 MAX_TRACK_POINTS = 262_144  # of all tracks together
-MAX_STEPS = 16
-_OF_A_LINE = ("distance", "duration", "until", "steps")
-
-
-def _has_length(direction: records.Vector) -> records.Vector:
-    if not 1e-9 < math.hypot(*direction) < 1e12:
-        raise ValueError(f"[dx, dy] must not have zero length, got {list(direction)}")
-    return direction
-
-
-Direction = Annotated[tuple[Finite, Finite], AfterValidator(_has_length)]
-Length = Annotated[Finite, Field(gt=0, le=1_000_000)]
-Seconds = Annotated[Finite, Field(gt=0, le=3600)]
-Speed = Annotated[Finite, Field(ge=0, le=100_000)]
-
-
-class MotionStepRequest(Record):
-    """A further leg of a motion, after the previous one has ended."""
-
-    direction: Direction = Field(description="[dx, dy] in the image, any length but zero.")
-    depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
-    distance: Length | None = Field(default=None, description="px at the depth of the first frame.")
-    duration: Seconds | None = Field(default=None, description="s.")
-
-
-class OtherMotionRequest(Record):
-    """Another object that is set moving at the first frame."""
-
-    object: ObjectWords = Field(description="Its name in `objects`.")
-    kind: Literal["linear", "projectile", "fall"] | None = Field(
-        default=None, description="By default linear; a fall takes no `direction`."
-    )
-    direction: Direction | None = Field(default=None, description="[dx, dy] in the image.")
-    depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
-    speed: Speed | None = Field(default=None, description="px/s; by default as for the moving object.")
-
-    @property
-    def stated_kind(self) -> records.MotionKind:
-        """The kind of motion."""
-        return self.kind or "linear"
-
-    @model_validator(mode="after")
-    def _goes_somewhere(self) -> OtherMotionRequest:
-        if (self.direction is None) != (self.stated_kind == "fall"):
-            needs = "takes no" if self.kind == "fall" else "needs a"
-            raise ValueError(f"a {self.stated_kind} motion {needs} `direction`")
-        return self
-
-
-class MotionRequest(Record):
-    """How the object moves. Skips stage 2, motion; without `kind` and `direction` they are read from the question."""
-
-    kind: records.MotionKind | None = Field(
-        default=None,
-        description="linear: straight on; projectile: thrown; fall: dropped; static: stays; place: put somewhere. By "
-        "default linear if there is a `direction`, else read from the question.",
-    )
-    law: records.Law = Field(
-        default="contact",
-        description="Physics of the motion. contact: bounces, pushes, rolls, comes to rest; ballistic: constant "
-        "velocity plus gravity, straight through everything.",
-    )
-    direction: Direction | None = Field(
-        default=None,
-        description="[dx, dy] in the image, x right, y down, any length but zero: [-1, 0] is to the left. By default "
-        "read from the question and from arrows drawn in the image. Not for a fall or a static object.",
-    )
-    depth: Finite = Field(default=0.0, ge=-1, le=1, description="See `Motion.depth`.")
-    rises: Flag = Field(
-        default=False, description="See `Motion.rises`; by default an object on the floor moves along the floor."
-    )
-    speed: Speed | None = Field(
-        default=None,
-        description="px/s; by default 0.26 image widths per second, or 1.8 m/s for a throw under the contact law.",
-    )
-    distance: Length | None = Field(
-        default=None, description="Stops after this distance, px at the depth of the first frame."
-    )
-    duration: Seconds | None = Field(default=None, description="Stops after this time, s.")
-    until: records.Until | None = Field(default=None, description="contact: stops at its first contact.")
-    steps: tuple[MotionStepRequest, ...] = Field(
-        default=(), max_length=MAX_STEPS, description="Further legs, after this one."
-    )
-    others: tuple[OtherMotionRequest, ...] = Field(
-        default=(), max_length=MAX_STEPS, description="Other objects set moving at the same time."
-    )
-    metres_per_pixel: Annotated[Finite, Field(ge=1e-6, le=1000)] | None = Field(
-        default=None, description="Scale at the object; by default the image is assumed to be 3 m wide there."
-    )
-    depth_deviation: Annotated[Finite, Field(ge=0, le=90)] | None = Field(
-        default=None, description="See `Motion.depth_deviation`; by default 20 for a throw without `depth`, else 0."
-    )
-    speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(
-        default=None, description="See `Motion.speed_deviation`; by default 0 for a given `speed`."
-    )
-
-    @property
-    def stated_kind(self) -> records.MotionKind | None:
-        """The kind of motion; None if the reader decides."""
-        return self.kind or ("linear" if self.direction is not None else None)
-
-    @model_validator(mode="after")
-    def _goes_somewhere(self) -> MotionRequest:
-        kind = self.stated_kind
-        if kind is None and (self.depth or self.depth_deviation is not None):
-            raise ValueError("`depth` and `depth_deviation` need a `direction` [dx, dy]")
-        if kind in records.DIRECTED_KINDS and self.direction is None:
-            raise ValueError(f"a {kind} motion needs a `direction` [dx, dy]")
-        speeds = self.direction is not None or self.speed is not None or self.speed_deviation is not None
-        if kind not in (None, *records.DIRECTED_KINDS) and (speeds or self.depth or self.depth_deviation is not None):
-            raise ValueError(f"a {kind} motion takes no `direction`, `speed` or `depth`; a throw is a `projectile`")
-        lengths = [name for name in _OF_A_LINE if getattr(self, name) not in (None, ())]
-        if kind not in (None, "linear") and lengths:
-            raise ValueError(f"a {kind} motion takes no `{lengths[0]}`: physics decides where it ends")
-        return self
 
 
 class TrajectoryRequest(Record):
@@ -391,7 +185,7 @@ class FramesRequest(Record):
     )
 
 
-class SimulateRequest(Record):
+class SimulateRequest(Reading):
     """One image and one what-if question; everything else has a default."""
 
     image: ImageRef
@@ -406,31 +200,7 @@ class SimulateRequest(Record):
         description="Answers to choose from: texts, which get the letters A, B, C..., or texts with letters; by "
         "default those that the question lists. Used by `/answer`.",
     )
-    language: Language | None = Field(
-        default=None,
-        description="Of the narration, and of what the embedded reader answers. By default that of the header "
-        "`Accept-Language`, unless it prefers English; else that of the question, where a multimodal LLM reads it; "
-        "else English.",
-    )
-    grounding: GroundingRequest | None = None
-    motion: MotionRequest | None = None
     trajectory: TrajectoryRequest | None = None
-    objects: tuple[ObjectRequest, ...] = Field(
-        default=(),
-        max_length=MAX_OBJECTS,
-        description="Other objects that matter, and their places, which take precedence over what the reader finds.",
-    )
-    objects_complete: Flag = Field(
-        default=False, description="`objects` are all that could be hit or hide something: nothing else is looked for."
-    )
-    interventions: tuple[InterventionRequest, ...] = Field(
-        default=(),
-        max_length=8,
-        description="Objects to take away or put somewhere before the motion, instead of the question's.",
-    )
-    asked: AskedRequest | None = Field(
-        default=None, description="What the question wants to know; by default it is read from the question."
-    )
     camera: CameraRequest | None = None
     depth: DepthRequest | None = Field(
         default=None, description="A depth map, from which the floor, the camera and the objects are measured."
@@ -471,16 +241,22 @@ class SimulateRequest(Record):
     @property
     def place(self) -> GroundingRequest | None:
         """Where the moving object is, if the request says so. A given trajectory begins on it."""
-        if self.grounding is None and self.trajectory is not None:
-            return GroundingRequest(point=self.trajectory.points[0])
-        return self.grounding
+        given = self.grounding or GroundingRequest()
+        if not given.has_place and self.trajectory is not None:
+            return given.model_copy(update={"point": self.trajectory.points[0]})
+        return given if given.has_place else None
 
     @property
     def left_to_reader(self) -> frozenset[str]:
         """The stages of a simulation that the request leaves to the reader."""
         needed = {"grounding"} if self.place is None else set[str]()
-        given = self.stated_motion is not None or self.trajectory is not None
+        given = self.trajectory is not None or self.whole_motion is not None
         return frozenset(needed if given else needed | {"motion"})
+
+    @property
+    def whole_motion(self) -> MotionRequest | None:
+        """The motion, if nothing of it is left to the reader."""
+        return None if self.motion is None or not self.motion.is_whole else self.motion
 
     @property
     def clip_seed(self) -> int:
@@ -491,17 +267,6 @@ class SimulateRequest(Record):
     def law(self) -> records.Law:
         """The law of the motion."""
         return MotionRequest().law if self.motion is None else self.motion.law
-
-    @property
-    def stated_motion(self) -> MotionRequest | None:
-        """The motion, if the request gives more than its law."""
-        return None if self.motion is None or self.motion.stated_kind is None else self.motion
-
-    @property
-    def changed_names(self) -> tuple[str, ...]:
-        """The names of all objects in its interventions, without repeats."""
-        named = (name for each in self.interventions for name in (each.object, *each.targets))
-        return tuple(dict.fromkeys(named))
 
     @property
     def attached(self) -> tuple[MaskRef, ...]:

@@ -1,24 +1,58 @@
 """Stage 1: which object moves and where it is, where the others are that matter, and what is asked of them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
-from cow_service.errors import CannotGround, FieldError, InvalidRequest, MllmBadReply, MllmUnavailable, field_of
+from cow_service.errors import (
+    CannotGround,
+    CannotReadDirection,
+    FieldError,
+    InvalidRequest,
+    MllmBadReply,
+    MllmUnavailable,
+    field_of,
+)
 from cow_service.media.images import decode, encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
 from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import GroundingReading, MotionHints, NamedChange, ReaderInput, SeenThing, WordReader
+from cow_service.readers.base import ReadResult, SeenThing, WordReader, WordsReading
 from cow_service.readers.options import plain
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import Asked, BBox, Grounding, Intervention, LocatedObject, ObjectPrior
-from cow_service.requests import ImageArtifact, InterventionRequest, MaskRef, PlaceRequest, SimulateRequest
+from cow_service.records import (
+    Artifact,
+    BBox,
+    Grounding,
+    GroundingRequest,
+    Intervention,
+    InterventionRequest,
+    LocatedObject,
+    MaskRef,
+    MotionRequest,
+    ObjectPrior,
+    ObjectRequest,
+    Reading,
+    Source,
+    kept_mask,
+)
+from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import UNREADABLE, Run
-from cow_service.stages.settling import SeenThings, settle_mover, settle_places, settle_question, things_of
+from cow_service.stages.settling import (
+    SeenThings,
+    box_of,
+    mover_of,
+    settle_mover,
+    settle_places,
+    settle_question,
+)
 from cow_service.vision.masks import CroppedMask, iou, is_among, is_same_object, mask_iou
+from cow_service.vision.scene import Scene
 from cow_service.vision.segmentation import mask_from_bbox
 
 DEFAULT_NAME = "object"
@@ -37,195 +71,184 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     Raises `InvalidRequest` and `CannotGround` for what the request says of places and for interventions that cannot be
     made, and what the reader raises.
     """
-    request, question = run.request, run.question
-    # Where things are: as the request says; the reader is asked for the rest.
     with run.cpu():
-        given, masks, reading, warnings = _read_places(run)
-    source = "request" if reading is not None else run.reader.source
-    if reading is None:
-        empty, changed = run.reader_input("grounding"), request.changed_names
-        sought = tuple(name for name in changed if not any(same_name(name, each.object) for each in given))
-        find = partial(_find, run) if "detector" in run.backends.perception.names else None
-        reading = _read_and_settle(run, replace(empty, known=given, sought=sought, find=find, words=question))
-        if run.can_segment:
-            with run.cpu():
-                reading = _outlined(run, reading)
-    # What the image shows, now that it is known what moves.
-    shows_trail = question.trail_named or (reading.hints is not None and reading.hints.cue == "trail")
+        given, own = locate_given(run)
+    if own is None:
+        reading, warnings = read_scene(run, given)
+        with run.cpu():
+            mover, others, doubts = outlined(run, reading) if run.can_segment else bare(reading)
+    else:
+        reading, warnings = said_in_words(run), ()
+        mover, others, doubts = own, (), ()
+    apart = [each for each in given if not each.is_same_as(mover)]
+    others = (*apart, *(each for each in others if not is_among(each.bbox, [known.bbox for known in apart])))
     with run.cpu():
-        scene = run.scene_with(reading.bbox, [each.bbox for each in (*given, *reading.others)], shows_trail)
-        silhouette = scene.silhouette(reading.bbox) if reading.mask is None else reading.mask
-        mask = run.backends.artifacts.put(encode_png(silhouette), "image/png")
-        drawn = [("an arrow", each.tail) for each in scene.arrows if "arrow" not in question.drawings_named]
-        drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in question.drawings_named]
-    # The others, and what is changed of all of them.
-    asked = reading.asked if request.asked is None else Asked(**dict(request.asked))
-    mover = LocatedObject(object=reading.object, bbox=reading.bbox, prior=reading.prior, source=source)
-    beside = [each for each, mask in zip(given, masks, strict=True) if not _is_mover(each, mask, reading)]
-    boxes = [each.bbox for each in beside]
-    seen = (each for each in reading.others if not is_among(each.bbox, boxes))
-    others = (*beside, *(each.model_copy(update={"source": each.source or source}) for each in seen))
-    interventions = _find_interventions(request, reading, (*others, mover))
-    removed = [each.object.bbox for each in interventions if each.kind == "remove"]
-    grounding = Grounding(
-        object=reading.object,
-        point=reading.point or ((mover.bbox[0] + mover.bbox[2]) / 2, (mover.bbox[1] + mover.bbox[3]) / 2),
-        bbox=reading.bbox,
-        mask=mask,
-        others=tuple(other for other in others if not is_among(other.bbox, removed)),
-        objects_complete=request.objects_complete or reading.objects_complete,
-        interventions=interventions,
-        prior=reading.prior,
-        asked=asked,
-        question_is_doubtful=reading.asked_is_doubtful,
-        trail_named=question.trail_named,
-        bbox_deviation=reading.bbox_deviation,
-        is_doubtful=reading.is_doubtful,
-        language=reading.language,
-        source=source,
+        scene, mask = cut_out(run, mover, others, reading)
+        placed = [each.stored(run) for each in others]
+    grounding = settle_grounding(run, reading, mover, placed, mask)
+    notes = (
+        *(warning for each in (mover, *given) for warning in each.warnings),
+        *(
+            f"`objects.{index}` ('{each.name}') lies where the moving object is, and was taken for it."
+            for index, each in enumerate(given)
+            if each not in apart and not same_name(each.name, mover.name)
+        ),
+        *drawings_removed(scene, run.words),
+        *unanswerable(grounding, run),
     )
-    grounding = put_into_first(understood(grounding, run.backends.words()), request, reading.hints)
-    warnings = [*reading.warnings, *warnings]
-    warnings += [
-        f"`objects.{index}` ('{each.object}') lies where the moving object is, and was taken for it."
-        for index, each in enumerate(given)
-        if each not in beside and not same_name(each.object, reading.object)
-    ]
-    if drawn:
-        places = ", ".join(f"{name} at ({x:.0f}, {y:.0f})" for name, (x, y) in drawn)
-        warnings.append(
-            f"Taken for annotations drawn over the image, although the question mentions none: {places}. "
-            "They are removed from the frames; `generator_options.clean_cues: false` keeps them."
-        )
-    if name := asked_of_itself(grounding):
-        warnings.append(
-            f"Something cannot hit itself, so the question about '{name}' has no answer: ask about another object."
-        )
-    if request.asked is not None or source != "embedded":  # which warns of what it does not find
-        known = [each.object for each in (mover, *others_of(grounding), *removed_of(grounding))]
-        asked = grounding.asked
-        named = () if asked is None else (asked.subject, asked.target, *asked.among)
-        warnings += [
-            f"The question asks about '{name}', which was not found in the image, so there is no outcome: give it in "
-            "`objects` under this name."
-            for name in named
-            if name is not None and not any(same_name(name, each) for each in known)
-        ]
     things = (*others_of(grounding), *removed_of(grounding))
     artifacts = (mask.sha256, *(each.mask.sha256 for each in things if each.mask is not None))
-    return StageResult(value=grounding, warnings=tuple(warnings), artifacts=artifacts, hints=reading.hints)
+    return StageResult(
+        value=grounding, warnings=(*warnings, *doubts, *notes), artifacts=artifacts, motion=reading.motion
+    )
 
 
-def _read_and_settle(run: Run[SimulateRequest], given: ReaderInput) -> GroundingReading:
-    """What the reader says of places and of what is asked, settled with the words and with what is seen.
+# --- what is read
+
+
+def said_in_words(run: Run[SimulateRequest]) -> Reading:
+    """What the words say beside where things are, for a mover that the request gives."""
+    said = run.words.reading
+    return said.model_copy(update={"grounding": None, "objects": (), "motion": None})
+
+
+def read_scene(run: Run[SimulateRequest], given: Sequence[Located]) -> tuple[Reading, tuple[str, ...]]:
+    """What the reader says of places and of what is asked, settled with the words and with what is seen; and warnings.
 
     A reader that may be wrong is asked once more with what speaks against its reading, and not to rely on the words
     where that is what they say; a reply that cannot be used then leaves the first. Raises what the reader raises.
     """
-    reading = run.reader.ground(given)
-    if not run.reader.heeds_objections:
-        return reading
-    settled, objections, misread = _settled(run, reading, given.known)
-    if objections:
-        given = replace(given, objections=objections, words=None if misread else given.words)
-        with suppress(CannotGround, MllmBadReply, MllmUnavailable):
-            settled, objections, _ = _settled(run, run.reader.ground(given), given.known)
-    return replace(settled, warnings=(*settled.warnings, *objections))
+    known = [each.said for each in given if isinstance(each.said, ObjectRequest)]
+    sought = [each for each in run.request.objects if not each.has_place]
+    find = partial(find_things, run) if "detector" in run.backends.perception.names else None
+    asking = run.reader_input("grounding", known=(*known, *sought))
+    asking = replace(asking, find=find, words=run.words)
+    settled = _settled(run, run.reader.read(asking), known)
+    if settled.objections:
+        again = replace(asking, objections=settled.objections, words=None if settled.is_misread else run.words)
+        with suppress(CannotGround, CannotReadDirection, MllmBadReply, MllmUnavailable):
+            settled = _settled(run, run.reader.read(again), known)
+    return settled.reading, (*settled.warnings, *settled.objections)
 
 
-def _settled(
-    run: Run[SimulateRequest], reading: GroundingReading, known: Sequence[LocatedObject]
-) -> tuple[GroundingReading, tuple[str, ...], bool]:
-    """The reading without what the request says: the places of things that are `known`, what is asked and changed.
+class Settled(NamedTuple):
+    """A reading, with warnings, and with what speaks against it."""
 
-    With what speaks against it, and whether that is what the words say of what moves or is asked.
-    """
-    words, question, request = run.backends.words(), run.question, run.request
-    if request.interventions:
-        question, reading = replace(question, changes=()), replace(reading, interventions=())
-    others = (each for each in reading.others if not any(same_name(each.object, given.object) for given in known))
-    if request.objects_complete:
-        others = (each for each in others if each.role == "target")
-    reading = replace(reading, others=tuple(others))
+    reading: Reading
+    warnings: tuple[str, ...] = ()
+    objections: tuple[str, ...] = ()
+    is_misread: bool = False  # that is what the words say of what moves or is asked
+
+
+def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[ObjectRequest]) -> Settled:
+    """The reading without what the request says, with its boxes, what is asked and what is changed settled."""
+    words, said, request = run.backends.words(), run.words, run.request
     with run.cpu():
-        scene = run.scene
-        boxes = [reading.bbox, *(each.bbox for each in things_of(reading))]
-        bare = frozenset(bbox for bbox in boxes if not scene.shows_thing(bbox))
-        placed, objections = settle_places(reading, SeenThings(scene.regions, bare))
-    settled, misnamed = settle_mover(placed, question, words)
-    settled, misread = settle_question(settled, question, words, is_given=request.asked is not None)
-    return settled, (*objections, *misnamed, *misread), bool(misnamed or misread)
+        reading = _located(run.scene, read.reading, run.reader.source)
+    if not run.reader.heeds_objections:
+        return Settled(reading, read.warnings)
+    if request.interventions:
+        said = replace(said, reading=said.reading.model_copy(update={"interventions": ()}))
+        reading = reading.model_copy(update={"interventions": ()})
+    others = [each for each in reading.objects if not any(same_name(each.object, one.object) for one in known)]
+    if request.objects_complete:
+        others = [each for each in others if each.role == "target"]
+    reading = reading.model_copy(update={"objects": tuple(others)})
+    with run.cpu():
+        boxes = [box_of(each) for each in (mover_of(reading), *others)]
+        is_bare = frozenset(bbox for bbox in boxes if not run.scene.shows_thing(bbox))
+        reading, objections, is_seen = settle_places(reading, SeenThings(run.scene.regions, is_bare))
+    unproved = () if is_seen else read.place_doubts
+    if unproved:
+        mover = mover_of(reading).model_copy(update={"is_doubtful": True})
+        reading = reading.model_copy(update={"grounding": mover})
+    reading, misnamed = settle_mover(reading, said, words)
+    reading, misread = settle_question(reading, said, words, is_given=request.asked is not None)
+    return Settled(reading, (*read.warnings, *unproved), (*objections, *misnamed, *misread), bool(misnamed or misread))
 
 
-def _is_mover(thing: LocatedObject, mask: CroppedMask | None, mover: GroundingReading) -> bool:
-    """Whether a thing is what moves. Two masks tell, however much their boxes overlap."""
-    if mask is None or mover.mask is None:
-        return is_same_object(thing.bbox, mover.bbox)
-    return mask_iou(mask.full(), mover.mask) > SAME_MASK
+def _located(scene: Scene, reading: Reading, source: Source) -> Reading:
+    """The reading with its source, and the box of what is at the point of a mover that was only pointed at."""
+    mover = mover_of(reading)
+    boxed = {} if mover.bbox is not None or mover.point is None else {"bbox": scene.bbox_at(mover.point)}
+    objects = tuple(each.model_copy(update={"source": source}) for each in reading.objects)
+    own = mover.model_copy(update={"source": source, **boxed})
+    return reading.model_copy(update={"grounding": own, "objects": objects})
 
 
-# --- places that the request gives
+# --- where things are
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where an object is."""
+class Located:
+    """A thing that was located: what is said of it, its box with it, and its mask."""
 
+    said: GroundingRequest | ObjectRequest
     bbox: BBox  # px, inside the image
     mask: CroppedMask | None = None  # where it does not follow from the box
     warnings: tuple[str, ...] = ()
-    is_doubtful: bool = False  # no two looks at it agree on its outline
+
+    @staticmethod
+    def at(
+        said: GroundingRequest | ObjectRequest,
+        bbox: BBox,
+        mask: CroppedMask | None = None,
+        warnings: tuple[str, ...] = (),
+    ) -> Located:
+        """What is said of a thing, in the box where it was found."""
+        return Located(said.model_copy(update={"bbox": bbox}), bbox, mask, warnings)
+
+    @staticmethod
+    def of(said: GroundingRequest | ObjectRequest) -> Located:
+        """A thing in its box."""
+        return Located(said, box_of(said))
+
+    @property
+    def name(self) -> str:
+        """As it is called."""
+        return self.said.object or DEFAULT_NAME
+
+    def is_same_as(self, mover: Located) -> bool:
+        """Whether it is what moves. Two masks tell, however much their boxes overlap."""
+        if self.mask is None or mover.mask is None:
+            return is_same_object(self.bbox, mover.bbox)
+        return mask_iou(self.mask.full(), mover.mask.full()) > SAME_MASK
+
+    def stored(self, run: Run[SimulateRequest]) -> LocatedObject:
+        """As a result reports it, its mask stored."""
+        put, said = run.backends.artifacts.put, self.said
+        return LocatedObject(
+            object=self.name,
+            bbox=self.bbox,
+            role=said.role if isinstance(said, ObjectRequest) else "target",
+            mask=None if self.mask is None else put(encode_png(self.mask.full()), "image/png"),
+            prior=said.prior,
+            source=said.source,
+            bbox_deviation=said.bbox_deviation or 0.0,
+            is_doubtful=said.is_doubtful,
+        )
 
 
-def _read_places(
-    run: Run[SimulateRequest],
-) -> tuple[tuple[LocatedObject, ...], list[CroppedMask | None], GroundingReading | None, list[str]]:
-    """The objects of a request with their masks, what it says of the mover and asks in words, and warnings.
+def locate_given(run: Run[SimulateRequest]) -> tuple[list[Located], Located | None]:
+    """The objects of a request that have places, and its mover; None where that is left to the reader.
 
-    The third is None where the mover is left to the reader. Raises as `_locate` does, and for an object that is given
-    twice.
+    Raises as `_locate` does, and for an object that is given twice.
     """
-    request = run.request
-    given = [(f"/objects/{index}", each) for index, each in enumerate(request.objects)]
-    mover = [] if request.place is None else [("/grounding", request.place)]
-    places = [_locate(run, each, pointer) for pointer, each in (*given, *mover)]
-    masks = [place.mask for place in places[: len(given)]]
-    objects, warnings = list[LocatedObject](), list[str]()
-    for (pointer, each), place in zip(given, places, strict=False):
-        twin = next((at for at, other in enumerate(objects) if iou(place.bbox, other.bbox) >= SAME_BOX_IOU), None)
+    request, found = run.request, list[Located]()
+    for index, each in enumerate(request.objects):
+        if not each.has_place:
+            continue
+        place = _locate(run, each, pointer := f"/objects/{index}")
+        twin = next((at for at, other in enumerate(found) if iou(place.bbox, other.bbox) >= SAME_BOX_IOU), None)
         if twin is not None:
             detail = f"lies in the same box as `objects.{twin}`"
             message = f"`{field_of(pointer)}` {detail}: give each object once."
             raise InvalidRequest(message, errors=(FieldError(pointer, detail),))
-        mask = None if place.mask is None else run.backends.artifacts.put(encode_png(place.mask.full()), "image/png")
-        objects.append(
-            LocatedObject(
-                object=each.object,
-                bbox=place.bbox,
-                role=each.role,
-                mask=mask,
-                prior=each.prior,
-                source="request",
-                is_doubtful=place.is_doubtful,
-            )
-        )
-        warnings += place.warnings
-    if request.place is None:
-        return tuple(objects), masks, None, warnings
-    reading = GroundingReading(
-        request.place.object or DEFAULT_NAME,
-        places[-1].bbox,
-        prior=request.place.prior,
-        mask=None if places[-1].mask is None else places[-1].mask.full(),
-        warnings=places[-1].warnings,
-        changes=() if request.interventions else run.question.changes,
-        asked=run.question.asked,
-        is_doubtful=places[-1].is_doubtful,
-    )
-    return tuple(objects), masks, reading, warnings
+        found.append(place)
+    return found, None if request.place is None else _locate(run, request.place, "/grounding")
 
 
-def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Place:
+def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, pointer: str) -> Located:
     """The place of an object; `pointer` is the JSON Pointer to `given`.
 
     Raises `InvalidRequest` for a place outside the image or all over it and for a mask that is none of this image, and
@@ -236,8 +259,9 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
     outside = f"lies outside the upright image of {scene.width} x {scene.height} px"
     if given.mask is not None:
         mask = _read_mask(run, given.mask, f"{pointer}/mask")
-        scene.preset_mask(mask.bbox, mask.full)
-        return Place(mask.bbox, mask)
+        bbox = mask.bbox if given.bbox is None else given.bbox
+        scene.preset_mask(bbox, mask.full)
+        return Located.at(given, bbox, mask)
     if given.bbox is not None:
         x0, y0, x1, y1 = given.bbox
         clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
@@ -248,18 +272,20 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
             raise _misplaced(f"{pointer}/bbox", given.bbox, f"covers {share:.0%} of the image")
         beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
         warnings = () if clipped == given.bbox else (beyond,)
-        return _outlined_box(run, clipped, field, warnings) if run.can_segment else Place(clipped, warnings=warnings)
+        if run.can_segment:
+            return _outlined_box(run, given, clipped, field, warnings)
+        return Located.at(given, clipped, warnings=warnings)
     x, y = given.point or (0.0, 0.0)
     if not (0 <= x < scene.width and 0 <= y < scene.height):
         raise _misplaced(f"{pointer}/point", (x, y), outside)
     # The first point of a path says less of the mover than a point that is given for it.
-    may_guess = pointer == "/grounding" and run.request.grounding is None
+    may_guess = pointer == "/grounding" and (run.request.grounding is None or not run.request.grounding.has_place)
     if run.can_segment:
         found = outlines_at(run.embedded(), (x, y))
         if len(found) == 1 or (found and may_guess):
             mask = CroppedMask.of(found[0].mask)
             scene.preset_mask(found[0].bbox, mask.full)
-            return Place(found[0].bbox, mask)
+            return Located.at(given, found[0].bbox, mask)
         fault = (
             f"{len(found)} objects lie there, one inside the other."
             if found
@@ -269,12 +295,12 @@ def _locate(run: Run[SimulateRequest], given: PlaceRequest, pointer: str) -> Pla
             raise _not_cut_out(f"The object at the point [{x:.0f}, {y:.0f}] is not clear: {fault}", pointer)
     cutout = scene.locate((x, y))
     if cutout.mask is None:
-        return Place(cutout.bbox)
+        return Located.at(given, cutout.bbox)
     if cutout.fault is not None and not may_guess:
         raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {cutout.fault}.", pointer)
     box = ", ".join(f"{value:.0f}" for value in cutout.bbox)
     warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
-    return Place(cutout.bbox, CroppedMask.of(cutout.mask), (warning,))
+    return Located.at(given, cutout.bbox, CroppedMask.of(cutout.mask), (warning,))
 
 
 def _not_cut_out(detail: str, pointer: str) -> CannotGround:
@@ -285,19 +311,26 @@ def _not_cut_out(detail: str, pointer: str) -> CannotGround:
     )
 
 
-def _outlined_box(run: Run[SimulateRequest], bbox: BBox, field: str, warnings: tuple[str, ...]) -> Place:
+def _outlined_box(
+    run: Run[SimulateRequest],
+    given: GroundingRequest | ObjectRequest,
+    bbox: BBox,
+    field: str,
+    warnings: tuple[str, ...],
+) -> Located:
     """What the segmenter sees in a box that the request gives; where it is not sure of it, nothing else is."""
     (outline,) = outlines_in(run.embedded(), [bbox])
     if outline is None or not outline.is_sure:
         doubt = f"Two attempts to outline what is in `{field}.bbox` disagree: give its outline as `{field}.mask`."
         mask = None if outline is None else CroppedMask.of(outline.mask)
-        return Place(bbox, mask, (*warnings, doubt), is_doubtful=True)
+        doubted = given.model_copy(update={"is_doubtful": True})
+        return Located.at(doubted, bbox, mask, (*warnings, doubt))
     mask = CroppedMask.of(outline.mask)
     run.scene.preset_mask(outline.bbox, mask.full)
-    return Place(outline.bbox, mask, warnings)
+    return Located.at(given, outline.bbox, mask, warnings)
 
 
-def _find(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, ...]:
+def find_things(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, ...]:
     """What the detector finds for some nouns, outlined as well as can be. To be called with `cpu` held."""
     detector, scene = run.backends.perception.detector, run.scene
     assert detector is not None, "asked for only where there is a detector"
@@ -309,53 +342,43 @@ def _find(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, .
     return tuple(SeenThing(each.phrase, one.mask, each.score) for each, one in outlines if one and one.is_sure)
 
 
-def _outlined(run: Run[SimulateRequest], reading: GroundingReading) -> GroundingReading:
-    """The reading with its things outlined by the segmenter. To be called with `cpu` held.
+def bare(reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
+    """The things of a reading by their boxes alone."""
+    return Located.of(mover_of(reading)), tuple(map(Located.of, reading.objects)), ()
+
+
+def outlined(run: Run[SimulateRequest], reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
+    """The things of a reading outlined by the segmenter, and doubts. To be called with `cpu` held.
 
     Raises `CannotGround` where no two looks agree on the outline of the mover: a scrap of it would be moved. Of others
     on which none agree, nothing is sure.
     """
-    changed = [thing for each in reading.interventions for thing in (each.object, *each.targets)]
-    located = [each for each in (*reading.others, *changed) if each.mask is None]
-    boxes = dict.fromkeys((reading.bbox, *(each.bbox for each in located)))
+    mover = mover_of(reading)
+    boxes = dict.fromkeys(box_of(each) for each in (mover, *reading.objects))
     outlines = dict(zip(boxes, outlines_in(run.embedded(), list(boxes)), strict=True))
-    own, doubted = outlines[reading.bbox], list[str]()
+    own, doubted = outlines[box_of(mover)], list[str]()
     if own is None or not own.is_sure:
-        box = ", ".join(f"{value:.0f}" for value in reading.bbox)
+        box = ", ".join(f"{value:.0f}" for value in box_of(mover))
         raise CannotGround(
-            f"'{reading.object}' was looked for in [{box}], but two attempts to outline it disagree.", remedy=GIVE_PLACE
+            f"'{mover.object}' was looked for in [{box}], but two attempts to outline it disagree.", remedy=GIVE_PLACE
         )
-
-    def outlined(thing: LocatedObject) -> LocatedObject:
-        outline = outlines.get(thing.bbox) if thing.mask is None else None
-        if thing.mask is not None:
-            return thing
+    others = list[Located]()
+    for thing in reading.objects:
+        outline = outlines[box_of(thing)]
         if outline is not None and mask_iou(outline.mask, own.mask) > SAME_MASK:  # the mover, under another name
-            return thing.model_copy(update={"bbox": own.bbox})
-        if outline is None or not outline.is_sure:
+            others.append(Located.at(thing, own.bbox))
+        elif outline is None or not outline.is_sure:
             doubted.append(thing.object)
-            return thing.model_copy(update={"is_doubtful": True})
-        mask = run.backends.artifacts.put(encode_png(outline.mask), "image/png")
-        return thing.model_copy(update={"bbox": outline.bbox, "bbox_deviation": 0.0, "mask": mask})
-
-    others = tuple(outlined(each) for each in reading.others)
-    interventions = tuple(
-        each.model_copy(update={"object": outlined(each.object), "targets": tuple(map(outlined, each.targets))})
-        for each in reading.interventions
-    )
-    doubts = [
+            others.append(Located.of(thing.model_copy(update={"is_doubtful": True})))
+        else:
+            exact = thing.model_copy(update={"bbox_deviation": None})
+            others.append(Located.at(exact, outline.bbox, CroppedMask.of(outline.mask)))
+    doubts = tuple(
         f"Two attempts to outline '{name}' disagree: give it in `objects`, with its `mask`."
         for name in dict.fromkeys(doubted)
-    ]
-    return replace(
-        reading,
-        bbox=own.bbox,
-        bbox_deviation=0.0,
-        mask=own.mask,
-        others=others,
-        interventions=interventions,
-        warnings=(*reading.warnings, *doubts),
     )
+    exact = mover.model_copy(update={"bbox_deviation": None})
+    return Located.at(exact, own.bbox, CroppedMask.of(own.mask)), tuple(others), doubts
 
 
 def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidRequest:
@@ -366,8 +389,7 @@ def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidReque
 
 def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> CroppedMask:
     """The mask of the image that a request names. Raises `InvalidRequest`."""
-    assert isinstance(given, ImageArtifact), "the masks of a request are kept before its stages run"
-    image = run.image.info
+    kept, image = kept_mask(given), run.image.info
 
     def refused(fault: str) -> InvalidRequest:
         return InvalidRequest(
@@ -377,7 +399,7 @@ def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Cropp
         )
 
     try:
-        data = run.backends.artifacts.read(given.artifact)
+        data = run.backends.artifacts.read(kept.artifact)
         picture = decode(data, max_megapixels=image.width * image.height / 1e6)
     except UNREADABLE as error:
         raise refused(f"cannot be read: {error.detail}") from error
@@ -393,11 +415,86 @@ def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Cropp
     return CroppedMask.of(mask)
 
 
+# --- what stage 1 comes to
+
+
+def cut_out(
+    run: Run[SimulateRequest], mover: Located, others: Sequence[Located], reading: Reading
+) -> tuple[Scene, Artifact]:
+    """The scene in which it is known what moves, and the mask of that, stored. To be called with `cpu` held."""
+    shows_trail = run.words.trail_named or (reading.motion is not None and reading.motion.cue == "trail")
+    scene = run.scene_with(mover.bbox, [each.bbox for each in others], shows_trail)
+    silhouette = scene.silhouette(mover.bbox) if mover.mask is None else mover.mask.full()
+    return scene, run.backends.artifacts.put(encode_png(silhouette), "image/png")
+
+
+def settle_grounding(
+    run: Run[SimulateRequest], reading: Reading, mover: Located, others: Sequence[LocatedObject], mask: Artifact
+) -> Grounding:
+    """The grounding, with its interventions made, its names understood, and where its mover goes, if it is put."""
+    request, said = run.request, mover.said
+    own = LocatedObject(object=mover.name, bbox=mover.bbox, prior=said.prior, source=said.source)
+    interventions = _find_interventions(request, reading, (*others, own))
+    removed = [each.object.bbox for each in interventions if each.kind == "remove"]
+    x0, y0, x1, y1 = mover.bbox
+    pointed = None if said.source == "request" else said.point
+    grounding = Grounding(
+        object=mover.name,
+        point=pointed or ((x0 + x1) / 2, (y0 + y1) / 2),
+        bbox=mover.bbox,
+        mask=mask,
+        others=tuple(other for other in others if not is_among(other.bbox, removed)),
+        objects_complete=request.objects_complete or reading.objects_complete,
+        interventions=interventions,
+        prior=said.prior,
+        asked=request.asked or reading.asked,
+        question_is_doubtful=request.question_is_doubtful or reading.question_is_doubtful,
+        trail_named=run.words.trail_named,
+        bbox_deviation=said.bbox_deviation or 0.0,
+        is_doubtful=said.is_doubtful,
+        language=reading.language,
+        source=said.source,
+    )
+    return put_into_first(understood(grounding, run.backends.words()), request, reading.motion)
+
+
+def drawings_removed(scene: Scene, words: WordsReading) -> list[str]:
+    """A warning where the image has drawings over it of which the question does not speak."""
+    drawn = [("an arrow", each.tail) for each in scene.arrows if "arrow" not in words.drawings_named]
+    drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in words.drawings_named]
+    places = ", ".join(f"{name} at ({x:.0f}, {y:.0f})" for name, (x, y) in drawn)
+    told = (
+        f"Taken for annotations drawn over the image, although the question mentions none: {places}. "
+        "They are removed from the frames; `generator_options.clean_cues: false` keeps them."
+    )
+    return [told] if drawn else []
+
+
+def unanswerable(grounding: Grounding, run: Run[SimulateRequest]) -> list[str]:
+    """Warnings where what is asked has no outcome."""
+    warnings, asked = list[str](), grounding.asked
+    if name := asked_of_itself(grounding):
+        warnings.append(
+            f"Something cannot hit itself, so the question about '{name}' has no answer: ask about another object."
+        )
+    if run.request.asked is not None or grounding.source != "embedded":  # which warns of what it does not find
+        things = (*others_of(grounding), *removed_of(grounding))
+        known = [grounding.object, *(each.object for each in things)]
+        named = () if asked is None else (asked.subject, asked.target, *asked.among)
+        warnings += [
+            f"The question asks about '{name}', which was not found in the image, so there is no outcome: give it in "
+            "`objects` under this name."
+            for name in named
+            if name is not None and not any(same_name(name, each) for each in known)
+        ]
+    return warnings
+
+
 # --- interventions
 
 
 def _find_interventions(
-    request: SimulateRequest, reading: GroundingReading, things: Sequence[LocatedObject]
+    request: SimulateRequest, reading: Reading, things: Sequence[LocatedObject]
 ) -> tuple[Intervention, ...]:
     """Those of the request, else those of the question; the last of `things` is the mover.
 
@@ -406,9 +503,10 @@ def _find_interventions(
     """
     mover, found = things[-1], list[Intervention]()
     given = [(f"/interventions/{index}", change) for index, change in enumerate(request.interventions)]
-    read = [(None, change) for change in (*reading.interventions, *reading.changes)]
+    read = [(None, change) for change in reading.interventions]
     for pointer, change in given or read:
-        each = change if isinstance(change, Intervention) else _located(change, things, pointer)
+        gone = [other.object for other in found if other.kind == "remove"]  # of two with one name, each goes once
+        each = _with_things(change, (*(thing for thing in things if thing not in gone), *gone), pointer)
         name, box, targets = each.object.object, each.object.bbox, [thing.bbox for thing in each.targets]
         taken = [other.object.bbox for other in found if other.kind == "remove"]
         put = [other for other in found if other.kind == "place"]
@@ -437,8 +535,8 @@ def _find_interventions(
     return tuple(found)
 
 
-def _located(
-    change: InterventionRequest | NamedChange, things: Sequence[LocatedObject], pointer: str | None = None
+def _with_things(
+    change: InterventionRequest, things: Sequence[LocatedObject], pointer: str | None = None
 ) -> Intervention:
     """A change with its objects in the place of their names, of the request at a JSON Pointer or of the question.
 
@@ -470,15 +568,15 @@ def placed_mover(grounding: Grounding) -> Intervention | None:
     return next((each for each in placed if is_same_object(each.object.bbox, grounding.bbox)), None)
 
 
-def put_into_first(grounding: Grounding, request: SimulateRequest, hints: MotionHints | None) -> Grounding:
+def put_into_first(grounding: Grounding, request: SimulateRequest, read: MotionRequest | None) -> Grounding:
     """With the mover put into the first of several things, if it is asked into which of them it fits and nothing says
     how it moves."""
     asked, mover = grounding.asked, LocatedObject(object=grounding.object, bbox=grounding.bbox, source=grounding.source)
     if asked is None or (asked.form, asked.relation, asked.subject) != ("which", "inside", None):
         return grounding
-    given, kind = request.stated_motion, None if hints is None else hints.kind
-    if grounding.source == "request" and request.trajectory is None:
-        kind = "place" if given is None else given.stated_kind
+    given, kind = request.motion, None if read is None else read.kind
+    if request.place is not None and request.trajectory is None:
+        kind = "place" if given is None or not given.is_whole else given.stated_kind
     first = [each for each in others_of(grounding) if asked.among and same_name(each.object, asked.among[0])]
     if kind != "place" or not first or placed_mover(grounding) is not None:
         return grounding

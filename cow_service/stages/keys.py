@@ -15,9 +15,19 @@ from pydantic import BaseModel
 
 from cow_service import __version__, records
 from cow_service.perception.base import PerceptionKind
-from cow_service.readers.base import MotionHints
 from cow_service.readers.prompts import load_prompt
-from cow_service.records import Clip, Grounding, Motion, ReaderInfo, Record, Simulation, Trajectory, Usage, Verdict
+from cow_service.records import (
+    Clip,
+    Grounding,
+    Motion,
+    MotionRequest,
+    ReaderInfo,
+    Record,
+    Simulation,
+    Trajectory,
+    Usage,
+    Verdict,
+)
 from cow_service.requests import DepthRequest, SimulateRequest, Stage
 
 Value = TypeVar("Value")
@@ -31,7 +41,7 @@ class StageResult(Record, Generic[Value]):
     reader: ReaderInfo | None = None  # null where the stage asked none
     usage: Usage = Usage()
     artifacts: tuple[records.Sha256, ...] = ()  # those that the value names
-    hints: MotionHints | None = None  # of stage 1 for stage 2
+    motion: MotionRequest | None = None  # of stage 1 for stage 2: what the reader said of it
 
 
 class EstimatedDepth(Record):
@@ -99,10 +109,10 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "language", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "baseline": KeyFields(("question", "language", "seed", "options", "votes"), "reader", votes="votes"),
     "grounding": KeyFields(
-        ("seed", "left_to_reader"),
+        ("seed", "left_to_reader", "grounding"),
         "reader",
         set_by_request=("place",),
-        always=("question", "asked", "objects", "objects_complete", "interventions"),
+        always=("question", "question_is_doubtful", "asked", "objects", "objects_complete", "interventions"),
         perception=("detector", "segmenter"),
         # The reader is asked the same of the place; hints for the motion are not used where the request gives it.
         read_with="motion",
@@ -110,7 +120,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
     "motion": KeyFields(
         ("question", "seed", "left_to_reader"),
         "reader",
-        set_by_request=("stated_motion", "trajectory"),
+        set_by_request=("whole_motion", "trajectory"),
         always=("law", "motion", "camera", "depth"),
         prompt="motion-sentence",
     ),

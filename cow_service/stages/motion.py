@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
@@ -14,19 +13,38 @@ from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, 
 from cow_service.narration.words import bare_name, direction_words, place_words, same_name
 from cow_service.perception.facing import facing
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
-from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera
+from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
-from cow_service.physics.trail_fit import fit_throw, straight_direction
-from cow_service.readers.base import MotionHints, MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
+from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
 from cow_service.readers.prompts import load_prompt
 from cow_service.readers.remedies import GIVE_DIRECTION
-from cow_service.records import BBox, Grounding, Law, LocatedObject, Motion, MotionKind, Source, Vector
-from cow_service.requests import MotionRequest, SimulateRequest
-from cow_service.stages.grounding import placed_mover
+from cow_service.records import (
+    DIRECTED_KINDS,
+    FALLING_KINDS,
+    OF_A_LINE,
+    BBox,
+    Cue,
+    Grounding,
+    GroundingRequest,
+    Law,
+    LocatedObject,
+    Motion,
+    MotionKind,
+    MotionRequest,
+    OtherMotionRequest,
+    Quantity,
+    Source,
+    SpeedWord,
+    Vector,
+    as_said,
+    merged,
+)
+from cow_service.requests import SimulateRequest
+from cow_service.stages.grounding import others_of, placed_mover
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
-from cow_service.stages.settling import SeenWay, settle_way
-from cow_service.vision.scene import Scene
+from cow_service.stages.settling import Objections, SeenWay, settle_way
+from cow_service.vision.scene import Scene, arrow_fault
 from cow_service.vision.shadows import find_shadow
 from cow_service.vision.trails import trail_of
 
@@ -38,157 +56,211 @@ SCALE_DEVIATION = 0.25  # of the logarithm of metres per pixel, where nobody gav
 ELSEWHERE_SIGMA = 0.3  # of the logarithm of a scale that is told by the size of what stands elsewhere
 LEAST_SIZE_SIGMA = 0.05
 MOST_APART = 2.0  # factor between two scales from which they disagree
-_OF_A_LINE = ("distance", "duration", "until", "steps")  # what only a motion along a line can have
 
 
-def read_motion(run: Run[SimulateRequest], grounding: Grounding, hints: MotionHints | None) -> StageResult[Motion]:
-    """The motion, from the request where it gives one or a whole path, else from the reader, which gave the `hints`.
+def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionRequest | None) -> StageResult[Motion]:
+    """The motion: what the request says of it goes before what was read, and what was measured before both.
 
-    What the request says of speed and length goes before what the reader says. Raises what the reader raises, and
-    `InvalidRequest` for a second mover that is none of the `objects`.
+    `read` is what the reader said while it looked for the object; where the request leaves the motion open and nothing
+    was read, the reader is asked. Raises what the reader raises, `CannotReadDirection` where nothing tells which way,
+    and `InvalidRequest` for a second mover that is none of the `objects`.
     """
     request = run.request
-    reading = _given_motion(request, grounding)
+    given, warnings = given_motion(request, grounding), list[str]()
     source: Source = "request"
-    if reading is None:
-        with run.cpu():
-            given = run.reader_input("motion", run.scene_of(grounding, None if hints is None else hints.cue))
-            seen = _way_seen(run, given.scene, grounding)
-        way, source = run.question.way, run.reader.source
-        reading, objections = settle_way(run.reader.read_motion(given, grounding, hints), way, seen, grounding.bbox)
-        if objections:
-            with suppress(CannotReadDirection, MllmBadReply, MllmUnavailable):
-                again = run.reader.read_motion(replace(given, objections=objections), grounding, hints)
-                reading, objections = settle_way(again, way, seen, grounding.bbox)
-        reading = replace(reading, warnings=(*reading.warnings, *objections))
-        if reading.direction is None and reading.kind in records.DIRECTED_KINDS:
-            raise CannotReadDirection(
-                f"Neither the image nor the question tells which way the {grounding.object} moves.",
-                remedy=GIVE_DIRECTION,
-            )
-    if request.motion is not None:
-        reading = _with_request(reading, request.motion, grounding)
-    placed = placed_mover(grounding)
-    if placed is not None and reading.kind == "place" and not reading.sentence:
-        sentence = f"The {bare_name(grounding.object)} is lifted, carried over and put {place_words(placed)}"
-        reading = replace(reading, sentence=sentence)
-    warnings = list(reading.warnings)
-    unused = [name for name in _OF_A_LINE if getattr(reading, name) not in (None, ())]
-    if reading.kind != "linear" and unused:
-        reading = replace(reading, distance=None, duration=None, until=None, steps=())
-        ends = f"a {reading.kind} ends where it hits something"
+    if given is not None and given.is_whole:
+        said, _ = settled_way(run, grounding, given, given)
+    else:
+        source, (said, warnings) = run.reader.source, read_way(run, grounding, read, given)
+    unused = [name for name in OF_A_LINE if getattr(said, name) not in (None, ())]
+    if said.stated_kind != "linear" and unused:
+        said = said.model_copy(update={"distance": None, "duration": None, "until": None, "steps": ()})
+        ends = f"a {said.stated_kind} ends where it hits something"
         warnings.append(f"The {' and '.join(unused)} of the motion was not used: {ends}.")
-    scale, doubts = scale_of(run, grounding, reading)
-    reading = replace(reading, metres_per_pixel=scale)
+    scale, doubts = scale_of(run, grounding, said)
     warnings += doubts
-    if _is_up_the_floor(reading, grounding, request.law):
+    if _is_up_the_floor(said, grounding, request.law):
         warnings.append(
             f"'Up' was read as along the floor, away from the camera. If the {bare_name(grounding.object)} leaves "
             "the floor, say that it is lifted or thrown, or give `motion.rises`."
         )
-        reading = replace(reading, depth=depth_motion(1.0)[1])
-    motion = _complete(run.image.info.width, grounding, reading, source, request.law)
+        said = said.model_copy(update={"depth": depth_motion(1.0)[1]})
+    motion = completed(run, grounding, said, scale, source)
     if motion.cue == "trail":
         with run.cpu():
             scene = run.scene_of(grounding, motion.cue)
-            motion = along_trail(scene, grounding, motion, run, reading.speed is not None)
-    # What nobody said: how fast a throw is, and the scale of lengths in metres.
-    if motion.kind == "projectile" and not isinstance(reading.speed, Quantity) and not motion.trail:
+            motion = along_trail(scene, grounding, motion, run, said.speed is not None)
+    return StageResult(value=motion, warnings=(*warnings, *assumed(motion, said)))
+
+
+def assumed(motion: Motion, said: MotionRequest) -> list[str]:
+    """Warnings of what nobody said: how fast a throw is, and the scale of lengths in metres."""
+    warnings = list[str]()
+    if motion.kind == "projectile" and (said.speed is None or isinstance(said.speed, str)) and not motion.trail:
         warnings.append(
             f"How far a throw goes depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it."
         )
-    lengths = [each for each in (reading.speed, reading.distance) if isinstance(each, Quantity)]
-    if motion.metres_per_pixel.source == "default" and any(each.unit in ("m", "m/s") for each in lengths):
+    units = [each.unit for each in (said.speed, said.distance) if isinstance(each, Quantity)]
+    if motion.metres_per_pixel.source == "default" and not {"m", "m/s"}.isdisjoint(units):
         warnings.append(
             f"Lengths in metres were taken at {motion.metres_per_pixel.value:.4f} m per pixel, which was assumed; "
             "`motion.metres_per_pixel` sets it."
         )
-    return StageResult(value=motion, warnings=tuple(warnings))
+    return warnings
 
 
-def _way_seen(run: Run[SimulateRequest], scene: Scene, grounding: Grounding) -> SeenWay:
+# --- which way
+
+
+def read_way(
+    run: Run[SimulateRequest], grounding: Grounding, read: MotionRequest | None, given: MotionRequest | None
+) -> tuple[MotionRequest, list[str]]:
+    """The motion as it was read, with what is given in its place, settled; and warnings.
+
+    A reader that may be wrong is asked once more with what speaks against its reading.
+    """
+    reader, warnings = run.reader, list[str]()
+    place = GroundingRequest(object=grounding.object, bbox=grounding.bbox)
+    known = tuple(map(as_said, grounding.others))
+    asking = run.reader_input("motion", run.scene_of(grounding, None if read is None else read.cue), known=known)
+    asking = replace(asking, given=asking.given.model_copy(update={"grounding": place, "motion": read or given}))
+    if read is None:
+        result = reader.read(asking)
+        read, warnings = result.reading.motion or MotionRequest(), [*result.warnings]
+    words = run.words.reading.motion or MotionRequest()
+
+    def settled(read: MotionRequest) -> tuple[MotionRequest, Objections]:
+        return settled_way(run, grounding, merged(given, read) or read, words, asking.scene)
+
+    way, objections = settled(read)
+    if objections and reader.heeds_objections:
+        open_way = read.model_copy(update={"direction": None, "along_arrow": None, "cue": None, "depth": 0.0})
+        again = asking.given.model_copy(update={"motion": open_way})
+        with suppress(CannotReadDirection, MllmBadReply, MllmUnavailable):
+            result = reader.read(replace(asking, given=again, objections=objections))
+            way, objections = settled(merged(result.reading.motion, open_way) or open_way)
+            warnings += result.warnings
+    if way.cue == "arrow" and not words.has_way and way.along_arrow and read.direction_deviation is None:
+        warnings.append("The question names no direction; the arrow drawn at the object was followed.")
+    return way, [*warnings, *objections]
+
+
+def settled_way(
+    run: Run[SimulateRequest],
+    grounding: Grounding,
+    read: MotionRequest,
+    said: MotionRequest,
+    scene: Scene | None = None,
+) -> tuple[MotionRequest, Objections]:
+    """The motion with its direction by the surest source. What is `said` in words, or given, decides.
+
+    Raises `CannotReadDirection` where the arrow, the goal or the front by which it is told cannot be seen.
+    """
+    if read.stated_kind not in (*DIRECTED_KINDS, "static", None) or _is_exact(read):
+        return read, ()
+    with run.cpu():
+        scene = scene or run.scene_of(grounding, read.cue)
+        seen = seen_way(run, scene, grounding, read, said)
+        way, objections = settle_way(read, said, seen, grounding.bbox)
+        if way.direction is None and way.stated_kind in DIRECTED_KINDS:
+            raise CannotReadDirection(_fault_of(scene, grounding, said, seen), remedy=GIVE_DIRECTION)
+    return way, objections
+
+
+def _is_exact(read: MotionRequest) -> bool:
+    return read.direction is not None and read.direction_deviation is None
+
+
+def seen_way(
+    run: Run[SimulateRequest], scene: Scene, grounding: Grounding, read: MotionRequest, said: MotionRequest
+) -> SeenWay:
     """What the image shows of the way of the mover. To be called with `cpu` held."""
-    way, words = run.question.way, run.backends.words()
-    arrow, front = scene.arrow_at(grounding.bbox), None
-    if way.forward is not None and grounding.prior is not None and grounding.prior.elongated:
+    words, arrow, front = run.backends.words(), scene.arrow_at(grounding.bbox), None
+    if said.forward is not None and grounding.prior is not None and grounding.prior.elongated:
         front = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
-    goals = [each for each in grounding.others if way.towards and words.likeness(way.towards, each.object) == "same"]
-    has_trail = trail_of(scene.trails, grounding.bbox) is not None
-    return SeenWay(None if arrow is None else arrow.direction, goals[0] if len(goals) == 1 else None, front, has_trail)
+    goal = said.towards or read.towards
+    others = others_of(grounding) if goal else ()
+    goals = [each for each in others if same_name(each.object, goal or "")]
+    goals = goals or [each for each in others if words.likeness(goal or "", each.object) == "same"]
+    trail = trail_of(scene.trails, grounding.bbox)
+    return SeenWay(
+        arrow=None if arrow is None else arrow.direction,
+        is_only_arrow=len(scene.arrows_near(grounding.bbox)) == 1,
+        goal=goals[0].bbox if len(goals) == 1 else None,
+        front=front,
+        trail=None if trail is None else trail.heading,
+        is_thrown=trail is not None and is_thrown(trail.positions),
+    )
+
+
+def _fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: SeenWay) -> str:
+    """Why nothing tells which way the mover goes."""
+    name = grounding.object
+    if said.along_arrow is not None:
+        return arrow_fault(scene, grounding)
+    if said.cue == "trail":
+        fault = f"no three positions of the {name} one after another were found in the image"
+        return f"The question speaks of a trail, and {fault}."
+    if said.towards is not None:
+        return f"Where the {name} moves to is not clear: '{said.towards}' was not found in the image."
+    if said.forward is not None:
+        told = f"The question says that the {name} moves {'forward' if said.forward else 'backward'}."
+        if grounding.prior is None or not grounding.prior.elongated:
+            return f"{told} The service sees only of vehicles with wheels which way they face."
+        return f"{told} Which way it faces could not be seen for certain."
+    near = len(scene.arrows_near(grounding.bbox))
+    return (
+        "No direction was read in the question (left, right, up, down, towards, away, along the arrow), and the image "
+        f"shows {near or 'no'} arrow{'s' * (near != 1)} at the {name}, and none was followed."
+    )
 
 
 # --- what the request says
 
 
-def _given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReading | None:
-    """What the request says of the motion; None where it leaves that to the reader.
+def given_motion(request: SimulateRequest, grounding: Grounding) -> MotionRequest | None:
+    """What the request says of the motion.
 
-    A given path amounts to a motion from its first point towards its last, at its mean speed (px/s).
+    A given path amounts to a motion from its first point towards its last, at its mean speed (px/s). What the request
+    puts somewhere moves so, where nothing else is said of it.
     """
-    given, path = request.stated_motion, request.trajectory
-    if given is not None:
-        # A direction in the image leaves open how far a throw leads into its depth.
-        is_open = given.stated_kind == "projectile" and "depth" not in given.model_fields_set
-        deviation = given.depth_deviation if given.depth_deviation is not None or is_open else 0.0
-        return MotionReading(
-            given.stated_kind or "linear", given.direction, "request", depth=given.depth, depth_deviation=deviation
-        )
+    given, path = request.motion, request.trajectory
+    if given is not None and given.is_whole:
+        return given
+    told = MotionRequest()
     if path is not None:
         (x0, y0), last = path.points[0], path.points[-1]
         way = sum(math.dist(a, b) for a, b in pairwise(path.points))
         if way < 1e-6:
-            return MotionReading("static", None, "request")
-        # The first move of a path that ends where it began.
-        x, y = next(point for point in (last, *path.points) if math.dist(point, (x0, y0)) > 1e-6)
-        speed = Quantity(way * path.fps / (len(path.points) - 1), "px/s")
-        return MotionReading("linear", (x - x0, y - y0), "request", speed=speed)
-    if grounding.source == "request" and placed_mover(grounding) is not None:
-        return MotionReading("place", None, "request")
-    return None
+            told = MotionRequest(kind="static")
+        else:  # the first move of a path that ends where it began
+            x, y = next(point for point in (last, *path.points) if math.dist(point, (x0, y0)) > 1e-6)
+            speed = way * path.fps / (len(path.points) - 1)
+            told = MotionRequest.model_construct(kind="linear", direction=(x - x0, y - y0), speed=speed)
+    elif request.place is not None and placed_mover(grounding) is not None:
+        told = MotionRequest(kind="place")
+    return merged(given, told)
 
 
-def _with_request(reading: MotionReading, given: MotionRequest, grounding: Grounding) -> MotionReading:
-    """The reading with what a request says of speed, length, scale and other movers.
-
-    Raises `InvalidRequest` for another mover that was not located.
-    """
-    others: list[OtherMotionReading] = []
-    for index, each in enumerate(given.others):
-        found = [other for other in grounding.others if same_name(other.object, each.object)]
-        if len(found) != 1:
+def others_given(motion: MotionRequest, grounding: Grounding) -> list[tuple[OtherMotionRequest, LocatedObject]]:
+    """What else moves, each with the thing of its name. Raises `InvalidRequest` for one that was not located."""
+    found = list[tuple[OtherMotionRequest, LocatedObject]]()
+    for index, each in enumerate(motion.others):
+        things = [other for other in grounding.others if same_name(other.object, each.object)]
+        if len(things) != 1:
             seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
             pointer = f"/motion/others/{index}/object"
-            detail = f"'{each.object}' matches {len(found)} of the located objects ({seen})"
+            detail = f"'{each.object}' matches {len(things)} of the located objects ({seen})"
             raise InvalidRequest(
                 f"`{field_of(pointer)}`: {detail}: give it in `objects` under this name.",
                 errors=(FieldError(pointer, detail),),
             )
-        speed = _quantity(each.speed, "px/s")
-        others.append(OtherMotionReading(found[0], each.stated_kind, each.direction, None, each.depth, speed))
-    scale = given.metres_per_pixel
-    said = {
-        "speed": _quantity(given.speed, "px/s"),
-        "speed_deviation": given.speed_deviation,
-        "distance": _quantity(given.distance, "px"),
-        "duration": given.duration,
-        "until": given.until,
-        "rises": given.rises or None,
-        "steps": tuple(
-            StepReading(step.direction, step.depth, _quantity(step.distance, "px"), step.duration)
-            for step in given.steps
-        ),
-        "metres_per_pixel": None if scale is None else records.MetresPerPixel(value=scale, source="request"),
-        "others": tuple(others),
-    }
-    return replace(reading, **{name: value for name, value in said.items() if value not in (None, ())})
-
-
-def _quantity(value: float | None, unit: Literal["px", "px/s"]) -> Quantity | None:
-    return None if value is None else Quantity(value, unit)
+        found.append((each, things[0]))
+    return found
 
 
 def scale_of(
-    run: Run[SimulateRequest], grounding: Grounding, reading: MotionReading
+    run: Run[SimulateRequest], grounding: Grounding, said: MotionRequest
 ) -> tuple[records.MetresPerPixel | None, list[str]]:
     """Metres per pixel at the mover, and doubts: by a depth map in metres, else as given, else by sizes that are given,
     else as read of it or others.
@@ -196,11 +268,11 @@ def scale_of(
     What stands elsewhere on the floor is nearer or farther, by the camera as far as it is known. None where nobody
     says anything of it.
     """
-    given = reading.metres_per_pixel
-    told = {} if given is None else {"metres_per_pixel": given.value}
+    given = said.metres_per_pixel
+    told = {} if given is None else {"metres_per_pixel": given}
     things = [LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior), *grounding.others]
     width, height = run.image.info.width, run.image.info.height
-    fit, depth_map = given_camera((width, height), reading.down, run.request.camera, run.focal), run.depth
+    fit, depth_map = given_camera((width, height), said.down, run.request.camera, run.focal), run.depth
     mapped = None
     if depth_map is not None and run.request.law == "contact" and run.request.trajectory is None:
         mapped = depth_map.metres_per_pixel(grounding.bbox, math.exp(fit.mean[1]) * width)
@@ -213,7 +285,7 @@ def scale_of(
         size = None if each.prior is None else each.prior.size
         if size is None or not size.value > 0:
             continue
-        in_air = reading.kind in records.FALLING_KINDS or (each.prior is not None and each.prior.stands_on == "air")
+        in_air = said.kind in FALLING_KINDS or (each.prior is not None and each.prior.stands_on == "air")
         nearer = 1.0 if in_air or not math.isfinite(depth) else float(depth)
         x0, y0, x1, y1 = each.bbox
         value = size.value / max(x1 - x0, y1 - y0) / nearer
@@ -222,22 +294,26 @@ def scale_of(
         told[f"the size of '{each.object}'"] = value
     doubts: list[str] = []
     if told and max(told.values()) > MOST_APART * min(told.values()):
-        said = ", ".join(f"{value:.4g} by {name}" for name, value in told.items())
-        doubts = [f"The given sizes disagree by more than a factor of two, in metres per pixel: {said}."]
+        listed = ", ".join(f"{value:.4g} by {name}" for name, value in told.items())
+        doubts = [f"The given sizes disagree by more than a factor of two, in metres per pixel: {listed}."]
     if mapped is not None:
         return records.MetresPerPixel(value=mapped, source="depth"), doubts
     exact = [each for each in sizes if each[2]]
-    if (given is not None and (given.source == "request" or not exact)) or not sizes:
-        return given, doubts
+    is_read = run.request.motion is None or run.request.motion.metres_per_pixel is None
+    if given is not None and not (is_read and exact):
+        source, note = ("reference", "by the size that the reader takes it to have") if is_read else ("request", "")
+        return records.MetresPerPixel(value=given, source=source, note=note), doubts
+    if not sizes:
+        return None, doubts
     weights = np.array([1 / (deviation + LEAST_SIZE_SIGMA) ** 2 for _, deviation, _ in exact or sizes])
     value = math.exp(float(weights @ [each[0] for each in exact or sizes] / weights.sum()))
     source = "request" if exact else "reference"
     return records.MetresPerPixel(value=value, source=source, note="by the sizes of objects"), doubts
 
 
-def _is_up_the_floor(reading: MotionReading, grounding: Grounding, law: Law) -> bool:
+def _is_up_the_floor(reading: MotionRequest, grounding: Grounding, law: Law) -> bool:
     """Whether words alone say that something moves up that may stand on the floor."""
-    said = reading.kind == "linear" and reading.cue == "text" and reading.depth == 0 and reading.towards is None
+    said = reading.stated_kind == "linear" and reading.cue == "text" and reading.depth == 0 and reading.towards is None
     in_air = reading.rises or (grounding.prior is not None and grounding.prior.stands_on == "air")
     if not said or in_air or law != "contact" or reading.direction is None:
         return False
@@ -265,63 +341,86 @@ def _unit(vector: Vector) -> Vector:
     return vector[0] / length, vector[1] / length
 
 
-def _pixels(quantity: Quantity, scale: records.MetresPerPixel, image_width: int) -> float:
+def _pixels(said: float | Quantity, scale: records.MetresPerPixel, image_width: int) -> float:
     """px, or px/s."""
-    match quantity.unit:
+    value, unit = (said.value, said.unit) if isinstance(said, Quantity) else (said, "px")
+    match unit:
         case "px" | "px/s":
-            return quantity.value
+            return value
         case "m" | "m/s":
-            return quantity.value / scale.value
+            return value / scale.value
         case "widths" | "widths/s":
-            return quantity.value * image_width
+            return value * image_width
 
 
-def _moving(
+def _speed_of(
+    said: MotionRequest | OtherMotionRequest, bbox: BBox, scale: records.MetresPerPixel, law: Law, image_width: int
+) -> tuple[float, float]:
+    """Speed (px/s) of what is in a box, and the deviation of its logarithm; kinds without a direction have none."""
+    kind = said.stated_kind or "linear"
+    if kind not in DIRECTED_KINDS:
+        return 0.0, 0.0
+    if said.speed is not None and not isinstance(said.speed, str):
+        is_metric = isinstance(said.speed, Quantity) and said.speed.unit == "m/s"
+        deviation = SCALE_DEVIATION if is_metric and scale.source == "default" else 0.0
+        return _pixels(said.speed, scale, image_width), deviation
+    usual = DEFAULT_SPEED * image_width
+    if kind == "projectile" and law == "contact":
+        usual = throw_speed(bbox, scale)
+    return usual * SPEED_FACTORS[said.speed or "normal"], SPEED_DEVIATIONS[kind]
+
+
+def _other(
+    said: OtherMotionRequest,
     thing: LocatedObject,
-    said: MotionReading | OtherMotionReading,
+    goal: LocatedObject | None,
     scale: records.MetresPerPixel,
     law: Law,
     image_width: int,
     usual_deviation: float,
 ) -> records.AlsoMoving:
-    """What a thing does; kinds of motion that have no direction have no speed either."""
-    moves, speed = said.kind in records.DIRECTED_KINDS, DEFAULT_SPEED * image_width
-    deviation = SPEED_DEVIATIONS.get(said.kind, 0.0)  # of what is assumed; 0 for a number in pixels
-    if said.kind == "projectile" and law == "contact":
-        speed = throw_speed(thing.bbox, scale)
-    if isinstance(said.speed, Quantity):
-        speed = _pixels(said.speed, scale, image_width)
-        deviation = SCALE_DEVIATION if said.speed.unit == "m/s" and scale.source == "default" else 0.0
-    elif said.speed is not None:
-        speed *= SPEED_FACTORS[said.speed]
+    """What another thing does."""
+    speed, deviation = _speed_of(said, thing.bbox, scale, law, image_width)
+    direction = None if goal is None else way_to(goal.bbox, thing.bbox, is_on_floor=False)
+    direction = said.direction or direction
     return records.AlsoMoving(
         object=thing,
-        kind=said.kind,
-        direction=_unit(said.direction) if moves and said.direction is not None else None,
+        kind=said.stated_kind,
+        direction=None if direction is None else _unit(direction),
         direction_deviation=usual_deviation if said.direction_deviation is None else said.direction_deviation,
-        depth=said.depth if moves else 0.0,
-        towards=said.towards if moves else None,
-        speed=speed if moves else 0.0,
+        depth=said.depth,
+        towards=goal,
+        speed=speed,
         speed_deviation=deviation,
     )
 
 
-def _complete(image_width: int, grounding: Grounding, reading: MotionReading, source: Source, law: Law) -> Motion:
-    """Adds what a reading leaves open: scale, speed, deviations, gravity and the sentence."""
-    scale = reading.metres_per_pixel or records.MetresPerPixel(
+def completed(
+    run: Run[SimulateRequest],
+    grounding: Grounding,
+    said: MotionRequest,
+    scale: records.MetresPerPixel | None,
+    source: Source,
+) -> Motion:
+    """The motion with what nobody said of it: scale, speed, deviations, gravity and the sentence."""
+    image_width, law, kind = run.image.info.width, run.request.law, said.stated_kind or "linear"
+    scale = scale or records.MetresPerPixel(
         value=DEFAULT_SCENE_WIDTH / image_width,
         source="default",
         note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
     )
-    moves, falls = reading.kind in records.DIRECTED_KINDS, reading.kind in records.FALLING_KINDS
-    thing = LocatedObject(object=grounding.object, bbox=grounding.bbox)
-    mover = _moving(thing, reading, scale, law, image_width, DIRECTION_DEVIATIONS[reading.cue])
-    depth_deviation = THROW_DEPTH_DEVIATION if reading.kind == "projectile" else 0.0
-    speed_deviation = mover.speed_deviation if moves else 0.0
-    if moves and reading.depth_deviation is not None:
-        depth_deviation = reading.depth_deviation
-    if moves and reading.speed_deviation is not None:
-        speed_deviation = reading.speed_deviation
+    moves, falls = kind in DIRECTED_KINDS, kind in FALLING_KINDS
+    cue = said.cue or ("request" if source == "request" else CUES.get(kind, "text"))
+    speed, speed_deviation = _speed_of(said, grounding.bbox, scale, law, image_width)
+    usual = DIRECTION_DEVIATIONS[cue]
+    things = (LocatedObject(object=grounding.object, bbox=grounding.bbox), *others_of(grounding))
+
+    def goal_of(name: str | None) -> LocatedObject | None:
+        return next((each for each in things if name is not None and same_name(each.object, name)), None)
+
+    # A direction in the image leaves open how far a throw leads into its depth.
+    is_open = kind == "projectile" and not (source == "request" and "depth" in said.model_fields_set)
+    depth_deviation = said.depth_deviation if said.depth_deviation is not None else THROW_DEPTH_DEVIATION * is_open
     steps = tuple(
         records.MotionStep(
             direction=_unit(step.direction),
@@ -329,52 +428,73 @@ def _complete(image_width: int, grounding: Grounding, reading: MotionReading, so
             distance=None if step.distance is None else _pixels(step.distance, scale, image_width),
             duration=step.duration,
         )
-        for step in reading.steps
+        for step in said.steps
     )
+    others = tuple(
+        _other(each, thing, goal_of(each.towards), scale, law, image_width, said.direction_deviation or usual)
+        for each, thing in others_given(said, grounding)
+    )
+    gravity, towards, down = GRAVITY / scale.value, goal_of(said.towards), _unit(said.down)  # px/s^2
+    direction = None if said.direction is None or not moves else _unit(said.direction)
+    return Motion(
+        kind=kind,
+        law=law,
+        direction=direction,
+        direction_deviation=usual if said.direction_deviation is None else said.direction_deviation,
+        other_direction=None if said.other_direction is None else _unit(said.other_direction),
+        depth=said.depth if moves else 0.0,
+        depth_deviation=depth_deviation if moves else 0.0,
+        towards=towards if moves else None,
+        rises=said.rises and kind == "linear",
+        cue=cue,
+        along_arrow=said.along_arrow,
+        speed=speed,
+        speed_deviation=speed_deviation if said.speed_deviation is None or not moves else said.speed_deviation,
+        distance=None if said.distance is None else _pixels(said.distance, scale, image_width),
+        duration=said.duration,
+        until=said.until,
+        steps=steps,
+        others=others,
+        gravity=(down[0] * gravity, down[1] * gravity) if falls else (0.0, 0.0),
+        down=down,
+        metres_per_pixel=scale,
+        sentence=sentence_of(grounding, kind, law, direction, said, steps, others),
+        source=source,
+    )
+
+
+CUES: dict[MotionKind, Cue] = {"fall": "gravity", "projectile": "gravity"}  # of a motion whose direction none tells
+
+
+def sentence_of(
+    grounding: Grounding,
+    kind: MotionKind,
+    law: Law,
+    direction: Vector | None,
+    said: MotionRequest,
+    steps: Sequence[records.MotionStep],
+    others: Sequence[records.AlsoMoving],
+) -> str:
+    """The motion in one line."""
+    placed, told = placed_mover(grounding), None
+    if placed is not None and kind == "place":
+        told = f"The {bare_name(grounding.object)} is lifted, carried over and put {place_words(placed)}"
     also: list[str] = []
-    for other in reading.others:
+    for other in others:
         verb = {"projectile": "is thrown", "fall": "falls", "static": "stays where it is"}.get(other.kind, "moves")
         way = "" if other.kind in ("fall", "static") else direction_words(other.direction, other.depth)
         also.append(f"{bare_name(other.object.object)} {verb} {way}".rstrip())
-    gravity = GRAVITY / scale.value  # px/s^2
-    return Motion(
-        kind=reading.kind,
-        law=law,
-        direction=mover.direction,
-        direction_deviation=mover.direction_deviation,
-        other_direction=None if reading.other_direction is None else _unit(reading.other_direction),
-        depth=mover.depth,
-        depth_deviation=depth_deviation,
-        towards=mover.towards,
-        rises=reading.rises and reading.kind == "linear",
-        cue=reading.cue,
-        along_arrow=reading.along_arrow,
-        speed=mover.speed,
-        speed_deviation=speed_deviation,
-        distance=None if reading.distance is None else _pixels(reading.distance, scale, image_width),
-        duration=reading.duration,
-        until=reading.until,
-        steps=steps,
-        trail=reading.trail,
-        others=tuple(
-            _moving(other.object, other, scale, law, image_width, mover.direction_deviation) for other in reading.others
-        ),
-        gravity=(reading.down[0] * gravity, reading.down[1] * gravity) if falls else (0.0, 0.0),
-        down=reading.down,
-        metres_per_pixel=scale,
-        sentence=motion_sentence(
-            grounding.object,
-            reading.kind,
-            law,
-            mover.direction,
-            mover.depth,
-            reading.sentence,
-            towards=None if mover.towards is None else mover.towards.object,
-            further=[direction_words(step.direction, step.depth) for step in reading.steps],
-            stops=any(value is not None for value in (reading.distance, reading.duration, reading.until)),
-            also=also,
-        ),
-        source=source,
+    return motion_sentence(
+        grounding.object,
+        kind,
+        law,
+        direction,
+        said.depth,
+        told,
+        towards=said.towards,
+        further=[direction_words(step.direction, step.depth) for step in steps],
+        stops=any(value is not None for value in (said.distance, said.duration, said.until)),
+        also=also,
     )
 
 

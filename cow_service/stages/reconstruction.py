@@ -53,8 +53,9 @@ class Situation:
     def of(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: Motion) -> Situation:
         """With the obstacles that the scene shows."""
         obstacles, removed = obstacles_of(scene, grounding)
-        is_estimate = grounding.objects_complete and not run.request.objects_complete
-        unlisted = unlisted_of(scene, grounding) if is_estimate else ()
+        said = run.request
+        is_estimate = not said.objects_complete or any(each.source != "request" for each in said.objects)
+        unlisted = unlisted_of(scene, grounding) if grounding.objects_complete and is_estimate else ()
         return Situation(scene, grounding, motion, run.request, obstacles, removed, unlisted, run.depth, run.focal)
 
     @property

@@ -24,9 +24,23 @@ from cow_service.media.images import DecodedImage, decode_depth, decode_own_mask
 from cow_service.observability.logging import rfc3339
 from cow_service.perception.base import Embedded, Perception
 from cow_service.physics.geometry import DepthMap
-from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
-from cow_service.records import Artifact, BBox, Cue, Estimate, Grounding, Language, ReaderInfo, Record, Usage
-from cow_service.requests import AnswerRequest, DepthRequest, ImageArtifact, SimulateRequest, Stage
+from cow_service.readers.base import CallLog, Reader, ReaderInput, WordReader, WordsReading
+from cow_service.records import (
+    Artifact,
+    BBox,
+    Cue,
+    Estimate,
+    Grounding,
+    ImageArtifact,
+    Language,
+    MotionRequest,
+    ObjectRequest,
+    ReaderInfo,
+    Reading,
+    Record,
+    Usage,
+)
+from cow_service.requests import AnswerRequest, DepthRequest, SimulateRequest, Stage
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
 from cow_service.vision.types import Mask
@@ -158,7 +172,7 @@ class Run(Generic[Request_co]):
     @cached_property
     def scene(self) -> Scene:
         """The image before it is known what moves, and what is measured in it when first asked for."""
-        scene = Scene(self.image.pixels, trail_named=self.question.trail_named)
+        scene = Scene(self.image.pixels, trail_named=self.words.trail_named)
         if self.seen is not None:
             self.seen.recall(self._image_key, scene)
         return scene
@@ -245,9 +259,9 @@ class Run(Generic[Request_co]):
         return None if exif is None else Estimate(value=exif, deviation=EXIF_DEVIATION * exif)
 
     @cached_property
-    def question(self) -> QuestionReading:
+    def words(self) -> WordsReading:
         """What the question says in words."""
-        given = [each.object for each in self.request.objects]
+        given = [each.object for each in self.request.objects if each.has_place]
         place = self.request.place
         given += [] if place is None or place.object is None else [place.object]
         return self.backends.words().read_question(self.request.question, given)
@@ -307,7 +321,7 @@ class Run(Generic[Request_co]):
             inputs,
             self._identity,
             self.repeats_answers,
-            lambda: bool(getattr(self.reader, "heeds_seed", True)),
+            lambda: self.reader.heeds_seed,
             self.backends.perception.identity,
         )
         try:
@@ -376,17 +390,26 @@ class Run(Generic[Request_co]):
         """To be held around the work of the generator."""
         return self.backends.device().held(self.priority, self.check_canceled)
 
-    def reader_input(self, stage: Stage, scene: Scene | None = None) -> ReaderInput:
-        """What the reader is given on behalf of a stage; by default with nothing known of what moves."""
+    def reader_input(
+        self, stage: Stage, scene: Scene | None = None, known: Sequence[ObjectRequest] = ()
+    ) -> ReaderInput:
+        """What the reader is given on behalf of a stage: the image, and what the caller says, with what is `known`."""
         self._calls[stage] = CallLog()
+        request = self.request
+        given = Reading(
+            grounding=request.grounding,
+            motion=request.motion,
+            objects=tuple(known),
+            interventions=request.interventions,
+            asked=request.asked,
+        )
         return ReaderInput(
             scene=scene or self.scene,
-            question=self.request.question,
+            question=request.question,
+            given=given,
+            motion_wanted="motion" in request.left_to_reader,
             language=self.language,
-            seed=self.request.seed,
-            motion_wanted="motion" in self.request.left_to_reader,
-            asked_wanted=self.request.asked is None,
-            changes_wanted=not self.request.interventions,
+            seed=request.seed,
             until=self.until,
             calls=self._calls[stage],
             check_canceled=self.check_canceled,
@@ -404,18 +427,17 @@ class Run(Generic[Request_co]):
         return self.results["grounding"].value if "grounding" in self.results else None
 
     @property
-    def hints(self) -> MotionHints | None:
-        """What stage 1 learned for stage 2, where that is left to the reader.
+    def read_motion(self) -> MotionRequest | None:
+        """What the reader said of the motion in stage 1, where that is left to it.
 
-        Else they are not heeded: a grounding that was found again may have some, one of this request would have none.
+        Ignored otherwise: a cached grounding may carry a motion that a fresh one would not.
         """
         wanted = "motion" in self.request.left_to_reader and "grounding" in self.results
-        return self.results["grounding"].hints if wanted else None
+        return self.results["grounding"].motion if wanted else None
 
     def repeats_answers(self, votes: int) -> bool:
-        """Whether the reader's answers are the same each time; one of another package that does not say is sampled."""
-        repeats = getattr(self.reader, "repeats_answers", None)
-        return repeats is not None and repeats(votes)
+        """Whether the reader's answers are the same each time."""
+        return self.reader.repeats_answers(votes)
 
     def usage(self, stages: Iterable[Stage]) -> Usage:
         """What some stages asked of a multimodal LLM, failed ones of this process included."""
@@ -453,9 +475,8 @@ class Run(Generic[Request_co]):
         """The warnings of some stages."""
         return tuple(warning for stage in stages if stage in self.results for warning in self.results[stage].warnings)
 
-    def _identity(self, backend: BackendRole) -> dict[str, Any] | None:
-        """All that decides the work of a backend; None where one of another package does not say."""
-        fingerprint = getattr(self.reader if backend == "reader" else self.generator, "fingerprint", None)
-        if fingerprint is None or backend == "reader":
-            return None if fingerprint is None else {"reader": fingerprint}
-        return {"generator": fingerprint, "options": self.generator_options.model_dump(mode="json")}
+    def _identity(self, backend: BackendRole) -> dict[str, Any]:
+        """All that decides the work of a backend."""
+        if backend == "reader":
+            return {"reader": self.reader.fingerprint}
+        return {"generator": self.generator.fingerprint, "options": self.generator_options.model_dump(mode="json")}

@@ -6,12 +6,24 @@ the reader to be asked again with, and to warn of where it stays.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TypeVar
 
-from cow_service.physics.camera import depth_motion, way_to
+from cow_service.physics.camera import way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
-from cow_service.readers.base import GroundingReading, MotionReading, QuestionReading, WayReading, WordReader
-from cow_service.records import Asked, BBox, Cue, LocatedObject, Vector
+from cow_service.readers.base import WordReader, WordsReading
+from cow_service.records import (
+    DIRECTED_KINDS,
+    FALLING_KINDS,
+    Asked,
+    BBox,
+    Cue,
+    GroundingRequest,
+    MotionRequest,
+    ObjectRequest,
+    Reading,
+    Vector,
+)
 from cow_service.vision.masks import iou, is_same_object
 from cow_service.vision.regions import Region
 
@@ -30,97 +42,139 @@ class SeenWay:
     """What the image shows of the way of what moves."""
 
     arrow: Vector | None = None  # of the arrow that is drawn at it
-    goal: LocatedObject | None = None  # where the thing is that the words have it move towards
+    is_only_arrow: bool = True  # no other one is near
+    goal: BBox | None = None  # where the thing is that it is said to move towards
     front: Vector | None = None  # the way that it faces
-    has_trail: bool = False  # which is measured
+    trail: Vector | None = None  # on from its earlier positions
+    is_thrown: bool = False  # along them
 
 
-def settle_way(read: MotionReading, said: WayReading, seen: SeenWay, mover: BBox) -> tuple[MotionReading, Objections]:
-    """The reading, with its direction by the surest source: an arrow that is meant, words, its front, what was read.
+def settle_way(
+    read: MotionRequest, said: MotionRequest, seen: SeenWay, mover: BBox
+) -> tuple[MotionRequest, Objections]:
+    """The motion with its direction by the surest source, and what speaks against what was `read`.
 
-    An arrow gives an axis. Its sense is that of the words, else as read. Where another source is more than two spreads
-    away from what was taken, worlds are drawn from both. A direction that was not estimated stays as it is, and so does
-    one along a trail, which is measured.
+    A direction that is not estimated stays. Else an arrow that is meant decides, what is `said` in words, the front,
+    what was read, and last what is drawn at the thing. An arrow gives an axis; its sense is that of the words, else as
+    read. Where another source is more than two spreads away, worlds are drawn from both. A trail is measured.
     """
-    if read.kind == "static" and said != WayReading():
-        way = said.direction or seen.arrow or FORWARD
-        stays = replace(read, other_direction=way, sentence=None)
+    kind = read.stated_kind or "linear"
+    if kind == "static" and said.has_way:
+        stays = read.model_copy(update={"other_direction": said.direction or seen.arrow or FORWARD})
         return stays, ("The question has it move, and it was read to stay where it is.",)
-    is_measured = read.cue == "trail" and seen.has_trail and said == WayReading()
-    if read.direction_deviation is None or is_measured:
+    if kind not in DIRECTED_KINDS or (read.direction is not None and read.direction_deviation is None):
         return read, ()
-    taken = _by_arrow(read, said, seen.arrow) or _by_words(read, said, seen.goal, mover) or _by_front(read, said, seen)
-    if taken is None or taken.direction is None:
-        senses = {said.along_arrow, read.along_arrow}
-        if read.direction is None or senses != {True, False}:
+    taken = (
+        _by_trail(read, said, seen)
+        or _by_arrow(read, said, seen.arrow)
+        or _by_words(read, said, seen.goal, mover)
+        or _by_front(read, said, seen.front)
+    )
+    if taken is None:
+        if read.direction is None:
+            return _by_drawing(read, said, seen), ()
+        if {said.along_arrow, read.along_arrow} != {True, False}:
             return read, ()
         told = "The question and the reading have it move to opposite ends of an arrow that is not seen."
-        return replace(read, other_direction=(-read.direction[0], -read.direction[1]), sentence=None), (told,)
-    objections, rival = list[str](), None
-    goal = None if seen.goal is None else way_to(seen.goal.bbox, mover, is_on_floor=read.kind == "linear")
+        return read.model_copy(update={"other_direction": _turned(read.direction)}), (told,)
+    rival, objections = _rival_of(taken, read, said, seen, mover)
+    # A direction beside another one is no goal.
+    update = {} if rival is None else {"other_direction": rival, "towards": None}
+    return taken.model_copy(update=update), objections
+
+
+def _rival_of(
+    taken: MotionRequest, read: MotionRequest, said: MotionRequest, seen: SeenWay, mover: BBox
+) -> tuple[Vector | None, Objections]:
+    """The direction that speaks against the one that was taken, and in which words it does."""
+    rival, objections, way = None, list[str](), taken.direction or FORWARD
+    goal = None if seen.goal is None else way_to(seen.goal, mover, is_on_floor=read.kind == "linear")
     words = said.direction or goal
-    if taken.cue == "arrow" and words is not None and angle(words, taken.direction) > WORDS_APART:
+    if taken.cue == "arrow" and words is not None and angle(words, way) > WORDS_APART:
         objections.append("The question's words for the direction contradict the arrow drawn at the object.")
         rival = words
-    if taken.cue == "arrow" and said == WayReading() and read.along_arrow is None and read.direction is None:
+    is_estimate = read.direction_deviation is not None
+    if is_estimate and taken.cue == "arrow" and not said.has_way and read.along_arrow is None and not read.direction:
         objections.append("Nothing tells whether it moves along the arrow drawn at it or against it.")
-        rival = (-taken.direction[0], -taken.direction[1])
-    off = 0.0 if read.direction is None else angle(read.direction, taken.direction)
-    if off > APART * math.hypot(read.direction_deviation, DIRECTION_DEVIATIONS[taken.cue]):
-        source = {"arrow": "the arrow drawn at the object", "orientation": "its front"}.get(taken.cue, "the question")
+        rival = _turned(way)
+    off = 0.0 if read.direction is None or taken.cue == "trail" else angle(read.direction, way)
+    if off > APART * math.hypot(read.direction_deviation or 0.0, DIRECTION_DEVIATIONS[taken.cue or "text"]):
+        source = {"arrow": "the arrow drawn at the object", "orientation": "its front"}.get(taken.cue or "", "")
+        source = source or "the question"
         if taken.cue == "arrow" and said.along_arrow is not None:
             source += f", which the question has it move {'along' if said.along_arrow else 'against'},"
         objections.append(f"The direction that was read is {off:.0f} degrees off what {source} says.")
         rival = read.direction
-    if rival is None:
-        return taken, ()
-    # Its sentence was worded for another direction.
-    return replace(taken, other_direction=rival, towards=None, sentence=None), tuple(objections)
+    return rival, tuple(objections)
 
 
-def _by_arrow(read: MotionReading, said: WayReading, arrow: Vector | None) -> MotionReading | None:
-    is_meant = said.along_arrow is not None or read.cue == "arrow" or (read.direction is None and said == WayReading())
-    if arrow is None or not is_meant:
+def _by_trail(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest | None:
+    """Measured, where the reading goes by the trail and the words say nothing else."""
+    told = said.has_way and said.cue != "trail"
+    is_meant = "trail" in (read.cue, said.cue) and not told
+    return _along_trail(read, seen) if is_meant and seen.trail is not None else None
+
+
+def _along_trail(read: MotionRequest, seen: SeenWay) -> MotionRequest:
+    is_thrown = seen.is_thrown or read.kind in FALLING_KINDS
+    update = {"kind": "projectile" if is_thrown else "linear"} if read.direction is None else {}
+    direction = read.direction or seen.trail
+    return read.model_copy(update=update | {"direction": direction, "cue": "trail"})
+
+
+def _by_arrow(read: MotionRequest, said: MotionRequest, arrow: Vector | None) -> MotionRequest | None:
+    is_open = read.direction is None and read.direction_deviation is not None and not said.has_way
+    if arrow is None or not (said.along_arrow is not None or read.cue == "arrow" or is_open):
         return None
     along = read.along_arrow if said.along_arrow is None else said.along_arrow
     if along is None:
         rough = said.direction or read.direction
         along = rough is None or angle(rough, arrow) <= 90
-    sign = 1.0 if along else -1.0
-    return _taken(read, (sign * arrow[0], sign * arrow[1]), "arrow", along=along)
+    return _taken(read, arrow if along else _turned(arrow), "arrow", along=along)
 
 
-def _by_words(read: MotionReading, said: WayReading, goal: LocatedObject | None, mover: BBox) -> MotionReading | None:
+def _by_words(read: MotionRequest, said: MotionRequest, goal: BBox | None, mover: BBox) -> MotionRequest | None:
     if said.direction is not None:
         return _taken(read, said.direction, "text", depth=said.depth)
-    if said.depth:
-        direction, depth = depth_motion(said.depth)
-        return _taken(read, direction, "text", depth=depth)
     if goal is None:
         return None
-    return replace(_taken(read, way_to(goal.bbox, mover, is_on_floor=read.kind == "linear"), "text"), towards=goal)
+    way = way_to(goal, mover, is_on_floor=(read.kind or "linear") == "linear")
+    return _taken(read, way, "text").model_copy(update={"towards": said.towards})
 
 
-def _by_front(read: MotionReading, said: WayReading, seen: SeenWay) -> MotionReading | None:
-    if seen.front is None or said.forward is None:
+def _by_front(read: MotionRequest, said: MotionRequest, front: Vector | None) -> MotionRequest | None:
+    if front is None or said.forward is None:
         return None
-    sign = 1.0 if said.forward else -1.0
-    return _taken(read, (sign * seen.front[0], sign * seen.front[1]), "orientation")
+    return _taken(read, front if said.forward else _turned(front), "orientation")
+
+
+def _by_drawing(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest:
+    """On along the trail or the only arrow at the thing, where nothing at all is said; else as it was."""
+    if said.has_way:
+        return read
+    if seen.trail is not None:
+        return _along_trail(read, seen)
+    return read if seen.arrow is None or not seen.is_only_arrow else _taken(read, seen.arrow, "arrow", along=True)
+
+
+def _turned(way: Vector) -> Vector:
+    return -way[0], -way[1]
 
 
 def _taken(
-    read: MotionReading, direction: Vector, cue: Cue, along: bool | None = None, depth: float | None = None
-) -> MotionReading:
+    read: MotionRequest, direction: Vector, cue: Cue, along: bool | None = None, depth: float | None = None
+) -> MotionRequest:
     """The reading with a direction that was not estimated; a throw keeps the depth that was read, unless it is said."""
     keeps = depth is None and read.kind == "projectile"
-    return replace(
-        read,
-        direction=direction,
-        cue=cue,
-        along_arrow=along,
-        direction_deviation=None,
-        depth=read.depth if keeps else depth or 0.0,
-        depth_deviation=read.depth_deviation if keeps else None,
+    return read.model_copy(
+        update={
+            "direction": direction,
+            "cue": cue,
+            "along_arrow": along,
+            "direction_deviation": None,
+            "depth": read.depth if keeps else depth or 0.0,
+            "depth_deviation": read.depth_deviation if keeps else None,
+        }
     )
 
 
@@ -137,50 +191,44 @@ class SeenThings:
     bare: frozenset[BBox] = frozenset()  # those of the boxes that were read in which nothing stands
 
 
-def settle_places(read: GroundingReading, seen: SeenThings) -> tuple[GroundingReading, Objections]:
+def settle_places(read: Reading, seen: SeenThings) -> tuple[Reading, Objections, bool]:
     """The reading, its boxes moved onto the things that are seen there, and what speaks against its places.
 
-    A box in which nothing stands, or something of another colour while the named one is elsewhere, is doubtful.
+    A box in which nothing stands, or something of another colour while the named one is elsewhere, is doubtful. The
+    last value says whether the mover's box was moved onto a thing.
     """
-    boxes = list(dict.fromkeys([read.bbox, *(each.bbox for each in things_of(read))]))
-    moved, objections, doubtful = _onto_regions(boxes, seen.regions), list[str](), set[BBox]()
-    mover = LocatedObject(object=read.object, bbox=read.bbox)
-    for thing in dict.fromkeys((mover, *things_of(read))):
-        fault = _fault_of(thing, moved[thing.bbox], seen)
+    mover = mover_of(read)
+    moved = _onto_regions(list(dict.fromkeys(box_of(each) for each in (mover, *read.objects))), seen.regions)
+    objections, doubtful = list[str](), set[BBox]()
+    for thing in dict.fromkeys((mover, *read.objects)):
+        fault = _fault_of(thing, moved[box_of(thing)], seen)
         if fault is not None and thing.bbox not in doubtful:
             objections.append(fault)
-            doubtful.add(thing.bbox)
+            doubtful.add(box_of(thing))
 
-    def settled(thing: LocatedObject) -> LocatedObject:
-        region = moved[thing.bbox]
-        return thing.model_copy(update={
-            "bbox": thing.bbox if region is None else region.bbox,
-            "bbox_deviation": read.bbox_deviation if region is None else 0.0,
-            "is_doubtful": thing.is_doubtful or thing.bbox in doubtful,
-        })  # fmt: skip
+    def settled(thing: Thing) -> Thing:
+        region = moved[box_of(thing)]
+        update: dict[str, object] = {"is_doubtful": thing.is_doubtful or thing.bbox in doubtful}
+        update |= {} if region is None else {"bbox": region.bbox, "bbox_deviation": None}
+        return thing.model_copy(update=update)
 
-    changed = tuple(
-        each.model_copy(update={"object": settled(each.object), "targets": tuple(map(settled, each.targets))})
-        for each in read.interventions
-    )
-    own = settled(mover)
-    unproved = read.place_doubts if moved[read.bbox] is None else ()
-    reading = replace(
-        read,
-        bbox=own.bbox,
-        bbox_deviation=own.bbox_deviation,
-        is_doubtful=read.is_doubtful or own.is_doubtful or bool(unproved),
-        warnings=(*read.warnings, *unproved),
-        others=tuple(map(settled, read.others)),
-        interventions=changed,
-    )
-    return reading, tuple(objections)
+    update = {"grounding": settled(mover), "objects": tuple(map(settled, read.objects))}
+    return read.model_copy(update=update), tuple(objections), moved[box_of(mover)] is not None
 
 
-def things_of(read: GroundingReading) -> list[LocatedObject]:
-    """All that was located besides the mover."""
-    changed = (thing for each in read.interventions for thing in (each.object, *each.targets))
-    return [*read.others, *changed]
+Thing = TypeVar("Thing", GroundingRequest, ObjectRequest)
+
+
+def mover_of(read: Reading) -> GroundingRequest:
+    """What a reading says of the moving object."""
+    assert read.grounding is not None, "a reading of stage 1 has a moving object"
+    return read.grounding
+
+
+def box_of(thing: GroundingRequest | ObjectRequest) -> BBox:
+    """The box of a thing that was located."""
+    assert thing.bbox is not None, "things are located before they are settled"
+    return thing.bbox
 
 
 def _onto_regions(boxes: Sequence[BBox], regions: Sequence[Region]) -> dict[BBox, Region | None]:
@@ -205,11 +253,12 @@ def _is_about(box: BBox, region: BBox) -> bool:
     return all(abs(a - b) <= EDGE_OFF * side for a, b, side in zip(box, region, sides, strict=True))
 
 
-def _fault_of(thing: LocatedObject, region: Region | None, seen: SeenThings) -> str | None:
-    if region is None and thing.bbox in seen.bare:
-        return f"In the box of '{thing.object}' nothing stands."
-    named = set(thing.object.lower().split(" with ")[0].split())  # "a truck with a red cab" need not be red
-    region = region or next((each for each in seen.regions if is_same_object(each.bbox, thing.bbox)), None)
+def _fault_of(thing: GroundingRequest | ObjectRequest, region: Region | None, seen: SeenThings) -> str | None:
+    name, box = thing.object or "", box_of(thing)
+    if region is None and box in seen.bare:
+        return f"In the box of '{name}' nothing stands."
+    named = set(name.lower().split(" with ")[0].split())  # "a truck with a red cab" need not be red
+    region = region or next((each for each in seen.regions if is_same_object(each.bbox, box)), None)
     if region is None or not named.isdisjoint((region.colour, *region.colours)):
         return None
     there = [each for each in seen.regions if each.colour in named]
@@ -217,23 +266,20 @@ def _fault_of(thing: LocatedObject, region: Region | None, seen: SeenThings) -> 
         return None
     x, y = there[0].centre
     return (
-        f"In the box of '{thing.object}' is something {region.colour}, while something {there[0].colour} is at "
+        f"In the box of '{name}' is something {region.colour}, while something {there[0].colour} is at "
         f"({x:.0f}, {y:.0f})."
     )
 
 
-def settle_mover(
-    read: GroundingReading, said: QuestionReading, words: WordReader
-) -> tuple[GroundingReading, Objections]:
+def settle_mover(read: Reading, said: WordsReading, words: WordReader) -> tuple[Reading, Objections]:
     """The reading; in doubt where what was read to move, or what was found for it, is not what the words say."""
-    if said.mover is None:
-        return read, ()
-    for name in filter(None, (read.object, read.label)):
-        likeness = words.likeness(said.mover, name)
-        rivals = read.others if likeness == "unknown" else ()
-        if likeness == "other" or any(words.likeness(said.mover, each.object) == "same" for each in rivals):
-            told = f"The question has '{said.mover}' move, and '{name}' was read."
-            return replace(read, is_doubtful=True), (told,)
+    mover, meant = mover_of(read), None if said.reading.grounding is None else said.reading.grounding.object
+    for name in filter(None, (mover.object, mover.label)) if meant is not None else ():
+        likeness = words.likeness(meant or "", name)
+        rivals = read.objects if likeness == "unknown" else ()
+        if likeness == "other" or any(words.likeness(meant or "", each.object) == "same" for each in rivals):
+            told = f"The question has '{meant}' move, and '{name}' was read."
+            return read.model_copy(update={"grounding": mover.model_copy(update={"is_doubtful": True})}), (told,)
     return read, ()
 
 
@@ -243,17 +289,17 @@ PLAIN, DETAILS = ("form", "relation", "negated"), ("every", "partly", "within")
 
 
 def settle_question(
-    read: GroundingReading, said: QuestionReading, words: WordReader, is_given: bool = False
-) -> tuple[GroundingReading, Objections]:
+    read: Reading, said: WordsReading, words: WordReader, is_given: bool = False
+) -> tuple[Reading, Objections]:
     """The reading with what is asked, and what speaks against it: the words decide what they plainly say.
 
     Names stay as they were read: the things that were found have them. Words that were not understood say nothing;
     where what is asked `is_given`, they tell only what is changed.
     """
-    asked, plain = read.asked, said.asked
+    asked, plain = read.asked, said.reading.asked
     if plain is None:
         return read, ()
-    objections, names = list[str](), [read.object, *(each.object for each in things_of(read))]
+    objections, names = list[str](), [mover_of(read).object or "", *(each.object for each in read.objects)]
     if asked is not None and not is_given:
         # What is left at its default was not said: the words complete it.
         usual = Asked(relation=asked.relation)
@@ -274,14 +320,13 @@ def settle_question(
             told = (f"`{name}` {_shown(getattr(plain, name))}, not {_shown(getattr(asked, name))}" for name in differ)
             objections.append(f"By its words the question asks with {', '.join(told)}.")
         asked = followed
-    removed = tuple(each.object for each in said.changes if each.kind == "remove")
-    taken = tuple(each.object.object for each in read.interventions if each.kind == "remove")
+    removed = tuple(each.object for each in said.reading.interventions if each.kind == "remove")
+    taken = tuple(each.object for each in read.interventions if each.kind == "remove")
     if not _are_meant(removed, taken, names, words):
         told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in (removed, taken)]
         objections.append(f"By its words the question takes {told[0]} away beforehand, and {told[1]} was read.")
-    return replace(read, asked=asked or plain, asked_is_doubtful=read.asked_is_doubtful or bool(objections)), tuple(
-        objections
-    )
+    update = {"asked": asked or plain, "question_is_doubtful": read.question_is_doubtful or bool(objections)}
+    return read.model_copy(update=update), tuple(objections)
 
 
 def _is_meant(wanted: str, taken: str, names: Sequence[str], words: WordReader) -> bool:

@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cow_service.errors import CannotReadDirection
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.contrast import View
@@ -418,11 +417,9 @@ class Scene:
         return bbox
 
 
-def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
-    """The mover's arrow. Raises `CannotReadDirection`, with that `remedy`, where it has none or several."""
-    arrow, near = scene.arrow_at(grounding.bbox), scene.arrows_near(grounding.bbox)
-    if arrow is not None:
-        return arrow
+def arrow_fault(scene: Scene, grounding: Grounding) -> str:
+    """Why none of the arrows is clearly that of the mover."""
+    near = scene.arrows_near(grounding.bbox)
     ends = "; ".join(
         f"from ({a.tail[0]:.0f}, {a.tail[1]:.0f}) to ({a.tip[0]:.0f}, {a.tip[1]:.0f})" for a in near or scene.arrows
     )
@@ -431,12 +428,8 @@ def arrow_of(scene: Scene, grounding: Grounding, remedy: str) -> Arrow:
     elif not near:
         fault = f"what was found stands elsewhere than the {grounding.object}: {ends}"
     else:
-        raise CannotReadDirection(
-            f"The question speaks of one arrow, but {len(near)} were found, and none is clearly that of the "
-            f"{grounding.object}: {ends}.",
-            remedy=remedy,
-        )
-    raise CannotReadDirection(f"The question speaks of an arrow, but {fault}.", remedy=remedy)
+        fault = f"{len(near)} were found, and none is clearly that of the {grounding.object}: {ends}"
+    return f"The question speaks of an arrow, but {fault}."
 
 
 MOST_IMAGES = 8

@@ -15,7 +15,7 @@ from cow_service.readers.embedded.english.lexicon import COLOURS, GENERIC, PLACE
 from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, prior_of
 from cow_service.readers.embedded.english.questions import Question
 from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
-from cow_service.records import BBox, LocatedObject
+from cow_service.records import BBox, ObjectRequest
 from cow_service.vision import forms
 from cow_service.vision.masks import is_same_object, mask_iou
 from cow_service.vision.regions import Region
@@ -140,13 +140,13 @@ def describe(regions: Sequence[Region]) -> str:
 
 
 def things_of_kinds(
-    regions: Sequence[Region], question: Question, mover: BBox, given: Sequence[LocatedObject]
-) -> list[LocatedObject]:
+    regions: Sequence[Region], question: Question, mover: BBox, given: Sequence[ObjectRequest]
+) -> list[ObjectRequest]:
     """Those of the regions, but for the mover's, that are of a kind asked about, each under its colour.
 
     None of a kind that the caller has `given`. Raises `CannotGround` where the question counts on them.
     """
-    found, asked = list[LocatedObject](), question.asked
+    found, asked = list[ObjectRequest](), question.asked
     among = () if asked is None or asked.form == "which-to-remove" else asked.among
     left = [region for region in regions if not is_same_object(region.bbox, mover)]
     # Of "which mug does it hit first" there may be none for certain.
@@ -163,10 +163,10 @@ def things_of_kinds(
     return found
 
 
-def named_by_colour(regions: Sequence[Region], kind: Kind) -> list[LocatedObject]:
+def named_by_colour(regions: Sequence[Region], kind: Kind) -> list[ObjectRequest]:
     """Things of a kind, each under its colour."""
     name = kind.phrase.head or "object"
-    return [LocatedObject(object=f"{each.colour} {name}", bbox=each.bbox, source="embedded") for each in regions]
+    return [ObjectRequest(object=f"{each.colour} {name}", bbox=each.bbox) for each in regions]
 
 
 def nouns_of(question: Question, sought: Sequence[str] = ()) -> tuple[str, ...]:

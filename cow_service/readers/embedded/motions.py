@@ -3,23 +3,35 @@
 import math
 from collections.abc import Sequence
 
+from pydantic import ValidationError
+
 from cow_service.errors import CannotGround, CannotReadDirection
-from cow_service.perception.facing import facing
 from cow_service.physics.camera import depth_motion, way_to
-from cow_service.physics.trail_fit import is_thrown
-from cow_service.readers.base import MotionReading, OtherMotionReading, Quantity, SpeedWord, StepReading
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.embedded.english.noun_phrases import kind_of, prior_of
 from cow_service.readers.embedded.english.questions import MotionWords, Question
 from cow_service.readers.embedded.matching import best_matches, match_one, unclear
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, BBox, Grounding, LocatedObject, MotionKind, Until, Vector
+from cow_service.records import (
+    DIRECTED_KINDS,
+    BBox,
+    Distance,
+    GroundingRequest,
+    MotionKind,
+    MotionRequest,
+    MotionStepRequest,
+    ObjectRequest,
+    OtherMotionRequest,
+    Speed,
+    SpeedWord,
+    Until,
+    Vector,
+)
 from cow_service.vision.masks import is_same_object
-from cow_service.vision.scene import Scene, arrow_of
+from cow_service.vision.scene import Scene
 from cow_service.vision.trails import trail_of
 
 NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
-AGREES = 0.5  # cosine of the angle from which an arrow and a direction that is named are two things
 _ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
 _ANY_THING = frozenset({"object", "thing", "item"})
 _RISES = frozenset({"lift", "raise", "rise", "ascend", "float"})  # what does so upwards leaves it
@@ -51,7 +63,7 @@ def settled_kind(question: Question) -> MotionKind | None:
 
 def quantities(
     words: Sequence[QuantityWords], way: float | None, bbox: BBox
-) -> tuple[SpeedWord | Quantity | None, Quantity | None, float | None, Until | None]:
+) -> tuple[SpeedWord | Speed | None, Distance | None, float | None, Until | None]:
     """Speed, distance, duration (s) and end of one leg; `way`, px, is the distance to the goal; `bbox` is the mover's.
 
     Raises `CannotReadDirection`.
@@ -62,12 +74,15 @@ def quantities(
         if found.setdefault(what, each) != each:
             raise _refused(f"The question names more than one {what} of the motion.")
     speed, length, duration = (found.get(what) for what in ("speed", "distance", "duration"))
-    distance = None if length is None else Quantity(length.value, "m" if length.is_metric else "px")
+    distance = None if length is None else Distance(value=length.value, unit="m" if length.is_metric else "px")
     if length is not None and length.what == "share" and way is None:
         raise _refused("The question says that it moves part of the way, but not where to.")
     if length is not None and length.what != "distance":
-        distance = Quantity(length.value * ((way or 0.0) if length.what == "share" else bbox[2] - bbox[0]), "px")
-    pace = None if speed is None else speed.pace or Quantity(speed.value, "m/s" if speed.is_metric else "px/s")
+        whole = (way or 0.0) if length.what == "share" else bbox[2] - bbox[0]
+        distance = Distance(value=length.value * whole, unit="px")
+    pace = None if speed is None else speed.pace
+    if speed is not None and pace is None:
+        pace = Speed(value=speed.value, unit="m/s" if speed.is_metric else "px/s")
     return pace, distance, None if duration is None else duration.value, "contact" if "until" in found else None
 
 
@@ -78,37 +93,42 @@ def _way(motion: MotionWords, direction: Vector | None = None) -> tuple[Vector, 
     return depth_motion(motion.depth) if direction is None else (direction, motion.depth)
 
 
-def step_readings(steps: Sequence[MotionWords], bbox: BBox) -> tuple[StepReading, ...]:
+def steps_of(steps: Sequence[MotionWords], bbox: BBox) -> tuple[MotionStepRequest, ...]:
     """The legs behind the first of what has this box."""
-    return tuple(StepReading(*_way(step), *quantities(step.quantities, None, bbox)[1:3]) for step in steps)
+    found = list[MotionStepRequest]()
+    for step in steps:
+        direction, depth = _way(step)
+        _, distance, duration, _ = quantities(step.quantities, None, bbox)
+        found.append(MotionStepRequest(direction=direction, depth=depth, distance=distance, duration=duration))
+    return tuple(found)
 
 
-def other_readings(
-    others: Sequence[tuple[ObjectPhrase, MotionWords]], scene: Scene, grounding: Grounding
-) -> tuple[OtherMotionReading, ...]:
+def others_of(
+    others: Sequence[tuple[ObjectPhrase, MotionWords]], scene: Scene, things: Sequence[ObjectRequest]
+) -> tuple[OtherMotionRequest, ...]:
     """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
-    readings: list[OtherMotionReading] = []
-    things = (*grounding.others, LocatedObject(object=grounding.object, bbox=grounding.bbox))
+    readings: list[OtherMotionRequest] = []
     for phrase, motion in others:
-        found = next((each for each in grounding.others if each.object == phrase.text), None)
-        goal = next((each for each in things if motion.towards and each.object == motion.towards.text), None)
+        found = next((each for each in things if each.object == phrase.text), None)
         if found is None or motion.steps or any(each.what != "speed" for each in motion.quantities):
             raise _refused(f"'{phrase.text}' moves, too, and was not found, or how far it moves is said.")
         refuse_unclear_fall(scene, motion, found)
-        kind = motion.kind or "linear"
-        ahead = None if motion.direction or goal is None else way_to(goal.bbox, found.bbox, is_on_floor=False)
-        way = _way(motion, ahead) if kind in DIRECTED_KINDS else (None, 0.0)
-        speed = quantities(motion.quantities, None, found.bbox)[0]
-        readings.append(OtherMotionReading(found, kind, way[0], None, way[1], speed, goal))
+        kind, said = motion.kind or "linear", dict[str, object]()
+        if kind in DIRECTED_KINDS:
+            goal = None if motion.direction or motion.towards is None else motion.towards.text
+            said = {"towards": goal} if goal else dict(zip(("direction", "depth"), _way(motion), strict=True))
+            said["speed"] = quantities(motion.quantities, None, found.bbox or (0.0, 0.0, 0.0, 0.0))[0]
+        readings.append(OtherMotionRequest.model_validate({"object": phrase.text, "kind": kind, **said}))
     return tuple(readings)
 
 
-def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: Grounding | LocatedObject) -> None:
+def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: GroundingRequest | ObjectRequest) -> None:
     """Raises `CannotReadDirection` for what falls over where it stands, and for a fall of what may stand."""
-    name, prior, region = thing.object, thing.prior, scene.region_of(thing.bbox)
+    name = thing.object or ""
+    region = None if thing.bbox is None else scene.region_of(thing.bbox)
     # The shadow of a ball tells how high it is.
     is_ball = prior_of(name).shape == "sphere" or (region is not None and region.is_disc)
-    in_air = words.in_air or is_ball or scene.side_view is not None or (prior is not None and prior.stands_on == "air")
+    in_air = words.in_air or is_ball or scene.side_view is not None or thing.stands_on == "air"
     if words.topples and not is_ball:
         raise _refused(f"The {name} would fall over where it stands, which is not simulated. Ask what a push does.")
     if words.kind == "fall" and not in_air:
@@ -154,93 +174,64 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     return scene.with_mover(trail.present.bbox), warnings
 
 
-def along_trail(scene: Scene, grounding: Grounding, words: MotionWords) -> MotionReading | None:
-    """On from the present position of the trail at the mover; None if there is none.
+def said_way(words: MotionWords, kind: MotionKind) -> dict[str, object]:
+    """Fields of a motion: which way it leads by its words alone, if they say it."""
+    way, towards, said = words.direction, words.towards, dict[str, object]()
+    on_floor = way is not None and words.verb in _ON_FLOOR and way[0] == 0.0 and not words.depth
+    if kind not in DIRECTED_KINDS:
+        return {}
+    if words.trail:
+        said = {"cue": "trail"}
+    elif words.along_arrow is not None:
+        said = {"along_arrow": words.along_arrow, "direction": way}
+    elif way is not None and not on_floor:
+        rises = kind == "linear" and words.verb in _RISES and way[1] < 0
+        said = {"direction": way, "cue": "text", "depth": words.depth or None, "rises": rises or None}
+    elif words.depth or way is not None:  # up the image is away on the floor
+        direction, depth = depth_motion(words.depth or (0.0 if way is None else -math.copysign(1.0, way[1])))
+        said = {"direction": direction, "depth": depth, "cue": "text"}
+    else:
+        said = {"towards": None if towards is None else towards.text, "forward": words.forward}
+    return {name: value for name, value in said.items() if value is not None}
 
-    Raises `CannotReadDirection` if the words speak of one all the same.
-    """
-    trail = trail_of(scene.trails, grounding.bbox)
-    if trail is None:
-        if words.trail:
-            told = f"no three positions of the {grounding.object} one after another were found in the image"
-            raise _refused(f"The question speaks of a trail, and {told}.")
-        return None
-    thrown = is_thrown(trail.positions) or words.kind in FALLING_KINDS
-    earlier = tuple(position.centre for position in trail.older)
-    return MotionReading("projectile" if thrown else "linear", trail.heading, "trail", trail=earlier)
 
-
-def read_way(scene: Scene, question: Question, grounding: Grounding) -> MotionReading:
-    """Kind and direction by the words, else by the only arrow or trail. Raises `CannotReadDirection`."""
-    words, name = question.motion, grounding.object
+def read_motion(
+    question: Question, scene: Scene, mover: GroundingRequest, things: Sequence[ObjectRequest]
+) -> MotionRequest:
+    """How the mover moves by the words, without the image's say in which way. Raises `CannotReadDirection`."""
+    words, name, bbox = question.motion, mover.object, mover.bbox or (0.0, 0.0, 0.0, 0.0)
     kind = words.kind or "linear"
     if question.unread_motion:
         unread = "', '".join(question.unread_motion)
         raise _refused(f"How the {name} moves was not understood: '{unread}'.")
     if words.is_contradictory or (kind == "static" and question.names_direction):
         raise _refused(f"What the question says of the motion of the {name} contradicts itself.")
-    refuse_unclear_fall(scene, words, grounding)
-    if kind not in DIRECTED_KINDS:
-        return MotionReading(kind, None, "gravity" if kind == "fall" else "text")
-    if scene.side_view is not None and words.direction == (0.0, 1.0) and kind == "linear":
-        return MotionReading("fall", None, "gravity")  # down a slope, or over an edge, by its weight
-    if scene.side_view is not None and words.depth:
-        raise _refused("The image is a drawing seen from the side: nothing in it moves towards the viewer, or away.")
-    said = _as_said(scene, words, kind, grounding)
-    if said is not None:
-        return said
-    if words.forward is None:
-        return along_trail(scene, grounding, words) or _along_arrow(scene, question, grounding, kind)
-    # Forward or backward, by the way that a vehicle is seen to face.
-    told = f"The question says that the {name} moves {'forward' if words.forward else 'backward'}."
-    if not prior_of(name).elongated:
-        raise _refused(f"{told} The embedded reader sees only of vehicles with wheels which way they face.")
-    way = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
-    if way is None:
-        raise _refused(f"{told} Which way it faces could not be seen for certain.")
-    return MotionReading(kind, way if words.forward else (-way[0], -way[1]), "orientation")
+    refuse_unclear_fall(scene, words, mover)
+    if kind in DIRECTED_KINDS and scene.side_view is not None:
+        if words.direction == (0.0, 1.0) and kind == "linear":
+            kind = "fall"  # down a slope, or over an edge, by its weight
+        elif words.depth:
+            raise _refused("The image is a drawing seen from the side: nothing moves towards the viewer, or away.")
+    way = said_way(words, kind)
+    if kind in DIRECTED_KINDS and not way and question.names_direction:
+        raise _refused("Which way it moves was not understood in the question.")
+    goal = goal_of(scene, words.towards, mover, things) if "towards" in way and words.towards else None
+    far = None if goal is None else math.hypot(*way_to(goal, bbox, kind == "linear"))
+    try:
+        speed, distance, duration, until = quantities(words.quantities, far, bbox)
+        said = {"speed": speed if kind in DIRECTED_KINDS else None, "distance": distance, "duration": duration}
+        said |= {"until": until, "steps": steps_of(words.steps, bbox), "others": others_of(words.others, scene, things)}
+        return MotionRequest.model_validate({"kind": kind, **way, **{k: v for k, v in said.items() if v}})
+    except ValidationError as error:
+        fault = error.errors()[0]
+        raise _refused(f"How far, how fast or how long the {name} moves cannot be used: {fault['msg']}.") from error
 
 
-def _as_said(scene: Scene, words: MotionWords, kind: MotionKind, grounding: Grounding) -> MotionReading | None:
-    """The motion whose direction the words give; None if they give none."""
-    if words.along_arrow is not None:
-        x, y = arrow_of(scene, grounding, GIVE_DIRECTION).direction
-        x, y = (x, y) if words.along_arrow else (-x, -y)
-        said = words.direction or (x, y)
-        if x * said[0] + y * said[1] < AGREES * math.hypot(x, y) * math.hypot(*said):
-            raise _refused("The question names the arrow and another direction, and the arrow does not point there.")
-        return MotionReading(kind, (x, y), "arrow", along_arrow=words.along_arrow)
-    on_floor = words.direction is not None and words.verb in _ON_FLOOR and words.direction[0] == 0.0 and not words.depth
-    if words.direction is not None and not on_floor:
-        rises = words.verb in _RISES and words.direction[1] < 0
-        return MotionReading(kind, words.direction, "text", depth=words.depth, rises=rises)
-    if words.depth or words.direction is not None:  # up the image is away on the floor
-        up = 0.0 if words.direction is None else -math.copysign(1.0, words.direction[1])
-        direction, depth = depth_motion(words.depth or up)
-        return MotionReading(kind, direction, "text", depth=depth)
-    if words.towards is not None:
-        goal = goal_of(scene, words.towards, grounding)
-        return MotionReading(kind, way_to(goal.bbox, grounding.bbox, kind == "linear"), "text", towards=goal)
-    return None
-
-
-def _along_arrow(scene: Scene, question: Question, grounding: Grounding, kind: MotionKind) -> MotionReading:
-    """Along the only arrow drawn at the mover, where the question names no direction at all."""
-    near = scene.arrows_near(grounding.bbox)
-    if len(near) == 1 and not question.names_direction:
-        note = "The question names no direction; the arrow drawn at the object was followed."
-        return MotionReading(kind, near[0].direction, "arrow", along_arrow=True, warnings=(note,))
-    raise _refused(
-        "No direction was read in the question (left, right, up, down, towards, away, along the arrow), and the image "
-        f"shows {len(near) or 'no'} arrow{'s' * (len(near) != 1)} at the {grounding.object}, and none was followed."
-    )
-
-
-def goal_of(scene: Scene, phrase: ObjectPhrase, grounding: Grounding) -> LocatedObject:
-    """The thing that the mover moves towards. Raises `CannotReadDirection`."""
-    goal = next((other for other in grounding.others if other.object == phrase.text), None)
-    besides = [each for each in scene.regions if not is_same_object(each.bbox, grounding.bbox)]
+def goal_of(scene: Scene, phrase: ObjectPhrase, mover: GroundingRequest, things: Sequence[ObjectRequest]) -> BBox:
+    """The box of the thing that the mover moves towards. Raises `CannotReadDirection`."""
+    goal = next((each.bbox for each in things if each.object == phrase.text), None)
+    besides = [each for each in scene.regions if not is_same_object(each.bbox, mover.bbox or each.bbox)]
     region = match_one(besides, phrase) if goal is None else None
     if goal is None and region is None:
-        raise _refused(f"Where the {grounding.object} moves to is not clear: {unclear(phrase, besides)}.")
-    return goal or LocatedObject(object=phrase.text, bbox=region.bbox if region is not None else grounding.bbox)
+        raise _refused(f"Where the {mover.object} moves to is not clear: {unclear(phrase, besides)}.")
+    return goal if goal is not None or region is None else region.bbox

@@ -1,13 +1,11 @@
 """The reader without weights: sentence forms for the question, classical vision for the image. It never guesses."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 from cow_service import __version__, records
 from cow_service.errors import CannotGround
 from cow_service.narration.words import phrases_of, same_name
-from cow_service.physics.camera import way_to
 from cow_service.readers import base
 from cow_service.readers.embedded import matching, motions
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
@@ -38,21 +36,25 @@ class EmbeddedReader:
         """Always: rules draw no random numbers."""
         return True
 
-    def read_question(self, question: str, names: Sequence[str] = ()) -> base.QuestionReading:
+    def read_question(self, question: str, names: Sequence[str] = ()) -> base.WordsReading:
         """What the sentence forms read; things that are given under one of the names have it."""
         read = parse(question, tuple(names))
-        changes = tuple(
-            base.NamedChange(each.kind, each.object.text, each.relation, tuple(target.text for target in each.targets))
-            for each in read.changes
-            if each.kind == "remove" or each.targets
+        said, mover = read.motion, None if read.asked is None or read.mover is None else read.mover.text
+        way = {} if read.unread_motion or said.is_contradictory else motions.said_way(said, said.kind or "linear")
+        kind = motions.settled_kind(read)
+        return base.WordsReading(
+            records.Reading(
+                grounding=None if mover is None else records.GroundingRequest(object=mover),
+                motion=records.MotionRequest.model_validate({"kind": kind, **way}),
+                objects=tuple(records.ObjectRequest(object=each.text) for each in read.others[: records.MAX_OBJECTS]),
+                interventions=changes_of(read.changes),
+                asked=read.asked,
+            ),
+            is_whole=kind is not None,
+            trail_named=said.trail,
+            nouns=matching.nouns_of(read),
+            drawings_named=frozenset(each for each in ("arrow", "box") if each in question.lower()),
         )
-        drawings = frozenset(each for each in ("arrow", "box") if each in question.lower())
-        said, towards = read.motion, None if read.motion.towards is None else read.motion.towards.text
-        way = base.WayReading(said.along_arrow, said.direction, said.depth, towards, said.forward)
-        way = base.WayReading() if read.unread_motion or said.is_contradictory else way
-        nouns, mover = matching.nouns_of(read), None if read.asked is None or read.mover is None else read.mover.text
-        kind, others = motions.settled_kind(read), tuple(each.text for each in read.others)
-        return base.QuestionReading(read.asked, mover, changes, said.trail, nouns, drawings, way, kind, others)
 
     def read_name(self, name: str) -> records.ObjectPrior:
         """By its noun."""
@@ -70,90 +72,79 @@ class EmbeddedReader:
         found = tuple(name for name in names if noun_phrases.may_name(kind.phrase, name))
         return found if found and kind.count in (None, len(found)) else (words,)
 
-    def ground(self, given: base.ReaderInput) -> base.GroundingReading:
-        """What is given under the mover's words, or the region that fits them. Raises `CannotGround`."""
+    def read(self, given: base.ReaderInput) -> base.ReadResult:
+        """The region that fits the mover's words, or what is given under them, and its motion in words.
+
+        Raises `CannotGround`, `CannotReadDirection`.
+        """
         question = parse(given.question, names_of(given))
-        mover, asked, unread = question.mover, question.asked, question.unread
-        changes = question.changes if given.changes_wanted else ()
-        if mover is None or (given.motion_wanted and not question.says_motion):
-            words = ("', '".join(unread) or given.question)[:MAX_UNREAD]
+        mover, place, is_open = question.mover, given.given.grounding, given.motion_wanted
+        if mover is None or (is_open and not question.says_motion):
+            words = ("', '".join(question.unread) or given.question)[:MAX_UNREAD]
             like = " Or: ".join(rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",))
             fault = (
                 f"What moves and how is not said in words that the embedded reader knows: '{words}'; it reads English."
             )
             raise CannotGround(f"{fault} Ask like: {like}", remedy=LOCATE_IT)
+        with given.cpu():
+            if place is None or not place.has_place:
+                scene, found = self._located(given, question, mover)
+            else:
+                scene, found = given.scene, base.ReadResult(records.Reading(grounding=place))
+            if not is_open or found.reading.grounding is None:
+                return found
+            things = (*given.known, *found.reading.objects)
+            motion = motions.read_motion(question, scene, found.reading.grounding, things)
+        return replace(found, reading=found.reading.model_copy(update={"motion": motion}))
+
+    def _located(
+        self, given: base.ReaderInput, question: Question, mover: ObjectPhrase
+    ) -> tuple[Scene, base.ReadResult]:
+        """Where the things are, and what is changed and asked; in the scene in which its trails end as is said."""
+        changes = () if given.given.interventions else question.changes
         _check_changes(question, changes)
-        with given.cpu():
-            scene, warnings = motions.scene_of_mover(given.scene, question)
-            if given.find is not None and scene.side_view is None:
-                scene = matching.with_found(scene, given.find(matching.nouns_of(question, given.sought)))
-            finder = _Finder(scene, given.known)
-            gone = [change.object for change in changes if change.kind == "remove"]
-            away = [each for phrase in gone for each in finder.found(phrase, f"takes '{phrase.text}' away")]
-            removed = [records.Intervention(kind="remove", object=each) for each in away]
-            finder.regions = finder.without([each.bbox for each in away])
-            bbox = finder.mover(mover, question.names_arrow)
-            finder.taken = {mover.text: bbox}
-            put = [finder.placed(change) for change in changes if change.kind == "place" and change.targets]
-            # The other things of the question, and those that the caller wants located under other words.
-            words = [phrase.text for phrase in (mover, *question.others)]
-            sought = [name for name in given.sought if not any(same_name(name, each) for each in words)]
-            parsed = [(name, noun_phrases.parse_noun_phrase(name)) for name in sought]
-            wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in parsed if phrase is not None)]
-            # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
-            apart = [each for each in finder.regions if each.bbox != bbox]
-            beside = [each for each in apart if each.called or not is_same_object(each.bbox, bbox)]
-            alone, sought = beside[0] if len(beside) == 1 else None, [each for each in wanted if not each.is_given]
-            others = [(each, alone if each.is_other else matching.match_one(beside, each)) for each in sought]
-            of_kinds = matching.things_of_kinds(finder.regions, question, bbox, given.known)
-            named = ((phrase.text, each.bbox) for phrase, each in reversed(others) if each is not None)
-            located = {bbox: records.LocatedObject(object=name, bbox=bbox) for name, bbox in named}
-            located |= {each.bbox: each for each in of_kinds}
-            warnings += tuple(
-                f"{matching.unclear(phrase, beside)}. No encounter is listed under that name."
-                for phrase, each in others
-                if each is None and phrase in question.others and (given.asked_wanted or given.changes_wanted)
-            )
-            things = [(phrase, each.bbox) for phrase, each in others if each is not None and phrase in question.others]
-            things += [] if mover.is_given else [(mover, bbox)]
-            doubts, doubtful = matching.noun_doubts(scene, things)
-        left = unread if given.asked_wanted or given.changes_wanted else ()
-        doubts += [f"The words '{each}' were not understood, so no outcome is sure." for each in left]
-        own = finder.known.get(mover.text)
-        seen = reversed(located.values())
-        in_doubt = bbox in doubtful or (own is not None and own.is_doubtful) or bool(left and not given.asked_wanted)
-        return base.GroundingReading(
-            mover.text,
-            bbox,
-            others=tuple(each.model_copy(update={"is_doubtful": each.bbox in doubtful}) for each in seen),
-            warnings=(*warnings, *doubts),
-            interventions=(*removed, *put),
-            asked=asked if given.asked_wanted else None,
-            prior=None if own is None else own.prior,
-            is_doubtful=in_doubt,
+        scene, warnings = motions.scene_of_mover(given.scene, question)
+        if given.find is not None and scene.side_view is None:
+            scene = matching.with_found(scene, given.find(matching.nouns_of(question, given.sought)))
+        finder = _Finder(scene, given.known)
+        bbox, changed = finder.changed(changes, mover, question.names_arrow)
+        named, things, unclear = finder.others(question, given, bbox)
+        is_told = given.given.asked is None or not given.given.interventions
+        doubts, doubtful = matching.noun_doubts(scene, [*named, *([] if mover.is_given else [(mover, bbox)])])
+        left = question.unread if is_told else ()
+        own = finder.known.get(mover.text) or records.ObjectRequest(object=mover.text)
+        # A thing has one name: that under which it is asked about goes before that of a change.
+        beside = {each.bbox: each for each in reversed([*things, *(thing for _, all in changed for thing in all)])}
+        beside.pop(bbox, None)
+        names = {each: thing.object for each, thing in beside.items()} | {bbox: mover.text}
+        known = {each.object for each in given.known}
+        reading = records.Reading(
+            grounding=records.GroundingRequest(
+                object=mover.text,
+                bbox=bbox,
+                shape=own.shape,
+                size=own.size,
+                stands_on=own.stands_on,
+                is_doubtful=bbox in doubtful or own.is_doubtful or bool(left and given.given.asked is not None),
+            ),
+            objects=tuple(
+                thing.model_copy(update={"is_doubtful": box in doubtful})
+                for box, thing in reversed(beside.items())
+                if thing.object not in known
+            )[: records.MAX_OBJECTS],
+            interventions=tuple(
+                records.InterventionRequest(
+                    kind=change.kind,
+                    object=names[each.bbox],
+                    relation=change.relation,
+                    targets=tuple(names[target.bbox] for target in targets),
+                )
+                for change, (each, *targets) in changed
+            ),
+            asked=question.asked if given.given.asked is None else None,
         )
-
-    def read_motion(
-        self, given: base.ReaderInput, grounding: records.Grounding, hints: base.MotionHints | None
-    ) -> base.MotionReading:
-        """Kind and direction from the words, and from the arrow where the words speak of one.
-
-        Raises `CannotReadDirection`.
-        """
-        with given.cpu():
-            scene, question = given.scene, parse(given.question, names_of(given, grounding))
-            words = question.motion
-            on = motions.along_trail(scene, grounding, words) if words.trail else None
-            reading = on or motions.read_way(scene, question, grounding)
-            goal, on_floor = reading.towards, reading.kind == "linear"
-            way = None if goal is None else math.hypot(*way_to(goal.bbox, grounding.bbox, on_floor))
-            said = motions.quantities(words.quantities, way, grounding.bbox)
-            return replace(
-                reading,
-                **dict(zip(("speed", "distance", "duration", "until"), said, strict=True)),
-                steps=motions.step_readings(words.steps, grounding.bbox),
-                others=motions.other_readings(words.others, scene, grounding),
-            )
+        told = (f"The words '{each}' were not understood, so no outcome is sure." for each in left)
+        return scene, base.ReadResult(reading, (*warnings, *(unclear if is_told else ()), *doubts, *told))
 
     def answer(
         self,
@@ -187,6 +178,20 @@ def names_of(given: base.ReaderInput, grounding: records.Grounding | None = None
     return tuple(each.object for each in given.known) or found
 
 
+def changes_of(changes: Sequence[ChangeWords]) -> tuple[records.InterventionRequest, ...]:
+    """The changes by the names of their things; not checked, as one phrase may mean two: "between both mugs"."""
+    return tuple(
+        records.InterventionRequest.model_construct(
+            kind=each.kind,
+            object=each.object.text,
+            relation=each.relation,
+            targets=tuple(target.text for target in each.targets),
+        )
+        for each in changes
+        if each.kind == "remove" or each.targets
+    )
+
+
 def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
     """Raises `CannotGround` if what is taken away moves or is asked about, or something is put into itself."""
     asked = question.asked
@@ -202,7 +207,7 @@ def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
 class _Finder:
     """Finds the things of one question: what is given under their words first, then what is seen."""
 
-    def __init__(self, scene: Scene, known: Sequence[records.LocatedObject]) -> None:
+    def __init__(self, scene: Scene, known: Sequence[records.ObjectRequest]) -> None:
         self.scene, self.regions = scene, tuple(scene.regions)
         self.known, self.taken = {each.object: each for each in known}, dict[str, records.BBox]()
         self._given = f" Given: {', '.join(self.known)}." if known else ""
@@ -215,7 +220,7 @@ class _Finder:
         """The box of what moves. Raises `CannotGround`."""
         scene = self.scene
         if phrase.is_given:
-            return self.known[phrase.text].bbox
+            return self.known[phrase.text].bbox or (0.0, 0.0, 0.0, 0.0)
         if phrase.inside_box:
             return matching.inside_drawn_box(scene, phrase)
         fitting = matching.best_matches(self.regions, phrase)
@@ -230,7 +235,60 @@ class _Finder:
             fault = f"Looked for '{phrase.text}', but no objects could be told apart in the image."
         raise CannotGround(fault + self._given, remedy=LOCATE_IT)
 
-    def found(self, phrase: ObjectPhrase, told: str, count: int | None = None) -> list[records.LocatedObject]:
+    def changed(
+        self, changes: Sequence[ChangeWords], mover: ObjectPhrase, names_arrow: bool
+    ) -> tuple[records.BBox, list[tuple[ChangeWords, list[records.ObjectRequest]]]]:
+        """The box of what moves, and each change with what it changes and what that is put to. Raises `CannotGround`.
+
+        What is taken away is found first: it is none of the others.
+        """
+        changed = list[tuple[ChangeWords, list[records.ObjectRequest]]]()
+        for change in (each for each in changes if each.kind == "remove"):
+            things = self._found(change.object, f"takes '{change.object.text}' away")
+            changed += [(change, [thing]) for thing in things]
+        gone = [thing.bbox for _, (thing,) in changed if thing.bbox is not None]
+        self.regions = self.without(gone)
+        bbox = self.mover(mover, names_arrow)
+        self.taken = {mover.text: bbox}
+        for change in (each for each in changes if each.kind == "place" and each.targets):
+            puts, things = f"puts '{change.object.text}'", list[records.ObjectRequest]()
+            for phrase in (change.object, *change.targets):
+                things += self._found(phrase, puts, 2)
+                self.taken[phrase.text] = things[-1].bbox or bbox
+            if len(things) != (3 if change.relation == "between" else 2):
+                raise CannotGround(f"The question {puts}, and between which things is not clear.", remedy=GIVE_OBJECT)
+            changed.append((change, things))
+        return bbox, changed
+
+    def others(
+        self, question: Question, given: base.ReaderInput, bbox: records.BBox
+    ) -> tuple[list[tuple[ObjectPhrase, records.BBox]], list[records.ObjectRequest], list[str]]:
+        """The other things that the question names, each with its box; all that are located; and what is unclear.
+
+        Located are also those of the kinds that are asked about, and those that the caller wants under other words.
+        """
+        words = [phrase.text for phrase in (question.mover, *question.others) if phrase is not None]
+        sought = [name for name in given.sought if not any(same_name(name, each) for each in words)]
+        parsed = [(name, noun_phrases.parse_noun_phrase(name)) for name in sought]
+        wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in parsed if phrase is not None)]
+        # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
+        apart = [each for each in self.regions if each.bbox != bbox]
+        beside = [each for each in apart if each.called or not is_same_object(each.bbox, bbox)]
+        alone = beside[0] if len(beside) == 1 else None
+        fitting = [
+            (each, alone if each.is_other else matching.match_one(beside, each)) for each in wanted if not each.is_given
+        ]
+        of_kinds = matching.things_of_kinds(self.regions, question, bbox, given.known)
+        seen = [records.ObjectRequest(object=phrase.text, bbox=each.bbox) for phrase, each in fitting if each]
+        unclear = [
+            f"{matching.unclear(phrase, beside)}. No encounter is listed under that name."
+            for phrase, each in fitting
+            if each is None and phrase in question.others
+        ]
+        named = [(phrase, each.bbox) for phrase, each in fitting if each is not None and phrase in question.others]
+        return named, [*of_kinds, *seen], unclear
+
+    def _found(self, phrase: ObjectPhrase, told: str, count: int | None = None) -> list[records.ObjectRequest]:
         """One thing, or several such as "both cylinders". Raises `CannotGround`."""
         if phrase.is_given:
             return [self.known[phrase.text]]
@@ -242,18 +300,8 @@ class _Finder:
         else:
             region = matching.match_one(free, phrase) if kind is None and taken is None else None
             box = region.bbox if region is not None else taken
-            things = [records.LocatedObject(object=phrase.text, bbox=box, source="embedded")] if box else []
+            things = [records.ObjectRequest(object=phrase.text, bbox=box)] if box else []
         if not things:
             why = matching.unclear(phrase, free)
             raise CannotGround(f"The question {told}, and {why}.{self._given}", remedy=GIVE_OBJECT)
         return things
-
-    def placed(self, change: ChangeWords) -> records.Intervention:
-        """What is put somewhere, and what it is put to. Raises `CannotGround`."""
-        puts, found = f"puts '{change.object.text}'", list[records.LocatedObject]()
-        for phrase in (change.object, *change.targets):
-            found += self.found(phrase, puts, 2)
-            self.taken[phrase.text] = found[-1].bbox
-        if len(found) != (3 if change.relation == "between" else 2):
-            raise CannotGround(f"The question {puts}, and between which things is not clear.", remedy=GIVE_OBJECT)
-        return records.Intervention(kind="place", object=found[0], relation=change.relation, targets=tuple(found[1:]))

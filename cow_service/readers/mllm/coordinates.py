@@ -24,7 +24,7 @@ from cow_service.weights.manifests import Family, ImageSize
 MEDIA_TYPE = "image/jpeg"
 QUALITY = 95  # percent; fine lines such as drawn arrows stay clean
 OVERSHOOT = 0.02  # of the image's side: so far outside a place is cut off at the edge, further out it is refused
-LEAST_SIDE = 1.0  # px of the upright image: a narrower box has no area
+LEAST_SIDE = 2.0  # px of the upright image: a narrower box has no area
 LEAST_LENGTH = 2.0  # px of the upright image between the ends of a direction
 MAX_RATIO = 200  # of the sides: what rounds sides to multiples takes no narrower image
 NUMBER = r"[-+]?(?:\d{1,12}(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,2})?"

@@ -13,7 +13,7 @@ from pydantic.json_schema import SkipJsonSchema
 from cow_service import records
 from cow_service.narration.words import RELATION_WORDS
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import OtherMotionHint, ReaderInput, StepReading
+from cow_service.readers.base import ReaderInput
 from cow_service.readers.mllm import replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import EncodedImage
@@ -22,7 +22,7 @@ from cow_service.readers.options import plain
 
 MAX_NAMED = 12  # other objects that the question names
 _NUMBERS = ("speed", "distance", "duration")  # which only a question with a number can say
-SAID_ALIKE = (*_NUMBERS, "until")  # fields of a reply and of `MotionHints`
+SAID_ALIKE = (*_NUMBERS, "until")  # fields of a reply and of a motion
 _MOTION = ("kind", *SAID_ALIKE, "then", "also_moving")
 # The reply to "With the vase gone, will the red car that drives left at 20 px/s miss the mug?"
 _EXAMPLE: dict[str, Any] = {
@@ -165,10 +165,12 @@ class AlsoMoving(replies.Reply):
     way: Annotated[tuple[records.Vector, float] | None, *_WAY] = None
 
     @property
-    def hint(self) -> OtherMotionHint:
-        """As stage 2 takes it."""
+    def as_said(self) -> records.OtherMotionRequest:
+        """As a request says it."""
         direction, depth = self.way if self.way is not None and self.kind in records.DIRECTED_KINDS else (None, 0.0)
-        return OtherMotionHint(object=self.object, kind=self.kind, direction=direction, depth=depth)
+        return records.OtherMotionRequest.model_validate(
+            {"object": self.object, "kind": self.kind, "direction": direction, "depth": depth}
+        )
 
     @pydantic.model_validator(mode="after")
     def _check_way(self) -> Self:
@@ -254,39 +256,44 @@ class Identified(replies.Reply):
         return tuple(names)
 
     @property
-    def hints(self) -> dict[str, Any]:
-        """Fields of `MotionHints`, as far as the reply says them."""
+    def motion(self) -> dict[str, Any]:
+        """Fields of a motion, as far as the reply says them."""
+        steps = (
+            {"direction": each.way[0], "depth": each.way[1], "distance": each.distance, "duration": each.duration}
+            for each in self.then
+        )
         return {
             "kind": self.kind or "linear",
             **{name: value for name in SAID_ALIKE if (value := getattr(self, name)) is not None},
-            "then": tuple(StepReading(*each.way, each.distance, each.duration) for each in self.then),
-            "also": tuple(each.hint for each in self.also_moving),
+            "steps": tuple(records.MotionStepRequest.model_validate(each) for each in steps),
+            "others": tuple(each.as_said for each in self.also_moving),
         }
 
 
 def identified_by_words(given: ReaderInput) -> Identified | None:
     """What the words of a question say of all that is asked here; None where they leave something open."""
     words = given.words
-    if words is None or words.kind is None or words.mover is None:
+    if words is None or not words.is_whole or words.reading.grounding is None or words.reading.motion is None:
         return None
+    read = words.reading
     return Identified.model_construct(
-        object=words.mover,
-        others=words.others,
-        asked=words.asked if given.asked_wanted else None,
-        kind=words.kind,
-        changes=words.changes if given.changes_wanted else (),
+        object=words.reading.grounding.object,
+        others=tuple(each.object for each in read.objects),
+        asked=read.asked if given.given.asked is None else None,
+        kind=words.reading.motion.kind,
+        changes=() if given.given.interventions else read.interventions,
     )
 
 
 def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
     """The call that asks which object moves, in words, and of the rest what neither the caller nor the words say."""
     has_numbers = any(map(str.isdigit, given.question))
-    asked = None if given.words is None or not given.asked_wanted else given.words.asked
+    asked = None if given.words is None or given.given.asked is not None else given.words.reading.asked
     if asked is not None and (asked.among or asked.form.startswith("which")):
         asked = None  # the words do not say which things these are
     said = frozenset((
-        *(() if given.asked_wanted and asked is None else ("asked",)),
-        *(() if given.changes_wanted else ("changes",)),
+        *(() if given.given.asked is None and asked is None else ("asked",)),
+        *(("changes",) if given.given.interventions else ()),
         *(() if given.motion_wanted else _MOTION),
         *(() if has_numbers else _NUMBERS),
     ))  # fmt: skip

@@ -87,7 +87,7 @@ class Located:
     bbox: records.BBox | None = None
     point: records.Point | None = None
     label: str = ""
-    others: tuple[records.LocatedObject, ...] = ()
+    others: tuple[records.ObjectRequest, ...] = ()
     objects_complete: bool = False  # the others are all that could be hit or hide something
     line: Line | None = None
     warnings: tuple[str, ...] = ()  # of what was left out
@@ -229,7 +229,7 @@ def _read_objects(
     bbox = None if replies.is_none(place.box) else frame.bbox(place.box)
     if bbox is not None and coordinates.covers_image(frame.width, frame.height, bbox):
         raise ReplyError(f"the box of '{wanted}' covers nearly the whole image; give that of the object alone")
-    objects: list[records.LocatedObject] = []
+    objects: list[records.ObjectRequest] = []
     named = list(_named(rest, others, context))
     for name, role, other in named:
         try:
@@ -242,7 +242,7 @@ def _read_objects(
         elif role == "target" and bbox is not None and is_same_object(box, bbox):
             context.faults.append(f"'{wanted}' and '{name}' have the same box")
         else:
-            objects.append(records.LocatedObject(object=name, bbox=box, role=role, source="mllm"))
+            objects.append(records.ObjectRequest(object=name, bbox=box, role=role))
     told = [replies.truth_of(held["complete"]) for held in fields if "complete" in held]
     is_complete = told[-1] is True if told else len(objects) >= MIN_COMPLETE_LIST
     return Located(
@@ -255,23 +255,24 @@ def _read_objects(
 
 
 def separate_objects(
-    mover: records.LocatedObject, others: Sequence[records.LocatedObject]
-) -> tuple[tuple[records.LocatedObject, ...], tuple[str, ...]]:
+    mover: records.GroundingRequest, others: Sequence[records.ObjectRequest]
+) -> tuple[tuple[records.ObjectRequest, ...], tuple[str, ...]]:
     """The others without those that have the box of the mover or of one before them, and with few obstacles.
 
     A warning reports each that is dropped, unless it is the mover under its own name.
     """
-    kept: list[records.LocatedObject] = []
-    warnings: list[str] = []
+    kept: list[records.ObjectRequest] = []
+    warnings, boxes = list[str](), [] if mover.bbox is None else [mover.bbox]
     for other in others:
-        if is_same_object(other.bbox, mover.bbox) and same_name(other.object, mover.object):
+        if other.bbox is None or (is_among(other.bbox, boxes[:1]) and same_name(other.object, mover.object or "")):
             continue
-        if is_among(other.bbox, [mover.bbox, *(each.bbox for each in kept)]):
+        if is_among(other.bbox, boxes):
             warnings.append(f"The reader's box of '{other.object}' was left out: it is that of another object.")
         elif other.role == "obstacle" and sum(each.role == "obstacle" for each in kept) >= MAX_OBSTACLES:
             warnings.append(f"The reader's box of '{other.object}' was left out: at most {MAX_OBSTACLES} are taken.")
         else:
             kept.append(other)
+            boxes.append(other.bbox)
     return tuple(kept), tuple(warnings)
 
 
@@ -452,13 +453,9 @@ class Scale:
     metres: float | None = None  # its longest side
     down: str = "bottom"
 
-    def metres_per_pixel(self, name: str, bbox: records.BBox) -> records.MetresPerPixel | None:
-        """At the object of that name; null if its size is not known."""
-        if self.metres is None:
-            return None
-        span = max(bbox[2] - bbox[0], bbox[3] - bbox[1])
-        note = f"{name}: {self.metres:g} m over {span:.0f} px"
-        return records.MetresPerPixel(value=self.metres / span, source="reference", note=note)
+    def metres_per_pixel(self, bbox: records.BBox) -> float | None:
+        """At the object in a box; null if its size is not known."""
+        return None if self.metres is None else self.metres / max(bbox[2] - bbox[0], bbox[3] - bbox[1])
 
 
 def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scale]:

@@ -5,12 +5,13 @@ They are read as leniently as they are written. What cannot be read is left out 
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Annotated, Any, cast
 
-from pydantic import PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import PlainValidator, ValidationError, ValidationInfo, WithJsonSchema
 
-from cow_service.readers.base import Quantity, Unit
+from cow_service import records
 from cow_service.readers.mllm.coordinates import HUGE, NUMBER
 from cow_service.readers.mllm.replies import is_none, is_number, nullable, text_of
 
@@ -78,16 +79,18 @@ def positive(written: object, unit: str) -> float | None:
     return found[0] if found is not None and found[1] in ("", unit) and found[0] > 0 else None
 
 
-def _quantity(*units: Unit) -> tuple[Any, Any]:
-    def read(written: object) -> Quantity | None:
+def _quantity(kind: type[records.Speed] | type[records.Distance], *units: str) -> tuple[Any, Any]:
+    def read(written: object) -> records.Quantity | None:
         found = measured(written)
         if found is None or found[1] not in units or not found[0] > 0:
             return None
-        return Quantity(found[0], found[1])
+        with suppress(ValidationError):  # a number that is too large
+            return kind.model_validate({"value": found[0], "unit": found[1]})
+        return None
 
     return _optional(f"a number with {' or '.join(units)}", read)
 
 
-Distance = Annotated[Quantity | None, *_quantity("px", "m")]
-Speed = Annotated[Quantity | None, *_quantity("px/s", "m/s")]
+Distance = Annotated[records.Distance | None, *_quantity(records.Distance, "px", "m")]
+Speed = Annotated[records.Speed | None, *_quantity(records.Speed, "px/s", "m/s")]
 Seconds = Annotated[float | None, *_optional("a time in seconds", lambda written: positive(written, "s"))]

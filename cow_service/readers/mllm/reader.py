@@ -10,19 +10,29 @@ from cow_service import __version__, records
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
 from cow_service.readers import base
-from cow_service.readers.base import GroundingReading, MotionHints, MotionReading, ReaderInput
+from cow_service.readers.base import ReaderInput, ReadResult
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.check import MllmCheck, check_model
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.contents import pictures
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
-from cow_service.readers.mllm.identify import SAID_ALIKE, Identified, identified_by_words, identify_call
+from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
-from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
+from cow_service.readers.mllm.locate import (
+    DOWN,
+    MAX_LABEL,
+    Line,
+    Located,
+    Scale,
+    locate_call,
+    scale_call,
+    separate_objects,
+)
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
+from cow_service.records import DIRECTED_KINDS, FALLING_KINDS
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
@@ -93,105 +103,135 @@ class MllmReader:
         """The reply to a chat of OpenAI's protocol, through pydantic-ai. Raises `InvalidRequest`, `MllmUnavailable`."""
         return await self._client.chat(body)
 
-    def ground(self, given: ReaderInput) -> GroundingReading:
+    def read(self, given: ReaderInput) -> ReadResult:
         """Two calls: what moves, unless the question's words say it; then where it is and which way it moves.
 
-        Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
+        Only the second where the place and the kind of motion are known. Raises `ObjectNotFound`, `MllmBadReply`,
+        `MllmUnavailable`.
         """
-        image, identified = self._identify(given)
-        if identified is None:
+        with given.cpu():
+            image = encode(given.scene.image, self._client.family)
+        place, motion = given.given.grounding, given.given.motion
+        is_placed = place is not None and place.bbox is not None
+        is_known = is_placed and motion is not None and motion.kind is not None
+        identified = None if is_known else self._identify(given, image)
+        name = (place.object if place is not None else None) or (None if identified is None else identified.object)
+        if name is None:
             raise ObjectNotFound(
                 f"{self._subject} sees nothing in the image that the question could move.", remedy=GIVE_PLACE
             )
-        located, scale = self._locate(given, image, identified, identified.object)
-        if located is None:
-            raise ObjectNotFound(f"{self._subject} does not see '{identified.object}' in the image.", remedy=GIVE_PLACE)
-        with given.cpu():
-            bbox = given.scene.bbox_at(located.point or (0.0, 0.0)) if located.bbox is None else located.bbox
-        mover = records.LocatedObject(object=identified.object, bbox=bbox, source="mllm")
-        others, doubles = separate_objects(mover, located.others)
-        known = {name_words(each.object): each for each in (mover, *others)}
+        kind = (motion.kind if is_known and motion else identified and identified.kind) or DEFAULT_KIND
+        bbox = place.bbox if is_placed and place is not None else None
+        located, scale = self._locate(given, image, identified, name, kind, bbox)
+        warnings = () if identified is None else identified.warnings
+        if bbox is not None:
+            reading = records.Reading()
+        elif located is None:
+            raise ObjectNotFound(f"{self._subject} does not see '{name}' in the image.", remedy=GIVE_PLACE)
+        else:
+            reading, told = self._placed(given, name, identified, located)
+            warnings += told
+        if given.motion_wanted:
+            said = {} if identified is None else identified.motion
+            said |= self._way(located.line) if located is not None and located.line and kind in DIRECTED_KINDS else {}
+            said |= {"direction_deviation": self._measured.direction_deviation} if kind in DIRECTED_KINDS else {}
+            placed = reading.grounding or place
+            said |= self._scaled(scale, placed.bbox if placed is not None else None)
+            if isinstance(scale, CowError):
+                default = "the default one was taken"
+                warnings += (f"The scale of the scene could not be read ({scale.code}): {default}.",)
+            reading, left_out = self._with_motion(given, reading, said)
+            warnings += left_out
+        warnings += () if located is None else located.warnings
+        return ReadResult(reading, warnings, self._family_warnings if bbox is None else ())
 
-        def changed(name: str) -> records.LocatedObject:
-            found = known.get(name_words(name))
-            if found is None:
+    def _placed(
+        self, given: ReaderInput, name: str, identified: Identified | None, located: Located
+    ) -> tuple[records.Reading, tuple[str, ...]]:
+        """Where the things are, and what is changed and asked; and warnings. Raises `ObjectNotFound`."""
+        deviation, label = self._measured.bbox_deviation, located.label[:MAX_LABEL].strip()
+        is_other = bool(label) and set(name_words(label)).isdisjoint(name_words(name))
+        mover = records.GroundingRequest(
+            object=name,
+            bbox=located.bbox,
+            point=None if located.bbox is not None else located.point,
+            bbox_deviation=deviation,
+            label=label or None,
+            is_doubtful=is_other,
+        )
+        others, doubles = separate_objects(mover, located.others)
+        changes = () if identified is None else identified.changes
+        changed = {each: "target" for change in changes for each in (change.object, *change.targets)}
+        seen = {" ".join(name_words(each.object)) for each in (*others, *given.known)} | {" ".join(name_words(name))}
+        for each in changed:
+            if " ".join(name_words(each)) not in seen:
                 raise ObjectNotFound(
-                    f"{self._subject} does not see '{name}' in the image, which the question changes.",
+                    f"{self._subject} does not see '{each}' in the image, which the question changes.",
                     remedy=GIVE_PLACE,
                 )
-            return found.model_copy(update={"role": "target"})
-
-        interventions = tuple(
-            records.Intervention(
-                kind=one.kind,
-                object=changed(one.object),
-                relation=one.relation,
-                targets=tuple(map(changed, one.targets)),
-            )
-            for one in identified.changes
-        )
-        removed = {each.object.bbox for each in interventions if each.kind == "remove"}
-        is_other = bool(located.label) and set(name_words(located.label)).isdisjoint(name_words(identified.object))
-        mismatch = f"Asked for '{identified.object}', the reader gave a place that it calls '{located.label}'."
-        warnings = (*((mismatch,) if is_other else ()), *identified.warnings, *located.warnings, *doubles)
-        return GroundingReading(
-            object=identified.object,
-            bbox=bbox,
-            bbox_deviation=self._measured.bbox_deviation,
-            label=located.label,
-            point=located.point,
-            others=tuple(other for other in others if other.bbox not in removed),
+        meant = [name_words(each) for each in changed]
+        reading = records.Reading(
+            grounding=mover,
+            objects=tuple(
+                each.model_copy(
+                    update={
+                        "bbox_deviation": deviation,
+                        "role": "target" if name_words(each.object) in meant else each.role,
+                    }
+                )
+                for each in others
+            ),
             objects_complete=located.objects_complete and not doubles,
-            interventions=interventions,
-            warnings=warnings,
-            place_doubts=self._family_warnings,
-            is_doubtful=is_other,
-            asked_is_doubtful=bool(identified.warnings),
-            hints=_hints(identified, located, scale, bbox) if given.motion_wanted else None,
-            asked=identified.asked,
-            language=identified.language,
+            interventions=tuple(
+                records.InterventionRequest(
+                    kind=each.kind, object=each.object, relation=each.relation, targets=each.targets
+                )
+                for each in changes
+            ),
+            asked=None if identified is None else identified.asked,
+            question_is_doubtful=bool(identified and identified.warnings),
+            language=None if identified is None else identified.language,
         )
+        mismatch = f"Asked for '{name}', the reader gave a place that it calls '{located.label}'."
+        return reading, (*((mismatch,) if is_other else ()), *doubles)
 
-    def read_motion(self, given: ReaderInput, grounding: records.Grounding, hints: MotionHints | None) -> MotionReading:
-        """No call with hints, one where something speaks against them, else two.
+    def _way(self, line: Line) -> dict[str, Any]:
+        """The fields of a motion that tell which way it goes."""
+        said: dict[str, Any] = {"cue": line.cue or "orientation", "along_arrow": line.along_arrow}
+        if line.camera is not None:
+            said["direction"], said["depth"] = depth_motion(CAMERA_SENSE[line.camera])
+            said["depth_deviation"] = self._measured.direction_deviation
+        elif line.ends is not None:
+            (x0, y0), (x1, y1) = line.ends
+            said["direction"] = (x1 - x0, y1 - y0)
+        return {name: value for name, value in said.items() if value is not None}
 
-        Raises `CannotReadDirection`, `MllmBadReply`, `MllmUnavailable`.
-        """
-        warnings: list[str] = []
-        others_sought = hints is not None  # with the mover
-        if hints is None:
-            image, identified = self._identify(replace(given, asked_wanted=False, changes_wanted=False))
-            located, scale = self._locate(given, image, identified, grounding.object, grounding.bbox)
-            hints = _hints(identified, located, scale, grounding.bbox)
-            warnings += () if identified is None else identified.warnings
-            warnings += () if located is None else located.warnings
-        elif given.objections and hints.kind in records.DIRECTED_KINDS:
-            with given.cpu():
-                image = encode(given.scene.image, self._client.family)
-            call = locate_call(given, image, grounding.object, grounding.bbox, (), True, self._reasoning)
-            if (located := self._client.complete(call, given)) is not None:
-                warnings += located.warnings
-                hints = hints.model_copy(update=vars(located.line or Line()))
-        places = {name_words(each.object): each for each in grounding.others}
-        others: list[base.OtherMotionReading] = []
-        for hint in hints.also:
-            place = places.get(name_words(hint.object))
-            if place is not None:
-                width = self._measured.direction_deviation
-                others.append(base.OtherMotionReading(place, hint.kind, hint.direction, width, hint.depth))
-            elif others_sought:
-                raise CannotReadDirection(f"'{hint.object}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
-            else:
-                warnings.append(f"'{hint.object}' moves, too, and was left out: it has no place. {GIVE_OBJECT}")
-        kind = hints.kind or DEFAULT_KIND
-        reading = MotionReading(kind, None, "text", others=tuple(others))
-        if kind in records.FALLING_KINDS:
-            reading = replace(reading, cue="gravity", metres_per_pixel=hints.metres_per_pixel, down=hints.down)
-            if hints.scale_error:
-                default = "the default one was taken"
-                warnings.append(f"The scale of the scene could not be read ({hints.scale_error}): {default}.")
-        reading = replace(reading, warnings=tuple(warnings))
-        return self._directed(reading, hints) if kind in records.DIRECTED_KINDS else reading
+    def _scaled(self, scale: Scale | CowError | None, bbox: records.BBox | None) -> dict[str, Any]:
+        """The fields of a motion that tell the scale, and which way things fall."""
+        if not isinstance(scale, Scale):
+            return {}
+        metres = None if bbox is None else scale.metres_per_pixel(bbox)
+        return {"down": DOWN[scale.down], **({} if metres is None else {"metres_per_pixel": metres})}
+
+    def _with_motion(
+        self, given: ReaderInput, reading: records.Reading, said: dict[str, Any]
+    ) -> tuple[records.Reading, tuple[str, ...]]:
+        """The reading with its motion; what else moves must have a place. Raises `CannotReadDirection`."""
+        places = {" ".join(name_words(each.object)) for each in (*given.known, *reading.objects)}
+        moving: tuple[records.OtherMotionRequest, ...] = said.pop("others", ())
+        lost = [each.object for each in moving if " ".join(name_words(each.object)) not in places]
+        if lost and reading.grounding is not None:  # they were looked for with the mover
+            raise CannotReadDirection(f"'{lost[0]}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
+        deviation = self._measured.direction_deviation
+        kept = (each for each in moving if each.object not in lost)
+        said |= (
+            {"others": tuple(each.model_copy(update={"direction_deviation": deviation}) for each in kept)}
+            if moving
+            else {}
+        )
+        left_out = (f"'{name}' moves, too, and was left out: it has no place. {GIVE_OBJECT}" for name in lost)
+        motion = records.MotionRequest.model_validate(said)
+        return reading.model_copy(update={"motion": motion}), tuple(left_out)
 
     def answer(
         self,
@@ -212,12 +252,11 @@ class MllmReader:
             raise next(each for each in results if isinstance(each, CowError))
         return tuple(replace(each, notes=(*each.notes, *given.calls.notes)) for each in readings)
 
-    def _identify(self, given: ReaderInput) -> tuple[EncodedImage, Identified | None]:
-        """The image as it is sent, and the question about it; of several arrows the MLLM says which one is meant."""
+    def _identify(self, given: ReaderInput, image: EncodedImage) -> Identified | None:
+        """The question in words; of several arrows the MLLM says which one is meant."""
         with given.cpu():
-            image = encode(given.scene.image, self._client.family)
             said = identified_by_words(given) if given.words and len(given.scene.arrows) <= 1 else None
-        return image, said or self._client.complete(identify_call(given, image, self._reasoning), given)
+        return said or self._client.complete(identify_call(given, image, self._reasoning), given)
 
     def _locate(
         self,
@@ -225,54 +264,29 @@ class MllmReader:
         image: EncodedImage,
         identified: Identified | None,
         name: str,
-        bbox: records.BBox | None = None,
+        kind: records.MotionKind,
+        bbox: records.BBox | None,
     ) -> tuple[Located | None, Scale | CowError | None]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
         None for what was not asked for, or not seen. Raises `MllmBadReply`, `MllmUnavailable`.
         """
-        kind = (identified.kind if identified else None) or DEFAULT_KIND
         others: tuple[str, ...] = ()
         if identified is not None and bbox is None:
             named = (*identified.must_be_found, *given.sought, *identified.others)
             others = tuple(dict.fromkeys(each for each in named if name_words(each) != name_words(name)))
-        wants_direction = given.motion_wanted and kind in records.DIRECTED_KINDS
+        wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
+        is_asked_again = bbox is not None and bool(given.objections)  # the direction alone
         calls: dict[str, PromptCall[Any]] = {}
         if bbox is None or wants_direction:
             calls["place"] = locate_call(given, image, name, bbox, others, wants_direction, self._reasoning)
-        if given.motion_wanted and kind in records.FALLING_KINDS:
+        if given.motion_wanted and kind in FALLING_KINDS and not is_asked_again:
             calls["scale"] = scale_call(image, name, self._reasoning)
         results = dict(zip(calls, self._client.complete_all(list(calls.values()), given), strict=True))
         located: Located | CowError | None = results.get("place")
         if isinstance(located, CowError):
             raise located
         return located, results.get("scale")
-
-    def _directed(self, reading: MotionReading, hints: MotionHints) -> MotionReading:
-        deviation = self._measured.direction_deviation
-        said: dict[str, Any] = {name: getattr(hints, name) for name in SAID_ALIKE}
-        said |= {"steps": hints.then, "cue": hints.cue or "orientation", "direction_deviation": deviation}
-        if hints.camera is not None:
-            said["direction"], said["depth"] = depth_motion(CAMERA_SENSE[hints.camera])
-            said["depth_deviation"] = deviation
-        elif hints.ends is not None:
-            (x0, y0), (x1, y1) = hints.ends
-            said["direction"] = (x1 - x0, y1 - y0)
-        return replace(reading, along_arrow=hints.along_arrow, **said)
-
-
-def _hints(
-    identified: Identified | None, located: Located | None, scale: Scale | CowError | None, bbox: records.BBox
-) -> MotionHints:
-    hints: dict[str, Any] = {"kind": DEFAULT_KIND} if identified is None else identified.hints
-    if located is not None and located.line is not None:
-        hints |= vars(located.line)
-    if isinstance(scale, Scale):
-        name = "" if identified is None else identified.object
-        hints |= {"metres_per_pixel": scale.metres_per_pixel(name, bbox), "down": DOWN[scale.down]}
-    elif isinstance(scale, CowError):
-        hints["scale_error"] = scale.code
-    return MotionHints(**hints)
 
 
 def create(settings: Settings) -> MllmReader:

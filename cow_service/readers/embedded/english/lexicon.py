@@ -7,8 +7,7 @@ from importlib.resources import files
 from itertools import count
 from typing import Literal, NamedTuple, cast
 
-from cow_service.readers.base import SpeedWord
-from cow_service.records import AskedForm, AskedRelation, MotionKind, Vector
+from cow_service.records import AskedForm, AskedRelation, MotionKind, SpeedWord, Vector
 
 
 def words(*lists: str) -> frozenset[str]:

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
 
-from cow_service.readers.base import Likeness, SpeedWord
+from cow_service.readers.base import Likeness
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.options import plain
-from cow_service.records import ObjectPrior
+from cow_service.records import ObjectPrior, SpeedWord
 
 _CONTRACTED = {
     r"\bcan ?not\b|\bcan't\b": "can not", r"\bwon't\b": "will not", r"n't\b": " not",

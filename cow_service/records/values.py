@@ -1,15 +1,23 @@
-"""Types of request fields: strict numbers, text that can be stored, points, images."""
+"""The base of all records, and types of the fields that callers fill in: strict numbers, text, points, images."""
 
 import json
-from collections.abc import Callable, Sequence
+import math
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from cow_service.errors import SHOWN_CHARACTERS, FieldError, pointer_part, shortened
-from cow_service.records import Record, Sha256
-
+Point = tuple[float, float]
+BBox = tuple[float, float, float, float]
+Vector = tuple[float, float]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 MAX_NAME = 100  # characters of a backend's name
+
+
+class Record(BaseModel):
+    """A frozen record; unknown fields are an error, so that a misspelt one is never ignored."""
+
+    # Validators are built at first use, so that importing the SDK or the command line stays quick.
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 def _number(value: Any) -> Any:
@@ -33,17 +41,6 @@ def _says_something(text: str) -> str:
     return text
 
 
-def has_more_values(value: Any, most: int) -> bool:
-    """Whether a JSON value contains more than `most` values, counting nested ones. Stops counting there."""
-    held = [value]
-    for _ in range(most):
-        if not held:
-            return False
-        one = held.pop()
-        held.extend(one.values() if isinstance(one, dict) else one if isinstance(one, list) else ())
-    return bool(held)
-
-
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # strict: no strings, no booleans
 WHOLE = BeforeValidator(_number)  # comes after the limits of an integer: in a union, the JSON schema omits later ones
 Whole = Annotated[int, WHOLE]
@@ -53,6 +50,24 @@ Name = Annotated[str, Field(max_length=MAX_NAME)]
 # Only the first wrong element of a long list is reported: all of them would fill the memory.
 Near = Annotated[Finite, Field(ge=-1e6, le=1e6)]  # px, of a point in the image or not too far from it
 Points = Annotated[tuple[tuple[Near, Near], ...], Field(fail_fast=True)]
+ObjectWords = Annotated[Words, Field(min_length=1, max_length=200)]
+Seconds = Annotated[Finite, Field(gt=0, le=3600)]
+
+
+def _with_area(bbox: BBox) -> BBox:
+    if bbox[2] - bbox[0] < 2 or bbox[3] - bbox[1] < 2:
+        raise ValueError(f"[x0, y0, x1, y1] must have x1 and y1 at least 2 px beyond x0 and y0, got {list(bbox)}")
+    return bbox
+
+
+def _has_length(direction: Vector) -> Vector:
+    if not 1e-9 < math.hypot(*direction) < 1e12:
+        raise ValueError(f"[dx, dy] must not have zero length, got {list(direction)}")
+    return direction
+
+
+Box = Annotated[tuple[Finite, Finite, Finite, Finite], AfterValidator(_with_area)]
+Direction = Annotated[tuple[Finite, Finite], AfterValidator(_has_length)]
 Flags = Annotated[tuple[Flag, ...], Field(fail_fast=True)]
 
 
@@ -81,35 +96,3 @@ def _no_address(mask: str | ImageArtifact) -> str | ImageArtifact:
 MaskRef = Annotated[
     Annotated[str, Field(description="data:image/png;base64,...")] | ImageArtifact, AfterValidator(_no_address)
 ]
-
-
-_OURS = {"extra_forbidden": "there is no such field", "string_too_short": "is empty"}  # by pydantic's type
-_HIDDEN = ("function-", "constrained-", "is-instance")
-_UNION_BRANCHES = frozenset({"ImageArtifact", "ImageUrl", "str", "texts", "pairs"})
-
-
-def field_errors(
-    found: Sequence[Any], placed: Callable[[str], str] = lambda pointer: pointer
-) -> tuple[FieldError, ...]:
-    """One error per place in a pydantic error's `errors()`; `placed` maps a JSON Pointer into the request."""
-    fields: dict[str, FieldError] = {}
-    for item in found:
-        # Without the names of union branches and validators, which callers cannot see.
-        parts = [p for p in item["loc"] if not str(p).startswith(_HIDDEN) and p not in _UNION_BRANCHES]
-        pointer = placed("".join("/" + pointer_part(part) for part in parts))
-        detail = _with_value(_OURS.get(item["type"], str(item["msg"])), item["input"])
-        if "is empty" in detail and pointer.endswith("/question"):
-            detail += ". Ask, for example: 'If the red ball moves to the left, will it hit the vase?'"
-        fields.setdefault(pointer, FieldError(pointer, detail))
-    return tuple(fields.values())
-
-
-def _with_value(message: str, value: Any) -> str:
-    """A validator's message with the value. Our own messages contain it already where it helps."""
-    ours = message.removeprefix("Value error, ")
-    if ours != message or not isinstance(value, str | int | float):
-        return ours
-    reason = message.partition(", got ")[0]  # pydantic says the kind of number there, we say the number
-    if isinstance(value, str) and len(value) > SHOWN_CHARACTERS:
-        return f"{reason}, got {len(value)} characters"
-    return f"{reason}, got {shortened(json.dumps(value))}"
