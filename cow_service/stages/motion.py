@@ -301,8 +301,12 @@ def scale_of(
     exact = [each for each in sizes if each[2]]
     is_read = run.request.motion is None or run.request.motion.metres_per_pixel is None
     if given is not None and not (is_read and exact):
-        source, note = ("reference", "by the size that the reader takes it to have") if is_read else ("request", "")
-        return records.MetresPerPixel(value=given, source=source, note=note), doubts
+        x0, y0, x1, y1 = grounding.bbox
+        span = max(x1 - x0, y1 - y0)
+        if not is_read:
+            return records.MetresPerPixel(value=given, source="request"), doubts
+        note = f"{grounding.object}: {given * span:.3g} m over {span:.0f} px"
+        return records.MetresPerPixel(value=given, source="reference", note=note), doubts
     if not sizes:
         return None, doubts
     weights = np.array([1 / (deviation + LEAST_SIZE_SIGMA) ** 2 for _, deviation, _ in exact or sizes])
