@@ -575,7 +575,7 @@ def put_into_first(grounding: Grounding, request: SimulateRequest, read: MotionR
     if asked is None or (asked.form, asked.relation, asked.subject) != ("which", "inside", None):
         return grounding
     given, kind = request.motion, None if read is None else read.kind
-    if request.place is not None and request.trajectory is None:
+    if grounding.source == "request" and request.trajectory is None:
         kind = "place" if given is None or not given.is_whole else given.stated_kind
     first = [each for each in others_of(grounding) if asked.among and same_name(each.object, asked.among[0])]
     if kind != "place" or not first or placed_mover(grounding) is not None:

@@ -237,7 +237,7 @@ def given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReques
             x, y = next(point for point in (last, *path.points) if math.dist(point, (x0, y0)) > 1e-6)
             speed = way * path.fps / (len(path.points) - 1)
             told = MotionRequest.model_construct(kind="linear", direction=(x - x0, y - y0), speed=speed)
-    elif request.place is not None and placed_mover(grounding) is not None:
+    elif grounding.source == "request" and placed_mover(grounding) is not None:
         told = MotionRequest(kind="place")
     return merged(given, told)
 

@@ -157,8 +157,8 @@ def test_results_and_requests_of_an_older_version_are_read() -> None:
     spec = JobSpec(kind="simulate", request=request, reader="embedded", generator="cutout", created_at="")
     asked = spec.parsed()
     assert (asked.law, asked.ensemble, spec.attached) == ("contact", 50, [])
-    assert asked.stated_motion is not None
-    assert asked.stated_motion.stated_kind == "linear"
+    assert asked.whole_motion is not None
+    assert asked.whole_motion.stated_kind == "linear"
 
 
 def test_tables_only_gain_what_older_servers_do_not_notice(tmp_path: Path) -> None:

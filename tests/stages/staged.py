@@ -13,7 +13,7 @@ from cow_service.records import Clip, Trajectory
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
 from cow_service.stages.keys import StageResult
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.types import Image
@@ -24,7 +24,7 @@ RED, BLUE, GREEN, YELLOW = (200, 30, 30), (40, 60, 200), (40, 160, 60), (210, 19
 def computed(run: Run) -> StageResult[Trajectory]:
     """Stages 1 to 3, with the warnings of all."""
     grounded = ground(run)
-    motion = read_motion(run, grounded.value, grounded.hints)
+    motion = settle_motion(run, grounded.value, grounded.motion)
     found = compute_trajectory(run, grounded.value, motion.value)
     warnings = (*grounded.warnings, *motion.warnings, *found.warnings)
     return StageResult(value=found.value, warnings=warnings)
@@ -33,7 +33,7 @@ def computed(run: Run) -> StageResult[Trajectory]:
 def clip_of(run: Run) -> tuple[Trajectory, Clip]:
     """Stages 1 to 4."""
     grounding = ground(run).value
-    motion = read_motion(run, grounding, None).value
+    motion = settle_motion(run, grounding, None).value
     told = compute_trajectory(run, grounding, motion).value
     return told, generate(run, grounding, motion, told).value
 

@@ -10,10 +10,10 @@ import pytest
 from refusals import refused
 from runs import run_of
 
-from cow_service.readers.base import MotionReading, Quantity
-from cow_service.records import Grounding, LocatedObject, Motion, Trajectory
+from cow_service.readers.base import ReadResult
+from cow_service.records import Grounding, LocatedObject, Motion, MotionRequest, Reading, Trajectory
 from cow_service.stages.keys import StageResult
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import simulate_world
@@ -25,23 +25,24 @@ GROUNDING = Grounding(object="ball", point=(150, 250), bbox=BALL, others=(OTHER,
 PLACES = {"grounding": {"object": "ball", "bbox": BALL}, "objects": [{"object": "Blue block", "bbox": BLOCK}]}
 
 
-def run_with(reading: MotionReading | None, given_: dict[str, Any]) -> Run:
+def run_with(reading: MotionRequest | None, given_: dict[str, Any]) -> Run:
     class Reader:
         source = "embedded"
+        heeds_objections = False
 
-        def read_motion(self, *_: Any) -> MotionReading:
+        def read(self, _: Any) -> ReadResult:
             assert reading is not None, "nobody is to be asked"
-            return reading
+            return ReadResult(Reading(motion=reading))
 
     return run_of(IMAGE, reader=Reader, motion=given_, ensemble=0, num_frames=65, **PLACES)
 
 
-def read(reading: MotionReading | None, **given_: Any) -> StageResult[Motion]:
+def read(reading: MotionRequest | None, **given_: Any) -> StageResult[Motion]:
     """The motion of a request, and of what a reader says."""
-    return read_motion(run_with(reading, given_), GROUNDING, None)
+    return settle_motion(run_with(reading, given_), GROUNDING, None)
 
 
-def moved(reading: MotionReading | None = None, **given_: Any) -> Trajectory:
+def moved(reading: MotionRequest | None = None, **given_: Any) -> Trajectory:
     run_, found = run_with(reading, given_), read(reading, **given_).value
     obstacles = run_.scene.obstacles(GROUNDING.bbox, GROUNDING.others)
     situation = Situation(run_.scene, GROUNDING, found, run_.request, obstacles)
@@ -54,7 +55,10 @@ def test_a_distance_and_a_turn_and_a_duration(law: str) -> None:
     path = np.array(moved(direction=(1, 0), speed=100, distance=60, steps=steps, law=law).path.points)
     assert path[:, 0].max() == pytest.approx(210, abs=4)
     assert path[-1, 0] == pytest.approx(180, abs=4)
-    words, lasts = MotionReading("linear", (0.0, -3.0), "text", speed="slow"), {"duration": 1, "speed": 40, "law": law}
+    words, lasts = (
+        MotionRequest(kind="linear", direction=(0.0, -3.0), cue="text", speed="slow"),
+        {"duration": 1, "speed": 40, "law": law},
+    )
     found, path = read(words, **lasts).value, moved(words, **lasts).path.points
     assert (found.direction, found.speed, found.speed_deviation) == ((0, -1), 40, 0), "what the request says counts"
     assert path[-1][1] < 245
@@ -79,16 +83,28 @@ def test_two_movers_meet_half_way() -> None:
 
 @pytest.mark.parametrize(
     ("speed", "pixels", "deviation"),
-    [(Quantity(50, "px/s"), 50, 0), (Quantity(1, "m/s"), 640 / 3, 0.25), (Quantity(0.5, "widths/s"), 320, 0)],
+    [
+        (50, 50, 0),
+        ({"value": 50, "unit": "px/s"}, 50, 0),
+        ({"value": 1, "unit": "m/s"}, 640 / 3, 0.25),
+        ({"value": 0.5, "unit": "widths/s"}, 320, 0),
+        ("slow", 0.13 * 640, 0.25),
+    ],
 )
-def test_speeds_as_they_are_said(speed, pixels: float, deviation: float) -> None:
-    found = read(MotionReading("linear", (1.0, 0.0), "text", speed=speed)).value
-    assert found.speed == pytest.approx(pixels)
-    assert found.speed_deviation == deviation
+def test_speeds_as_they_are_said_by_readers_and_callers(speed: Any, pixels: float, deviation: float) -> None:
+    said = {"kind": "linear", "direction": (1.0, 0.0), "speed": speed}
+    for found in (read(MotionRequest.model_validate(said | {"cue": "text"})).value, read(None, **said).value):
+        assert found.speed == pytest.approx(pixels)
+        assert found.speed_deviation == deviation
+
+
+@pytest.mark.parametrize(("distance", "pixels"), [(60, 60), ({"value": 0.3, "unit": "m"}, 0.3 * 640 / 3)])
+def test_distances_have_units(distance: Any, pixels: float) -> None:
+    assert read(None, direction=(1, 0), distance=distance).value.distance == pytest.approx(pixels)
 
 
 def test_a_throw_has_no_length() -> None:
-    found = read(MotionReading("projectile", (1.0, -1.0), "text"), duration=2)
+    found = read(MotionRequest(kind="projectile", direction=(1.0, -1.0), cue="text"), duration=2)
     assert found.value.duration is None
     assert len(found.warnings) == 2, "that it was not used, and that the speed was assumed"
 

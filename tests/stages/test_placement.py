@@ -16,7 +16,7 @@ from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Asked, Grounding, Intervention, LocatedObject, Placement, Trajectory
 from cow_service.stages.grounding import understood
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import obstacles_of
 from cow_service.stages.trajectory import compute_trajectory
 
@@ -55,7 +55,7 @@ def put(image: Image, relation: str, *targets: LocatedObject, mover=SMALL, asked
     middle = (mover[0] + mover[2]) / 2, (mover[1] + mover[3]) / 2
     given = {"object": "red ball", "point": middle, "bbox": mover, "interventions": (placed,), "asked": asked}
     grounding = understood(Grounding(**given, source="request"), EmbeddedReader())
-    motion = read_motion(run, grounding, None).value
+    motion = settle_motion(run, grounding, None).value
     return run, grounding, motion, compute_trajectory(run, grounding, motion).value
 
 
@@ -174,6 +174,6 @@ def test_where_it_cannot_be_put(relation: str, targets: list[LocatedObject]) -> 
 def test_nothing_says_where() -> None:
     run = run_of(with_bowl(SMALL), motion={"kind": "place"}, num_frames=FRAMES)
     grounding = Grounding(object="red ball", point=(150, 290), bbox=SMALL, source="request")
-    motion = read_motion(run, grounding, None).value
+    motion = settle_motion(run, grounding, None).value
     with refused("cannot-ground"):
         compute_trajectory(run, grounding, motion)

@@ -15,7 +15,7 @@ from cow_service.generators.cutout import create
 from cow_service.physics.ensemble import run_ensemble
 from cow_service.settings import Settings
 from cow_service.stages.grounding import ground
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import judge
@@ -88,7 +88,9 @@ def test_what_is_not_seen_clearly_makes_that_candidate_unsure_and_the_whole(monk
     asked = {"form": "which", "relation": "touches", "among": ("cube", "green block")}
     wanted = run(interventions=(), asked=asked, camera={"pitch": 28, "focal": 640}, objects_complete=True)
     grounding = ground(wanted).value
-    situation = Situation.of(wanted, wanted.scene_of(grounding), grounding, read_motion(wanted, grounding, None).value)
+    situation = Situation.of(
+        wanted, wanted.scene_of(grounding), grounding, settle_motion(wanted, grounding, None).value
+    )
     world, query, _ = reconstruct(situation)
     (result,) = run_ensemble(world, query, 15)
     for blurred, sure in ((None, [True, True]), (GOAL, [False, True]), (MOVER, [False, False])):

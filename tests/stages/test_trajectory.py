@@ -14,7 +14,7 @@ from runs import run_of
 from staged import BLUE, RED, computed
 
 from cow_service.records import Grounding, LocatedObject, ObjectPrior, Trajectory
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import Situation, reconstruct
 from cow_service.stages.trajectory import simulate_world
 from cow_service.vision.masks import CroppedMask
@@ -171,7 +171,7 @@ def seen(mover, others, prior: ObjectPrior | None = None, **request: Any) -> Tra
     grounding = Grounding(object="ball", bbox=mover, point=middle, prior=prior, others=tuple(named), source="request")
     SEEN.preset_mask(mover, lambda: masked(mover).full())
     obstacles = [Obstacle(other.object, other.bbox, masked(other.bbox)) for other in named]
-    situation = Situation(SEEN, grounding, read_motion(run, grounding, None).value, run.request, obstacles)
+    situation = Situation(SEEN, grounding, settle_motion(run, grounding, None).value, run.request, obstacles)
     return simulate_world(situation, *reconstruct(situation))
 
 
