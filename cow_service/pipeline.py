@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from cow_service import errors
 from cow_service.narration.summary import narrate
 from cow_service.readers.options import choices_source, read_choices
-from cow_service.records import Answer, Problem, Simulation, Verdict
+from cow_service.records import Answer, Problem, Simulation, Verdict, reading_of
 from cow_service.requests import AnswerRequest, SimulateRequest, Stage
 from cow_service.stages.answering import answer_question, ask_baseline, ask_first, gate_of
 from cow_service.stages.depth import estimate_depth
@@ -38,6 +38,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
         image=run.image.info,
         grounding=grounding,
         motion=motion,
+        reading=reading_of(grounding, motion),
         trajectory=trajectory,
         narration=narrate(grounding, trajectory, run.language),
         **dict(clip),

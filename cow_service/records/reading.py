@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -12,6 +12,7 @@ from cow_service.records.grounding import (
     Asked,
     Cue,
     Estimate,
+    Grounding,
     InterventionKind,
     Language,
     Law,
@@ -35,6 +36,7 @@ from cow_service.records.values import (
     Record,
     Seconds,
 )
+from cow_service.records.world import AlsoMoving, Motion
 
 MAX_STEPS = 16
 MAX_CHANGES = 8
@@ -75,9 +77,11 @@ class PlaceRequest(Record):
         return ObjectPrior(shape=self.shape, size=size, stands_on=self.stands_on)
 
     @model_validator(mode="after")
-    def _one_place(self) -> PlaceRequest:
-        if self.point is not None and (self.bbox is not None or self.mask is not None):
-            raise ValueError("give `bbox`, `mask` or both, or a `point` alone")
+    def _in_one_place(self) -> PlaceRequest:
+        if self.bbox is not None and self.point is not None:
+            (x0, y0, x1, y1), (x, y) = self.bbox, self.point
+            if not (x0 <= x <= x1 and y0 <= y <= y1):
+                raise ValueError(f"the `point` {[x, y]} must lie in the `bbox` {[x0, y0, x1, y1]}")
         return self
 
 
@@ -188,6 +192,10 @@ class WayRequest(Record):
         "default 0.26 image widths per second, or 1.8 m/s for a throw under the contact law.",
     )
 
+    speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(
+        default=None, description="See `Motion.speed_deviation`; by default 0 for a given `speed`."
+    )
+
     @property
     def has_way(self) -> bool:
         """Whether it says which way."""
@@ -263,9 +271,6 @@ class MotionRequest(WayRequest):
     )
     depth_deviation: Degrees | None = Field(
         default=None, description="See `Motion.depth_deviation`; by default 20 for a throw without `depth`, else 0."
-    )
-    speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(
-        default=None, description="See `Motion.speed_deviation`; by default 0 for a given `speed`."
     )
     down: Direction = Field(default=(0.0, 1.0), description="The direction of a fall in the image.")
 
@@ -343,18 +348,68 @@ def merged(given: Said | None, read: Said | None) -> Said | None:
 
 def as_said(thing: LocatedObject) -> ObjectRequest:
     """A thing that was located, as a caller would give it."""
+    return ObjectRequest(role=thing.role, source=thing.source or "embedded", **_place_of(thing))
+
+
+def _place_of(thing: LocatedObject | Grounding) -> dict[str, Any]:
     prior = thing.prior or ObjectPrior()
-    return ObjectRequest(
-        object=thing.object,
-        bbox=thing.bbox,
-        bbox_deviation=thing.bbox_deviation or None,
-        mask=None if thing.mask is None else ImageArtifact(artifact=thing.mask.sha256),
-        role=thing.role,
-        shape=prior.shape,
-        size=None if prior.size is None else prior.size.value,
-        stands_on=prior.stands_on,
-        source=thing.source or "embedded",
-        is_doubtful=thing.is_doubtful,
+    return {
+        "object": thing.object,
+        "bbox": thing.bbox,
+        "bbox_deviation": thing.bbox_deviation or None,
+        "mask": None if thing.mask is None else ImageArtifact(artifact=thing.mask.sha256),
+        "shape": prior.shape,
+        "size": None if prior.size is None else prior.size.value,
+        "stands_on": prior.stands_on,
+        "is_doubtful": thing.is_doubtful,
+    }
+
+
+def reading_of(grounding: Grounding, motion: Motion) -> Reading:
+    """What stages 1 and 2 came to, as fields of a request: sent back, they give the same trajectory."""
+    changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
+    things = {each.bbox: each for each in (*changed, *grounding.others) if each.bbox != grounding.bbox}
+    own = _place_of(grounding) | {"point": grounding.point, "source": grounding.source}
+    return Reading(
+        grounding=GroundingRequest.model_validate(own),
+        motion=_motion_of(motion),
+        objects=tuple(map(as_said, things.values())),
+        objects_complete=grounding.objects_complete,
+        interventions=tuple(
+            InterventionRequest(
+                kind=each.kind,
+                object=each.object.object,
+                relation=each.relation,
+                targets=tuple(target.object for target in each.targets),
+            )
+            for each in grounding.interventions
+        ),
+        asked=grounding.asked,
+        question_is_doubtful=grounding.question_is_doubtful,
+        language=grounding.language,
+    )
+
+
+def _way_of(way: Motion | AlsoMoving) -> dict[str, Any]:
+    if way.kind not in DIRECTED_KINDS:
+        return {}
+    towards = None if way.towards is None else way.towards.object
+    names = ("direction", "direction_deviation", "depth", "speed", "speed_deviation")
+    return {"towards": towards, **{name: getattr(way, name) for name in names}}
+
+
+def _motion_of(motion: Motion) -> MotionRequest:
+    names = ["kind", "law", "other_direction", "along_arrow", "cue", "rises", "distance", "duration", "until", "down"]
+    names += ["depth_deviation"] if motion.kind in DIRECTED_KINDS else []
+    others = ({"object": each.object.object, "kind": each.kind, **_way_of(each)} for each in motion.others)
+    return MotionRequest.model_validate(
+        {
+            **{name: getattr(motion, name) for name in names},
+            **_way_of(motion),
+            "steps": tuple(MotionStepRequest.model_validate(each.model_dump()) for each in motion.steps),
+            "others": tuple(map(OtherMotionRequest.model_validate, others)),
+            "metres_per_pixel": motion.metres_per_pixel.value,
+        }
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field
 
 from cow_service.records.grounding import Artifact, BBox, Grounding, ImageInfo, Language, Record, Sha256
+from cow_service.records.reading import Reading
 from cow_service.records.world import Motion, Trajectory
 
 FramePolicy = Literal["initial", "uniform", "events"]
@@ -138,6 +139,11 @@ class Simulation(Clip, Result):
 
     grounding: Grounding
     motion: Motion
+    reading: Reading | None = Field(
+        default=None,
+        description="What the trajectory rests on, as fields of a request. Sent back with the image and the question "
+        "they give the same trajectory, and each of them can be corrected. Null in results of earlier versions.",
+    )
     trajectory: Trajectory
     narration: Narration = Field(default_factory=Narration, description="Empty in results of versions before 0.2.")
 

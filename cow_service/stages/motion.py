@@ -68,8 +68,8 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
     request = run.request
     given, warnings = given_motion(request, grounding), list[str]()
     source: Source = "request"
-    if given is not None and given.is_whole:
-        said, _ = settled_way(run, grounding, given, given)
+    if given is not None and given.is_whole:  # a direction that is given stays, whatever its spread
+        said = given if given.direction is not None else settled_way(run, grounding, given, given)[0]
     else:
         source, (said, warnings) = run.reader.source, read_way(run, grounding, read, given)
     unused = [name for name in OF_A_LINE if getattr(said, name) not in (None, ())]

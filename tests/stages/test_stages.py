@@ -154,7 +154,7 @@ def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, eve
 
 PUT = {"kind": "place", "object": "a"}
 MEANT_BY_NOBODY: dict[str, list[dict[str, Any]]] = {
-    "grounding": [{"bbox": [0, 0, 9, 9], "point": [1, 1]}],
+    "grounding": [{"bbox": [0, 0, 9, 9], "point": [10, 1]}],
     "grounding.mask": [{"mask": "https://example.org/mask.png"}],
     "objects": [[{"object": "mug", "bbox": [0, 0, 9, 9]}] * 65],
     "camera": [{}],
