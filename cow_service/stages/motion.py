@@ -395,7 +395,7 @@ def _other(
         depth=said.depth,
         towards=goal,
         speed=speed,
-        speed_deviation=deviation,
+        speed_deviation=deviation if said.speed_deviation is None else said.speed_deviation,
     )
 
 
