@@ -72,6 +72,7 @@ class ReadResult:
 
     reading: Reading
     warnings: tuple[str, ...] = ()
+    label: str = ""  # what it calls the thing in the box of the moving object, if not by that name
     place_doubts: tuple[str, ...] = ()  # why its boxes may be wrong, unless the image shows the moving object there
 
 

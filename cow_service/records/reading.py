@@ -89,9 +89,6 @@ class GroundingRequest(PlaceRequest):
     """The moving object, and where it is: a box, a mask or a point on it. Skips stage 1, grounding (finding it)."""
 
     object: ObjectWords | None = Field(default=None, description="Name of the object.")
-    label: ObjectWords | None = Field(
-        default=None, description="What a reader calls the thing in the place, where that is not the name."
-    )
 
 
 class ObjectRequest(PlaceRequest):

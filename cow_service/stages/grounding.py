@@ -162,7 +162,7 @@ def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[Object
     if unproved:
         mover = mover_of(reading).model_copy(update={"is_doubtful": True})
         reading = reading.model_copy(update={"grounding": mover})
-    reading, misnamed = settle_mover(reading, said, words)
+    reading, misnamed = settle_mover(reading, said, words, read.label)
     reading, misread = settle_question(reading, said, words, is_given=request.asked is not None)
     return Settled(reading, (*read.warnings, *unproved), (*objections, *misnamed, *misread), bool(misnamed or misread))
 

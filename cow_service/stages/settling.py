@@ -271,10 +271,10 @@ def _fault_of(thing: GroundingRequest | ObjectRequest, region: Region | None, se
     )
 
 
-def settle_mover(read: Reading, said: WordsReading, words: WordReader) -> tuple[Reading, Objections]:
+def settle_mover(read: Reading, said: WordsReading, words: WordReader, label: str = "") -> tuple[Reading, Objections]:
     """The reading; in doubt where what was read to move, or what was found for it, is not what the words say."""
     mover, meant = mover_of(read), None if said.reading.grounding is None else said.reading.grounding.object
-    for name in filter(None, (mover.object, mover.label)) if meant is not None else ():
+    for name in filter(None, (mover.object, label)) if meant is not None else ():
         likeness = words.likeness(meant or "", name)
         rivals = read.objects if likeness == "unknown" else ()
         if likeness == "other" or any(words.likeness(meant or "", each.object) == "same" for each in rivals):

@@ -15,9 +15,8 @@ from pydantic import BaseModel
 from servers import data_url
 from tables import rows
 
-from cow_service.records import Answer, Estimate, ObjectPrior, Simulation
+from cow_service.records import Answer, Estimate, ObjectPrior, PlaceRequest, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
-from cow_service.requests.simulation import PlaceRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
 
@@ -53,6 +52,7 @@ PUT = {"kind": "place", "object": "green post", "relation": "next-to", "targets"
 TO = {"grounding": {"object": "red ball", "bbox": BALL}, "objects": [BLOCKS, {"object": "green post", "bbox": POST}]}
 STEPS = [{"direction": [0, 1], "distance": 30}, {"direction": [1, 0]}]
 OTHER = {"object": "blue block", "direction": [0, 1]}
+GOES = {"object": "blue block"}  # towards something
 ASKED = {"relation": "touches", "target": "blue block"}
 # Fields, other fields that they need, and two values of each.
 CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
@@ -66,10 +66,18 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "grounding.size": ({"grounding": {"bbox": BALL}}, 0.02, 30),
     "grounding.stands_on": ({"grounding": {"bbox": BALL}}, "floor", "air"),
     "grounding.object": ({"grounding": {"bbox": BALL}}, "red ball", "marble"),
+    "grounding.bbox_deviation": ({"grounding": {"bbox": BALL}}, None, 0.4),
+    "grounding.source": ({"grounding": {"bbox": BALL}}, "request", "mllm"),
+    "grounding.is_doubtful": ({"grounding": {"bbox": BALL}}, False, True),
     "motion.kind": ({"motion": {"direction": [1, 0]}}, "linear", "projectile"),
     "motion.law": ({"motion": MOVES}, "contact", "ballistic"),
     "motion.direction": ({}, [1, 0], [0, 1]),
     "motion.depth": ({"motion": MOVES}, 0, 0.5),
+    "motion.direction_deviation": ({"motion": MOVES}, None, 40),
+    "motion.other_direction": ({"motion": MOVES}, None, [0, 1]),
+    "motion.towards": (TO, "blue block", "green post"),
+    "motion.cue": ({"motion": MOVES}, None, "orientation"),
+    "motion.down": ({"motion": {"kind": "fall"}}, [0, 1], [1, 0]),
     "motion.rises": ({"motion": MOVES | {"direction": [0, -1]}}, False, True),
     "motion.speed": ({"motion": MOVES}, 50, 200),
     "motion.distance": ({"motion": MOVES}, 20, 60),
@@ -83,6 +91,9 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "motion.others.kind": (TO | {"motion": MOVES | {"others": [OTHER]}}, "linear", "projectile"),
     "motion.others.direction": (TO | {"motion": MOVES | {"others": [OTHER]}}, [0, 1], [1, 0]),
     "motion.others.depth": (TO | {"motion": MOVES | {"others": [OTHER]}}, 0, 0.5),
+    "motion.others.direction_deviation": (TO | {"motion": MOVES | {"others": [OTHER]}}, None, 40),
+    "motion.others.towards": (TO | {"motion": MOVES | {"others": [GOES]}}, "green post", "red ball"),
+    "motion.others.speed_deviation": (TO | {"motion": MOVES | {"others": [OTHER]}}, None, 0.5),
     "motion.others.speed": (TO | {"motion": MOVES | {"others": [OTHER]}}, 100, 300),
     "motion.metres_per_pixel": ({"motion": MOVES}, 0.001, 0.01),
     "motion.depth_deviation": ({"motion": MOVES | {"kind": "projectile"}}, 0, 20),
@@ -98,6 +109,9 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     "objects.bbox": ({"objects": [BLOCKS]}, BLOCK, (150, 75, 185, 111)),
     "objects.point": ({"objects": [{"object": "blue block"}]}, [167, 115], [230, 95]),
     "objects.mask": ({"objects": [{"object": "blue block"}]}, mask_of(BLOCK), mask_of(POST)),
+    "objects.bbox_deviation": ({"objects": [BLOCKS]}, None, 0.4),
+    "objects.source": ({"objects": [BLOCKS]}, "request", "mllm"),
+    "objects.is_doubtful": ({"objects": [BLOCKS]}, False, True),
     "objects.shape": ({"objects": [BLOCKS]}, "sphere", "cone"),
     "objects.size": ({"objects": [BLOCKS]}, 0.02, 30),
     "objects.stands_on": ({"objects": [BLOCKS]}, "floor", "air"),
@@ -109,6 +123,7 @@ CHANGES: dict[str, tuple[dict[str, Any], Any, Any]] = {
     ),
     "interventions.relation": (TO | {"interventions": [PUT]}, "left-of", "behind"),
     "interventions.targets": (TO | {"interventions": [PUT]}, ["blue block"], ["red ball"]),
+    "question_is_doubtful": ({}, False, True),
     "asked.form": ({"asked": ASKED}, "whether", "when"),
     "asked.relation": ({"asked": ASKED}, "touches", "covers"),
     "asked.subject": ({"asked": ASKED | {"target": "red ball"}}, None, "blue block"),
@@ -150,17 +165,20 @@ CORE = {
     *("trajectory.scale", "objects.bbox", "objects.role", "interventions.relation", "asked.relation", "asked.among"),
     *("camera.focal", "depth.scale", "frames.indices", "frames.factual"),
 }
-# Tested where there is what they choose from: readers, generators, a queue, a receiver, a reader that draws votes.
-ELSEWHERE = {"reader", "generator", "generator_options", "priority", "webhook", "imagine_votes"}
-WHOLE = {"image", "options"}  # of several forms
+# Tested where there is what they choose from: readers, generators, a queue, a receiver, votes, an arrow, a vehicle.
+ELSEWHERE = {
+    *("reader", "generator", "generator_options", "priority", "webhook", "imagine_votes"),
+    *("motion.along_arrow", "motion.forward"),
+}
+WHOLE = {"image", "options", "speed", "distance"}  # of several forms
 # What differs from run to run, and what only repeats the request.
-VOLATILE = {"id", "created_at", "timings", "usage", "usage_total", "reused", "url", "prior", "note"}
+VOLATILE = {"id", "created_at", "reading", "timings", "usage", "usage_total", "reused", "url", "prior", "note"}
 
 
 def leaves(model: type[BaseModel], at: str = "") -> Iterator[str]:
     """The fields of a request by their paths, without those that are made of further fields."""
     for name, field in model.model_fields.items():
-        inner = None if at == "" and name in WHOLE else model_in(field.annotation)
+        inner = None if name in WHOLE else model_in(field.annotation)
         if inner is None:
             yield at + name
         else:

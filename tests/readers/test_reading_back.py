@@ -10,8 +10,9 @@ from typing import Any
 import mllm_server as say
 import pytest
 from conftest import EXAMPLES
-from drawn import ball, block, bowl, floor, png_bytes
+from drawn import angle_between, ball, block, bowl, floor, png_bytes
 from mllm_server import MllmServer, completion
+from refusals import refused
 
 from cow_service.records import Simulation
 from cow_service.requests import SimulateRequest
@@ -109,3 +110,36 @@ def test_what_a_multimodal_llm_reads_comes_back(name: str, tmp_path: Path) -> No
     assert first.usage.calls > 0
     assert again.trajectory == first.trajectory
     assert again.usage.calls == 0
+
+
+def way_of(service: Service, name: str, motion: dict[str, Any], **given: Any) -> tuple[float, float]:
+    """The direction in which what moves in an example sets out, by what a request says of it."""
+    folder = EXAMPLES / name
+    truth = json.loads((folder / "meta.json").read_text())
+    image = {"artifact": service.keep_image((folder / "image.jpg").read_bytes()).sha256}
+    place = {"object": truth["object"], "bbox": truth["boxes"][truth["object"]][0]}
+    body = {"image": image, "question": "What happens?", "grounding": place, "motion": motion, **SHORT, **given}
+    found = service.simulate(SimulateRequest.model_validate(body)).motion.direction
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "motion", "is_asked"),
+    [("ball-and-mug", {"along_arrow": True}, False), ("car-forward", {"forward": True}, True)],
+)
+def test_a_request_may_say_which_way_by_what_the_picture_shows(
+    service: Service, name: str, motion: dict[str, Any], is_asked: bool
+) -> None:
+    """The question of one asks for the opposite of its arrow."""
+    told = {"objects_complete": True}
+    found, back = way_of(service, name, motion, **told), way_of(service, name, {next(iter(motion)): False}, **told)
+    assert angle_between(found, (-back[0], -back[1])) < 1
+    given = json.loads((EXAMPLES / name / "meta.json").read_text())
+    assert angle_between(found if is_asked else back, given["direction"]) < 25
+
+
+def test_an_arrow_or_a_goal_that_cannot_be_seen_is_refused(service: Service) -> None:
+    for motion in ({"along_arrow": True}, {"towards": "teapot"}, {"forward": True}):
+        with refused("cannot-read-direction"):
+            way_of(service, "falling-ball", motion)

@@ -243,7 +243,6 @@ PLACES: dict[str, tuple[Reading, str | None, bool, bool]] = {
     "as the words say": (found("red ball", RED), "the ball", False, False),
     "under another word": (found("red toy", RED), "the vehicle", False, False),
     "another thing than they say": (found("blue box", BLUE), "the red ball", True, False),
-    "another thing by its label": (found("red ball", RED, label="red box"), "the red ball", True, False),
     "a thing that they tell apart": (
         found("toy", BLUE, named("duck", RED)), "the duck", True, False
     ),
@@ -263,6 +262,12 @@ def test_what_speaks_against_a_name_or_a_place_is_a_doubt(
     assert mover_of(settled).is_doubtful is is_doubtful
     assert any(each.is_doubtful for each in settled.objects) is is_other_doubtful
     assert bool(misplaced or misnamed) is (is_doubtful or is_other_doubtful)
+
+
+def test_a_place_that_the_reader_labels_otherwise_is_a_doubt() -> None:
+    said = WordsReading(Reading(grounding=GroundingRequest(object="the red ball")))
+    settled, misnamed = settle_mover(found("red ball", RED), said, WORDS, label="red box")
+    assert (mover_of(settled).is_doubtful, len(misnamed)) == (True, 1)
 
 
 class Estimating:

@@ -21,7 +21,6 @@ from cow_service.readers.mllm.identify import Identified, identified_by_words, i
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
 from cow_service.readers.mllm.locate import (
     DOWN,
-    MAX_LABEL,
     Line,
     Located,
     Scale,
@@ -143,20 +142,20 @@ class MllmReader:
             reading, left_out = self._with_motion(given, reading, said)
             warnings += left_out
         warnings += () if located is None else located.warnings
-        return ReadResult(reading, warnings, self._family_warnings if bbox is None else ())
+        label = "" if located is None else located.label
+        return ReadResult(reading, warnings, label, self._family_warnings if bbox is None else ())
 
     def _placed(
         self, given: ReaderInput, name: str, identified: Identified | None, located: Located
     ) -> tuple[records.Reading, tuple[str, ...]]:
         """Where the things are, and what is changed and asked; and warnings. Raises `ObjectNotFound`."""
-        deviation, label = self._measured.bbox_deviation, located.label[:MAX_LABEL].strip()
+        deviation, label = self._measured.bbox_deviation, located.label
         is_other = bool(label) and set(name_words(label)).isdisjoint(name_words(name))
         mover = records.GroundingRequest(
             object=name,
             bbox=located.bbox,
             point=None if located.bbox is not None else located.point,
             bbox_deviation=deviation,
-            label=label or None,
             is_doubtful=is_other,
         )
         others, doubles = separate_objects(mover, located.others)
