@@ -127,30 +127,24 @@ class InterventionRequest(Record):
 
 # --- motion
 
-Unit = Literal["px", "m", "widths", "px/s", "m/s", "widths/s"]
 SpeedWord = Literal["slow", "normal", "fast"]
 
 
-class Quantity(Record):
-    """A number with its unit. `widths` are image widths."""
+class Speed(Record):
+    """A speed with its unit. `widths` are image widths."""
 
     value: Annotated[Finite, Field(ge=0, le=1_000_000)]
-    unit: Unit
-
-
-class Speed(Quantity):
-    """A speed with its unit."""
-
     unit: Literal["px/s", "m/s", "widths/s"]
 
 
-class Distance(Quantity):
+class Distance(Record):
     """A length above 0 with its unit."""
 
     value: Annotated[Finite, Field(gt=0, le=1_000_000)]
     unit: Literal["px", "m", "widths"]
 
 
+Quantity = Speed | Distance
 AnySpeed = Annotated[Finite, Field(ge=0, le=100_000)] | Speed | SpeedWord
 AnyDistance = Annotated[Finite, Field(gt=0, le=1_000_000)] | Distance
 Depth = Annotated[Finite, Field(ge=-1, le=1)]

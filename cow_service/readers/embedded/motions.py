@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -113,10 +114,10 @@ def others_of(
         if found is None or motion.steps or any(each.what != "speed" for each in motion.quantities):
             raise _refused(f"'{phrase.text}' moves, too, and was not found, or how far it moves is said.")
         refuse_unclear_fall(scene, motion, found)
-        kind, said = motion.kind or "linear", dict[str, object]()
+        kind, said = motion.kind or "linear", dict[str, Any]()
         if kind in DIRECTED_KINDS:
             goal = None if motion.direction or motion.towards is None else motion.towards.text
-            said = {"towards": goal} if goal else dict(zip(("direction", "depth"), _way(motion), strict=True))
+            said |= {"towards": goal} if goal else dict(zip(("direction", "depth"), _way(motion), strict=True))
             said["speed"] = quantities(motion.quantities, None, found.bbox or (0.0, 0.0, 0.0, 0.0))[0]
         readings.append(OtherMotionRequest.model_validate({"object": phrase.text, "kind": kind, **said}))
     return tuple(readings)
@@ -231,7 +232,9 @@ def goal_of(scene: Scene, phrase: ObjectPhrase, mover: GroundingRequest, things:
     """The box of the thing that the mover moves towards. Raises `CannotReadDirection`."""
     goal = next((each.bbox for each in things if each.object == phrase.text), None)
     besides = [each for each in scene.regions if not is_same_object(each.bbox, mover.bbox or each.bbox)]
-    region = match_one(besides, phrase) if goal is None else None
-    if goal is None and region is None:
+    region = match_one(besides, phrase)
+    if goal is not None:
+        return goal
+    if region is None:
         raise _refused(f"Where the {mover.object} moves to is not clear: {unclear(phrase, besides)}.")
-    return goal if goal is not None or region is None else region.bbox
+    return region.bbox

@@ -80,7 +80,7 @@ def positive(written: object, unit: str) -> float | None:
 
 
 def _quantity(kind: type[records.Speed] | type[records.Distance], *units: str) -> tuple[Any, Any]:
-    def read(written: object) -> records.Quantity | None:
+    def read(written: object) -> records.Speed | records.Distance | None:
         found = measured(written)
         if found is None or found[1] not in units or not found[0] > 0:
             return None
