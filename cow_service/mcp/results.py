@@ -31,6 +31,7 @@ LEFT_OUT: dict[str, Any] = {
     },
     "frames": {"__all__": {"url": True}},
     "factual_frames": True,
+    "reading": True,
     "generator": {"options": True, "revision": True, "steps": True},
     "reader": {"prompts": True, "stages": True, "revision": True},
     **dict.fromkeys(("status", "created_at", "question", "usage", "usage_total", "timings", "reused"), True),
