@@ -4,64 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from cow_service.errors import (
-    CannotGround,
-    CannotReadDirection,
-    FieldError,
-    InvalidRequest,
-    MllmBadReply,
-    MllmUnavailable,
-    field_of,
-)
-from cow_service.media.images import decode, encode_png
+from cow_service import errors, records
+from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
+from cow_service.media.images import encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
-from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import ReadResult, SeenThing, WordReader, WordsReading
+from cow_service.readers.base import ReadResult, WordReader, WordsReading
 from cow_service.readers.options import plain
-from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
+from cow_service.readers.remedies import GIVE_OBJECT
 from cow_service.records import (
-    Artifact,
-    BBox,
     Grounding,
-    GroundingRequest,
     Intervention,
-    InterventionRequest,
     LocatedObject,
-    MaskRef,
     MotionRequest,
     ObjectPrior,
     ObjectRequest,
     Reading,
-    Source,
-    kept_mask,
 )
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
-from cow_service.stages.run import UNREADABLE, Run
-from cow_service.stages.settling import (
-    SeenThings,
-    box_of,
-    mover_of,
-    settle_mover,
-    settle_places,
-    settle_question,
-)
-from cow_service.vision.masks import CroppedMask, iou, is_among, is_same_object, mask_iou
+from cow_service.stages.places import Located, bare, find_things, locate_given, outlined
+from cow_service.stages.run import Run
+from cow_service.stages.settling import SeenThings, box_of, mover_of, settle_mover, settle_places, settle_question
+from cow_service.vision.masks import is_among, is_same_object
 from cow_service.vision.scene import Scene
-from cow_service.vision.segmentation import mask_from_bbox
 
-DEFAULT_NAME = "object"
-SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
-SAME_MASK = 0.5  # IoU from which two outlines are of one thing
-MOST_FOUND = 24  # detections that are outlined, best first
-WHITE = 128  # grey level from which a pixel of a mask is the object's
 FLOOR = frozenset({"floor", "the floor", "ground", "the ground"})
-MAX_SHARE = 0.95  # of the image that a box or a mask covers: more is no object
 
 
 def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
@@ -126,7 +98,7 @@ def read_scene(run: Run[SimulateRequest], given: Sequence[Located]) -> tuple[Rea
     settled = _settled(run, run.reader.read(asking), known)
     if settled.objections:
         again = replace(asking, objections=settled.objections, words=None if settled.is_misread else run.words)
-        with suppress(CannotGround, CannotReadDirection, MllmBadReply, MllmUnavailable):
+        with suppress(CannotGround, errors.CannotReadDirection, errors.MllmBadReply, errors.MllmUnavailable):
             settled = _settled(run, run.reader.read(again), known)
     return settled.reading, (*settled.warnings, *settled.objections)
 
@@ -167,7 +139,7 @@ def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[Object
     return Settled(reading, (*read.warnings, *unproved), (*objections, *misnamed, *misread), bool(misnamed or misread))
 
 
-def _located(scene: Scene, reading: Reading, source: Source) -> Reading:
+def _located(scene: Scene, reading: Reading, source: records.Source) -> Reading:
     """The reading with its source, and the box of what is at the point of a mover that was only pointed at."""
     mover = mover_of(reading)
     boxed = {} if mover.bbox is not None or mover.point is None else {"bbox": scene.bbox_at(mover.point)}
@@ -176,251 +148,12 @@ def _located(scene: Scene, reading: Reading, source: Source) -> Reading:
     return reading.model_copy(update={"grounding": own, "objects": objects})
 
 
-# --- where things are
-
-
-@dataclass(frozen=True)
-class Located:
-    """A thing that was located: what is said of it, its box with it, and its mask."""
-
-    said: GroundingRequest | ObjectRequest
-    bbox: BBox  # px, inside the image
-    mask: CroppedMask | None = None  # where it does not follow from the box
-    warnings: tuple[str, ...] = ()
-
-    @staticmethod
-    def at(
-        said: GroundingRequest | ObjectRequest,
-        bbox: BBox,
-        mask: CroppedMask | None = None,
-        warnings: tuple[str, ...] = (),
-    ) -> Located:
-        """What is said of a thing, in the box where it was found."""
-        return Located(said.model_copy(update={"bbox": bbox}), bbox, mask, warnings)
-
-    @staticmethod
-    def of(said: GroundingRequest | ObjectRequest) -> Located:
-        """A thing in its box."""
-        return Located(said, box_of(said))
-
-    @property
-    def name(self) -> str:
-        """As it is called."""
-        return self.said.object or DEFAULT_NAME
-
-    def is_same_as(self, mover: Located) -> bool:
-        """Whether it is what moves. Two masks tell, however much their boxes overlap."""
-        if self.mask is None or mover.mask is None:
-            return is_same_object(self.bbox, mover.bbox)
-        return mask_iou(self.mask.full(), mover.mask.full()) > SAME_MASK
-
-    def stored(self, run: Run[SimulateRequest]) -> LocatedObject:
-        """As a result reports it, its mask stored."""
-        put, said = run.backends.artifacts.put, self.said
-        return LocatedObject(
-            object=self.name,
-            bbox=self.bbox,
-            role=said.role if isinstance(said, ObjectRequest) else "target",
-            mask=None if self.mask is None else put(encode_png(self.mask.full()), "image/png"),
-            prior=said.prior,
-            source=said.source,
-            bbox_deviation=said.bbox_deviation or 0.0,
-            is_doubtful=said.is_doubtful,
-        )
-
-
-def locate_given(run: Run[SimulateRequest]) -> tuple[list[Located], Located | None]:
-    """The objects of a request that have places, and its mover; None where that is left to the reader.
-
-    Raises as `_locate` does, and for an object that is given twice.
-    """
-    request, found = run.request, list[Located]()
-    for index, each in enumerate(request.objects):
-        if not each.has_place:
-            continue
-        place = _locate(run, each, pointer := f"/objects/{index}")
-        twin = next((at for at, other in enumerate(found) if iou(place.bbox, other.bbox) >= SAME_BOX_IOU), None)
-        if twin is not None:
-            detail = f"lies in the same box as `objects.{twin}`"
-            message = f"`{field_of(pointer)}` {detail}: give each object once."
-            raise InvalidRequest(message, errors=(FieldError(pointer, detail),))
-        found.append(place)
-    return found, None if request.place is None else _locate(run, request.place, "/grounding")
-
-
-def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, pointer: str) -> Located:
-    """The place of an object; `pointer` is the JSON Pointer to `given`.
-
-    Raises `InvalidRequest` for a place outside the image or all over it and for a mask that is none of this image, and
-    `CannotGround` where what can be cut out around a point is no object.
-    """
-    run.check_canceled()
-    scene, field = run.scene, field_of(pointer)
-    outside = f"lies outside the upright image of {scene.width} x {scene.height} px"
-    if given.mask is not None:
-        mask = _read_mask(run, given.mask, f"{pointer}/mask")
-        bbox = mask.bbox if given.bbox is None else given.bbox
-        scene.preset_mask(bbox, mask.full)
-        return Located.at(given, bbox, mask)
-    if given.bbox is not None:
-        x0, y0, x1, y1 = given.bbox
-        clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
-        wide, high = clipped[2] - clipped[0], clipped[3] - clipped[1]
-        if wide < 2 or high < 2:
-            raise _misplaced(f"{pointer}/bbox", given.bbox, outside)
-        if (share := wide * high / (scene.width * scene.height)) > MAX_SHARE:
-            raise _misplaced(f"{pointer}/bbox", given.bbox, f"covers {share:.0%} of the image")
-        beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
-        warnings = () if clipped == given.bbox else (beyond,)
-        if run.can_segment:
-            return _outlined_box(run, given, clipped, field, warnings)
-        return Located.at(given, clipped, warnings=warnings)
-    x, y = given.point or (0.0, 0.0)
-    if not (0 <= x < scene.width and 0 <= y < scene.height):
-        raise _misplaced(f"{pointer}/point", (x, y), outside)
-    # The first point of a path says less of the mover than a point that is given for it.
-    may_guess = pointer == "/grounding" and (run.request.grounding is None or not run.request.grounding.has_place)
-    if run.can_segment:
-        found = outlines_at(run.embedded(), (x, y))
-        if len(found) == 1 or (found and may_guess):
-            mask = CroppedMask.of(found[0].mask)
-            scene.preset_mask(found[0].bbox, mask.full)
-            return Located.at(given, found[0].bbox, mask)
-        fault = (
-            f"{len(found)} objects lie there, one inside the other."
-            if found
-            else "two attempts to outline it disagree."
-        )
-        if not may_guess:
-            raise _not_cut_out(f"The object at the point [{x:.0f}, {y:.0f}] is not clear: {fault}", pointer)
-    cutout = scene.locate((x, y))
-    if cutout.mask is None:
-        return Located.at(given, cutout.bbox)
-    if cutout.fault is not None and not may_guess:
-        raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {cutout.fault}.", pointer)
-    box = ", ".join(f"{value:.0f}" for value in cutout.bbox)
-    warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
-    return Located.at(given, cutout.bbox, CroppedMask.of(cutout.mask), (warning,))
-
-
-def _not_cut_out(detail: str, pointer: str) -> CannotGround:
-    field = field_of(pointer)
-    return CannotGround(
-        f"{detail} Give its box as `{field}.bbox`, or its outline as `{field}.mask`.",
-        errors=(FieldError(f"{pointer}/point", detail),),
-    )
-
-
-def _outlined_box(
-    run: Run[SimulateRequest],
-    given: GroundingRequest | ObjectRequest,
-    bbox: BBox,
-    field: str,
-    warnings: tuple[str, ...],
-) -> Located:
-    """What the segmenter sees in a box that the request gives; where it is not sure of it, nothing else is."""
-    (outline,) = outlines_in(run.embedded(), [bbox])
-    if outline is None or not outline.is_sure:
-        doubt = f"Two attempts to outline what is in `{field}.bbox` disagree: give its outline as `{field}.mask`."
-        mask = None if outline is None else CroppedMask.of(outline.mask)
-        doubted = given.model_copy(update={"is_doubtful": True})
-        return Located.at(doubted, bbox, mask, (*warnings, doubt))
-    mask = CroppedMask.of(outline.mask)
-    run.scene.preset_mask(outline.bbox, mask.full)
-    return Located.at(given, outline.bbox, mask, warnings)
-
-
-def find_things(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, ...]:
-    """What the detector finds for some nouns, outlined as well as can be. To be called with `cpu` held."""
-    detector, scene = run.backends.perception.detector, run.scene
-    assert detector is not None, "asked for only where there is a detector"
-    found = detector.detect(scene.undrawn, nouns)[:MOST_FOUND] if nouns else ()
-    if not run.can_segment:
-        masks = [(each, mask_from_bbox(scene.clean, each.bbox)) for each in found]
-        return tuple(SeenThing(each.phrase, mask, each.score) for each, mask in masks if mask.any())
-    outlines = zip(found, outlines_in(run.embedded(), [each.bbox for each in found]), strict=True)
-    return tuple(SeenThing(each.phrase, one.mask, each.score) for each, one in outlines if one and one.is_sure)
-
-
-def bare(reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
-    """The things of a reading by their boxes alone."""
-    return Located.of(mover_of(reading)), tuple(map(Located.of, reading.objects)), ()
-
-
-def outlined(run: Run[SimulateRequest], reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
-    """The things of a reading outlined by the segmenter, and doubts. To be called with `cpu` held.
-
-    Raises `CannotGround` where no two looks agree on the outline of the mover: a scrap of it would be moved. Of others
-    on which none agree, nothing is sure.
-    """
-    mover = mover_of(reading)
-    boxes = dict.fromkeys(box_of(each) for each in (mover, *reading.objects))
-    outlines = dict(zip(boxes, outlines_in(run.embedded(), list(boxes)), strict=True))
-    own, doubted = outlines[box_of(mover)], list[str]()
-    if own is None or not own.is_sure:
-        box = ", ".join(f"{value:.0f}" for value in box_of(mover))
-        raise CannotGround(
-            f"'{mover.object}' was looked for in [{box}], but two attempts to outline it disagree.", remedy=GIVE_PLACE
-        )
-    others = list[Located]()
-    for thing in reading.objects:
-        outline = outlines[box_of(thing)]
-        if outline is not None and mask_iou(outline.mask, own.mask) > SAME_MASK:  # the mover, under another name
-            others.append(Located.at(thing, own.bbox))
-        elif outline is None or not outline.is_sure:
-            doubted.append(thing.object)
-            others.append(Located.of(thing.model_copy(update={"is_doubtful": True})))
-        else:
-            exact = thing.model_copy(update={"bbox_deviation": None})
-            others.append(Located.at(exact, outline.bbox, CroppedMask.of(outline.mask)))
-    doubts = tuple(
-        f"Two attempts to outline '{name}' disagree: give it in `objects`, with its `mask`."
-        for name in dict.fromkeys(doubted)
-    )
-    exact = mover.model_copy(update={"bbox_deviation": None})
-    return Located.at(exact, own.bbox, CroppedMask.of(own.mask)), tuple(others), doubts
-
-
-def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidRequest:
-    detail = f"{list(value)} {fault}."
-    message = f"`{field_of(pointer)}`: {detail} Give pixels of the object alone, x right and y down."
-    return InvalidRequest(message, errors=(FieldError(pointer, detail),))
-
-
-def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> CroppedMask:
-    """The mask of the image that a request names. Raises `InvalidRequest`."""
-    kept, image = kept_mask(given), run.image.info
-
-    def refused(fault: str) -> InvalidRequest:
-        return InvalidRequest(
-            f"`{field_of(pointer)}` {fault}. Give a PNG of the upright image's size, white where the object is and "
-            "black elsewhere.",
-            errors=(FieldError(pointer, fault),),
-        )
-
-    try:
-        data = run.backends.artifacts.read(kept.artifact)
-        picture = decode(data, max_megapixels=image.width * image.height / 1e6)
-    except UNREADABLE as error:
-        raise refused(f"cannot be read: {error.detail}") from error
-    mask = picture.pixels.min(axis=2) >= WHITE
-    share = float(mask.mean())
-    if (picture.info.width, picture.info.height) != (image.width, image.height):
-        given_size, size = (f"{each.width} x {each.height} px" for each in (picture.info, image))
-        raise refused(f"has {given_size} where the upright image has {size}")
-    if not share:
-        raise refused("is empty: no pixel is white")
-    if share > MAX_SHARE:
-        raise refused(f"covers {share:.0%} of the image: white, or transparent, is the object alone")
-    return CroppedMask.of(mask)
-
-
 # --- what stage 1 comes to
 
 
 def cut_out(
     run: Run[SimulateRequest], mover: Located, others: Sequence[Located], reading: Reading
-) -> tuple[Scene, Artifact]:
+) -> tuple[Scene, records.Artifact]:
     """The scene in which it is known what moves, and the mask of that, stored. To be called with `cpu` held."""
     shows_trail = run.words.trail_named or (reading.motion is not None and reading.motion.cue == "trail")
     scene = run.scene_with(mover.bbox, [each.bbox for each in others], shows_trail)
@@ -429,7 +162,7 @@ def cut_out(
 
 
 def settle_grounding(
-    run: Run[SimulateRequest], reading: Reading, mover: Located, others: Sequence[LocatedObject], mask: Artifact
+    run: Run[SimulateRequest], reading: Reading, mover: Located, others: Sequence[LocatedObject], mask: records.Artifact
 ) -> Grounding:
     """The grounding, with its interventions made, its names understood, and where its mover goes, if it is put."""
     request, said = run.request, mover.said
@@ -536,7 +269,7 @@ def _find_interventions(
 
 
 def _with_things(
-    change: InterventionRequest, things: Sequence[LocatedObject], pointer: str | None = None
+    change: records.InterventionRequest, things: Sequence[LocatedObject], pointer: str | None = None
 ) -> Intervention:
     """A change with its objects in the place of their names, of the request at a JSON Pointer or of the question.
 

@@ -20,24 +20,13 @@ from cow_service.readers.prompts import load_prompt
 from cow_service.readers.remedies import GIVE_DIRECTION
 from cow_service.records import (
     DIRECTED_KINDS,
-    FALLING_KINDS,
-    OF_A_LINE,
     BBox,
-    Cue,
     Grounding,
-    GroundingRequest,
-    Law,
     LocatedObject,
     Motion,
     MotionKind,
     MotionRequest,
-    OtherMotionRequest,
-    Quantity,
-    Source,
-    SpeedWord,
     Vector,
-    as_said,
-    merged,
 )
 from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover
@@ -51,7 +40,7 @@ from cow_service.vision.trails import trail_of
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
 THROW_DEPTH_DEVIATION = 20.0  # degrees: words and arrows tell a throw's heading in the image alone
 SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.28}  # of the logarithm of a default speed
-SPEED_FACTORS: dict[SpeedWord, float] = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
+SPEED_FACTORS: dict[records.SpeedWord, float] = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
 SCALE_DEVIATION = 0.25  # of the logarithm of metres per pixel, where nobody gave them
 ELSEWHERE_SIGMA = 0.3  # of the logarithm of a scale that is told by the size of what stands elsewhere
 LEAST_SIZE_SIGMA = 0.05
@@ -67,12 +56,12 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
     """
     request = run.request
     given, warnings = given_motion(request, grounding), list[str]()
-    source: Source = "request"
+    source: records.Source = "request"
     if given is not None and given.is_whole:  # a direction that is given stays, whatever its spread
         said = given if given.direction is not None else settled_way(run, grounding, given, given)[0]
     else:
         source, (said, warnings) = run.reader.source, read_way(run, grounding, read, given)
-    unused = [name for name in OF_A_LINE if getattr(said, name) not in (None, ())]
+    unused = [name for name in records.OF_A_LINE if getattr(said, name) not in (None, ())]
     if said.stated_kind != "linear" and unused:
         said = said.model_copy(update={"distance": None, "duration": None, "until": None, "steps": ()})
         ends = f"a {said.stated_kind} ends where it hits something"
@@ -100,7 +89,7 @@ def assumed(motion: Motion, said: MotionRequest) -> list[str]:
         warnings.append(
             f"How far a throw goes depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it."
         )
-    units = [each.unit for each in (said.speed, said.distance) if isinstance(each, Quantity)]
+    units = [each.unit for each in (said.speed, said.distance) if isinstance(each, records.Quantity)]
     if motion.metres_per_pixel.source == "default" and not {"m", "m/s"}.isdisjoint(units):
         warnings.append(
             f"Lengths in metres were taken at {motion.metres_per_pixel.value:.4f} m per pixel, which was assumed; "
@@ -120,8 +109,8 @@ def read_way(
     A reader that may be wrong is asked once more with what speaks against its reading.
     """
     reader, warnings = run.reader, list[str]()
-    place = GroundingRequest(object=grounding.object, bbox=grounding.bbox)
-    known = tuple(map(as_said, grounding.others))
+    place = records.GroundingRequest(object=grounding.object, bbox=grounding.bbox)
+    known = tuple(map(records.as_said, grounding.others))
     asking = run.reader_input("motion", run.scene_of(grounding, None if read is None else read.cue), known=known)
     asking = replace(asking, given=asking.given.model_copy(update={"grounding": place, "motion": read or given}))
     if read is None:
@@ -130,7 +119,7 @@ def read_way(
     words = run.words.reading.motion or MotionRequest()
 
     def settled(read: MotionRequest) -> tuple[MotionRequest, Objections]:
-        return settled_way(run, grounding, merged(given, read) or read, words, asking.scene)
+        return settled_way(run, grounding, records.merged(given, read) or read, words, asking.scene)
 
     way, objections = settled(read)
     if objections and reader.heeds_objections:
@@ -138,7 +127,7 @@ def read_way(
         again = asking.given.model_copy(update={"motion": open_way})
         with suppress(CannotReadDirection, MllmBadReply, MllmUnavailable):
             result = reader.read(replace(asking, given=again, objections=objections))
-            way, objections = settled(merged(result.reading.motion, open_way) or open_way)
+            way, objections = settled(records.merged(result.reading.motion, open_way) or open_way)
             warnings += result.warnings
     if way.cue == "arrow" and not words.has_way and way.along_arrow and read.direction_deviation is None:
         warnings.append("The question names no direction; the arrow drawn at the object was followed.")
@@ -239,12 +228,12 @@ def given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReques
             told = MotionRequest.model_construct(kind="linear", direction=(x - x0, y - y0), speed=speed)
     elif grounding.source == "request" and placed_mover(grounding) is not None:
         told = MotionRequest(kind="place")
-    return merged(given, told)
+    return records.merged(given, told)
 
 
-def others_given(motion: MotionRequest, grounding: Grounding) -> list[tuple[OtherMotionRequest, LocatedObject]]:
+def others_given(motion: MotionRequest, grounding: Grounding) -> list[tuple[records.OtherMotionRequest, LocatedObject]]:
     """What else moves, each with the thing of its name. Raises `InvalidRequest` for one that was not located."""
-    found = list[tuple[OtherMotionRequest, LocatedObject]]()
+    found = list[tuple[records.OtherMotionRequest, LocatedObject]]()
     for index, each in enumerate(motion.others):
         things = [other for other in grounding.others if same_name(other.object, each.object)]
         if len(things) != 1:
@@ -285,7 +274,7 @@ def scale_of(
         size = None if each.prior is None else each.prior.size
         if size is None or not size.value > 0:
             continue
-        in_air = said.kind in FALLING_KINDS or (each.prior is not None and each.prior.stands_on == "air")
+        in_air = said.kind in records.FALLING_KINDS or (each.prior is not None and each.prior.stands_on == "air")
         nearer = 1.0 if in_air or not math.isfinite(depth) else float(depth)
         x0, y0, x1, y1 = each.bbox
         value = size.value / max(x1 - x0, y1 - y0) / nearer
@@ -315,7 +304,7 @@ def scale_of(
     return records.MetresPerPixel(value=value, source=source, note="by the sizes of objects"), doubts
 
 
-def _is_up_the_floor(reading: MotionRequest, grounding: Grounding, law: Law) -> bool:
+def _is_up_the_floor(reading: MotionRequest, grounding: Grounding, law: records.Law) -> bool:
     """Whether words alone say that something moves up that may stand on the floor."""
     said = reading.stated_kind == "linear" and reading.cue == "text" and reading.depth == 0 and reading.towards is None
     in_air = reading.rises or (grounding.prior is not None and grounding.prior.stands_on == "air")
@@ -345,9 +334,9 @@ def _unit(vector: Vector) -> Vector:
     return vector[0] / length, vector[1] / length
 
 
-def _pixels(said: float | Quantity, scale: records.MetresPerPixel, image_width: int) -> float:
+def _pixels(said: float | records.Quantity, scale: records.MetresPerPixel, image_width: int) -> float:
     """px, or px/s."""
-    value, unit = (said.value, said.unit) if isinstance(said, Quantity) else (said, "px")
+    value, unit = (said.value, said.unit) if isinstance(said, records.Quantity) else (said, "px")
     match unit:
         case "px" | "px/s":
             return value
@@ -358,14 +347,18 @@ def _pixels(said: float | Quantity, scale: records.MetresPerPixel, image_width: 
 
 
 def _speed_of(
-    said: MotionRequest | OtherMotionRequest, bbox: BBox, scale: records.MetresPerPixel, law: Law, image_width: int
+    said: MotionRequest | records.OtherMotionRequest,
+    bbox: BBox,
+    scale: records.MetresPerPixel,
+    law: records.Law,
+    image_width: int,
 ) -> tuple[float, float]:
     """Speed (px/s) of what is in a box, and the deviation of its logarithm; kinds without a direction have none."""
     kind = said.stated_kind or "linear"
     if kind not in DIRECTED_KINDS:
         return 0.0, 0.0
     if said.speed is not None and not isinstance(said.speed, str):
-        is_metric = isinstance(said.speed, Quantity) and said.speed.unit == "m/s"
+        is_metric = isinstance(said.speed, records.Quantity) and said.speed.unit == "m/s"
         deviation = SCALE_DEVIATION if is_metric and scale.source == "default" else 0.0
         return _pixels(said.speed, scale, image_width), deviation
     usual = DEFAULT_SPEED * image_width
@@ -375,11 +368,11 @@ def _speed_of(
 
 
 def _other(
-    said: OtherMotionRequest,
+    said: records.OtherMotionRequest,
     thing: LocatedObject,
     goal: LocatedObject | None,
     scale: records.MetresPerPixel,
-    law: Law,
+    law: records.Law,
     image_width: int,
     usual_deviation: float,
 ) -> records.AlsoMoving:
@@ -404,7 +397,7 @@ def completed(
     grounding: Grounding,
     said: MotionRequest,
     scale: records.MetresPerPixel | None,
-    source: Source,
+    source: records.Source,
 ) -> Motion:
     """The motion with what nobody said of it: scale, speed, deviations, gravity and the sentence."""
     image_width, law, kind = run.image.info.width, run.request.law, said.stated_kind or "linear"
@@ -413,7 +406,7 @@ def completed(
         source="default",
         note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
     )
-    moves, falls = kind in DIRECTED_KINDS, kind in FALLING_KINDS
+    moves, falls = kind in DIRECTED_KINDS, kind in records.FALLING_KINDS
     cue = said.cue or ("request" if source == "request" else CUES.get(kind, "text"))
     speed, speed_deviation = _speed_of(said, grounding.bbox, scale, law, image_width)
     usual = DIRECTION_DEVIATIONS[cue]
@@ -467,13 +460,16 @@ def completed(
     )
 
 
-CUES: dict[MotionKind, Cue] = {"fall": "gravity", "projectile": "gravity"}  # of a motion whose direction none tells
+CUES: dict[MotionKind, records.Cue] = {
+    "fall": "gravity",
+    "projectile": "gravity",
+}  # of a motion whose direction none tells
 
 
 def sentence_of(
     grounding: Grounding,
     kind: MotionKind,
-    law: Law,
+    law: records.Law,
     direction: Vector | None,
     said: MotionRequest,
     steps: Sequence[records.MotionStep],
@@ -533,7 +529,7 @@ def along_trail(
 def motion_sentence(
     object: str,
     kind: MotionKind,
-    law: Law,
+    law: records.Law,
     direction: Vector | None,
     depth: float,
     sentence: str | None = None,

@@ -9,21 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+from cow_service import records
 from cow_service.physics.camera import way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.readers.base import WordReader, WordsReading
-from cow_service.records import (
-    DIRECTED_KINDS,
-    FALLING_KINDS,
-    Asked,
-    BBox,
-    Cue,
-    GroundingRequest,
-    MotionRequest,
-    ObjectRequest,
-    Reading,
-    Vector,
-)
+from cow_service.records import DIRECTED_KINDS, BBox, GroundingRequest, MotionRequest, ObjectRequest, Reading, Vector
 from cow_service.vision.masks import iou, is_same_object
 from cow_service.vision.regions import Region
 
@@ -116,7 +106,7 @@ def _by_trail(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> Motion
 
 
 def _along_trail(read: MotionRequest, seen: SeenWay) -> MotionRequest:
-    is_thrown = seen.is_thrown or read.kind in FALLING_KINDS
+    is_thrown = seen.is_thrown or read.kind in records.FALLING_KINDS
     update = {"kind": "projectile" if is_thrown else "linear"} if read.direction is None else {}
     direction = read.direction or seen.trail
     return read.model_copy(update=update | {"direction": direction, "cue": "trail"})
@@ -162,7 +152,7 @@ def _turned(way: Vector) -> Vector:
 
 
 def _taken(
-    read: MotionRequest, direction: Vector, cue: Cue, along: bool | None = None, depth: float | None = None
+    read: MotionRequest, direction: Vector, cue: records.Cue, along: bool | None = None, depth: float | None = None
 ) -> MotionRequest:
     """The reading with a direction that was not estimated; a throw keeps the depth that was read, unless it is said."""
     keeps = depth is None and read.kind == "projectile"
@@ -302,7 +292,7 @@ def settle_question(
     objections, names = list[str](), [mover_of(read).object or "", *(each.object for each in read.objects)]
     if asked is not None and not is_given:
         # What is left at its default was not said: the words complete it.
-        usual = Asked(relation=asked.relation)
+        usual = records.Asked(relation=asked.relation)
         differ = [name for name in PLAIN if getattr(asked, name) != getattr(plain, name)]
         differ += [name for name in DETAILS if getattr(asked, name) not in (getattr(usual, name), getattr(plain, name))]
         followed = asked.model_copy(update={name: getattr(plain, name) for name in (*PLAIN, *DETAILS)})

@@ -19,15 +19,7 @@ from cow_service.readers.mllm.contents import pictures
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
 from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
-from cow_service.readers.mllm.locate import (
-    DOWN,
-    Line,
-    Located,
-    Scale,
-    locate_call,
-    scale_call,
-    separate_objects,
-)
+from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
