@@ -1,7 +1,4 @@
-"""The responses of `/v1`: OpenAI's records, each with COW's own fields as `cow`.
-
-Replies of an MLLM go on as they came: of those, these records say only what COW adds.
-"""
+"""What COW adds to OpenAI's records: the models, and `cow` of the replies of `/v1`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,44 +26,6 @@ class ChatModels(Record):
 
     object: Literal["list"] = "list"
     data: tuple[ChatModel, ...]
-
-
-class ChatUsage(Record):
-    """Tokens of everything that the multimodal LLM was asked: simulation, votes and baseline."""
-
-    prompt_tokens: int
-    completion_tokens: int
-    total_tokens: int
-
-
-class ChatReply(Record):
-    """The answer as a message."""
-
-    role: Literal["assistant"] = "assistant"
-    content: str = Field(description='A letter; text for an open question; "Not sure" where `cow.answer` is null.')
-    reasoning_content: str | None = Field(default=None, description="The MLLM's own, where there is one.")
-    refusal: None = None
-
-
-class ChatChoice(Record):
-    """The only choice."""
-
-    index: Literal[0] = 0
-    message: ChatReply
-    finish_reason: Literal["stop"] = "stop"
-    logprobs: None = None
-
-
-class ChatCompletion(Record):
-    """What `POST /v1/chat/completions` returns."""
-
-    id: str = Field(description="`chatcmpl-` and the id of the job.")
-    object: Literal["chat.completion"] = "chat.completion"
-    created: int = Field(description="Seconds since 1970.")
-    model: str
-    choices: tuple[ChatChoice]
-    usage: ChatUsage
-    cow: Answer = Field(description="The whole answer, as `POST /answer` returns it.")
 
 
 class ChatImagination(Record):
@@ -97,39 +56,6 @@ class ChatImagination(Record):
     warnings: tuple[str, ...] = ()
 
 
-class MllmCompletion(BaseModel, extra="allow"):
-    """What `POST /v1/chat/completions` returns of an MLLM: the reply as it came, and `cow`."""
-
-    cow: ChatImagination
-
-
-class ResponseReply(BaseModel, extra="allow"):
-    """What `POST /v1/responses` returns: a response as OpenAI has it, and `cow` as in a chat."""
-
-    id: str
-    object: Literal["response"]
-    status: Literal["completed", "incomplete"]
-    output: list[dict[str, Any]]
-    cow: Answer | ChatImagination
-
-
-class ChatDelta(Record):
-    """What a chunk adds to the message."""
-
-    role: Literal["assistant"] | None = None
-    content: str | None = None
-    reasoning_content: str | None = None
-
-
-class ChunkChoice(Record):
-    """The only choice."""
-
-    index: Literal[0] = 0
-    delta: ChatDelta
-    finish_reason: Literal["stop"] | None = None
-    logprobs: None = None
-
-
 class ChatProgress(Record):
     """How far the job is."""
 
@@ -139,15 +65,21 @@ class ChatProgress(Record):
     progress: float = Field(ge=0, le=1, description="Share of the work that is done.")
 
 
-class ChatChunk(Record):
-    """One event of a stream: progress, then the answer's reasoning and text, then its end."""
+class ChatCompletion(BaseModel, extra="allow"):
+    """OpenAI's chat completion, of an MLLM as it came. Without an MLLM `id` is `chatcmpl-` and the id of the job."""
 
-    id: str
-    object: Literal["chat.completion.chunk"] = "chat.completion.chunk"
-    created: int
-    model: str
-    choices: tuple[ChunkChoice, ...] = Field(description="Empty in the chunk that has `usage`.")
-    usage: ChatUsage | None = None
+    cow: Answer | ChatImagination = Field(description="Without an MLLM the whole answer, as `POST /answer` returns it.")
+
+
+class ResponseReply(BaseModel, extra="allow"):
+    """OpenAI's response, and `cow` as in a chat completion."""
+
+    cow: Answer | ChatImagination
+
+
+class ChatChunk(BaseModel, extra="allow"):
+    """OpenAI's chunk of a chat completion, an event of a stream: progress, then reasoning and text, then the end."""
+
     cow: ChatProgress | Answer | ChatImagination | None = Field(
         default=None,
         description="Progress; the answer in the last chunk; of an MLLM, what was imagined, before its first chunk.",

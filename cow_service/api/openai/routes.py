@@ -32,7 +32,6 @@ REQUESTS = (ChatRequest, ResponsesRequest)
 REPLIES = (
     records.ChatChunk,
     records.ChatCompletion,
-    records.MllmCompletion,
     records.ResponseReply,
     records.UpstreamError,
     ChatProblem,
@@ -53,13 +52,13 @@ def _body_of(record: type[BaseModel]) -> dict[str, Any]:
     return {"required": True, "content": {"application/json": {"schema": schema}}}
 
 
-def _reply(records: list[type[BaseModel]], data: str) -> dict[str, Any]:
+def _reply(record: type[BaseModel], data: str) -> dict[str, Any]:
     event = {
         "type": "object",
         "required": ["data"],
         "properties": {"data": {"type": "string", "description": f"{data}, as JSON; or `[DONE]`."}},
     }
-    whole: dict[str, Any] = {"anyOf": [{"$ref": REFERENCE.format(model=record.__name__)} for record in records]}
+    whole = {"$ref": REFERENCE.format(model=record.__name__)}
     return {
         "description": "The reply; with `stream` the chunks of it, progress of imagining before them.",
         "content": {"application/json": {"schema": whole}, "text/event-stream": {"schema": event}},
@@ -73,7 +72,7 @@ router = APIRouter(prefix=OPENAI_ROOT.rstrip("/"), tags=["OpenAI-compatible"])
     "/chat/completions",
     summary="The MLLM behind a model, seeing more",
     responses={
-        200: _reply([records.ChatCompletion, records.MllmCompletion], "A `ChatChunk`, or a `ChatProblem` at the end"),
+        200: _reply(records.ChatCompletion, "A `ChatChunk`, or a `ChatProblem` at the end"),
         **ACCEPTED,
         **documented(*FAILURES, errors.ModelNotFound),
         **UPSTREAM_ERRORS,
@@ -95,7 +94,7 @@ async def chat(request: Request, completer: ChatCompleter) -> Response:
     "/responses",
     summary="The same, as OpenAI's responses",
     responses={
-        200: _reply([records.ResponseReply], "An event of OpenAI's responses"),
+        200: _reply(records.ResponseReply, "An event of OpenAI's responses"),
         **documented(*FAILURES, errors.ModelNotFound),
         **UPSTREAM_ERRORS,
     },
