@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from typing import ClassVar
 
@@ -28,7 +28,6 @@ from cow_service.workers.pool import WorkerPool
 START_WAIT_SECONDS, LOAD_WAIT_SECONDS = 1.0, 0.5
 LOAD_SECONDS = 3600.0  # longest that models may take to load where nothing is asked before
 START_POLL_SECONDS = 0.01
-TICK_SECONDS = 1.0  # between two looks at the clock
 CLOSE_SECONDS = 5.0  # for open connections, after the grace period of running jobs
 
 log = logging.getLogger("cow_service")
@@ -38,30 +37,9 @@ class Server(uvicorn.Server):
     """Tells the engine as soon as the server is to stop, so that requests that wait for jobs do not hold it up."""
 
     def __init__(self, config: uvicorn.Config, engine: JobEngine) -> None:
-        self._loop: asyncio.AbstractEventLoop | None = None  # while it serves
-        self._exiting = asyncio.Event()
         super().__init__(config)
         self._engine = engine
         self.is_ending = threading.Event()
-
-    @property
-    def should_exit(self) -> bool:  # type: ignore[override] # uvicorn looks at it ten times a second
-        """Whether it is to stop. May be set by every thread, and by a handler of signals."""
-        return self._should_exit
-
-    @should_exit.setter
-    def should_exit(self, value: bool) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        self._should_exit = value
-        if value and self._loop is not None:
-            self._loop.call_soon_threadsafe(self._exiting.set)
-
-    async def main_loop(self) -> None:
-        """Serves until it is to stop."""
-        self._loop = asyncio.get_running_loop()
-        while not await self.on_tick(0):  # which renews the header `Date` of responses
-            with suppress(TimeoutError):
-                await asyncio.wait_for(self._exiting.wait(), TICK_SECONDS)
-        self._loop = None
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listens, and logs how to begin."""
