@@ -9,7 +9,6 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 from uuid import uuid4
 
 import sqlalchemy as sa
@@ -37,14 +36,10 @@ class Sqlite(Database):
     is_shared = False
     now = (sa.func.julianday("now") - 2440587.5) * 86400.0
 
-    def __init__(self, file: Path, *, read_only: bool = False) -> None:
-        """`read_only`: the file must exist, and is not changed."""
+    def __init__(self, file: Path) -> None:
         self.file = file
         self._held: int | None = None  # the descriptor of the folder
         self._executor = ""
-        if read_only:
-            super().__init__(sa.create_engine(f"sqlite:///file:{quote(str(file.resolve()))}?mode=ro&uri=true"))
-            return
         super().__init__(sa.create_engine(f"sqlite:///{file}", pool_size=16, max_overflow=32, hide_parameters=True))
         event.listen(self.engine, "connect", _prepare)
 
