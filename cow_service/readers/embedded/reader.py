@@ -43,7 +43,8 @@ class EmbeddedReader:
         way = {} if read.unread_motion or said.is_contradictory else motions.said_way(said, said.kind or "linear")
         kind = motions.settled_kind(read)
         return base.WordsReading(
-            records.Reading(
+            # Not checked: the stage tells what is wrong with a change that cannot be made.
+            records.Reading.model_construct(
                 grounding=None if mover is None else records.GroundingRequest(object=mover),
                 motion=records.MotionRequest.model_validate({"kind": kind, **way}),
                 objects=tuple(records.ObjectRequest(object=each.text) for each in read.others[: records.MAX_OBJECTS]),
@@ -202,6 +203,8 @@ def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
             raise CannotGround(f"The question takes '{name}' away and says or asks what it does: ask one of both.")
         if change.object in change.targets:
             raise CannotGround(f"The question puts '{name}' {change.relation} itself: name another thing.")
+        if len(set(change.targets)) < len(change.targets):
+            raise CannotGround(f"The question puts '{name}' {change.relation} one thing: name another one, too.")
 
 
 class _Finder:
@@ -296,7 +299,7 @@ class _Finder:
         free = self.without(list(self.taken.values()))
         if kind is not None and kind.count in (None, 2) and taken is None:
             kind = replace(kind, count=kind.count or count)
-            things = matching.named_by_colour(matching.match_several(free, kind), kind)
+            things = matching.named_by_colour(matching.match_several(free, kind), kind, self.taken)
         else:
             region = matching.match_one(free, phrase) if kind is None and taken is None else None
             box = region.bbox if region is not None else taken

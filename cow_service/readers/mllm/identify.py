@@ -142,7 +142,9 @@ class Change(replies.Reply):
 
     @pydantic.model_validator(mode="after")
     def _check_place(self) -> Self:
-        if self.kind == "place" and (self.relation is None or not self.targets):
+        count = 2 if self.relation == "between" else 1
+        things = {replies.name_words(each) for each in (self.object, *self.targets)}
+        if self.kind == "place" and (self.relation is None or not len(self.targets) == len(things) - 1 == count):
             raise ValueError("says not where to")
         return self
 
@@ -262,9 +264,11 @@ class Identified(replies.Reply):
             {"direction": each.way[0], "depth": each.way[1], "distance": each.distance, "duration": each.duration}
             for each in self.then
         )
+        kind = self.kind or "linear"
+        said = (name for name in SAID_ALIKE if name != "speed" or kind in records.DIRECTED_KINDS)
         return {
-            "kind": self.kind or "linear",
-            **{name: value for name in SAID_ALIKE if (value := getattr(self, name)) is not None},
+            "kind": kind,
+            **{name: value for name in said if (value := getattr(self, name)) is not None},
             "steps": tuple(records.MotionStepRequest.model_validate(each) for each in steps),
             "others": tuple(each.as_said for each in self.also_moving),
         }
