@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import cache
 from typing import Any
 
 import cv2
 import pytest
 from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from refusals import refused
 from runs import run_of
 
+from cow_service.errors import CowError
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import ReaderInput, ReadResult
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import (
+    MAX_OBJECTS,
     BBox,
     Distance,
     GroundingRequest,
@@ -52,12 +57,12 @@ def three() -> Scene:
     return Scene(jpeg(block(image, (430, 150, 520, 250), BLUE)))
 
 
-def said(scene: Scene, question: str, **given: Any) -> ReadResult:
-    return reader.read(ReaderInput(scene, question, given=Reading(**given)))
+def said(scene: Scene, question: str, **known: Any) -> ReadResult:
+    return reader.read(ReaderInput(scene, question, given=Reading(**known)))
 
 
-def found(scene: Scene, question: str, **given: Any) -> Reading:
-    return said(scene, question, **given).reading
+def found(scene: Scene, question: str, **known: Any) -> Reading:
+    return said(scene, question, **known).reading
 
 
 def mover_box(reading: Reading) -> BBox:
@@ -322,8 +327,8 @@ def test_a_fall_is_that_of_a_ball_or_of_what_is_in_the_air() -> None:
     place = GroundingRequest(object="blue cube", bbox=(430, 150, 520, 250))
 
     def kind(words: str, stands_on: str | None = None) -> str | None:
-        given = place.model_copy(update={"stands_on": stands_on})
-        motion = found(drawn(), f"If the blue cube {words}, what happens?", grounding=given).motion
+        known = place.model_copy(update={"stands_on": stands_on})
+        motion = found(drawn(), f"If the blue cube {words}, what happens?", grounding=known).motion
         return motion and motion.kind
 
     for words in ("falls freely from its current position", "is dropped", "drops", "is let go"):
@@ -401,3 +406,33 @@ def test_arrows_that_may_not_be_the_movers_are_not_followed() -> None:
 def test_a_name_says_what_its_noun_does(name: str, shape: str | None, opening: str | None) -> None:
     read = reader.read_name(name)
     assert (read.shape, read.opening) == (shape, opening)
+
+
+MANY = ", the ".join(f"{colour} {noun}" for noun in ("mug", "cone", "cup") for colour in ("red", "blue", "green"))
+WORDS = st.one_of(
+    st.text(max_size=40),
+    st.sampled_from(("red ball", "blue cube", "both balls", "cubes", "one", "ball " + "x" * 250, "very " * 50 + "ball")),
+    st.just(MANY),
+)
+NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from(("0", "-0.0", "1e9", "½", "two", "half a", "9" * 20)))
+UNITS = st.sampled_from(("pixels", "px", "m", "cm", "km", "s", "seconds", "hours", "ms", "m/s", "km/h", "px/s", "%", ""))
+FORMS = (
+    "{one}",
+    "If the {one} rolls right by {n} {unit}, will it hit the {two}?",
+    "If the red ball rolls right for {n} {unit}, then left at {n} {unit}, will it hit the {two} within {n} {unit}?",
+    "If the red ball rolls towards the {one} at a speed of {n} {unit}, does it hit the {two} or the blue cube first?",
+    "If the {one} is removed and the red ball falls at {n} {unit}, will it hit the {two}?",
+    "If I put the red ball between the {one} and the {two}, will it fit?",
+    "If the {one} is put onto the {two} and the red ball rolls right, which of the {one}, the {two} does it hit?",
+    "If the red ball rolls right and the {one} moves towards the {two} at {n} {unit}, will they collide?",
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(FORMS), WORDS, WORDS, NUMBERS, UNITS)
+def test_whatever_is_asked_is_read_or_refused(form: str, one: str, two: str, number: object, unit: str) -> None:
+    """Names, numbers and lists beyond the limits of a request among them."""
+    question = form.format(one=one, two=two, n=number, unit=unit)
+    assert len(reader.read_question(question).reading.objects) <= MAX_OBJECTS
+    with suppress(CowError):
+        Reading.model_validate(said(three(), question).reading.model_dump())
