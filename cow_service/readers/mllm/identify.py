@@ -295,9 +295,11 @@ def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int
     asked = None if given.words is None or given.given.asked is not None else given.words.reading.asked
     if asked is not None and (asked.among or asked.form.startswith("which")):
         asked = None  # the words do not say which things these are
+    place = given.given.grounding
+    is_placed = place is not None and place.bbox is not None  # then all but the motion is known
     said = frozenset((
-        *(() if given.given.asked is None and asked is None else ("asked",)),
-        *(("changes",) if given.given.interventions else ()),
+        *(("asked",) if is_placed or asked is not None or given.given.asked is not None else ()),
+        *(("changes",) if is_placed or given.given.interventions else ()),
         *(() if given.motion_wanted else _MOTION),
         *(() if has_numbers else _NUMBERS),
     ))  # fmt: skip
