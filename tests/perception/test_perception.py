@@ -226,7 +226,9 @@ def test_boxes_of_a_reader_are_outlined() -> None:
 
         def read(self, given: Any) -> ReadResult:
             others = (ObjectRequest(object="cyan cone", bbox=loose(cone)),)
-            return ReadResult(Reading(grounding=GroundingRequest(object="blue candle", bbox=loose(candle)), objects=others))
+            return ReadResult(
+                Reading(grounding=GroundingRequest(object="blue candle", bbox=loose(candle)), objects=others)
+            )
 
     run = run_of(truth.image, reader=Reader, question="If the candle slides right, will it hit the cone?")
     run.backends = replace(run.backends, perception=TrueModels(truth))

@@ -288,7 +288,10 @@ def test_a_refusal_says_what_was_looked_for_and_what_is_seen() -> None:
         ("rolls over to the left", {"direction": (-1, 0)}),
         ("rolls slowly to the right", {"speed": "slow"}),
         ("is pushed hard to the right", {"speed": "fast"}),
-        ("rolls right at 20 pixels per second for 5 seconds", {"speed": Speed(value=20.0, unit="px/s"), "duration": 5.0}),
+        (
+            "rolls right at 20 pixels per second for 5 seconds",
+            {"speed": Speed(value=20.0, unit="px/s"), "duration": 5.0},
+        ),
         ("rolls right at a speed of 2.5 m/s", {"speed": Speed(value=2.5, unit="m/s")}),
         ("moves right by 50 pixels", {"distance": Distance(value=50.0, unit="px")}),
         ("moves 10 centimetres to the right", {"distance": Distance(value=0.1, unit="m")}),
@@ -321,6 +324,24 @@ def test_towards_a_thing_a_part_of_the_way_and_a_second_mover() -> None:
     _, motion = settled(drawn(), told)
     (other,) = motion.others
     assert (other.object.object, other.direction, motion.direction) == ("blue cube", (-1.0, 0.0), (1.0, 0.0))
+
+
+def test_of_what_is_given_the_words_or_the_arrow_alone_tell_the_motion() -> None:
+    """Neither a goal nor a mover need be named as one that was located."""
+    place = {"object": "red ball", "bbox": (110, 160, 190, 240)}
+
+    def motion(scene: Scene, question: str) -> Motion:
+        run = run_of(scene.image, reader=lambda: reader, question=question, grounding=place)
+        return run.stage("motion", settle_motion, run.stage("grounding", ground), None)
+
+    told = motion(drawn(), "If the red ball rolls towards the blue cube, will it hit it?")
+    assert told.direction is not None
+    assert angle_between(told.direction, (1, 0)) < 4
+    assert "towards the blue cube" in told.sentence
+    told = motion(drawn(0.2), "Trifft die Kugel den Würfel?")
+    assert (told.cue, told.along_arrow) == ("arrow", True)
+    with refused("cannot-read-direction"):
+        motion(drawn(), "Trifft die Kugel den Würfel?")
 
 
 def test_a_fall_is_that_of_a_ball_or_of_what_is_in_the_air() -> None:
@@ -411,11 +432,15 @@ def test_a_name_says_what_its_noun_does(name: str, shape: str | None, opening: s
 MANY = ", the ".join(f"{colour} {noun}" for noun in ("mug", "cone", "cup") for colour in ("red", "blue", "green"))
 WORDS = st.one_of(
     st.text(max_size=40),
-    st.sampled_from(("red ball", "blue cube", "both balls", "cubes", "one", "ball " + "x" * 250, "very " * 50 + "ball")),
+    st.sampled_from(
+        ("red ball", "blue cube", "both balls", "cubes", "one", "ball " + "x" * 250, "very " * 50 + "ball")
+    ),
     st.just(MANY),
 )
 NUMBERS = st.one_of(st.integers(), st.floats(), st.sampled_from(("0", "-0.0", "1e9", "½", "two", "half a", "9" * 20)))
-UNITS = st.sampled_from(("pixels", "px", "m", "cm", "km", "s", "seconds", "hours", "ms", "m/s", "km/h", "px/s", "%", ""))
+UNITS = st.sampled_from(
+    ("pixels", "px", "m", "cm", "km", "s", "seconds", "hours", "ms", "m/s", "km/h", "px/s", "%", "")
+)
 FORMS = (
     "{one}",
     "If the {one} rolls right by {n} {unit}, will it hit the {two}?",

@@ -151,7 +151,10 @@ def test_what_is_taken_away_or_asked_about_is_located_and_how_far_it_goes_is_kep
     result = reader.read(ReaderInput(scene, question))
     assert {"> blue vase", "> coin"} <= set(mllm.text(1).splitlines())
     assert result.reading.interventions == (InterventionRequest(kind="remove", object="blue vase"),)
-    assert {(each.object, each.role) for each in result.reading.objects} == {("coin", "target"), ("blue vase", "target")}
+    assert {(each.object, each.role) for each in result.reading.objects} == {
+        ("coin", "target"),
+        ("blue vase", "target"),
+    }
     assert result.reading.asked == Asked(relation="covers", target="coin")
     motion = motion_of(result)
     speed, distance = Speed(value=20, unit="px/s"), Distance(value=0.1, unit="m")
@@ -597,7 +600,9 @@ def test_the_cpu_is_held_for_work_and_never_while_the_model_is_waited_for(mllm, 
 NAMES = st.one_of(
     st.sampled_from(("red ball", "vase", "cup", "\u200b", "\u200bx", "x" * 130, "", "blue  vase", None, 5)), st.text()
 )
-AMOUNTS = st.sampled_from(("0 px", "-2 m", "1e9 km", "1e12 px/s", "2 m/s", "3 h", "5000 s", "0.000001 ms", 1e300, "NaN"))
+AMOUNTS = st.sampled_from(
+    ("0 px", "-2 m", "1e9 km", "1e12 px/s", "2 m/s", "3 h", "5000 s", "0.000001 ms", 1e300, "NaN")
+)
 CHANGES = st.fixed_dictionaries(
     {
         "kind": st.sampled_from(("remove", "place", "put")),

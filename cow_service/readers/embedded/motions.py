@@ -218,7 +218,10 @@ def read_motion(
     if kind in DIRECTED_KINDS and not way and question.names_direction:
         raise _refused("Which way it moves was not understood in the question.")
     goal = goal_of(scene, words.towards, mover, things) if "towards" in way and words.towards else None
-    far = None if goal is None else math.hypot(*way_to(goal, bbox, kind == "linear"))
+    ahead = None if goal is None else way_to(goal, bbox, kind == "linear")
+    if ahead is not None and all(each.object != way["towards"] for each in things):  # only here it is known where
+        way |= {"direction": ahead, "cue": "text"}
+    far = None if ahead is None else math.hypot(*ahead)
     try:
         speed, distance, duration, until = quantities(words.quantities, far, bbox)
         said = {"speed": speed if kind in DIRECTED_KINDS else None, "distance": distance, "duration": duration}

@@ -80,7 +80,8 @@ class EmbeddedReader:
         """
         question = parse(given.question, names_of(given))
         mover, place, is_open = question.mover, given.given.grounding, given.motion_wanted
-        if mover is None or (is_open and not question.says_motion):
+        is_placed = place is not None and place.has_place  # of such a thing a drawn arrow tells the motion, too
+        if not is_placed and (mover is None or (is_open and not question.says_motion)):
             words = ("', '".join(question.unread) or given.question)[:MAX_UNREAD]
             like = " Or: ".join(rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",))
             fault = (
@@ -88,10 +89,9 @@ class EmbeddedReader:
             )
             raise CannotGround(f"{fault} Ask like: {like}", remedy=LOCATE_IT)
         with given.cpu():
-            if place is None or not place.has_place:
+            scene, found = given.scene, base.ReadResult(records.Reading(grounding=place))
+            if not is_placed and mover is not None:
                 scene, found = self._located(given, question, mover)
-            else:
-                scene, found = given.scene, base.ReadResult(records.Reading(grounding=place))
             if not is_open or found.reading.grounding is None:
                 return found
             things = (*given.known, *found.reading.objects)
