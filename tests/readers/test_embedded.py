@@ -308,7 +308,7 @@ def test_a_refusal_says_what_was_looked_for_and_what_is_seen() -> None:
     ],
 )
 def test_how_the_words_say_that_it_moves(words: str, expected: dict[str, Any]) -> None:
-    wanted = {"kind": "linear", "direction": (1, 0), "cue": "text"} | expected
+    wanted: dict[str, Any] = {"kind": "linear", "direction": (1, 0), "cue": "text"} | expected
     told = MotionRequest(**{name: value for name, value in wanted.items() if value is not None})
     assert found(drawn(), asking(words)).motion == told, "and nothing else is said"
 
