@@ -44,6 +44,7 @@ Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
 Opening = Literal["round", "square", "none"]
 Language = Literal["en", "de", "es", "fr", "zh", "ja"]
 MAX_OBJECTS = 64
+MAX_WITHIN = 1e6  # s
 
 
 AskedRelation = Literal["touches", "covers", "covered", "inside", "tips", "moves", "leaves", "lands"]
@@ -74,7 +75,7 @@ class Asked(Record):
     )
     every: bool = Field(default=False, description="It counts only if it happens with each of `among`.")
     partly: bool = Field(default=False, description="For `covers` and `covered`: any hidden part counts.")
-    within: Annotated[Finite, Field(gt=0, le=1e6)] | None = Field(
+    within: Annotated[Finite, Field(gt=0, le=MAX_WITHIN)] | None = Field(
         default=None, description="Time limit for the event, s; null: until everything is at rest or out of view."
     )
 

@@ -50,8 +50,10 @@ Name = Annotated[str, Field(max_length=MAX_NAME)]
 # Only the first wrong element of a long list is reported: all of them would fill the memory.
 Near = Annotated[Finite, Field(ge=-1e6, le=1e6)]  # px, of a point in the image or not too far from it
 Points = Annotated[tuple[tuple[Near, Near], ...], Field(fail_fast=True)]
-ObjectWords = Annotated[Words, Field(min_length=1, max_length=200)]
-Seconds = Annotated[Finite, Field(gt=0, le=3600)]
+MAX_OBJECT_WORDS = 200  # characters
+MAX_SECONDS = 3600
+ObjectWords = Annotated[Words, Field(min_length=1, max_length=MAX_OBJECT_WORDS)]
+Seconds = Annotated[Finite, Field(gt=0, le=MAX_SECONDS)]
 
 
 def _with_area(bbox: BBox) -> BBox:

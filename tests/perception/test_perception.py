@@ -30,8 +30,8 @@ from stand_ins import TrueModels, TrueScene, TrueSegmenter, motorcycle, read_tru
 from cow_service.media.images import decode_own, encode_png
 from cow_service.perception.base import MOST_EMBEDDINGS, Embedded, Perception, Prompt, Segment
 from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import GroundingReading
-from cow_service.records import BBox, LocatedObject
+from cow_service.readers.base import ReadResult
+from cow_service.records import BBox, GroundingRequest, ObjectRequest, Reading
 from cow_service.requests import AnswerRequest, LookRequest, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
@@ -224,9 +224,11 @@ def test_boxes_of_a_reader_are_outlined() -> None:
         source = "mllm"
         heeds_objections = False
 
-        def ground(self, given: Any) -> GroundingReading:
-            others = (LocatedObject(object="cyan cone", bbox=loose(cone)),)
-            return GroundingReading("blue candle", loose(candle), others=others)
+        def read(self, given: Any) -> ReadResult:
+            others = (ObjectRequest(object="cyan cone", bbox=loose(cone)),)
+            return ReadResult(
+                Reading(grounding=GroundingRequest(object="blue candle", bbox=loose(candle)), objects=others)
+            )
 
     run = run_of(truth.image, reader=Reader, question="If the candle slides right, will it hit the cone?")
     run.backends = replace(run.backends, perception=TrueModels(truth))

@@ -12,12 +12,13 @@ from conftest import DATA, example
 from drawn import angle_between, floor
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from runs import run_of
 
 from cow_service.perception.facing import DARK, OTHER, PAINT, VehicleModel, facing
 from cow_service.physics.camera import FloorCamera
-from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.records import Grounding
+from cow_service.stages.grounding import ground
+from cow_service.stages.motion import settle_motion
 from cow_service.vision.masks import bbox_of, iou
 from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image, Mask
@@ -62,16 +63,17 @@ def test_paint_alone_does_not_tell_the_front() -> None:
 @pytest.mark.parametrize(("word", "sense"), [("forward", 1), ("backward", -1)])
 def test_forward_and_backward_are_the_way_that_the_car_of_an_example_faces(word: str, sense: int) -> None:
     car = example("car-forward")
-    asked = ReaderInput(Scene(car.pixels("image.jpg")), f"If the red toy car moves {word}, what happens?")
-    x0, y0, x1, y1 = car.meta["bbox"]
-    place = Grounding(
-        object="red toy car", point=((x0 + x1) / 2, (y0 + y1) / 2), bbox=(x0, y0, x1, y1), source="embedded"
+    run = run_of(
+        car.pixels("image.jpg"),
+        reader=EmbeddedReader,
+        question=f"If the red toy car moves {word}, what happens?",
+        grounding={"object": "red toy car", "bbox": car.meta["bbox"]},
     )
-    reading = EmbeddedReader().read_motion(asked, place, None)
+    motion = run.stage("motion", settle_motion, run.stage("grounding", ground), None)
     x, y = car.meta["direction"]
-    assert reading.cue == "orientation"
-    assert reading.direction is not None
-    assert angle_between(reading.direction, (sense * x, sense * y)) <= 5
+    assert motion.cue == "orientation"
+    assert motion.direction is not None
+    assert angle_between(motion.direction, (sense * x, sense * y)) <= 5
 
 
 VEHICLES = DATA / "vehicles"  # rendered, with where they truly are and face

@@ -148,11 +148,12 @@ def test_other_coordinates_are_noticed_and_kept(
     reader, true = reader_of(mllm, tmp_path), TRUE["ball-and-mug"]
     assert reader.fingerprint != first.fingerprint, "results of before are not reused"
     pixels = decode((EXAMPLES / "ball-and-mug" / "image.jpg").read_bytes()).pixels
-    found = reader.ground(ReaderInput(Scene(pixels), true["question"]))
+    found = reader.read(ReaderInput(Scene(pixels), true["question"])).reading.grounding
     reader.close()
     again = checked(mllm, tmp_path, model(**written))
     assert usable(again)["box"], "they are asked for now"
     assert measured(again) == measured(check), "and stay"
+    assert found is not None
     assert found.bbox == pytest.approx(true["bbox"], abs=2)
     assert found.bbox_deviation == measured(check).bbox_deviation
 

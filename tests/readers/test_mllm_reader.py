@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -16,28 +16,33 @@ import mllm_server as say
 import numpy as np
 import pytest
 from drawn import DrawnArrow, angle_between, ball, block, floor, trail
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mllm_server import MllmServer
 from refusals import refused
 from runs import run_of
 from waiting import TIME_LIMIT, eventually
 
-from cow_service.errors import Canceled
-from cow_service.readers.base import (
-    AnswerReading,
-    CallLog,
-    GroundingReading,
-    MotionHints,
-    MotionReading,
-    Quantity,
-    QuestionReading,
-    ReaderInput,
-)
+from cow_service.errors import Canceled, CowError
+from cow_service.readers.base import AnswerReading, CallLog, ReaderInput, ReadResult, WordsReading
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.readers.options import read_choices
-from cow_service.records import Asked, Grounding, Usage
+from cow_service.records import (
+    Asked,
+    Distance,
+    GroundingRequest,
+    InterventionRequest,
+    MotionRequest,
+    ObjectRequest,
+    OtherMotionRequest,
+    Reading,
+    Source,
+    Speed,
+    Usage,
+)
 from cow_service.settings import Settings
 from cow_service.stages.grounding import ground
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.trajectory import compute_trajectory
 from cow_service.vision.scene import Scene
 
@@ -86,16 +91,19 @@ def scene() -> Scene:
     return Scene(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200)))
 
 
-def grounding(source: str) -> Grounding:
-    return Grounding.model_validate(
-        {"object": "red ball", "point": (150, 200), "bbox": (110, 156, 190, 236), "source": source}
-    )
+def known(source: Source = "mllm", **said: Any) -> Reading:
+    """What is given where the place of the ball is known, and perhaps more."""
+    place = GroundingRequest(object="red ball", bbox=(110, 156, 190, 236), source=source)
+    return Reading.model_validate({"grounding": place, **said})
 
 
-def stored(hints: MotionHints | None) -> MotionHints:
-    """As they are after a restart."""
-    assert hints is not None
-    return MotionHints.model_validate_json(hints.model_dump_json())
+def motion_of(result: ReadResult) -> MotionRequest:
+    assert result.reading.motion is not None
+    return result.reading.motion
+
+
+def names(result: ReadResult) -> list[str]:
+    return [each.object for each in result.reading.objects]
 
 
 def answers(reader: MllmReader, votes: int = 1, **given: Any) -> tuple[AnswerReading, ...]:
@@ -105,20 +113,31 @@ def answers(reader: MllmReader, votes: int = 1, **given: Any) -> tuple[AnswerRea
 # What is asked and handed on
 
 
-def test_what_was_read_with_the_place_needs_no_second_call(mllm, reader, scene) -> None:
-    """Also after a restart, from hints that were stored."""
+def test_place_and_motion_are_read_at_once(mllm, reader, scene) -> None:
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    reading = reader.ground(ReaderInput(scene, QUESTION))
-    assert reading.object == "red ball"
+    result = reader.read(ReaderInput(scene, QUESTION))
+    assert result.reading.grounding is not None
+    assert result.reading.grounding.object == "red ball"
     assert len(mllm.asked) == 2
-    motion = reader.read_motion(ReaderInput(scene, QUESTION), grounding("mllm"), stored(reading.hints))
-    assert len(mllm.asked) == 2
+    motion = motion_of(result)
     assert (motion.kind, motion.cue) == ("linear", "arrow")
     assert motion.direction == pytest.approx((0.37 * scene.width, 0), abs=1)
     # A motion that the request gives is not asked for.
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    assert reader.ground(ReaderInput(scene, QUESTION, motion_wanted=False)).hints is None
+    assert reader.read(ReaderInput(scene, QUESTION, motion_wanted=False)).reading.motion is None
     assert list(mllm.asked[-1]["response_format"]["json_schema"]["schema"]["properties"]) == ["reasoning", "objects"]
+
+
+def test_what_is_read_with_the_place_needs_no_second_call(mllm, reader, scene) -> None:
+    """Also after a restart, from what was stored."""
+    mllm.say(json.dumps(BALL), json.dumps(PLACE))
+    run = run_of(scene.image, reader=lambda: reader, question="Rollt die Kugel?")
+    found = run.stage("grounding", ground)
+    asked = len(mllm.asked)
+    read = run.read_motion
+    assert read is not None
+    motion = run.stage("motion", settle_motion, found, MotionRequest.model_validate_json(read.model_dump_json()))
+    assert (len(mllm.asked), motion.kind) == (asked, "linear")
 
 
 def test_what_is_taken_away_or_asked_about_is_located_and_how_far_it_goes_is_kept(mllm, reader, scene) -> None:
@@ -129,40 +148,43 @@ def test_what_is_taken_away_or_asked_about_is_located_and_how_far_it_goes_is_kep
     boxes = [("blue vase", [600, 400, 700, 600]), ("coin", [800, 400, 900, 600])]
     others = [{"label": name, "bbox_2d": box} for name, box in boxes]
     mllm.say(json.dumps(said | ends), json.dumps(PLACE | {"others": others}))
-    reading = reader.ground(ReaderInput(scene, question))
+    result = reader.read(ReaderInput(scene, question))
     assert {"> blue vase", "> coin"} <= set(mllm.text(1).splitlines())
-    assert [(each.kind, each.object.object) for each in reading.interventions] == [("remove", "blue vase")]
-    assert [(each.object, each.role) for each in reading.others] == [("coin", "target")]
-    assert reading.asked == Asked(relation="covers", target="coin")
-    motion = reader.read_motion(ReaderInput(scene, question), grounding("mllm"), stored(reading.hints))
-    assert (motion.speed, motion.distance, motion.duration) == (Quantity(20, "px/s"), Quantity(0.1, "m"), None)
+    assert result.reading.interventions == (InterventionRequest(kind="remove", object="blue vase"),)
+    assert {(each.object, each.role) for each in result.reading.objects} == {
+        ("coin", "target"),
+        ("blue vase", "target"),
+    }
+    assert result.reading.asked == Asked(relation="covers", target="coin")
+    motion = motion_of(result)
+    speed, distance = Speed(value=20, unit="px/s"), Distance(value=0.1, unit="m")
+    assert (motion.speed, motion.distance, motion.duration) == (speed, distance, None)
     assert motion.until == "contact"
     mllm.say(json.dumps(said), json.dumps(PLACE))
     with refused("object-not-found"):
-        reader.ground(ReaderInput(scene, QUESTION))
+        reader.read(ReaderInput(scene, QUESTION))
 
 
 def test_further_legs_and_other_movers_are_kept(mllm, reader, scene) -> None:
     then = [{"way": "down", "distance": "30 px"}, {"way": "..."}, "right", {"direction": "away", "duration": "1 s"}]
     car, cup = {"object": "blue car", "kind": "linear", "way": "left"}, {"object": "cup", "kind": "fall"}
     boxes = [{"label": "blue car", "bbox_2d": [600, 400, 700, 600]}, {"label": "cup", "bbox_2d": [800, 100, 850, 200]}]
-    mllm.say(
-        json.dumps(BALL | {"then": then, "also_moving": [car, cup, {"object": None}]}),
-        json.dumps(PLACE | {"others": boxes}),
-    )
-    reading = reader.ground(ReaderInput(scene, QUESTION, sought=("tall lamp",)))
+    named = json.dumps(BALL | {"then": then, "also_moving": [car, cup, {"object": None}]})
+    mllm.say(named, json.dumps(PLACE | {"others": boxes}))
+    lamp = Reading(objects=(ObjectRequest(object="tall lamp"),))
+    result = reader.read(ReaderInput(scene, QUESTION, given=lamp))
     assert {"> blue car", "> tall lamp"} <= set(mllm.text(1).splitlines()), "what the request changes is located, too"
-    hints = stored(reading.hints)
-    found = grounding("mllm").model_copy(update={"others": reading.others})
-    motion = reader.read_motion(ReaderInput(scene, QUESTION), found, hints)
+    motion = motion_of(result)
     assert [(each.direction, each.distance, each.duration) for each in motion.steps] == [
-        ((0, 1), Quantity(30, "px"), None), ((1, 0), None, None), ((0, -1), None, 1.0),
+        ((0, 1), Distance(value=30, unit="px"), None), ((1, 0), None, None), ((0, -1), None, 1.0),
     ]  # fmt: skip
-    assert [(each.object.object, each.kind, each.direction) for each in motion.others] == [
-        ("blue car", "linear", (-1, 0)), ("cup", "fall", None),
-    ]  # fmt: skip
+    assert motion.others == (
+        OtherMotionRequest(object="blue car", kind="linear", direction=(-1, 0), direction_deviation=20),
+        OtherMotionRequest(object="cup", kind="fall", direction_deviation=20),
+    )
+    mllm.say(named, json.dumps(PLACE))
     with refused("cannot-read-direction"):
-        reader.read_motion(ReaderInput(scene, QUESTION), grounding("mllm"), hints)
+        reader.read(ReaderInput(scene, QUESTION))
 
 
 def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm, reader) -> None:
@@ -178,7 +200,7 @@ def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm, reader) 
     )
     run = run_of(image, reader=lambda: reader, question="Trifft die Kugel den Würfel?")
     found = run.stage("grounding", ground)
-    motion = run.stage("motion", read_motion, found, run.hints)
+    motion = run.stage("motion", settle_motion, found, run.read_motion)
     assert motion.cue == "trail"
     assert [round(x) for x, _ in motion.trail] == pytest.approx([120, 215], abs=2)
     # The earlier positions are taken out of the image.
@@ -186,10 +208,12 @@ def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm, reader) 
 
 
 @pytest.mark.parametrize("source", ["request", "mllm"])
-def test_without_hints_the_motion_is_asked_for_with_the_box_that_is_known(source: str, mllm, reader, scene) -> None:
+def test_the_motion_alone_is_asked_for_with_the_box_that_is_known(source: Source, mllm, reader, scene) -> None:
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    asked = ReaderInput(scene, QUESTION)
-    assert reader.read_motion(asked, grounding(source), None).direction is not None
+    asked = ReaderInput(scene, QUESTION, given=known(source))
+    result = reader.read(asked)
+    assert motion_of(result).direction is not None
+    assert result.reading.model_copy(update={"motion": None}) == Reading(), "and nothing else is said"
     assert asked.calls.prompts.keys() == {"identify", "locate", "looking"}
     assert asked.calls.usage == Usage(calls=2, input_tokens=200, output_tokens=20)
     schema = mllm.asked[-1]["response_format"]["json_schema"]["schema"]
@@ -197,14 +221,14 @@ def test_without_hints_the_motion_is_asked_for_with_the_box_that_is_known(source
     assert "`changes`" not in mllm.text(0), "the question's changes are known with the places"
     assert "in the box [" in mllm.text(-1)
     mllm.say(json.dumps(BALL | {"also_moving": [{"object": "cup", "kind": "fall"}]}), json.dumps(PLACE))
-    motion = reader.read_motion(asked, grounding(source), None)
-    assert motion.others == ()
-    assert "'cup'" in motion.warnings[0]
+    result = reader.read(asked)
+    assert motion_of(result).others == ()
+    assert any("'cup'" in warning for warning in result.warnings)
 
 
 def test_large_images_are_made_smaller_and_pixels_count_in_what_was_sent(mllm, make) -> None:
-    asked = ReaderInput(Scene(floor(4000, 2000)), "Where does the car go?")
-    place = Grounding(object="car", point=(2000, 1000), bbox=(1600, 800, 2400, 1200), source="request")
+    place = GroundingRequest(object="car", bbox=(1600, 800, 2400, 1200))
+    asked = ReaderInput(Scene(floor(4000, 2000)), "Where does the car go?", given=Reading(grounding=place))
     way = np.array([math.cos(0.3), math.sin(0.3)])
 
     def line(handler) -> None:
@@ -214,7 +238,7 @@ def test_large_images_are_made_smaller_and_pixels_count_in_what_was_sent(mllm, m
         handler.send(200, say.completion(json.dumps({"reasoning": "", "cue": "orientation", "direction": ends})))
 
     mllm.say(json.dumps(BALL | {"object": "the car"}), line)
-    direction = make("qwen2.5-vl-7b").read_motion(asked, place, None).direction
+    direction = motion_of(make("qwen2.5-vl-7b").read(asked)).direction
     assert direction is not None
     assert angle_between(direction, (way[0], way[1])) < 0.2
     height, width = mllm.images(-1)[0].shape[:2]
@@ -229,22 +253,20 @@ def test_large_images_are_made_smaller_and_pixels_count_in_what_was_sent(mllm, m
 # Places, and what else is not asked for
 
 
-def placed(
-    mllm: MllmServer, reader: MllmReader, scene: Scene, reply: dict[str, Any]
-) -> tuple[GroundingReading, MotionReading]:
+def placed(mllm: MllmServer, reader: MllmReader, scene: Scene, reply: dict[str, Any]) -> ReadResult:
     mllm.say(json.dumps(BALL | {"others": ["vase"]}), json.dumps(PLACE | LINE | reply))
     asked = ReaderInput(scene, "If the red ball rolls to the right, will it hit the vase?")
-    reading = reader.ground(asked)
-    place = grounding("mllm").model_copy(update={"bbox": reading.bbox})
-    motion = reader.read_motion(asked, place, reading.hints)
+    result = reader.read(asked)
     assert len(mllm.asked) == 2, "nothing was asked again"
-    return reading, motion
+    return result
 
 
 def test_guesses_are_neither_asked_for_nor_read(mllm, reader, scene) -> None:
     guesses = {"size": 0.2, "shape": "ball", "depth_degrees": 30, "speed": "slowly", "others": [VASE]}
-    reading, motion = placed(mllm, reader, scene, guesses)
-    assert (reading.prior, reading.others[0].prior, reading.warnings) == (None, None, ())
+    result = placed(mllm, reader, scene, guesses)
+    motion, mover = motion_of(result), result.reading.grounding
+    assert mover is not None
+    assert (mover.prior, result.reading.objects[0].prior, result.warnings) == (None, None, ())
     assert (motion.depth, motion.depth_deviation, motion.speed) == (0.0, None, None)
     assert motion.direction == pytest.approx((0.37 * 640, 0))
     assert motion.direction_deviation == 20
@@ -254,12 +276,12 @@ def test_each_object_has_one_box_and_obstacles_are_few(mllm, reader, scene) -> N
     boxes = [{"label": f"block {n}", "bbox_2d": [60 * n, 800, 60 * n + 40, 950]} for n in range(14)]
     mover = {"label": "red ball", "bbox_2d": [175, 395, 297, 590]}
     doubles = [mover, mover | {"label": "ball again"}, {"label": "vase as well", "bbox_2d": [705, 300, 800, 600]}]
-    reading, _ = placed(mllm, reader, scene, {"others": [*doubles, *boxes, VASE]})
-    assert [other.object for other in reading.others[:2]] == ["vase", "block 0"]
-    assert len(reading.others) == 1 + 12
-    for warning, name in zip(reading.warnings, ("ball again", "vase as well", "block 12", "block 13"), strict=True):
+    result = placed(mllm, reader, scene, {"others": [*doubles, *boxes, VASE]})
+    assert names(result)[:2] == ["vase", "block 0"]
+    assert len(result.reading.objects) == 1 + 12
+    for warning, name in zip(result.warnings, ("ball again", "vase as well", "block 12", "block 13"), strict=True):
         assert f"'{name}'" in warning
-    assert not reading.objects_complete
+    assert not result.reading.objects_complete
     assert "> vase" in mllm.text(1).splitlines()
 
 
@@ -270,23 +292,25 @@ def test_a_part_that_cannot_be_used_is_asked_for_once_more_then_left_out_aloud(m
         ([unread, whole], ["vase"], 0), ([unread, unread], [], 1), ([unread, "no idea"], [], 1),
     ):  # fmt: skip
         mllm.say(named, *script)
-        reading = reader.ground(ReaderInput(scene, QUESTION))
+        result = reader.read(ReaderInput(scene, QUESTION))
         assert len(mllm.asked) == 3
         assert "without a label and a box" in mllm.text(-1)
-        assert [other.object for other in reading.others] == found
-        assert len(reading.warnings) == warned
+        assert names(result) == found
+        assert len(result.warnings) == warned
 
 
 def test_objections_to_a_reading_are_put_to_the_model(mllm, reader, scene) -> None:
     objection = "The box of 'red ball' lies\nwhere nothing stands."
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    hints = reader.ground(ReaderInput(scene, QUESTION, objections=(objection,))).hints
+    reader.read(ReaderInput(scene, QUESTION, objections=(objection,)))
     for call in (0, 1):
         assert "> The box of 'red ball' lies where nothing stands." in mllm.text(call).splitlines()
     against = json.dumps({"cue": "arrow", "sense": "against", "start": [230, 500], "end": [30, 500]})
     mllm.say(against)
-    asked = ReaderInput(scene, QUESTION, objections=("It moves the other way.",))
-    motion = reader.read_motion(asked, grounding("mllm"), stored(hints))
+    asked = ReaderInput(
+        scene, QUESTION, given=known(motion={"kind": "linear"}), objections=("It moves the other way.",)
+    )
+    motion = motion_of(reader.read(asked))
     assert "> It moves the other way." in mllm.text(0).splitlines()
     assert len(mllm.asked) == 1
     assert motion.along_arrow is False
@@ -295,8 +319,10 @@ def test_objections_to_a_reading_are_put_to_the_model(mllm, reader, scene) -> No
 
 def test_what_the_caller_says_is_not_asked(mllm, reader, scene) -> None:
     mllm.say(json.dumps({"object": "red ball", "others": []}), json.dumps(PLACE))
-    given = ReaderInput(scene, QUESTION, motion_wanted=False, asked_wanted=False, changes_wanted=False)
-    reader.ground(given)
+    said = Reading(
+        asked=Asked(relation="touches"), interventions=(InterventionRequest(kind="remove", object="red ball"),)
+    )
+    reader.read(ReaderInput(scene, QUESTION, given=said, motion_wanted=False))
     schema = mllm.asked[0]["response_format"]["json_schema"]["schema"]
     assert list(schema["properties"]) == ["reasoning", "object", "others", "language"]
     assert not any(f"`{field}`" in mllm.text(0) for field in ("asked", "changes", "kind", "then"))
@@ -305,20 +331,21 @@ def test_what_the_caller_says_is_not_asked(mllm, reader, scene) -> None:
 ROLLS = "If the red ball rolls to the right, will it hit the vase?"
 
 
-def words_of(question: str) -> QuestionReading:
+def words_of(question: str) -> WordsReading:
     return EmbeddedReader().read_question(question)
 
 
 def test_one_call_is_enough_where_the_words_say_the_rest(mllm, reader, scene) -> None:
     mllm.say(json.dumps({"objects": [{"bbox_2d": [172, 390, 297, 590], "label": "red ball"}, VASE], **LINE}))
-    reading = reader.ground(ReaderInput(scene, ROLLS, words=words_of(ROLLS)))
+    result = reader.read(ReaderInput(scene, ROLLS, words=words_of(ROLLS)))
     assert len(mllm.asked) == 1
     assert "The object that moves is this one" in mllm.text(0)
     assert {"> red ball", "> vase"} <= set(mllm.text(0).splitlines())
-    assert (reading.object, reading.asked) == ("red ball", Asked(relation="touches", target="vase"))
-    assert [(each.object, each.role) for each in reading.others] == [("vase", "target")]
-    assert reading.hints is not None
-    assert reading.hints.kind == "linear"
+    reading = result.reading
+    assert reading.grounding is not None
+    assert (reading.grounding.object, reading.asked) == ("red ball", Asked(relation="touches", target="vase"))
+    assert [(each.object, each.role) for each in reading.objects] == [("vase", "target")]
+    assert motion_of(result).kind == "linear"
 
 
 @pytest.mark.parametrize(
@@ -336,7 +363,7 @@ def test_one_call_is_enough_where_the_words_say_the_rest(mllm, reader, scene) ->
 )
 def test_words_that_leave_something_open_do_not_spare_a_call(question: str, mllm, reader, scene) -> None:
     mllm.say(json.dumps(BALL), json.dumps(PLACE | {"others": [VASE]}))
-    reader.ground(ReaderInput(scene, question, words=words_of(question)))
+    reader.read(ReaderInput(scene, question, words=words_of(question)))
     assert "Find out which one object" in mllm.text(0)
 
 
@@ -345,7 +372,7 @@ def test_of_several_arrows_the_model_says_which_is_meant(mllm, reader, scene) ->
     for y in (60, 340):
         image = DrawnArrow((200, y), 0.0, 110, 5, (30, 160, 30), "filled").on(image)
     mllm.say(json.dumps(BALL | {"others": ["vase"]}), json.dumps(PLACE | {"others": [VASE]}))
-    reading = reader.ground(ReaderInput(Scene(image), ROLLS, words=words_of(ROLLS)))
+    reading = reader.read(ReaderInput(Scene(image), ROLLS, words=words_of(ROLLS))).reading
     assert "`asked`" not in mllm.text(0), "the words say it"
     assert len(mllm.asked) == 2
     assert reading.asked == Asked(relation="touches", target="vase")
@@ -373,7 +400,7 @@ def test_a_drawn_arrow_is_surer_than_the_reader(
     mllm.say(json.dumps(asked), json.dumps(PLACE | {"along_arrow": along, "direction": ends, "others": [block]}))
     run = run_of(drawn, reader=lambda: reader, question="Rollt die Kugel gegen den Block?")
     found = run.stage("grounding", ground)
-    motion = run.stage("motion", read_motion, found, run.hints)
+    motion = run.stage("motion", settle_motion, found, run.read_motion)
     assert motion.direction is not None
     assert angle_between(motion.direction, expected) < 2.5
     assert (motion.cue, motion.other_direction is not None) == ("arrow", is_doubtful)
@@ -488,7 +515,7 @@ def test_a_canceled_run_and_a_reader_that_closes_wait_no_longer(mllm, make, scen
             raise Canceled("The caller left.")
 
     with held(mllm), pytest.raises(Canceled):
-        closing.ground(ReaderInput(scene, QUESTION, check_canceled=canceled))
+        closing.read(ReaderInput(scene, QUESTION, check_canceled=canceled))
 
     def close() -> None:
         eventually(lambda: mllm.asked)
@@ -563,9 +590,65 @@ def test_the_cpu_is_held_for_work_and_never_while_the_model_is_waited_for(mllm, 
 
     mllm.say(reply)
     asked = ReaderInput(scene, QUESTION, cpu=cpu)
-    hints = reader.ground(asked).hints
-    reader.read_motion(asked, grounding("mllm"), hints)
+    reader.read(asked)
     reader.answer(asked, (), None, None, votes=2)
     assert held == 0
     assert set(seen) == {0, 1}  # no call while it was held, and not taken twice
     assert seen.count(0) == len(mllm.asked) == 4
+
+
+NAMES = st.one_of(
+    st.sampled_from(("red ball", "vase", "cup", "\u200b", "\u200bx", "x" * 130, "", "blue  vase", None, 5)), st.text()
+)
+AMOUNTS = st.sampled_from(
+    ("0 px", "-2 m", "1e9 km", "1e12 px/s", "2 m/s", "3 h", "5000 s", "0.000001 ms", 1e300, "NaN")
+)
+CHANGES = st.fixed_dictionaries(
+    {
+        "kind": st.sampled_from(("remove", "place", "put")),
+        "object": NAMES,
+        "relation": st.sampled_from(("into", "between", "beside", None)),
+        "targets": st.lists(NAMES, max_size=3),
+    }
+)
+REPLIES = st.fixed_dictionaries(
+    {
+        "object": st.sampled_from(("red ball", "r" * 120)),
+        "others": st.lists(NAMES, max_size=3),
+        "kind": st.sampled_from(("linear", "projectile", "fall", "static", "place", None)),
+    },
+    optional={
+        "changes": st.lists(CHANGES, max_size=2),
+        "asked": st.fixed_dictionaries({"relation": st.just("touches"), "target": NAMES, "within": AMOUNTS}),
+        "speed": AMOUNTS,
+        "distance": AMOUNTS,
+        "duration": AMOUNTS,
+        "until": st.sampled_from(("contact", "never")),
+        "then": st.lists(st.fixed_dictionaries({"way": st.just("left"), "distance": AMOUNTS, "duration": AMOUNTS})),
+        "also_moving": st.lists(
+            st.fixed_dictionaries({"object": NAMES, "kind": st.sampled_from(("fall", "static")), "way": NAMES})
+        ),
+    },
+)
+BOXES = st.lists(
+    st.fixed_dictionaries({"label": NAMES, "bbox_2d": st.lists(st.integers(0, 1000), min_size=4, max_size=4)})
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(REPLIES, BOXES)
+def test_whatever_the_model_replies_is_read_or_refused(
+    mllm, reader, scene, reply: dict[str, Any], boxes: list[dict[str, Any]]
+) -> None:
+    """Names, numbers and lists beyond the limits of a request among them."""
+    scale = json.dumps({"metres": 1000, "down": "top"})
+
+    def replies(handler) -> None:
+        text = mllm.text(-1)
+        said = json.dumps(reply) if "Find out which one object" in text else scale if "`metres`" in text else where
+        handler.send(200, say.completion(said))
+
+    where = json.dumps(PLACE | LINE | {"others": boxes})
+    mllm.say(replies)
+    with suppress(CowError):
+        Reading.model_validate(reader.read(ReaderInput(scene, "Does it go 3 m?")).reading.model_dump())

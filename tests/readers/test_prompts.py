@@ -11,10 +11,10 @@ import pytest
 from drawn import floor
 from jinja2.exceptions import SecurityError
 
-from cow_service.readers.base import Quantity, ReaderInput
+from cow_service.readers.base import ReaderInput
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import Prompt, load_prompt, parse_prompt
-from cow_service.records import Asked
+from cow_service.records import Asked, Speed
 from cow_service.stages.motion import motion_sentence
 from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import PROMPTS, load_families
@@ -91,7 +91,8 @@ def test_a_prompt_asks_for_the_fields_of_its_schema_and_shows_a_reply_that_is_re
     shown = {name: load_prompt(name).render(**call.inputs).rpartition("Such as: ")[2] for name, call in made.items()}
     named, found, scale = (made[name].parse(shown[name]) for name in ("identify", "locate", "scale"))
     assert (named.object, named.others, named.kind) == ("red car", ("mug", "vase"), "linear")
-    assert (named.asked, named.speed) == (Asked(relation="touches", target="mug", negated=True), Quantity(20, "px/s"))
+    assert named.asked == Asked(relation="touches", target="mug", negated=True)
+    assert named.speed == Speed(value=20, unit="px/s")
     assert [(each.kind, each.object) for each in named.changes] == [("remove", "vase")]
     assert found.bbox == pytest.approx((128, 240, 192, 288), abs=0.7)
     assert [(each.object, each.bbox) for each in found.others] == [

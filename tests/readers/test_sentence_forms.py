@@ -13,7 +13,7 @@ from refusals import refused
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.english.questions import parse, rewordings
 from cow_service.readers.embedded.reader import EmbeddedReader
-from cow_service.records import LocatedObject, ObjectPrior
+from cow_service.records import Asked, InterventionRequest, ObjectRequest, Reading
 from cow_service.vision.scene import Scene
 
 
@@ -90,7 +90,7 @@ def test_what_is_not_read_is_refused_with_questions_that_are() -> None:
     assert parse(question).asked is None
     assert any("thwarted" in words for words in parse(question).unread)
     with refused("cannot-ground") as caught:
-        EmbeddedReader().ground(ReaderInput(scene, "Can the red ball thwart the blue cube?"))
+        EmbeddedReader().read(ReaderInput(scene, "Can the red ball thwart the blue cube?"))
     assert "'can the red ball thwart the blue cube'" in caught.value.detail.lower()
     for like in rewordings(parse("Can the red ball thwart the blue cube?")):
         assert parse(like).asked is not None
@@ -99,10 +99,14 @@ def test_what_is_not_read_is_refused_with_questions_that_are() -> None:
 
 def test_what_is_given_is_not_parsed_for() -> None:
     scene = Scene(jpeg(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200))))
-    known = (LocatedObject(object="gizmo", bbox=(110, 160, 190, 240), prior=ObjectPrior(shape="sphere")),)
-    nothing = {"asked_wanted": False, "changes_wanted": False, "motion_wanted": False}
-    reading = EmbeddedReader().ground(ReaderInput(scene, "The gizmo, does it flummox?", known=known, **nothing))
-    assert (reading.object, reading.bbox, reading.prior) == ("gizmo", known[0].bbox, known[0].prior)
-    assert (reading.warnings, reading.is_doubtful) == ((), False)
+    gizmo = ObjectRequest(object="gizmo", bbox=(110, 160, 190, 240), shape="sphere")
+    question = "The gizmo, does it flummox?"
+    change = InterventionRequest(kind="remove", object="blue cube")
+    said = Reading(objects=(gizmo,), asked=Asked(relation="touches"), interventions=(change,))
+    result = EmbeddedReader().read(ReaderInput(scene, question, given=said, motion_wanted=False))
+    mover = result.reading.grounding
+    assert mover is not None
+    assert (mover.object, mover.bbox, mover.prior) == ("gizmo", gizmo.bbox, gizmo.prior)
+    assert (result.warnings, mover.is_doubtful) == ((), False)
     with refused("cannot-ground"):
-        EmbeddedReader().ground(ReaderInput(scene, "The gizmo, does it flummox?", known=known))
+        EmbeddedReader().read(ReaderInput(scene, question, given=Reading(objects=(gizmo,))))

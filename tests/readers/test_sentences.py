@@ -17,7 +17,7 @@ from cow_service.readers.embedded.answers import choose_option
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding, Motion, Trajectory
 from cow_service.stages.grounding import ground
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.trajectory import compute_trajectory
 
 ASKED = (
@@ -86,6 +86,6 @@ def contradictions(grounding: Grounding, motion: Motion, told: Trajectory) -> li
 def test_no_sentence_contradicts_what_happens(seed: int, question: str) -> None:
     run = run_of(drawing(seed), reader=EmbeddedReader, question=question)
     grounded = ground(run)
-    motion = read_motion(run, grounded.value, grounded.hints)
+    motion = settle_motion(run, grounded.value, grounded.motion)
     told = compute_trajectory(run, grounded.value, motion.value).value
     assert contradictions(grounded.value, motion.value, told) == []

@@ -347,12 +347,13 @@ def test_a_question_is_answered_as_the_page_sets_it_up(
     given = ReaderInput(scene=SCENE, question=QUESTION)
     imagined = Imagined(simulated(YES), (PIXELS,) * 4)
     try:
-        grounding = reader.ground(given)
+        mover = reader.read(given).reading.grounding
         (answer,) = reader.answer(given, OPTIONS, None, imagined, 1)
     finally:
         reader.close()
-    assert (grounding.object, answer.answer, replies) == ("red ball", "A", [])
-    assert grounding.bbox == pytest.approx((110, 160, 190, 240), abs=2)
+    assert mover is not None
+    assert (mover.object, answer.answer, replies) == ("red ball", "A", [])
+    assert mover.bbox == pytest.approx((110, 160, 190, 240), abs=2)
     assert len(mllm.asked) == 3 + habit.lost <= 3 + LIMIT
     (kept,) = (json.loads(path.read_text()) for path in (tmp_path / "mllm").iterdir())
     assert kept == model.first.model_dump() | habit.learned
@@ -399,7 +400,7 @@ def test_a_failure_is_told_in_the_words_of_the_page(
     reader = create(settings.model_copy(update={"mllm_budget": 0.5}))  # which is what repeats would take
     mllm.say(lambda handler: handler.send(status, body))
     with refused(code) as caught:
-        reader.ground(ReaderInput(scene=SCENE, question=QUESTION))
+        reader.read(ReaderInput(scene=SCENE, question=QUESTION))
     reader.close()
     assert reason in caught.value.detail
     assert f"| `{code}`: {reason}" in PAGES[page]

@@ -12,8 +12,8 @@ from refusals import refused
 from runs import run_of
 
 from cow_service.media.images import decode_own, encode_png
-from cow_service.readers.base import GroundingReading
-from cow_service.records import LocatedObject
+from cow_service.readers.base import ReadResult
+from cow_service.records import GroundingRequest, ObjectRequest, Reading
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
 from cow_service.stages.grounding import ground
@@ -31,9 +31,9 @@ class OneReader:
     source = "embedded"
     heeds_objections = False
 
-    def ground(self, given):
-        others = (LocatedObject(object="blue cube", bbox=CUBE), LocatedObject(object="vase", bbox=(20, 300, 60, 390)))
-        return GroundingReading("red ball", MOVER, others=others)
+    def read(self, given):
+        others = (ObjectRequest(object="blue cube", bbox=CUBE), ObjectRequest(object="vase", bbox=(20, 300, 60, 390)))
+        return ReadResult(Reading(grounding=GroundingRequest(object="red ball", bbox=MOVER), objects=others))
 
 
 def kept(run, mask: np.ndarray) -> dict[str, str]:

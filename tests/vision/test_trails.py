@@ -19,7 +19,7 @@ from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_directi
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
 from cow_service.stages.grounding import ground
-from cow_service.stages.motion import read_motion
+from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
 from cow_service.vision.circles import Edges
 from cow_service.vision.regions import measure
@@ -87,7 +87,7 @@ def grounded(image: np.ndarray, question: str) -> tuple[Run, Grounding]:
 @pytest.mark.slow
 def test_the_question_tells_the_end_and_the_trail_the_motion() -> None:
     run, grounding = grounded(OPAQUE, ", the last of which is the rightmost")
-    motion = run.stage("motion", read_motion, grounding, run.hints)
+    motion = run.stage("motion", settle_motion, grounding, run.read_motion)
     assert math.dist(grounding.point, PLACES[-1]) < 2
     assert (motion.kind, motion.cue) == ("projectile", "trail")
     assert np.abs(np.array(motion.trail) - np.array(PLACES[:-1])).max() < 1.5
@@ -109,7 +109,7 @@ def test_an_end_that_nothing_tells_is_that_nearest_to_what_is_asked_about() -> N
 def test_a_trail_that_is_not_there_is_refused() -> None:
     run, grounding = grounded(ball(SCENE, (300, 110), 26, ORANGE), "")
     with refused("cannot-read-direction"):
-        run.stage("motion", read_motion, grounding, run.hints)
+        run.stage("motion", settle_motion, grounding, run.read_motion)
 
 
 def test_what_rolls_goes_on_straight() -> None:

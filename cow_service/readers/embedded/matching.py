@@ -3,7 +3,8 @@
 A thing is meant by positive evidence alone. What is merely left is not meant.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 import numpy as np
@@ -159,14 +160,18 @@ def things_of_kinds(
         if not fitting and kind in kinds[: len(among)]:
             told = f"Which things '{kind.phrase.text}' are, the image does not tell for certain."
             raise CannotGround(f"{told} Seen: {describe(regions)}.", remedy=GIVE_OBJECT)
-        found += named_by_colour(fitting, kind)
+        found += named_by_colour(fitting, kind, () if question.mover is None else (question.mover.text,))
     return found
 
 
-def named_by_colour(regions: Sequence[Region], kind: Kind) -> list[ObjectRequest]:
-    """Things of a kind, each under its colour."""
-    name = kind.phrase.head or "object"
-    return [ObjectRequest(object=f"{each.colour} {name}", bbox=each.bbox) for each in regions]
+def named_by_colour(regions: Sequence[Region], kind: Kind, taken: Iterable[str]) -> list[ObjectRequest]:
+    """Things of a kind, each under its colour; with a number where that name is `taken`."""
+    count, found = Counter(taken), list[ObjectRequest]()
+    for each in regions:
+        name = f"{each.colour} {kind.phrase.head or 'object'}"
+        count[name] += 1
+        found.append(ObjectRequest(object=name if count[name] == 1 else f"{name} {count[name]}", bbox=each.bbox))
+    return found
 
 
 def nouns_of(question: Question, sought: Sequence[str] = ()) -> tuple[str, ...]:

@@ -56,7 +56,7 @@ def settled_kind(question: Question) -> MotionKind | None:
     )
     is_open = words.quantities or words.steps or words.others or words.trail or words.topples or words.is_contradictory
     is_open = is_open or (words.kind == "fall" and not words.in_air)
-    is_open = is_open or any(change.kind == "place" and not change.targets for change in question.changes)
+    is_open = is_open or not all(change.is_whole for change in question.changes)
     if asked is None or asked.among or asked.form.startswith("which") or is_open or not is_named:
         return None
     return words.kind
@@ -214,10 +214,15 @@ def read_motion(
         elif words.depth:
             raise _refused("The image is a drawing seen from the side: nothing moves towards the viewer, or away.")
     way = said_way(words, kind)
+    if words.along_arrow is not None:  # which is surer than the words beside it
+        way.pop("direction", None)
     if kind in DIRECTED_KINDS and not way and question.names_direction:
         raise _refused("Which way it moves was not understood in the question.")
     goal = goal_of(scene, words.towards, mover, things) if "towards" in way and words.towards else None
-    far = None if goal is None else math.hypot(*way_to(goal, bbox, kind == "linear"))
+    ahead = None if goal is None else way_to(goal, bbox, kind == "linear")
+    if ahead is not None and all(each.object != way["towards"] for each in things):  # only here it is known where
+        way |= {"direction": ahead, "cue": "text"}
+    far = None if ahead is None else math.hypot(*ahead)
     try:
         speed, distance, duration, until = quantities(words.quantities, far, bbox)
         said = {"speed": speed if kind in DIRECTED_KINDS else None, "distance": distance, "duration": duration}

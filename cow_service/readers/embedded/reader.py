@@ -43,7 +43,8 @@ class EmbeddedReader:
         way = {} if read.unread_motion or said.is_contradictory else motions.said_way(said, said.kind or "linear")
         kind = motions.settled_kind(read)
         return base.WordsReading(
-            records.Reading(
+            # Not checked: the stage tells what is wrong with a change that cannot be made.
+            records.Reading.model_construct(
                 grounding=None if mover is None else records.GroundingRequest(object=mover),
                 motion=records.MotionRequest.model_validate({"kind": kind, **way}),
                 objects=tuple(records.ObjectRequest(object=each.text) for each in read.others[: records.MAX_OBJECTS]),
@@ -79,7 +80,8 @@ class EmbeddedReader:
         """
         question = parse(given.question, names_of(given))
         mover, place, is_open = question.mover, given.given.grounding, given.motion_wanted
-        if mover is None or (is_open and not question.says_motion):
+        is_placed = place is not None and place.has_place  # of such a thing a drawn arrow tells the motion, too
+        if not is_placed and (mover is None or (is_open and not question.says_motion)):
             words = ("', '".join(question.unread) or given.question)[:MAX_UNREAD]
             like = " Or: ".join(rewordings(question) or ("If the red ball moves to the left, will it hit the vase?",))
             fault = (
@@ -87,10 +89,9 @@ class EmbeddedReader:
             )
             raise CannotGround(f"{fault} Ask like: {like}", remedy=LOCATE_IT)
         with given.cpu():
-            if place is None or not place.has_place:
+            scene, found = given.scene, base.ReadResult(records.Reading(grounding=place))
+            if not is_placed and mover is not None:
                 scene, found = self._located(given, question, mover)
-            else:
-                scene, found = given.scene, base.ReadResult(records.Reading(grounding=place))
             if not is_open or found.reading.grounding is None:
                 return found
             things = (*given.known, *found.reading.objects)
@@ -202,6 +203,8 @@ def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
             raise CannotGround(f"The question takes '{name}' away and says or asks what it does: ask one of both.")
         if change.object in change.targets:
             raise CannotGround(f"The question puts '{name}' {change.relation} itself: name another thing.")
+        if len(set(change.targets)) < len(change.targets):
+            raise CannotGround(f"The question puts '{name}' {change.relation} one thing: name another one, too.")
 
 
 class _Finder:
@@ -296,7 +299,7 @@ class _Finder:
         free = self.without(list(self.taken.values()))
         if kind is not None and kind.count in (None, 2) and taken is None:
             kind = replace(kind, count=kind.count or count)
-            things = matching.named_by_colour(matching.match_several(free, kind), kind)
+            things = matching.named_by_colour(matching.match_several(free, kind), kind, self.taken)
         else:
             region = matching.match_one(free, phrase) if kind is None and taken is None else None
             box = region.bbox if region is not None else taken

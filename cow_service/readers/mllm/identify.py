@@ -142,7 +142,9 @@ class Change(replies.Reply):
 
     @pydantic.model_validator(mode="after")
     def _check_place(self) -> Self:
-        if self.kind == "place" and (self.relation is None or not self.targets):
+        count = 2 if self.relation == "between" else 1
+        things = {replies.name_words(each) for each in (self.object, *self.targets)}
+        if self.kind == "place" and (self.relation is None or not len(self.targets) == len(things) - 1 == count):
             raise ValueError("says not where to")
         return self
 
@@ -262,9 +264,11 @@ class Identified(replies.Reply):
             {"direction": each.way[0], "depth": each.way[1], "distance": each.distance, "duration": each.duration}
             for each in self.then
         )
+        kind = self.kind or "linear"
+        said = (name for name in SAID_ALIKE if name != "speed" or kind in records.DIRECTED_KINDS)
         return {
-            "kind": self.kind or "linear",
-            **{name: value for name in SAID_ALIKE if (value := getattr(self, name)) is not None},
+            "kind": kind,
+            **{name: value for name in said if (value := getattr(self, name)) is not None},
             "steps": tuple(records.MotionStepRequest.model_validate(each) for each in steps),
             "others": tuple(each.as_said for each in self.also_moving),
         }
@@ -291,9 +295,11 @@ def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int
     asked = None if given.words is None or given.given.asked is not None else given.words.reading.asked
     if asked is not None and (asked.among or asked.form.startswith("which")):
         asked = None  # the words do not say which things these are
+    place = given.given.grounding
+    is_placed = place is not None and place.bbox is not None  # then all but the motion is known
     said = frozenset((
-        *(() if given.given.asked is None and asked is None else ("asked",)),
-        *(("changes",) if given.given.interventions else ()),
+        *(("asked",) if is_placed or asked is not None or given.given.asked is not None else ()),
+        *(("changes",) if is_placed or given.given.interventions else ()),
         *(() if given.motion_wanted else _MOTION),
         *(() if has_numbers else _NUMBERS),
     ))  # fmt: skip

@@ -91,6 +91,11 @@ def _quantity(kind: type[records.Speed] | type[records.Distance], *units: str) -
     return _optional(f"a number with {' or '.join(units)}", read)
 
 
+def _seconds(written: object) -> float | None:
+    value = positive(written, "s")
+    return value if value is not None and value <= records.MAX_SECONDS else None
+
+
 Distance = Annotated[records.Distance | None, *_quantity(records.Distance, "px", "m")]
 Speed = Annotated[records.Speed | None, *_quantity(records.Speed, "px/s", "m/s")]
-Seconds = Annotated[float | None, *_optional("a time in seconds", lambda written: positive(written, "s"))]
+Seconds = Annotated[float | None, *_optional(f"a time of up to {records.MAX_SECONDS} s", _seconds)]

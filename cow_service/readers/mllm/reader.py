@@ -174,8 +174,10 @@ class MllmReader:
             ),
             objects_complete=located.objects_complete and not doubles,
             interventions=tuple(
-                records.InterventionRequest(
-                    kind=each.kind, object=each.object, relation=each.relation, targets=each.targets
+                records.InterventionRequest(kind="remove", object=each.object)
+                if each.kind == "remove"
+                else records.InterventionRequest(
+                    kind="place", object=each.object, relation=each.relation, targets=each.targets
                 )
                 for each in changes
             ),

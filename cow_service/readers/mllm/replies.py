@@ -209,8 +209,8 @@ def truth_of(value: object) -> bool | None:
 
 
 def text_of(value: object) -> str:
-    """A field that should hold words, as one line, without what no text may hold; empty if it holds something else."""
-    if not isinstance(value, str):
+    """A field that should hold words, as one line, without what no text may hold; empty if it holds nothing visible."""
+    if not isinstance(value, str) or not any(each.isprintable() and not each.isspace() for each in value):
         return ""
     return " ".join(value.encode(errors="replace").decode().replace("\0", " ").split())
 

@@ -11,7 +11,17 @@ from typing import cast
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
 from cow_service.readers.options import plain, says_not_sure, split_options, without_reply_form
-from cow_service.records import Asked, AskedRelation, InterventionKind, MotionKind, PlaceRelation, Vector
+from cow_service.records import (
+    MAX_OBJECT_WORDS,
+    MAX_OBJECTS,
+    MAX_WITHIN,
+    Asked,
+    AskedRelation,
+    InterventionKind,
+    MotionKind,
+    PlaceRelation,
+    Vector,
+)
 
 MAX_WORDS = 240  # of a question that is read
 _THING = re.compile(r"X\d+")
@@ -56,6 +66,12 @@ class ChangeWords:
     relation: PlaceRelation | None = None
     targets: tuple[lex.ObjectPhrase, ...] = ()
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether it tells what is put where, each of them another thing."""
+        count = 2 if self.relation == "between" else 1
+        return self.kind == "remove" or len(self.targets) + 1 == len({self.object, *self.targets}) == count + 1
+
 
 @dataclass(frozen=True)
 class Question:
@@ -83,7 +99,10 @@ def parse(question: str, names: tuple[str, ...] = ()) -> Question:
     if len(text.split()) > MAX_WORDS:
         return Question(unread=(" ".join(text.split()[MAX_WORDS : MAX_WORDS + 7]),))
     options = [text for _, text in listed.options if not says_not_sure(text)]
-    return _Parser(tokens_of(text, names), options).question()
+    tokens = tokens_of(text, names)
+    if too_long := tuple(each.text for each in tokens.things if len(each.text) > MAX_OBJECT_WORDS):
+        return Question(unread=too_long)
+    return _Parser(tokens, options).question()
 
 
 MOST_OF_A_NAME = 5  # words: what is longer is no name, but words that were not understood
@@ -350,6 +369,9 @@ class _Parser:
             options = [parse_noun_phrase(text) for text in self.options]
             among = listed or ([each for each in options if each is not None] if all(options) else [])
         names_one = form in {"whether", "when", "what-happens", "which-to-remove"}
+        within = min((each.value for each in self.tokens.quantities if each.what == "within"), default=None)
+        if len(among) > MAX_OBJECTS or (within is not None and not 0 < within <= MAX_WITHIN):
+            return None, ()
         asked = Asked(
             form=form,
             relation=relation,
@@ -359,7 +381,7 @@ class _Parser:
             among=tuple(each.text for each in among),
             every=counts == "SOMEOF" if is_negated and asking.is_passive else counts == "ALLOF" and not is_negated,
             partly=relation in {"covers", "covered"} and not {"PARTLY", "SOMETIME"}.isdisjoint(self.plain),
-            within=min((each.value for each in self.tokens.quantities if each.what == "within"), default=None),
+            within=within,
         )
         return asked, tuple(listed or kinds) if form == "which-first" else ()
 
