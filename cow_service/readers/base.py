@@ -70,7 +70,7 @@ class ReaderInput:
 class ReadResult:
     """What a reader says of an image and a question: nothing that was given, and nothing that was not wanted."""
 
-    reading: Reading
+    reading: Reading = NOTHING_SAID
     warnings: tuple[str, ...] = ()
     label: str = ""  # what it calls the thing in the box of the moving object, if not by that name
     place_doubts: tuple[str, ...] = ()  # why its boxes may be wrong, unless the image shows the moving object there

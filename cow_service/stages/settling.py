@@ -124,7 +124,8 @@ def _by_arrow(read: MotionRequest, said: MotionRequest, arrow: Vector | None) ->
 
 
 def _by_words(read: MotionRequest, said: MotionRequest, goal: BBox | None, mover: BBox) -> MotionRequest | None:
-    if said.direction is not None:
+    is_beside_arrow = said.along_arrow is not None and read.direction_deviation is None  # which then must be seen
+    if said.direction is not None and not is_beside_arrow:
         return _taken(read, said.direction, "text", depth=said.depth)
     if goal is None:
         return None

@@ -93,10 +93,11 @@ class EmbeddedReader:
             if not is_placed and mover is not None:
                 scene, found = self._located(given, question, mover)
             if not is_open or found.reading.grounding is None:
-                return found
+                return base.ReadResult() if is_placed else found
             things = (*given.known, *found.reading.objects)
             motion = motions.read_motion(question, scene, found.reading.grounding, things)
-        return replace(found, reading=found.reading.model_copy(update={"motion": motion}))
+        update = {"motion": motion} | ({"grounding": None} if is_placed else {})
+        return replace(found, reading=found.reading.model_copy(update=update))
 
     def _located(
         self, given: base.ReaderInput, question: Question, mover: ObjectPhrase
