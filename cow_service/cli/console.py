@@ -19,7 +19,7 @@ from cow_service import __version__, records
 from cow_service.cli.options import HINTS, read_file, writable
 from cow_service.client import display
 from cow_service.errors import CowError, InvalidRequest
-from cow_service.requests import AnswerRequest, SimulateRequest, Stage, field_errors
+from cow_service.requests import AnswerRequest, SimulateRequest, field_errors
 from cow_service.service import Service
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ def run_request(
     with Progress(TextColumn("{task.description:<10}"), BarColumn(24), console=console, transient=True) as bars:
         bar = bars.add_task("loading", total=1.0)  # loading a model takes a while before the first stage
 
-        def show(stage: Stage | None, done: float) -> None:
-            bars.update(bar, description=stage, completed=stage and done)
+        def show(stage: records.Stage | None, done: float) -> None:
+            bars.update(bar, description=stage, completed=stage and records.share_done(kind, stage, done))
 
         is_answer = isinstance(request, AnswerRequest)
         result = service.answer(request, show) if is_answer else service.simulate(request, show)

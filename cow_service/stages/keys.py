@@ -18,7 +18,8 @@ from cow_service.perception.base import PerceptionKind
 from cow_service.readers.base import MotionHints
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import Clip, Grounding, Motion, ReaderInfo, Record, Simulation, Trajectory, Usage, Verdict
-from cow_service.requests import DepthRequest, SimulateRequest, Stage
+from cow_service.records.stages import Stage
+from cow_service.requests import DepthRequest, SimulateRequest
 
 Value = TypeVar("Value")
 

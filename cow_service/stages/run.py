@@ -25,8 +25,8 @@ from cow_service.observability.logging import rfc3339
 from cow_service.perception.base import Embedded, Perception
 from cow_service.physics.geometry import DepthMap
 from cow_service.readers.base import CallLog, MotionHints, QuestionReading, Reader, ReaderInput, WordReader
-from cow_service.records import Artifact, BBox, Cue, Estimate, Grounding, Language, ReaderInfo, Record, Usage
-from cow_service.requests import AnswerRequest, DepthRequest, ImageArtifact, SimulateRequest, Stage
+from cow_service.records import Artifact, BBox, Cue, Estimate, Grounding, Language, ReaderInfo, Record, Stage, Usage
+from cow_service.requests import AnswerRequest, DepthRequest, ImageArtifact, SimulateRequest
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
 from cow_service.vision.types import Mask
