@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from cow_service.cli.options import EXISTING, Url, argument, object_in, open_client, option, printable
-from cow_service.client.options import CONCURRENCY, BatchSettings
+from cow_service.client import CONCURRENCY
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
     from cow_service.client.batches import Question
+    from cow_service.client.options import BatchSettings
     from cow_service.records import JobKind
 
 EXIT_SOME_FAILED = 3
@@ -54,14 +55,14 @@ def batch(
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch had to stop.
     """
-    given = locals()
     from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
 
     asked = _read(questions, object_in(request or "{}", "--request"), kind)
-    settings: dict[str, Any] = {name: given[name] for name in BatchSettings.__annotations__.keys() & given.keys()}
+    settings: BatchSettings = {"concurrency": concurrency, "timeout": timeout, "save": save, "out": out}
+    settings |= {"fresh": fresh, "minimal": minimal, "retry_failed": retry_failed, "only_new": True, "progress": True}
     try:
         with open_client(url) as client:
-            for result in client.map(asked, kind=kind, only_new=True, progress=True, **settings):
+            for result in client.map(asked, kind=kind, **settings):
                 if result.unsaved is not None:
                     typer.echo(printable(f"{result.id}: not saved: {result.unsaved.detail}"), err=True)
     except KeyboardInterrupt:

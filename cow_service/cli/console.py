@@ -41,7 +41,7 @@ def run_request(
     Returns the simulation. `formats` are names of `video.FORMATS`. Raises `InvalidRequest`, which names the wrong
     fields, or says that a format needs the video.
     """
-    if formats and not body["video"]:
+    if formats and not body.get("video", True):
         raise InvalidRequest("--format converts the video: leave --no-video out.")
     # Silent with JSON: standard output is for a program.
     console = Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)

@@ -10,8 +10,9 @@ from mcp_types import CallToolResult, ImageContent, TextContent
 from PIL import Image
 
 from cow_service.client import AsyncClient, display
-from cow_service.mcp.arguments import ARTIFACTS, ToolName, inlined
+from cow_service.mcp.arguments import ARTIFACTS, ToolName
 from cow_service.records import Answer, Body, Simulation
+from cow_service.requests.flat import inlined
 
 # What a model has no use for: thousands of numbers, and who made it how.
 _OF_OBJECT = {"mask": True, "prior": True, "source": True, "role": True}
