@@ -1,7 +1,6 @@
 """`cow eval`: measures whether imagination helps a multimodal LLM, by how much, and at what cost."""
 
 import sys
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -89,9 +88,7 @@ def shared_options(
 
 
 class _WithShared(Sharing):
-    def reader(self) -> Callable[..., dict[str, Any]]:
-        """Of `shared_options`."""
-        return shared_options
+    reader = staticmethod(lambda: shared_options)
 
 
 @app.command(cls=_WithShared, epilog="Example: cow eval run questions.jsonl --mllm openai/gpt-5 --out run")

@@ -63,9 +63,7 @@ COMMANDS = {
 class Sharing(TyperCommand):
     """A command with the options of a function besides its own; `ctx.obj` becomes what the function returns."""
 
-    def reader(self) -> Callable[..., dict[str, Any]]:
-        """The function."""
-        raise NotImplementedError
+    reader: Callable[..., Callable[..., dict[str, Any]]]  # of the command: the function
 
     @cached_property
     def shared(self) -> Any:
@@ -217,31 +215,25 @@ def request_reader(kind: JobKind) -> Callable[..., dict[str, Any]]:
             if not (points := body.get("trajectory", {}).get("points")):
                 raise InvalidRequest("--object needs --point, --box or --trajectory. Or name it in the question.")
             body["grounding"]["point"] = points[0]
-        for name, value in object_in(request or "{}", "--request").items():
+        for name, value in WRITTEN["request"].read(request or "{}").items():
             both = isinstance(value, dict) and isinstance(body.get(name), dict)
             body[name] = body[name] | value if both else value  # such as the focal length of a depth map
         return body
 
-    help = 'Other request fields, such as {"camera": {"pitch": 25}}.'
-    declared = {"request": (Annotated[str | None, option(help, metavar="JSON", shown="none")], None)}
-    declared |= {name: _declared(name, schema) for name, (_, schema) in fields.items()}
-    shown = (
-        Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-        for name, (kind, default) in declared.items()
-    )
-    cast("Any", read).__signature__ = Signature([*shown])
+    options = {name: schema for name, (_, schema) in fields.items()} | {"request": {}}
+    cast("Any", read).__signature__ = Signature([_parameter(name, schema) for name, schema in options.items()])
     return read
 
 
-def _declared(name: str, schema: dict[str, Any]) -> tuple[Any, Any]:
-    """The type and the default of the option of a field, as `WRITTEN` and the field's JSON schema say them."""
+def _parameter(name: str, schema: dict[str, Any]) -> Parameter:
+    """The option of a field, as `WRITTEN` and the field's JSON schema say it."""
     told, default, how = schema.get("description", ""), schema.get("default"), WRITTEN.get(name)
-    if how is not None:
-        declared = option(how.help or told, **(EXISTING if how.kind is Path else {"metavar": how.metavar}))
-        return Annotated[how.kind | None, declared], default if how.kind is int else None
     kind: Any = Literal[tuple(schema["enum"])] if "enum" in schema else TYPES.get(schema.get("type", ""), str)
-    flag = ["--" + name] if default is False else []  # without its opposite
-    return Annotated[kind | None, option(told, *flag)], default
+    declared = option(told, *(["--" + name] if default is False else []))  # of a flag without its opposite
+    if how is not None:
+        kind, default = how.kind, default if how.kind is int else None
+        declared = option(how.help or told, **(EXISTING if kind is Path else {"metavar": how.metavar}))
+    return Parameter(name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind | None, declared], default=default)
 
 
 def _value(name: str, value: Any, schema: dict[str, Any]) -> Any:
@@ -356,6 +348,9 @@ WRITTEN = {  # by the option
         None, lambda path: object_in(read_file(path), path.name), "JSON file: the `trajectory` of a request.", Path
     ),
     "depth": Written(None, lambda path: f"data:image/png;base64,{b64encode(read_file(path)).decode()}", kind=Path),
+    "request": Written(
+        "JSON", partial(object_in, name="--request"), 'Other request fields, such as {"camera": {"pitch": 25}}.', str
+    ),
     "max_side": Written(None, lambda side: side or None, "Longest side of the pictures, px; 0: that of the clip.", int),
     "choice": Written("TEXT", str, "An answer to choose from; may be repeated: A, B, C... Default: the question's."),
     "remove": Written("NAME", _removal, "Object to take away before the motion; may be repeated."),

@@ -73,15 +73,12 @@ FLAT = {  # by the group in the help of a command
 
 def flat_fields(kind: JobKind) -> dict[FlatField, dict[str, Any]]:
     """The flat fields of a kind of request, each with its JSON schema as `inlined` has it."""
-    whole = inlined(REQUESTS[kind].model_json_schema())
-
-    def at(path: str) -> dict[str, Any]:
-        schema = whole
-        for name in path.split("/"):
-            schema = schema["properties"][name]
-        return schema
-
-    return {each: at(each.path) for group in FLAT.values() for each in group if kind in each.kinds}
+    whole, found = inlined(REQUESTS[kind].model_json_schema()), dict[FlatField, dict[str, Any]]()
+    for field in (each for group in FLAT.values() for each in group if kind in each.kinds):
+        found[field] = whole
+        for name in field.path.split("/"):
+            found[field] = found[field]["properties"][name]
+    return found
 
 
 def put(request: dict[str, Any], path: str, value: Any) -> None:
