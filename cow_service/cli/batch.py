@@ -88,10 +88,10 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
     """
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service import requests  # noqa: PLC0415
     from cow_service.client.batches import questions  # noqa: PLC0415
+    from cow_service.requests import field_errors  # noqa: PLC0415
+    from cow_service.requests.flat import REQUESTS  # noqa: PLC0415
 
-    model = requests.AnswerRequest if kind == "answer" else requests.SimulateRequest
     items: list[dict[str, Any]] = []
     faults: list[str] = []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
@@ -101,10 +101,10 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
             item = object_in(line, "it")
             (question,) = questions([item], defaults, path.parent)
             image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
-            model.model_validate({**question.options, "image": image, "question": question.question})
+            REQUESTS[kind].model_validate({**question.options, "image": image, "question": question.question})
             items.append(item)
         except ValidationError as error:
-            wrong = requests.field_errors(error.errors())[0]
+            wrong = field_errors(error.errors())[0]
             faults.append(f"{path.name}, line {number}: {wrong.pointer}: {wrong.detail}.")
         except InvalidRequest as error:
             fields = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]

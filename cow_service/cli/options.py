@@ -307,10 +307,6 @@ def _generator_option(text: str) -> tuple[str, Any]:
     return name, _json_or_text(value)
 
 
-def _removal(thing: str) -> dict[str, object]:
-    return {"kind": "remove", "object": thing}
-
-
 def _placement(text: str) -> dict[str, object]:
     """The intervention that a `--place` option describes."""
     from cow_service.narration.words import PREPOSITIONS, RELATION_WORDS  # noqa: PLC0415 - it imports pydantic
@@ -353,7 +349,7 @@ WRITTEN = {  # by the option
     ),
     "max_side": Written(None, lambda side: side or None, "Longest side of the pictures, px; 0: that of the clip.", int),
     "choice": Written("TEXT", str, "An answer to choose from; may be repeated: A, B, C... Default: the question's."),
-    "remove": Written("NAME", _removal, "Object to take away before the motion; may be repeated."),
+    "remove": Written("NAME", lambda it: {"kind": "remove", "object": it}, "Object to take away; may be repeated."),
     "place": Written("THING RELATION THING", _placement, 'Put an object first: "apple into bowl"; may be repeated.'),
     "other": Written(
         "NAME=X0,Y0,X1,Y1",

@@ -71,13 +71,17 @@ def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, An
             with suppress(ValueError):  # some clients write lists and numbers as JSON in a string
                 value = json.loads(argument)
         if name in _CHANGES:
-            things = value if isinstance(value, list) else [value]
-            changes = [{"object": thing} if name == "remove" else thing for thing in things]
-            changes = [{"kind": name, **change} if isinstance(change, Mapping) else change for change in changes]
-            put(request, "interventions", changes)
+            put(request, "interventions", _changes(name, value))
         else:
             put(request, NESTED.get(name, name), value)
     return request
+
+
+def _changes(kind: str, value: Any) -> list[Any]:
+    """The interventions of a kind that an argument lists, or is the only one of."""
+    things = value if isinstance(value, list) else [value]
+    changes = ({"object": thing} if kind == "remove" else thing for thing in things)
+    return [{"kind": kind, **change} if isinstance(change, Mapping) else change for change in changes]
 
 
 ARTIFACTS = "cow://artifacts/"

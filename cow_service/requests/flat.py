@@ -105,9 +105,8 @@ def inlined(schema: dict[str, Any], exclude: Mapping[str, Any] | None = None) ->
             return walk(choices[0] | {key: one for key, one in schema.items() if key != "anyOf"}, left_out)
         needless = {"$defs", "title"} | ({"default"} if schema.get("default", ...) is None else set[str]())
         found = {key: one for key, one in schema.items() if key not in needless}
-        for key in ("anyOf", "oneOf", "prefixItems"):
-            if key in found:
-                found[key] = [walk(one, left_out) for one in found[key]]
+        forms = {"anyOf", "oneOf", "prefixItems"} & found.keys()
+        found |= {key: [walk(one, left_out) for one in found[key]] for key in forms}
         if isinstance(found.get("items"), dict):
             found["items"] = walk(found["items"], left_out.get("__all__", {}))
         if "properties" in found:
