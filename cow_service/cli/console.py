@@ -225,24 +225,15 @@ def answer_table(answer: records.Answer) -> Table:
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(style="bold")
     table.add_column()
-    table.add_row("answer", _verdict(answer))
-    if sum(answer.votes.values()) > 1:
-        table.add_row("votes", escape(display.votes_words(answer)))
-    if answer.baseline is not None:
-        votes = escape(display.votes_words(answer.baseline))
-        table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {votes}")
-    if answer.gate is not None:
-        table.add_row("before looking", escape(display.gate_words(answer.gate)))
+    colour = "yellow" if answer.not_sure or answer.answer is None else "green"
+    table.add_row("answer", f"[{colour}]{escape(display.describe_answer(answer))}[/]")
+    for name, said in display.answer_facts(answer).items():
+        table.add_row(name, escape(said))
     table.add_row("tokens", display.asked_words(answer.usage, answer.usage_total))
     table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
     model = answer.reader.model
     table.add_row("reader", escape(answer.reader.name if model is None else f"{answer.reader.name} ({model})"))
     return table
-
-
-def _verdict(verdict: records.Verdict) -> str:
-    colour = "yellow" if verdict.not_sure or verdict.answer is None else "green"
-    return f"[{colour}]{escape(display.describe_answer(verdict))}[/]"
 
 
 # `cow doctor`

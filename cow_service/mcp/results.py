@@ -90,13 +90,7 @@ def answer_text(answer: Answer, video: str) -> str:
     lines = [f"Answer: {display.describe_answer(answer)}."]
     if answer.reasoning:
         lines.append(f"Reasoning: {answer.reasoning}")
-    if sum(answer.votes.values()) > 1:
-        lines.append(f"Votes: {display.votes_words(answer)}.")
-    if answer.gate is not None:
-        lines.append(f"Before looking: {display.gate_words(answer.gate)}.")
-    if (baseline := answer.baseline) is not None:
-        votes = f"; votes {display.votes_words(baseline)}" if sum(baseline.votes.values()) > 1 else ""
-        lines.append(f"Without imagined frames: {display.describe_answer(baseline)}{votes}.")
+    lines += (f"{name.capitalize()}: {said}." for name, said in display.answer_facts(answer).items())
     if answer.simulation is not None:
         lines += ["", "Imagined:", *_simulation_lines(answer.simulation, video)]
     else:
