@@ -1,6 +1,7 @@
 """`cow eval`: measures whether imagination helps a multimodal LLM, by how much, and at what cost."""
 
 import sys
+from collections.abc import Set as AbstractSet
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -171,30 +172,40 @@ def plan(
 
 def _request(given: dict[str, Any]) -> Any:
     """The request in the options, completed from the plan or the preset. Raises `InvalidRequest`."""
-    from cow_service.evals import design, plan, request  # noqa: PLC0415
+    from cow_service.evals.request import EvalRequest  # noqa: PLC0415
 
-    names = request.EvalRequest.__dataclass_fields__.keys() & given.keys()
-    fields: dict[str, Any] = {name: given[name] for name in names}
-    if given["plan"] is not None:
-        fixed = plan.read_plan(given["plan"])
-        names = [name for name in (*fixed.options, "arm", "preset", "repeats") if name in given]
-        changed = [name for name in names if given[name] is not None and given[name] is not False]
-        if changed:
-            raise InvalidRequest(f"The plan already sets --{changed[0].replace('_', '-')}: leave that option out.")
-        fields |= {name: fixed.options[name] for name in fields.keys() & fixed.options.keys()}
-        subsets = tuple(fixed.options["subset"])
-        fields |= {"plan": fixed, "arms": tuple(fixed.arms), "repeats": fixed.repeats, "subsets": subsets}
-        return request.EvalRequest(**fields)
+    fields = {name: given[name] for name in EvalRequest.__dataclass_fields__.keys() & given.keys()}
+    return EvalRequest(**fields | (_of_preset(given) if given["plan"] is None else _of_plan(given, fields.keys())))
+
+
+def _of_plan(given: dict[str, Any], names: AbstractSet[str]) -> dict[str, Any]:
+    """What a plan fixes of the fields of a request."""
+    from cow_service.evals.plan import read_plan  # noqa: PLC0415
+
+    fixed = read_plan(given["plan"])
+    asked = (name for name in (*fixed.options, "arm", "preset", "repeats") if name in given)
+    changed = [name for name in asked if given[name] is not None and given[name] is not False]
+    if changed:
+        raise InvalidRequest(f"The plan already sets --{changed[0].replace('_', '-')}: leave that option out.")
+    own = {name: fixed.options[name] for name in names & fixed.options.keys()}
+    subsets = tuple(fixed.options["subset"])
+    return own | {"plan": fixed, "arms": tuple(fixed.arms), "repeats": fixed.repeats, "subsets": subsets}
+
+
+def _of_preset(given: dict[str, Any]) -> dict[str, Any]:
+    """What the options leave to the preset, and the arms of both."""
+    from cow_service.evals.design import PRESETS  # noqa: PLC0415
+
     if given["data"] is None:
         raise InvalidRequest("Give the data to ask about, or a plan with --plan.")
-    preset = design.PRESETS[given["preset"] or "default"]
+    preset = PRESETS[given["preset"] or "default"]
     ask = given["ask"] or ("answer" if given["mllm"] is None else "prompt")
     # An arm given by factors contains commas.
     named = [name for text in given["arm"] or () for name in ([text] if "=" in text else text.split(","))]
     own = preset.arms if given["preset"] or not named else ()
     if given["preset"] is None and ask == "answer" and not named:
         own = ("never", "always")  # the service's own /answer shows no placebos
-    fields |= {
+    return {
         "ask": ask,
         "arms": [*own, *(name.strip() for name in named if name.strip())],
         "repeats": given["repeats"] or preset.repeats,
@@ -202,7 +213,6 @@ def _request(given: dict[str, Any]) -> Any:
         "order": given["order"] or preset.order,
         "subsets": tuple(given["subset"] or ()),
     }
-    return request.EvalRequest(**fields)
 
 
 @app.command(epilog="Example: cow eval report run-a run-b --out comparison")
