@@ -77,13 +77,14 @@ bench: $(VENV)/.base ## the figures of docs/figures.md, then pairs with the last
 	$(if $(RELEASE),$(BIN)/python benchmarks/turns.py $(RELEASE) .,@echo "No release to compare with: name a revision by RELEASE=.")
 
 clean: ## remove what the other targets made
-	rm -rf $(VENV) $(TOOLS) demo site dist build cow_service/client/sync_client.py cow_service/client/sync_results.py
+	rm -rf $(VENV) $(TOOLS) demo site dist build $(addprefix cow_service/client/,options.py sync_client.py sync_results.py)
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-# What an installation makes the blocking classes of the SDK from.
-TWINS := hatch_build.py cow_service/client/async_client.py cow_service/client/async_results.py
+# What an installation makes modules of the SDK from.
+TWINS := hatch_build.py $(addprefix cow_service/,client/async_client.py client/async_results.py client/batches.py \
+	requests/simulation.py requests/values.py)
 
 $(VENV)/.base: pyproject.toml $(TWINS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable .

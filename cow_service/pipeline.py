@@ -1,12 +1,12 @@
-"""The pipeline: what happens to a request, stage by stage. The only file that names the stages in order."""
+"""The pipeline: what happens to a request, stage by stage. `records.stages` lists them."""
 
 from contextlib import nullcontext
 
 from cow_service import errors
 from cow_service.narration.summary import narrate
 from cow_service.readers.options import choices_source, read_choices
-from cow_service.records import Answer, Problem, Simulation, Verdict, reading_of
-from cow_service.requests import AnswerRequest, SimulateRequest, Stage
+from cow_service.records import SIMULATION_STAGES, STAGES, Answer, Problem, Simulation, Stage, Verdict, reading_of
+from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.stages.answering import answer_question, ask_baseline, ask_first, gate_of
 from cow_service.stages.depth import estimate_depth
 from cow_service.stages.generation import generate
@@ -14,8 +14,6 @@ from cow_service.stages.grounding import ground
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
-
-SIMULATION_STAGES: tuple[Stage, ...] = ("grounding", "depth", "motion", "trajectory", "generation")
 
 
 def simulate(run: Run[SimulateRequest]) -> Simulation:
@@ -42,7 +40,7 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
         trajectory=trajectory,
         narration=narrate(grounding, trajectory, run.language),
         **dict(clip),
-        reader=run.reader_info("grounding", "motion"),
+        reader=run.reader_info(*SIMULATION_STAGES),
         **run.accounts(*SIMULATION_STAGES),
         warnings=run.warnings(*SIMULATION_STAGES),
     )
@@ -83,8 +81,8 @@ def answer(run: Run[AnswerRequest]) -> Answer:
         simulation_problem=None if failure is None else Problem(**failure.as_problem()),
         gate=gate,
         baseline=alone if request.baseline else None,
-        reader=run.reader_info("gating", "baseline", "grounding", "motion", "answering"),
-        **run.accounts("gating", "baseline", *SIMULATION_STAGES, "answering"),
+        reader=run.reader_info(*STAGES),
+        **run.accounts(*STAGES),
         warnings=tuple(dict.fromkeys(warnings)),
     )
 

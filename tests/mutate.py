@@ -120,7 +120,7 @@ def changes_of(path: Path) -> Iterator[Change]:
 
 def draw(seed: int, count: int) -> list[Change]:
     """As many changes of each kind, the same for the same seed."""
-    generated = {PRODUCT / "client" / name for name in ("sync_client.py", "sync_results.py")}
+    generated = {PRODUCT / "client" / name for name in ("options.py", "sync_client.py", "sync_results.py")}
     drawn: list[tuple[str, Change]] = []
     for path in sorted(set(PRODUCT.rglob("*.py")) - generated):
         lines, seen = path.read_text().splitlines(), dict[str, int]()

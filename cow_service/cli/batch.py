@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from cow_service.cli.options import EXISTING, Url, argument, object_in, open_client, option, printable
-from cow_service.client.options import CONCURRENCY, BatchSettings
+from cow_service.client import CONCURRENCY
 from cow_service.errors import InvalidRequest, StorageUnavailable, Unauthorized
 
 if TYPE_CHECKING:
     from cow_service.client.batches import Question
+    from cow_service.client.options import BatchSettings
     from cow_service.records import JobKind
 
 EXIT_SOME_FAILED = 3
@@ -54,14 +55,14 @@ def batch(
 
     Exit code 0: all succeeded; 3: some failed, with their reasons in results.jsonl; 1: the batch had to stop.
     """
-    given = locals()
     from cow_service.client.batches import TRANSIENT  # noqa: PLC0415
 
     asked = _read(questions, object_in(request or "{}", "--request"), kind)
-    settings: dict[str, Any] = {name: given[name] for name in BatchSettings.__annotations__.keys() & given.keys()}
+    settings: BatchSettings = {"concurrency": concurrency, "timeout": timeout, "save": save, "out": out}
+    settings |= {"fresh": fresh, "minimal": minimal, "retry_failed": retry_failed, "only_new": True, "progress": True}
     try:
         with open_client(url) as client:
-            for result in client.map(asked, kind=kind, only_new=True, progress=True, **settings):
+            for result in client.map(asked, kind=kind, **settings):
                 if result.unsaved is not None:
                     typer.echo(printable(f"{result.id}: not saved: {result.unsaved.detail}"), err=True)
     except KeyboardInterrupt:
@@ -87,10 +88,10 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
     """
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from cow_service import requests  # noqa: PLC0415
     from cow_service.client.batches import questions  # noqa: PLC0415
+    from cow_service.requests import field_errors  # noqa: PLC0415
+    from cow_service.requests.flat import REQUESTS  # noqa: PLC0415
 
-    model = requests.AnswerRequest if kind == "answer" else requests.SimulateRequest
     items: list[dict[str, Any]] = []
     faults: list[str] = []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
@@ -100,10 +101,10 @@ def _read(path: Path, defaults: dict[str, Any], kind: JobKind) -> list[Question]
             item = object_in(line, "it")
             (question,) = questions([item], defaults, path.parent)
             image = dict(question.image) if isinstance(question.image, Mapping) else "data:"
-            model.model_validate({**question.options, "image": image, "question": question.question})
+            REQUESTS[kind].model_validate({**question.options, "image": image, "question": question.question})
             items.append(item)
         except ValidationError as error:
-            wrong = requests.field_errors(error.errors())[0]
+            wrong = field_errors(error.errors())[0]
             faults.append(f"{path.name}, line {number}: {wrong.pointer}: {wrong.detail}.")
         except InvalidRequest as error:
             fields = [f"`{field.pointer.rpartition('/')[2]}` {field.detail}." for field in error.errors]

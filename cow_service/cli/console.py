@@ -19,7 +19,8 @@ from cow_service import __version__, records
 from cow_service.cli.options import HINTS, read_file, writable
 from cow_service.client import display
 from cow_service.errors import CowError, InvalidRequest
-from cow_service.requests import AnswerRequest, SimulateRequest, Stage, field_errors
+from cow_service.requests import AnswerRequest, SimulateRequest, field_errors
+from cow_service.requests.flat import REQUESTS
 from cow_service.service import Service
 
 if TYPE_CHECKING:
@@ -41,35 +42,35 @@ def run_request(
     Returns the simulation. `formats` are names of `video.FORMATS`. Raises `InvalidRequest`, which names the wrong
     fields, or says that a format needs the video.
     """
-    if formats and not body["video"]:
+    if formats and not body.get("video", True):
         raise InvalidRequest("--format converts the video: leave --no-video out.")
     # Silent with JSON: standard output is for a program.
     console = Console(stderr=as_json, quiet=as_json, highlight=False, soft_wrap=True)
     if out is not None:
         with writable(out):  # before the work, so that its results are not lost
             out.mkdir(parents=True, exist_ok=True)
-    artifact = service.keep_image(read_file(image))
-    model = AnswerRequest if kind == "answer" else SimulateRequest
-    try:
-        request = model.model_validate({"image": {"artifact": artifact.sha256}, **body})
-    except ValidationError as error:
-        fields, known = field_errors(error.errors()), ", ".join([*model.model_fields][2:])
-        faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
-        remedy = f"--request takes these fields: {known}. The page /docs of a server describes them."
-        raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy * ("no such field" in faults)) from error
+    request = _checked(kind, {"image": {"artifact": service.keep_image(read_file(image)).sha256}, **body})
     result: records.Simulation | records.Answer
     with Progress(TextColumn("{task.description:<10}"), BarColumn(24), console=console, transient=True) as bars:
         bar = bars.add_task("loading", total=1.0)  # loading a model takes a while before the first stage
 
-        def show(stage: Stage | None, done: float) -> None:
-            bars.update(bar, description=stage, completed=stage and done)
+        def show(stage: records.Stage | None, done: float) -> None:
+            bars.update(bar, description=stage, completed=stage and records.share_done(kind, stage, done))
 
         is_answer = isinstance(request, AnswerRequest)
         result = service.answer(request, show) if is_answer else service.simulate(request, show)
     written = [] if out is None else save(service, result, out, formats)
     if as_json:
         print(result.model_dump_json(indent=2))
-    simulation = result.simulation if isinstance(result, records.Answer) else result
+    _print_result(console, result)
+    if written:
+        console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
+    return result.simulation if isinstance(result, records.Answer) else result
+
+
+def _print_result(console: Console, result: records.Simulation | records.Answer) -> None:
+    is_answer = isinstance(result, records.Answer)
+    simulation, problem = (result.simulation, result.simulation_problem) if is_answer else (result, None)
     if simulation is not None:
         print_stages(console, simulation)
     if isinstance(result, records.Answer):
@@ -78,14 +79,21 @@ def run_request(
             console.print(f"[dim]reasoning[/]: {escape(result.reasoning)}")
     elif result.narration.answer:
         console.print(f"[bold]{escape(result.narration.summary)}[/]")
-    problem = result.simulation_problem if isinstance(result, records.Answer) else None
     hint = None if problem is None else HINTS.get(problem.code)
     for warning in result.warnings:
         told = warning.replace(problem.remedy, hint) if problem and problem.remedy and hint else warning
         console.print(f"[yellow]warning[/]: {escape(told)}")
-    if written:
-        console.print(f"Wrote to [bold]{escape(str(out))}[/]: {', '.join(written)}")
-    return simulation
+
+
+def _checked(kind: records.JobKind, body: dict[str, Any]) -> SimulateRequest:
+    model = REQUESTS[kind]
+    try:
+        return model.model_validate(body)
+    except ValidationError as error:
+        fields, known = field_errors(error.errors()), ", ".join([*model.model_fields][2:])
+        faults = "; ".join(f"{field.pointer[1:].replace('/', '.') or 'request'}: {field.detail}" for field in fields)
+        remedy = f"--request takes these fields: {known}. The page /docs of a server describes them."
+        raise InvalidRequest(f"{faults}.", errors=fields, remedy=remedy * ("no such field" in faults)) from error
 
 
 def print_stages(console: Console, simulation: records.Simulation) -> None:
@@ -217,24 +225,15 @@ def answer_table(answer: records.Answer) -> Table:
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(style="bold")
     table.add_column()
-    table.add_row("answer", _verdict(answer))
-    if sum(answer.votes.values()) > 1:
-        table.add_row("votes", escape(display.votes_words(answer)))
-    if answer.baseline is not None:
-        votes = escape(display.votes_words(answer.baseline))
-        table.add_row("without frames", f"{_verdict(answer.baseline)}, votes {votes}")
-    if answer.gate is not None:
-        table.add_row("before looking", escape(display.gate_words(answer.gate)))
+    colour = "yellow" if answer.not_sure or answer.answer is None else "green"
+    table.add_row("answer", f"[{colour}]{escape(display.describe_answer(answer))}[/]")
+    for name, said in display.answer_facts(answer).items():
+        table.add_row(name, escape(said))
     table.add_row("tokens", display.asked_words(answer.usage, answer.usage_total))
     table.add_row("time", f"{sum(answer.timings.values()):.2f} s")
     model = answer.reader.model
     table.add_row("reader", escape(answer.reader.name if model is None else f"{answer.reader.name} ({model})"))
     return table
-
-
-def _verdict(verdict: records.Verdict) -> str:
-    colour = "yellow" if verdict.not_sure or verdict.answer is None else "green"
-    return f"[{colour}]{escape(display.describe_answer(verdict))}[/]"
 
 
 # `cow doctor`

@@ -1,7 +1,7 @@
 """`cow eval`: measures whether imagination helps a multimodal LLM, by how much, and at what cost."""
 
 import sys
-from functools import partial
+from collections.abc import Set as AbstractSet
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,8 +10,8 @@ import typer
 from typer.core import TyperGroup
 
 from cow_service.cli.batch import EXIT_INTERRUPTED, EXIT_SOME_FAILED
-from cow_service.cli.options import NotInstalled, Texts, argument, option, printable, with_options
-from cow_service.client.options import CONCURRENCY
+from cow_service.cli.options import NotInstalled, Sharing, Texts, argument, option, printable
+from cow_service.client import CONCURRENCY
 from cow_service.errors import InvalidRequest, install_line
 
 _OF_EXTRA = ("inspect_ai", "pyarrow", "scipy", "matplotlib", "json_repair", "pydantic_ai", "tenacity")
@@ -88,9 +88,13 @@ def shared_options(
     return locals()
 
 
-@app.command(epilog="Example: cow eval run questions.jsonl --mllm openai/gpt-5 --out run")
-@partial(with_options, read=shared_options)
+class _WithShared(Sharing):
+    reader = staticmethod(lambda: shared_options)
+
+
+@app.command(cls=_WithShared, epilog="Example: cow eval run questions.jsonl --mllm openai/gpt-5 --out run")
 def run(
+    shared: typer.Context,
     out: Out,
     data: Annotated[str | None, argument(DATA)] = None,
     plan: Annotated[
@@ -111,8 +115,6 @@ def run(
     concurrency: Annotated[int, option("Most questions at the same time, in each arm.", min=1)] = CONCURRENCY,
     retry_failed: Annotated[bool, option("Ask failed questions again.", "--retry-failed")] = False,
     log_images: Annotated[bool, option("Keep pictures in Inspect's logs, for `inspect view`.")] = False,
-    *,
-    shared: dict[str, Any],
 ) -> None:
     """Ask every question in every arm, and report.
 
@@ -120,12 +122,12 @@ def run(
 
     Exit code 0: all were asked; 3: some failed, with their reasons in the report; 1: the run could not start or go on.
     """
-    given = {**locals(), **shared}
+    given = {**locals(), **shared.obj}
     _check_installed()
     from cow_service.evals.run import evaluate  # noqa: PLC0415
     from cow_service.evals.runs import REPORT  # noqa: PLC0415
 
-    priced = _priced(shared["prices"])
+    priced = _priced(shared.obj["prices"])
     wanted = _request(given)
     try:
         done = evaluate(wanted, lambda told: typer.echo(printable(told), err=True))
@@ -144,9 +146,9 @@ def run(
         raise typer.Exit(EXIT_SOME_FAILED)
 
 
-@app.command(epilog="Example: cow eval plan questions.jsonl --mllm openai/gpt-5 --out plan.json")
-@partial(with_options, read=shared_options)
+@app.command(cls=_WithShared, epilog="Example: cow eval plan questions.jsonl --mllm openai/gpt-5 --out plan.json")
 def plan(
+    shared: typer.Context,
     data: Annotated[str, argument(DATA)],
     out: Annotated[Path, option("The file to write.", "--out", "-o")],
     mllm: Annotated[str, option("Multimodal LLM, as Inspect names it, such as openai/gpt-5.")],
@@ -154,48 +156,56 @@ def plan(
     pilot: Annotated[
         Path | None, option("Folder of a smaller run, from which variance and costs are estimated.", shown="none")
     ] = None,
-    *,
-    shared: dict[str, Any],
 ) -> None:
     """Fix the analysis before the run, and estimate its cost.
 
     The file names the primary question, its test and the scenes it needs. Nothing is asked yet: run it with
     `cow eval run --plan FILE --out DIR`. The report says whether the plan was followed.
     """
-    given = {**locals(), **shared, "ask": "prompt", "plan": None}
+    given = {**locals(), **shared.obj, "ask": "prompt", "plan": None}
     _check_installed()
     from cow_service.evals.run import write_plan  # noqa: PLC0415
 
-    typer.echo(printable(write_plan(_request(given), out, effect / 100, pilot, _priced(shared["prices"]))))
+    typer.echo(printable(write_plan(_request(given), out, effect / 100, pilot, _priced(shared.obj["prices"]))))
     typer.echo(f"\nThe plan: {out}. Run it with: cow eval run --plan {out} --out DIR")
 
 
 def _request(given: dict[str, Any]) -> Any:
     """The request in the options, completed from the plan or the preset. Raises `InvalidRequest`."""
-    from cow_service.evals import design, plan, request  # noqa: PLC0415
+    from cow_service.evals.request import EvalRequest  # noqa: PLC0415
 
-    names = request.EvalRequest.__dataclass_fields__.keys() & given.keys()
-    fields: dict[str, Any] = {name: given[name] for name in names}
-    if given["plan"] is not None:
-        fixed = plan.read_plan(given["plan"])
-        names = [name for name in (*fixed.options, "arm", "preset", "repeats") if name in given]
-        changed = [name for name in names if given[name] is not None and given[name] is not False]
-        if changed:
-            raise InvalidRequest(f"The plan already sets --{changed[0].replace('_', '-')}: leave that option out.")
-        fields |= {name: fixed.options[name] for name in fields.keys() & fixed.options.keys()}
-        subsets = tuple(fixed.options["subset"])
-        fields |= {"plan": fixed, "arms": tuple(fixed.arms), "repeats": fixed.repeats, "subsets": subsets}
-        return request.EvalRequest(**fields)
+    fields = {name: given[name] for name in EvalRequest.__dataclass_fields__.keys() & given.keys()}
+    return EvalRequest(**fields | (_of_preset(given) if given["plan"] is None else _of_plan(given, fields.keys())))
+
+
+def _of_plan(given: dict[str, Any], names: AbstractSet[str]) -> dict[str, Any]:
+    """What a plan fixes of the fields of a request."""
+    from cow_service.evals.plan import read_plan  # noqa: PLC0415
+
+    fixed = read_plan(given["plan"])
+    asked = (name for name in (*fixed.options, "arm", "preset", "repeats") if name in given)
+    changed = [name for name in asked if given[name] is not None and given[name] is not False]
+    if changed:
+        raise InvalidRequest(f"The plan already sets --{changed[0].replace('_', '-')}: leave that option out.")
+    own = {name: fixed.options[name] for name in names & fixed.options.keys()}
+    subsets = tuple(fixed.options["subset"])
+    return own | {"plan": fixed, "arms": tuple(fixed.arms), "repeats": fixed.repeats, "subsets": subsets}
+
+
+def _of_preset(given: dict[str, Any]) -> dict[str, Any]:
+    """What the options leave to the preset, and the arms of both."""
+    from cow_service.evals.design import PRESETS  # noqa: PLC0415
+
     if given["data"] is None:
         raise InvalidRequest("Give the data to ask about, or a plan with --plan.")
-    preset = design.PRESETS[given["preset"] or "default"]
+    preset = PRESETS[given["preset"] or "default"]
     ask = given["ask"] or ("answer" if given["mllm"] is None else "prompt")
     # An arm given by factors contains commas.
     named = [name for text in given["arm"] or () for name in ([text] if "=" in text else text.split(","))]
     own = preset.arms if given["preset"] or not named else ()
     if given["preset"] is None and ask == "answer" and not named:
         own = ("never", "always")  # the service's own /answer shows no placebos
-    fields |= {
+    return {
         "ask": ask,
         "arms": [*own, *(name.strip() for name in named if name.strip())],
         "repeats": given["repeats"] or preset.repeats,
@@ -203,7 +213,6 @@ def _request(given: dict[str, Any]) -> Any:
         "order": given["order"] or preset.order,
         "subsets": tuple(given["subset"] or ()),
     }
-    return request.EvalRequest(**fields)
 
 
 @app.command(epilog="Example: cow eval report run-a run-b --out comparison")

@@ -3,13 +3,13 @@
 import sys
 from importlib.resources import as_file
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 import typer
 
 from cow_service import __version__
 from cow_service.cli import batch, eval, models, options, server
-from cow_service.cli.options import AsJson, Commands, Grouped, Texts, option, with_options
+from cow_service.cli.options import AsJson, Asking, Commands, option
 
 app = typer.Typer(
     cls=Commands,
@@ -33,21 +33,18 @@ def main(
     """Look before you answer: imagine the future of an image."""
 
 
-@app.command(cls=Grouped, epilog='Example: cow simulate photo.jpg "If the ball falls, what does it hit?"')
-@with_options
+@app.command(cls=Asking, epilog='Example: cow simulate photo.jpg "If the ball falls, what does it hit?"')
 def simulate(
+    request: typer.Context,
     image: options.Image,
     question: options.Question,
     out: Annotated[Path | None, option("Folder for results.", "--out", "-o", shown="./<image>-cow, or -cow-2")] = None,
-    video: Annotated[bool, option("Make a video (mp4) of the whole clip.")] = True,
     formats: Annotated[
         list[options.Format] | None,
         option("Also make an animated gif or webp, or a contact sheet; may be repeated.", "--format"),
     ] = None,
     open_it: Annotated[bool, option("Open the video (or the overlay, without one) at the end.", "--open")] = False,
     as_json: Annotated[bool, option("Print the simulation as JSON, and nothing else.", "--json")] = False,
-    *,
-    request: dict[str, Any],
 ) -> None:
     """Imagine an image's future: frames, video and overlay.
 
@@ -55,12 +52,12 @@ def simulate(
     """
     from cow_service.cli.console import default_folder, run_request  # noqa: PLC0415
 
-    body = {**request, "question": question, "video": video}
+    body = {**request.obj, "question": question}
     out = out or default_folder(image)
     with server.open_service() as service:
         simulation = run_request(service, "simulate", image, body, out, formats or (), as_json=as_json)
     if open_it and simulation is not None:
-        typer.launch(str(out / ("video.mp4" if video else simulation.overlay_name)))
+        typer.launch(str(out / ("video.mp4" if simulation.video else simulation.overlay_name)))
 
 
 @app.command(epilog="Example: cow demo --open")
@@ -79,30 +76,14 @@ def demo(
         typer.launch(str(out / "video.mp4"))
 
 
-@app.command(cls=Grouped, epilog='Example: cow answer photo.jpg "If the red ball moves left, will it hit the vase?"')
-@with_options
+@app.command(cls=Asking, epilog='Example: cow answer photo.jpg "If the red ball moves left, will it hit the vase?"')
 def answer(
+    request: typer.Context,
     image: options.Image,
     question: options.Question,
-    choice: Annotated[
-        Texts,
-        option("An answer to choose from; may be repeated: A, B, C...", metavar="TEXT", shown="those in the question"),
-    ] = None,
-    imagine: Annotated[
-        Literal["always", "auto", "never"],
-        option("Whether to simulate first; auto: only if answers from the image alone disagree."),
-    ] = "always",
     no_imagine: Annotated[bool, option("The same as --imagine never.", "--no-imagine")] = False,
-    imagine_votes: Annotated[int, option("With --imagine auto: answers to ask for from the image alone.")] = 3,
-    imagine_threshold: Annotated[
-        float, option("With --imagine auto: share of them that must agree to skip the simulation.")
-    ] = 1.0,
-    votes: Annotated[int, option("How often to ask; the most frequent answer wins.")] = 1,
-    baseline: Annotated[bool, option("Also answer without frames, for comparison.", "--baseline")] = False,
     out: Annotated[Path | None, option("Folder for simulation and answer.json.", "--out", "-o", shown="none")] = None,
     as_json: Annotated[bool, option("Print the answer as JSON, and nothing else.", "--json")] = False,
-    *,
-    request: dict[str, Any],
 ) -> None:
     """Answer a question after looking at the imagined future.
 
@@ -110,17 +91,8 @@ def answer(
     """
     from cow_service.cli.console import run_request  # noqa: PLC0415
 
-    body = {
-        **request,
-        "question": question,
-        "options": choice,
-        "imagine": "never" if no_imagine else imagine,
-        "imagine_votes": imagine_votes,
-        "imagine_threshold": imagine_threshold,
-        "votes": votes,
-        "baseline": baseline,
-        "video": out is not None,
-    }
+    never = {"imagine": "never"} if no_imagine else {}
+    body = {**request.obj, **never, "question": question, "video": out is not None}
     with server.open_service() as service:
         run_request(service, "answer", image, body, out, as_json=as_json)
 

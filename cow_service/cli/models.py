@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from cow_service.weights.manifests import Manifest, Source
     from cow_service.weights.repositories import Download
 
-
 app = typer.Typer(rich_markup_mode=None, epilog="Example: cow models pull ati")
 
 Name = Annotated[str, argument("Name of the model, as `cow models` lists it.", "NAME")]
@@ -67,9 +66,10 @@ def _pull(name: str, revision: list[str] | None) -> None:
         return
     from rich.filesize import decimal  # noqa: PLC0415
 
+    from cow_service.settings import load_settings  # noqa: PLC0415
     from cow_service.weights.repositories import download, folder_of  # noqa: PLC0415
 
-    weights_dir = _weights_dir()
+    weights_dir = load_settings().weights_dir
     typer.echo("Comparing the repository with the files that are here ...")
     downloads = _downloads(manifest, weights_dir, revisions)
     files = [file for each in downloads for file in each.files]
@@ -98,9 +98,10 @@ def check(
         return
     if save:
         raise InvalidRequest("--save is for the check of COW_MLLM: leave the name out.")
+    from cow_service.settings import load_settings  # noqa: PLC0415
     from cow_service.weights import repositories as weights  # noqa: PLC0415
 
-    manifest, weights_dir = _manifest(name), _weights_dir()
+    manifest, weights_dir = _manifest(name), load_settings().weights_dir
     findings = {part: weights.check(source, weights_dir) for part, source in manifest.sources.items()}
     complete = not any(findings.values())
     if as_json:
@@ -144,12 +145,6 @@ def _check_mllm(*, save: bool, as_json: bool) -> None:
         raise problem
     if not all(finding.usable for finding in found.findings):
         raise typer.Exit(1)
-
-
-def _weights_dir() -> Path:
-    from cow_service.settings import load_settings  # noqa: PLC0415
-
-    return load_settings().weights_dir
 
 
 def _manifest(name: str) -> Manifest:

@@ -1,15 +1,16 @@
-"""The options that `simulate` and `answer` share, the request that they build, and how help and errors are shown."""
+"""Options: those of `simulate` and `answer`, and the request that they become; and how help and errors are shown."""
 
 from __future__ import annotations
 
-import base64
 import json
 import re
+from base64 import b64encode
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from enum import StrEnum
-from functools import wraps
-from inspect import Parameter, signature
+from functools import cached_property, partial
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
@@ -20,6 +21,7 @@ from cow_service.errors import CowError, InvalidRequest
 
 if TYPE_CHECKING:
     from cow_service.client import Client
+    from cow_service.records import JobKind
 
 _GIVE_PLACE = (
     "Use --point X,Y or --box X0,Y0,X1,Y1 (and --object NAME) for the moving object, and "
@@ -56,29 +58,55 @@ COMMANDS = {
     "Maintain": ("doctor", "models"),
     "Measure and convert": ("eval", "tracks"),
 }  # of `cow --help`
-GROUPS = {
-    "The moving object": ("point", "box", "name"),
-    "Its motion": ("direction", "kind", "speed", "distance", "duration", "until", "law", "trajectory"),
-    "The scene": ("other", "remove", "place", "depth", "depth_scale"),
-    "The simulation": ("ensemble", "reader", "language", "seed", "fields"),
-    "The frames": ("generator", "own", "num_frames", "fps", "frames", "count", "max_side"),
-}  # of the options that `simulate` and `answer` share
 
 
-class Grouped(TyperCommand):
-    """A command whose help lists its options in `GROUPS`, after its own."""
+class Sharing(TyperCommand):
+    """A command with the options of a function besides its own; `ctx.obj` becomes what the function returns."""
+
+    reader: Callable[..., Callable[..., dict[str, Any]]]  # of the command: the function
+
+    @cached_property
+    def shared(self) -> Any:
+        """The function as a command."""
+        app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+        app.command()(self.reader())
+        return typer.main.get_command(app)
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """All arguments and options."""
+        *own, help = super().get_params(ctx)
+        return [*own, *self.shared.params, help]
+
+    def invoke(self, ctx: Any) -> Any:
+        """Calls the function, then the command."""
+        ctx.obj = self.shared.callback(**{each.name: ctx.params.pop(each.name) for each in self.shared.params})
+        return super().invoke(ctx)
+
+
+class Asking(Sharing):
+    """A command with fields of a request as options: `ctx.obj` becomes the request.
+
+    They come from the request models when they are needed: the import would slow down `cow --help`.
+    """
+
+    def reader(self) -> Callable[..., dict[str, Any]]:
+        """Of the kind of request that the command is named after."""
+        return request_reader("answer" if self.name == "answer" else "simulate")
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Writes the arguments and the options."""
-        shared = {name: group for group, names in GROUPS.items() for name in names}
-        rows: dict[str, list[Any]] = {title: [] for title in ("Arguments", "Options", *GROUPS)}
+        """Writes the arguments and the options, its own first."""
+        from cow_service.requests.flat import FLAT  # noqa: PLC0415 - it imports pydantic
+
+        groups = {field.option: title for title, fields in FLAT.items() for field in fields if field.option}
+        rows: dict[str, list[Any]] = {title: [] for title in ("Arguments", "Options", *FLAT)}
         for param in self.get_params(ctx):
             own = "Arguments" if param.param_type_name == "argument" else "Options"
             if (record := param.get_help_record(ctx)) is not None:
-                rows[shared.get(param.name or "", own)].append(record)
+                rows[groups.get(param.name or "", own)].append(record)
         for title, records in rows.items():
-            with formatter.section(title):
-                formatter.write_dl(records)
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
 
 
 class Commands(TyperGroup):
@@ -147,10 +175,6 @@ Question = Annotated[
 Url = Annotated[str | None, option("URL of the server.", shown="COW_BASE_URL, http://127.0.0.1:8000")]
 AsJson = Annotated[bool, option("Print JSON.", "--json")]
 Texts = list[str] | None
-Policy = Literal["initial", "uniform", "events"]
-Kind = Literal["linear", "projectile", "fall", "static"]
-Law = Literal["contact", "ballistic"]
-Language = Literal["en", "de", "es", "fr", "zh", "ja"]
 
 
 class Format(StrEnum):
@@ -161,115 +185,65 @@ class Format(StrEnum):
     SHEET = "sheet"
 
 
-# The request field of each option. The options below repeat the fields' defaults, because importing pydantic would
-# slow down `--help`; a test checks that they agree.
-FIELDS = {
-    **{"point": "grounding/point", "box": "grounding/bbox", "name": "grounding/object"},
-    **{name: f"motion/{name}" for name in ("direction", "kind", "speed", "distance", "duration", "until", "law")},
-    **{"frames": "frames/policy", "count": "frames/count", "max_side": "frames/max_side"},
-}
-_NUMBERS = {"point": 2, "box": 4, "direction": 2}  # how many comma-separated numbers an option takes
-_SAME_NAME = ("language", "ensemble", "reader", "generator", "num_frames", "fps", "seed")
+@dataclass(frozen=True)
+class Written:
+    """How an option is written whose field is not a number or a word."""
+
+    metavar: str | None
+    read: Callable[[Any], Any]  # what was written as the field has it; of one where the option may be repeated
+    help: str = ""  # instead of the description of the field
+    kind: Any = list[str]
 
 
-def request_body(
-    point: Annotated[str | None, option("X,Y of a point on the moving object, px.")] = None,
-    box: Annotated[str | None, option("X0,Y0,X1,Y1 of a box around the moving object, px.")] = None,
-    name: Annotated[str | None, option("Name of the object, with --point, --box or --trajectory.", "--object")] = None,
-    direction: Annotated[str | None, option("DX,DY of the motion in the image; x right, y down.")] = None,
-    kind: Annotated[Kind | None, option("Motion; linear and projectile need --direction.", shown="linear")] = None,
-    speed: Annotated[float | None, option("Speed, px/s.", shown="0.26 image widths/s")] = None,
-    distance: Annotated[float | None, option("Stop the object after this distance, px.")] = None,
-    duration: Annotated[float | None, option("Stop the object after this time, s.")] = None,
-    until: Annotated[Literal["contact"] | None, option("contact: stop the object at its first contact.")] = None,
-    remove: Annotated[Texts, option("Object to take away before the motion; may be repeated.", metavar="NAME")] = None,
-    place: Annotated[
-        Texts, option('Put an object first: "apple into bowl"; may be repeated.', metavar="THING RELATION THING")
-    ] = None,
-    law: Annotated[
-        Law | None, option("Physics. contact: bounces, pushes; ballistic: through everything.", shown="contact")
-    ] = None,
-    other: Annotated[
-        Texts,
-        option(
-            'Another object and its box (or X,Y of a point on it), such as "red mug=10,20,90,140"; may be repeated.',
-            metavar="NAME=X0,Y0,X1,Y1",
-        ),
-    ] = None,
-    ensemble: Annotated[int, option("Most simulated versions, over which probabilities are counted; 0: none.")] = 50,
-    depth: Annotated[Path | None, option("Depth map of the image: a 16-bit grey PNG.", **EXISTING)] = None,
-    depth_scale: Annotated[float | None, option("Metres per unit of the depth map.", shown="unknown")] = None,
-    trajectory: Annotated[Path | None, option("JSON file: the `trajectory` of a request.", **EXISTING)] = None,
-    language: Annotated[Language | None, option("Language of answer and story.", shown="en")] = None,
-    fields: Annotated[
-        str | None,
-        option('Other request fields, such as {"camera": {"pitch": 25}}.', "--request", metavar="JSON", shown="none"),
-    ] = None,
-    reader: Annotated[str | None, option("Part that understands the question.", shown="COW_READER")] = None,
-    generator: Annotated[str | None, option("Part that makes the frames.", shown="COW_GENERATOR")] = None,
-    own: Annotated[
-        Texts,
-        option("An option of the generator, such as steps=20; may be repeated.", "--option", metavar="NAME=VALUE"),
-    ] = None,
-    num_frames: Annotated[int, option("Length of the clip, frames.")] = 81,
-    fps: Annotated[float, option("Frames per second of the clip.")] = 16,
-    seed: Annotated[int | None, option("Random seed.", shown="0, and none for a multimodal LLM")] = None,
-    frames: Annotated[Policy, option("Frames to save as pictures: around events, uniform, or initial.")] = "events",
-    count: Annotated[int, option("Number of these pictures.")] = 4,
-    max_side: Annotated[int, option("Their longest side, px; 0: the size of the clip.")] = 512,
-) -> dict[str, Any]:
-    """The request fields that both commands have. Raises `InvalidRequest`, naming the wrong option."""
-    given = locals()
-    body: dict[str, Any] = {name: given[name] for name in _SAME_NAME} | {"generator_options": {}}
-    for text in own or []:
-        own_name, equals, own_value = text.partition("=")
-        if not own_name or not equals:
-            raise InvalidRequest(f"--option takes NAME=VALUE, such as steps=20; got '{text}'.")
-        body["generator_options"][own_name] = own_value
-        with suppress(ValueError):  # a value that is not JSON is text
-            body["generator_options"][own_name] = json.loads(own_value)
-    body["objects"] = [_other_object(text) for text in other or []]
-    removed = ({"kind": "remove", "object": thing} for thing in remove or [])
-    body["interventions"] = [*removed, *map(_placement, place or [])]
-    for option_name, path in FIELDS.items():
-        if (value := given[option_name]) is not None:
-            record, _, field = path.partition("/")
-            if option_name in _NUMBERS:
-                value = _numbers(f"--{option_name}", value, _NUMBERS[option_name])
-            body.setdefault(record, {})[field] = value
-    body["frames"]["max_side"] = max_side or None
-    if depth is not None:
-        url = f"data:image/png;base64,{base64.b64encode(read_file(depth)).decode()}"
-        body["depth"] = {"map": url, "scale": depth_scale}
-    elif depth_scale is not None:
-        raise InvalidRequest("--depth-scale needs --depth, the file of the depth map.")
-    if trajectory is not None:
-        body["trajectory"] = object_in(read_file(trajectory), trajectory.name)
-    if body.get("grounding", {}).keys() == {"object"}:
-        points = body.get("trajectory", {}).get("points")
-        if not points:
-            raise InvalidRequest("--object needs --point, --box or --trajectory. Or name the object in the question.")
-        body["grounding"]["point"] = points[0]
-    more = object_in(fields or "{}", "--request")
-    if isinstance(more.get("depth"), dict):  # such as focal length or deviation, in addition to the map
-        more["depth"] = body.get("depth", {}) | more["depth"]
-    return body | more
+def request_reader(kind: JobKind) -> Callable[..., dict[str, Any]]:
+    """The function whose parameters are the options of a kind of request; it returns the fields that they set.
+
+    It raises `InvalidRequest`, naming the wrong option.
+    """
+    from cow_service.requests.flat import flat_fields, put  # noqa: PLC0415 - it imports pydantic
+
+    fields = {field.option: (field.path, schema) for field, schema in flat_fields(kind).items() if field.option}
+
+    def read(request: str | None = None, **given: Any) -> dict[str, Any]:
+        body: dict[str, Any] = {}
+        for name, (path, schema) in fields.items():
+            if (value := given.get(name)) not in (None, [], schema.get("default")):
+                put(body, path, _value(name, value, schema))
+        if body.get("depth", {}).keys() == {"scale"}:
+            raise InvalidRequest("--depth-scale needs --depth, the file of the depth map.")
+        if body.get("grounding", {}).keys() == {"object"}:
+            if not (points := body.get("trajectory", {}).get("points")):
+                raise InvalidRequest("--object needs --point, --box or --trajectory. Or name it in the question.")
+            body["grounding"]["point"] = points[0]
+        for name, value in WRITTEN["request"].read(request or "{}").items():
+            both = isinstance(value, dict) and isinstance(body.get(name), dict)
+            body[name] = body[name] | value if both else value  # such as the focal length of a depth map
+        return body
+
+    options = {name: schema for name, (_, schema) in fields.items()} | {"request": {}}
+    cast("Any", read).__signature__ = Signature([_parameter(name, schema) for name, schema in options.items()])
+    return read
 
 
-def with_options(
-    command: Callable[..., None], read: Callable[..., dict[str, Any]] = request_body
-) -> Callable[..., None]:
-    """The command with its last parameter replaced by the options of `read`, of which it gets what that returns."""
-    shared = signature(read, eval_str=True).parameters
-    *own, last = signature(command, eval_str=True).parameters.values()
+def _parameter(name: str, schema: dict[str, Any]) -> Parameter:
+    """The option of a field, as `WRITTEN` and the field's JSON schema say it."""
+    told, default, how = schema.get("description", ""), schema.get("default"), WRITTEN.get(name)
+    kind: Any = Literal[tuple(schema["enum"])] if "enum" in schema else TYPES.get(schema.get("type", ""), str)
+    declared = option(told, *(["--" + name] if default is False else []))  # of a flag without its opposite
+    if how is not None:
+        kind, default = how.kind, default if how.kind is int else None
+        declared = option(how.help or told, **(EXISTING if kind is Path else {"metavar": how.metavar}))
+    return Parameter(name, Parameter.KEYWORD_ONLY, annotation=Annotated[kind | None, declared], default=default)
 
-    @wraps(command)
-    def with_shared(**given: Any) -> None:
-        command(**{last.name: read(**{name: given.pop(name) for name in shared})}, **given)
 
-    keyword_only = [parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in (*own, *shared.values())]
-    cast("Any", with_shared).__signature__ = signature(command).replace(parameters=keyword_only)
-    return with_shared
+def _value(name: str, value: Any, schema: dict[str, Any]) -> Any:
+    """The value of a field for what was written."""
+    if name not in WRITTEN:
+        return value if schema.get("type", "") in TYPES else _json_or_text(value)
+    if not isinstance(value, list):
+        return WRITTEN[name].read(value)
+    each = [WRITTEN[name].read(text) for text in value]
+    return dict(each) if schema.get("type") == "object" else each
 
 
 def open_client(url: str | None) -> Client:
@@ -311,15 +285,26 @@ def object_in(text: str | bytes, name: str) -> dict[str, Any]:
     return given
 
 
-def _numbers(option: str, text: str, count: int) -> list[float]:
-    try:
+def _json_or_text(text: str) -> Any:
+    with suppress(ValueError):
+        return json.loads(text)
+    return text
+
+
+def _numbers(option: str, form: str, text: str) -> list[float]:
+    """As many numbers as `form` has, such as X,Y."""
+    with suppress(ValueError):
         values = [float(part) for part in text.replace(" ", "").split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        example = {"--direction": "-1,0 for to the left (x right, y down)"}.get(option, "10,20,90,140"[: 4 * count - 3])
-        raise InvalidRequest(f"{option} takes {count} numbers separated by commas, such as {example}; got '{text}'.")
-    return values
+        if len(values) == form.count(",") + 1:
+            return values
+    raise InvalidRequest(f"{option} takes {form}, numbers separated by commas (x right, y down); got '{text}'.")
+
+
+def _generator_option(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not name or not equals:
+        raise InvalidRequest(f"--option takes NAME=VALUE, such as steps=20; got '{text}'.")
+    return name, _json_or_text(value)
 
 
 def _placement(text: str) -> dict[str, object]:
@@ -345,5 +330,31 @@ def _other_object(text: str) -> dict[str, object]:
     if not name.strip():
         raise InvalidRequest(f"--other takes NAME=X0,Y0,X1,Y1 or NAME=X,Y; got '{text}'.")
     is_point = place.count(",") == 1
-    field, count = ("point", 2) if is_point else ("bbox", 4)
-    return {"object": name.strip(), field: _numbers("--other NAME=", place, count)}
+    field, form = ("point", "X,Y") if is_point else ("bbox", "X0,Y0,X1,Y1")
+    return {"object": name.strip(), field: _numbers("--other NAME=", form, place)}
+
+
+TYPES = {"integer": int, "number": float, "boolean": bool, "string": str}
+WRITTEN = {  # by the option
+    **{
+        name: Written(form, partial(_numbers, "--" + name, form), kind=str)
+        for name, form in {"point": "X,Y", "box": "X0,Y0,X1,Y1", "direction": "DX,DY"}.items()
+    },
+    "trajectory": Written(
+        None, lambda path: object_in(read_file(path), path.name), "JSON file: the `trajectory` of a request.", Path
+    ),
+    "depth": Written(None, lambda path: f"data:image/png;base64,{b64encode(read_file(path)).decode()}", kind=Path),
+    "request": Written(
+        "JSON", partial(object_in, name="--request"), 'Other request fields, such as {"camera": {"pitch": 25}}.', str
+    ),
+    "max_side": Written(None, lambda side: side or None, "Longest side of the pictures, px; 0: that of the clip.", int),
+    "choice": Written("TEXT", str, "An answer to choose from; may be repeated: A, B, C... Default: the question's."),
+    "remove": Written("NAME", lambda it: {"kind": "remove", "object": it}, "Object to take away; may be repeated."),
+    "place": Written("THING RELATION THING", _placement, 'Put an object first: "apple into bowl"; may be repeated.'),
+    "other": Written(
+        "NAME=X0,Y0,X1,Y1",
+        _other_object,
+        'Another object and its box (or X,Y of a point on it), such as "red mug=10,20,90,140"; may be repeated.',
+    ),
+    "option": Written("NAME=VALUE", _generator_option, "Option of the generator, such as steps=20; may be repeated."),
+}

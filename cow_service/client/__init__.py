@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Answer", "AsyncAnswer", "AsyncClient", "AsyncJobHandle", "AsyncSimulation", "BatchResult", "Client"]
 __all__ += ["CowError", "Event", "ImageLike", "JobHandle", "Models", "Question", "QuestionLike", "Simulation", "errors"]
 
+CONCURRENCY = 64  # most questions of a batch at the same time
 # Each is imported on first use, so that a program with one client does not wait for the rest.
 _MODULES = {
     "async_client": ("AsyncClient",),

@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack, overload
 
-from cow_service.client.options import DEFAULT_TIMEOUT, RETRIES
-
 if TYPE_CHECKING:
     from datetime import datetime
 
@@ -23,6 +21,9 @@ if TYPE_CHECKING:
     from cow_service.client.progress import ProgressLike
     from cow_service.client.request import ImageLike
     from cow_service.records import JobKind, JobStatus, Workers
+
+DEFAULT_TIMEOUT = 60.0  # seconds without a word from the server
+RETRIES = 5
 
 
 class AsyncClient:

@@ -11,9 +11,8 @@ from typing import Any, Generic, Literal, Self, TypeVar
 
 from cow_service import records
 from cow_service.adaptive import AdaptiveLimit
-from cow_service.client import errors, protocol
+from cow_service.client import CONCURRENCY, errors, protocol
 from cow_service.client.journal import Journal, Question, QuestionLike, questions
-from cow_service.client.options import CONCURRENCY
 from cow_service.client.progress import BatchProgress, describe_load, progress_shown
 from cow_service.client.request import JobRequest, job_request
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -33,15 +33,19 @@ def readiness_words(backend: records.BackendInfo) -> str:
     return "yes" if backend.ready else f"needs {', '.join(backend.missing) or 'its weights'}"
 
 
-def votes_words(verdict: records.Verdict) -> str:
-    """How often each was answered."""
-    return ", ".join(f"{answer}: {count}" for answer, count in verdict.votes.items())
+def answer_facts(answer: records.Answer) -> dict[str, str]:
+    """How the votes went, and what was answered without looking; by what that is called."""
 
+    def votes(counts: Mapping[str, int]) -> str:
+        return ", ".join(f"{name} {count}" for name, count in counts.items()) or "no vote"
 
-def gate_words(gate: records.Gate) -> str:
-    """What was answered before looking, and what came of it."""
-    votes = ", ".join(f"{name} {count}" for name, count in gate.votes.items()) or "no vote"
-    return f"{votes} of {gate.asked}; {gate.reason}: {'imagined' if gate.imagined else 'not imagined'}"
+    facts = {"votes": votes(answer.votes)} if sum(answer.votes.values()) > 1 else {}
+    if (gate := answer.gate) is not None:
+        came = "imagined" if gate.imagined else "not imagined"
+        facts["before looking"] = f"{votes(gate.votes)} of {gate.asked}; {gate.reason}: {came}"
+    if (alone := answer.baseline) is not None:
+        facts["without frames"] = f"{describe_answer(alone)}; votes {votes(alone.votes)}"
+    return facts
 
 
 def band_words(trajectory: records.Trajectory) -> str:
@@ -131,12 +135,7 @@ def answer_html(answer: records.Answer, get: GetBytes) -> str:
     body = _line(describe_answer(answer), f"font-size:16px;font-weight:600;{_LONG_TEXT}")
     if answer.reasoning:
         body += _line(answer.reasoning, _LONG_TEXT)
-    if sum(answer.votes.values()) > 1:
-        body += _line(f"votes: {votes_words(answer)}", DIM_STYLE)
-    if answer.gate is not None:
-        body += _line(f"before looking: {gate_words(answer.gate)}", DIM_STYLE)
-    if answer.baseline is not None:
-        body += _line(f"without frames: {describe_answer(answer.baseline)}", DIM_STYLE)
+    body += "".join(_line(f"{name}: {said}", DIM_STYLE) for name, said in answer_facts(answer).items())
     shown: tuple[str, ...] = ()
     if answer.simulation is not None:
         body += _found(answer.simulation, get)

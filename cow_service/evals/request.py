@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from cow_service import __version__
-from cow_service.client.options import CONCURRENCY
+from cow_service.client import CONCURRENCY
 from cow_service.errors import InvalidRequest
 from cow_service.evals.design import PRESETS, Arm, Order
 from cow_service.evals.items import Ask, Item

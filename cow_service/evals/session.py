@@ -12,8 +12,7 @@ from typing import Any
 import httpx
 
 from cow_service.adaptive import AdaptiveLimit, AdaptivePlaces
-from cow_service.client import AsyncClient, progress, protocol
-from cow_service.client.options import CONCURRENCY
+from cow_service.client import CONCURRENCY, AsyncClient, progress, protocol
 from cow_service.errors import CowError
 from cow_service.evals.imagination import Imagination
 from cow_service.evals.items import Item, Observation, Pictures

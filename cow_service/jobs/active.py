@@ -9,16 +9,10 @@ from dataclasses import dataclass, field
 
 from cow_service.errors import Canceled, CowError
 from cow_service.records import JobKind, WorkerJob
-from cow_service.requests import Stage
+from cow_service.records.stages import At, Stage, is_ahead, share_done
 
-STAGES: tuple[Stage, ...] = ("grounding", "motion", "trajectory", "generation", "answering")
 QUIET_SECONDS = 30.0  # without a job that anybody runs or waits for, after which a process looks for some more rarely
 MAX_ELSEWHERE = 10_000  # jobs whose progress in other processes is remembered
-STAGE_SHARES = (0.1, 0.05, 0.05, 0.7, 0.1)  # of the whole work; of a simulation the last is left out
-
-
-At = tuple[Stage | None, float]
-"""A stage, and the share of it that is done."""
 
 
 @dataclass(eq=False)
@@ -94,11 +88,9 @@ class ActiveJobs:
         self._busy_at = time.monotonic()
 
     def progress(self, job: str, active: ActiveJob, stage: Stage | None, done: float) -> None:
-        """Records how far the work on a job is, and wakes its waiters. Raises `Canceled` on request."""
+        """Notes how far a job is, never less than before, and wakes its waiters. Raises `Canceled` on request."""
         active.check()
-        if stage is None:
-            return
-        if stage != active.at[0] or done > active.at[1]:
+        if is_ahead((stage, done), active.at):
             active.begun = active.begun or time.monotonic()
             active.at = stage, done
             self._wake(job)
@@ -184,12 +176,3 @@ class ActiveJobs:
     def _waiters_of(self, job: str) -> list[Waiter]:
         with self._lock:
             return [waiter for waiter in self._waiters.get(job, []) if not waiter.loop.is_closed()]
-
-
-def share_done(kind: str, stage: str | None, done: float) -> float:
-    """Share of all work, 0 to 1, when a stage is so far."""
-    shares = STAGE_SHARES if kind == "answer" else STAGE_SHARES[:-1]
-    if stage not in STAGES[: len(shares)]:
-        return 0.0
-    place = STAGES.index(stage)
-    return round(min(1.0, (sum(shares[:place]) + shares[place] * done) / sum(shares)), 4)

@@ -25,8 +25,8 @@ from cow_service.jobs.job_table import JobTable, TakenJob
 from cow_service.media.artifacts import ArtifactStore
 from cow_service.observability.metrics import gpu_memory
 from cow_service.pipeline import answer, simulate
-from cow_service.records import Answer, WorkerInfo, verdict_of
-from cow_service.requests import AnswerRequest, ImageArtifact, Stage
+from cow_service.records import STAGES, Answer, Stage, WorkerInfo, verdict_of
+from cow_service.requests import AnswerRequest, ImageArtifact
 from cow_service.service import Service
 from cow_service.settings import Settings, usable_memory
 from cow_service.stages.keys import RESULT_TYPES, StageKey, StageResult, digest_of
@@ -36,11 +36,6 @@ CANCEL_POLL_SECONDS = 0.1  # how often a job that waits for another one's result
 FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # seconds between two tries
 BYTES_PER_PIXEL = 4.5  # of an image, that a job holds while it waits for an MLLM
 SHARE_WAITING = 0.5  # of the memory, that such jobs may take all together if their images are the largest
-
-# Stages that take less than their transactions would: behind one that was computed they are not looked for, either.
-QUICK: tuple[Stage, ...] = ("grounding", "depth", "motion", "trajectory")
-# Stages that run beside others. A job holds one key at a time: its process hears of one that was granted to the job.
-UNLOCKED: tuple[Stage, ...] = ("baseline",)
 
 Value = TypeVar("Value")
 HoldKey = Callable[[str, Callable[[], None]], AbstractContextManager[None]]
@@ -132,10 +127,11 @@ class StoredStep:
         elif self.owner is not None:
             scope = {"owner": self.owner}
         digest, *also = (digest_of({**scope, "key": each}) if scope else each for each in (key.digest, *key.also))
-        with nullcontext() if stage in UNLOCKED else self.hold_key(digest, self.outages.check_canceled):
+        is_quick, is_beside = STAGES[stage].is_quick, STAGES[stage].is_beside
+        with nullcontext() if is_beside else self.hold_key(digest, self.outages.check_canceled):
             found = None
             with self.guard:
-                if stage not in QUICK or not self.waiting:
+                if not (is_quick and self.waiting):
                     found = self.outages.wait_through(
                         lambda: next((each for key in (digest, *also) if (each := self._find(stage, key))), None)
                     )
@@ -147,7 +143,7 @@ class StoredStep:
                     trajectory, self.trajectory_key = result.value.model_dump_json(), digest
                 with self.guard:
                     self.waiting.append(StoredResult(digest, stage, text, result.artifacts, trajectory))
-                    if result.usage.calls or stage not in QUICK:
+                    if result.usage.calls or not is_quick:
                         self.flush()
             self.stages.add(stage)
             return found

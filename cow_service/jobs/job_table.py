@@ -23,14 +23,14 @@ from pydantic import AwareDatetime, BaseModel, Field
 from pydantic_core import to_json
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds, unforeseen
-from cow_service.jobs.active import At, share_done
 from cow_service.jobs.database import OPEN, Database, Notification
 from cow_service.jobs.packing import packed, unpacked
 from cow_service.jobs.queues import moves, next_turn
 from cow_service.jobs.schema import CALLS, JOBS, REFERENCES, STAGES, TRAJECTORIES
 from cow_service.observability.logging import rfc3339
 from cow_service.records import AcceptedRequest, Answer, Job, JobKind, JobPage, JobStatus, Problem, Record, Simulation
-from cow_service.requests import AnswerRequest, Priority, SimulateRequest, Stage
+from cow_service.records.stages import At, Stage, share_done
+from cow_service.requests import AnswerRequest, Priority, SimulateRequest
 from cow_service.stages.keys import FORMAT, digest_of
 
 VERSION = "2"  # of the workflow that computes jobs; those of another version wait for a server that has it

@@ -19,7 +19,7 @@ from cow_service.jobs.computing import Computer, EngineParts, Outages, Work
 from cow_service.jobs.job_table import TakenJob
 from cow_service.observability import logging as context
 from cow_service.observability import tracing
-from cow_service.requests import Stage
+from cow_service.records import Stage
 
 LOOK_SECONDS, WAITING_SECONDS = 20.0, 2.0  # between two looks besides whenever it is woken, and while jobs wait
 RETRY_SECONDS = 0.5  # after a look that failed

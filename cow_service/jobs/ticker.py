@@ -9,12 +9,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.concurrency import BackgroundThread
 from cow_service.errors import CowError
-from cow_service.jobs.active import At
 from cow_service.jobs.cleaning import CLEAN_UP_SECONDS, clean_up
 from cow_service.jobs.computing import EngineParts
 from cow_service.jobs.loop import JobLoop
 from cow_service.jobs.processes import Processes
 from cow_service.jobs.webhooks import Webhooks
+from cow_service.records.stages import At
 
 TICK_SECONDS, QUIET_TICK_SECONDS = 1.0, 5.0  # between two rounds, and while there are no jobs
 TELL_SECONDS = 2.0  # between two signs of life

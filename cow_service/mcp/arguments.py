@@ -1,6 +1,6 @@
 """Arguments of the tools: fields of the service's requests, flat, because models fill in flat arguments best.
 
-Names, types and descriptions are those of `SimulateRequest` and `AnswerRequest`; the server checks the values.
+`requests.flat` has their names, the request models all else; the server checks the values.
 """
 
 import json
@@ -8,59 +8,41 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, TypeAlias
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from cow_service.client import CowError, ImageLike
 from cow_service.errors import FieldError, InvalidRequest
 from cow_service.media.artifacts import media_type_of
-from cow_service.requests import AnswerRequest, ImageArtifact, SimulateRequest
+from cow_service.records import JobKind
+from cow_service.requests import ImageArtifact
+from cow_service.requests.flat import FLAT, flat_fields, put
 
-ToolName = Literal["simulate", "answer"]
-REQUESTS: dict[ToolName, type[SimulateRequest]] = {"simulate": SimulateRequest, "answer": AnswerRequest}
+ToolName: TypeAlias = JobKind
 # Arguments that stand deeper in a request. Every other argument is the field of its name.
-NESTED = {
-    **{name: f"grounding/{name}" for name in ("object", "bbox", "point")},
-    "direction": "motion/direction",
-    "motion_kind": "motion/kind",
-    **{name: f"motion/{name}" for name in ("speed", "distance", "duration", "until", "law")},
-    "frames_policy": "frames/policy",
-    "frames_count": "frames/count",
+NESTED = {each.argument: each.path for group in FLAT.values() for each in group if each.argument and "/" in each.path}
+# What the things in a list are described by.
+_MEMBERS = {"objects": ("object", "bbox"), "place": ("object", "relation", "targets")}
+_CHANGES = {
+    "remove": "Objects to take away before anything moves, in words.",
+    "place": "Objects to put somewhere: before anything else moves, or as the whole motion.",
 }
-# Fields that are no arguments: `interventions` are `remove` and `place`, the rest is for programs.
-_LEFT_OUT = {
-    *("grounding", "motion", "frames", "interventions", "trajectory", "camera", "depth", "ensemble", "fps"),
-    *("generator_options", "priority", "webhook", "live", "language"),
-}
-_LEFT_OUT_OF = {"simulate": {"options"}, "answer": {"video"}}
-_OF_OBJECTS = ("object", "bbox")
-_OF_PLACE = ("object", "relation", "targets")
 # `simulate` is for a caller who looks at the pictures.
 DEFAULTS: dict[ToolName, dict[str, Any]] = {"simulate": {"video": False}, "answer": {}}
 
 
 def input_schema(tool: ToolName, image: str) -> dict[str, Any]:
     """The JSON schema of a tool's arguments; `image` says how an image may be given."""
-    fields = inlined(REQUESTS[tool].model_json_schema())["properties"]
-    intervention = fields["interventions"]["items"]["properties"]
-    properties: dict[str, Any] = {name: fields[name] for name in ("image", "question")}
-    for name, path in NESTED.items():
-        record, _, field = path.partition("/")
-        properties[name] = fields[record]["properties"][field]
-    properties["remove"] = {
-        "type": "array",
-        "items": {"type": "string"},
-        "description": "Objects to take away before anything moves, in words.",
-    }
-    properties["place"] = {
-        "type": "array",
-        "items": _record_of(intervention, _OF_PLACE),
-        "description": "Objects to put somewhere: before anything else moves, or as the whole motion.",
-    }
-    properties |= {name: field for name, field in fields.items() if name not in _LEFT_OUT | _LEFT_OUT_OF[tool]}
-    properties["objects"] |= {"items": _record_of(fields["objects"]["items"]["properties"], _OF_OBJECTS)}
-    properties["image"] = {"type": "string", "description": image}
+    properties: dict[str, Any] = {"image": {"type": "string", "description": image}}
+    properties |= {field.argument: schema for field, schema in flat_fields(tool).items() if field.argument}
+    for name, members in _MEMBERS.items():
+        known = properties[name]["items"]["properties"]
+        item = {"type": "object", "properties": {each: known[each] for each in members}, "required": list(members)}
+        properties[name] = {**properties[name], "items": item}
+    for name, description in _CHANGES.items():
+        items = properties[name]["items"] if name in _MEMBERS else {"type": "string"}
+        properties[name] = {"type": "array", "items": items, "description": description}
     for name, default in DEFAULTS[tool].items():
         properties[name] = {**properties[name], "default": default}
     required = ["image", "question"]
@@ -88,51 +70,18 @@ def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, An
         if isinstance(argument, str) and known[name].get("type") != "string":
             with suppress(ValueError):  # some clients write lists and numbers as JSON in a string
                 value = json.loads(argument)
-        if name in ("remove", "place"):
-            things = value if isinstance(value, list) else [value]
-            changes = [{"object": thing} if name == "remove" else thing for thing in things]
-            changes = [{"kind": name, **change} if isinstance(change, Mapping) else change for change in changes]
-            request.setdefault("interventions", []).extend(changes)
-        elif name in NESTED:
-            record, _, field = NESTED[name].partition("/")
-            request.setdefault(record, {})[field] = value
+        if name in _CHANGES:
+            put(request, "interventions", _changes(name, value))
         else:
-            request[name] = value
+            put(request, NESTED.get(name, name), value)
     return request
 
 
-def inlined(schema: dict[str, Any], exclude: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """A JSON schema with each reference replaced, and without parts that tell a model nothing.
-
-    Those are titles and defaults of null; in arguments also null itself, which is always allowed. `exclude` names the
-    fields of results to leave out, as `BaseModel.model_dump` takes it.
-    """
-    records = schema.get("$defs", {})
-
-    def walk(schema: dict[str, Any], left_out: Mapping[str, Any]) -> dict[str, Any]:
-        if (reference := schema.get("$ref")) is not None:
-            schema = records[reference.rpartition("/")[2]] | {key: one for key, one in schema.items() if key != "$ref"}
-        choices = [one for one in schema.get("anyOf", ()) if one != {"type": "null"}]
-        if len(choices) == 1 and exclude is None:
-            return walk(choices[0] | {key: one for key, one in schema.items() if key != "anyOf"}, left_out)
-        needless = {"$defs", "title"} | ({"default"} if schema.get("default", ...) is None else set[str]())
-        found = {key: one for key, one in schema.items() if key not in needless}
-        for key in ("anyOf", "oneOf", "prefixItems"):
-            if key in found:
-                found[key] = [walk(one, left_out) for one in found[key]]
-        if isinstance(found.get("items"), dict):
-            found["items"] = walk(found["items"], left_out.get("__all__", {}))
-        if "properties" in found:
-            kept = {name: one for name, one in found["properties"].items() if left_out.get(name) is not True}
-            found["properties"] = {name: walk(one, left_out.get(name, {})) for name, one in kept.items()}
-            found["required"] = [name for name in found.get("required", ()) if name in kept]
-        return found
-
-    return walk(schema, exclude or {})
-
-
-def _record_of(properties: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    return {"type": "object", "properties": {name: properties[name] for name in names}, "required": list(names)}
+def _changes(kind: str, value: Any) -> list[Any]:
+    """The interventions of a kind that an argument lists, or is the only one of."""
+    things = value if isinstance(value, list) else [value]
+    changes = ({"object": thing} if kind == "remove" else thing for thing in things)
+    return [{"kind": kind, **change} if isinstance(change, Mapping) else change for change in changes]
 
 
 ARTIFACTS = "cow://artifacts/"

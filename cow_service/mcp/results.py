@@ -10,8 +10,9 @@ from mcp_types import CallToolResult, ImageContent, TextContent
 from PIL import Image
 
 from cow_service.client import AsyncClient, display
-from cow_service.mcp.arguments import ARTIFACTS, ToolName, inlined
+from cow_service.mcp.arguments import ARTIFACTS, ToolName
 from cow_service.records import Answer, Body, Simulation
+from cow_service.requests.flat import inlined
 
 # What a model has no use for: thousands of numbers, and who made it how.
 _OF_OBJECT = {"mask": True, "prior": True, "source": True, "role": True}
@@ -90,13 +91,7 @@ def answer_text(answer: Answer, video: str) -> str:
     lines = [f"Answer: {display.describe_answer(answer)}."]
     if answer.reasoning:
         lines.append(f"Reasoning: {answer.reasoning}")
-    if sum(answer.votes.values()) > 1:
-        lines.append(f"Votes: {display.votes_words(answer)}.")
-    if answer.gate is not None:
-        lines.append(f"Before looking: {display.gate_words(answer.gate)}.")
-    if (baseline := answer.baseline) is not None:
-        votes = f"; votes {display.votes_words(baseline)}" if sum(baseline.votes.values()) > 1 else ""
-        lines.append(f"Without imagined frames: {display.describe_answer(baseline)}{votes}.")
+    lines += (f"{name.capitalize()}: {said}." for name, said in display.answer_facts(answer).items())
     if answer.simulation is not None:
         lines += ["", "Imagined:", *_simulation_lines(answer.simulation, video)]
     else:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from cow_service.jobs.engine import JobEngine
 
-
 CANCEL_TIMEOUT_SECONDS = 5.0  # for telling the server that a caller has left
 
 log = logging.getLogger("cow_service")

@@ -7,5 +7,6 @@ Times are seconds from the first frame. Records hold no pixels and do no I/O: by
 from cow_service.records.grounding import *  # noqa: F403
 from cow_service.records.reading import *  # noqa: F403
 from cow_service.records.results import *  # noqa: F403
+from cow_service.records.stages import *  # noqa: F403
 from cow_service.records.values import *  # noqa: F403
 from cow_service.records.world import *  # noqa: F403

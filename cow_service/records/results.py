@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field
 
 from cow_service.records.grounding import Artifact, BBox, Grounding, ImageInfo, Language, Record, Sha256
 from cow_service.records.reading import Reading
+from cow_service.records.stages import ReadingStage
 from cow_service.records.world import Motion, Trajectory
 
 FramePolicy = Literal["initial", "uniform", "events"]
@@ -42,7 +43,7 @@ class ReaderInfo(Record):
     model: str | None = Field(default=None, description="Name under which the multimodal LLM is served.")
     revision: str | None = None
     prompts: dict[str, int] = Field(default_factory=dict, description="Version of each prompt sent.")
-    stages: tuple[Literal["gating", "baseline", "grounding", "motion", "answering"], ...] = Field(
+    stages: tuple[ReadingStage, ...] = Field(
         default=(), description="The stages that used the reader; the request gave the others."
     )
 

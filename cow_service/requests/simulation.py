@@ -337,6 +337,3 @@ class AnswerRequest(SimulateRequest):
     )
     baseline: Flag = Field(default=False, description="Also answer without frames, for comparison.")
     votes: Whole = Field(default=1, ge=1, le=32, description="How often to ask; the most frequent answer wins.")
-
-
-Stage = Literal["gating", "baseline", "grounding", "depth", "motion", "trajectory", "generation", "answering"]

@@ -8,8 +8,8 @@ from cow_service.errors import MllmBadReply
 from cow_service.media.images import decode_own
 from cow_service.readers.base import AnswerReading, Imagined, Reader, ReaderInput
 from cow_service.readers.options import read_choices
-from cow_service.records import AnswerOption, Gate, GateReason, Grounding, Simulation, Verdict
-from cow_service.requests import AnswerRequest, Stage
+from cow_service.records import AnswerOption, Gate, GateReason, Grounding, Simulation, Stage, Verdict
+from cow_service.requests import AnswerRequest
 from cow_service.stages.keys import FirstAnswers, StageResult
 from cow_service.stages.run import Run
 

@@ -24,11 +24,12 @@ from cow_service.records import (
     ReaderInfo,
     Record,
     Simulation,
+    Stage,
     Trajectory,
     Usage,
     Verdict,
 )
-from cow_service.requests import DepthRequest, SimulateRequest, Stage
+from cow_service.requests import DepthRequest, SimulateRequest
 
 Value = TypeVar("Value")
 

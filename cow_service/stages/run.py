@@ -15,7 +15,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from cow_service import errors
+from cow_service import errors, records
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator, Limits
@@ -25,22 +25,8 @@ from cow_service.observability.logging import rfc3339
 from cow_service.perception.base import Embedded, Perception
 from cow_service.physics.geometry import DepthMap
 from cow_service.readers.base import CallLog, Reader, ReaderInput, WordReader, WordsReading
-from cow_service.records import (
-    Artifact,
-    BBox,
-    Cue,
-    Estimate,
-    Grounding,
-    ImageArtifact,
-    Language,
-    MotionRequest,
-    ObjectRequest,
-    ReaderInfo,
-    Reading,
-    Record,
-    Usage,
-)
-from cow_service.requests import AnswerRequest, DepthRequest, SimulateRequest, Stage
+from cow_service.records import BBox, Grounding, Language, MotionRequest, ObjectRequest, Reading, Record, Stage, Usage
+from cow_service.requests import AnswerRequest, DepthRequest, SimulateRequest
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
 from cow_service.vision.scene import ImageKey, Scene, SeenImages
 from cow_service.vision.types import Mask
@@ -119,7 +105,7 @@ def priority_of(turn: int, created_at: str) -> str:
     return f"{turn:010d} {created_at}"
 
 
-def _stored_mask(artifacts: ArtifactStore, mask: Artifact) -> Mask:
+def _stored_mask(artifacts: ArtifactStore, mask: records.Artifact) -> Mask:
     """A function apart from the run: a scene that knew its run would hold its pixels until garbage is collected."""
     return decode_own_mask(artifacts.read(mask.sha256))
 
@@ -186,7 +172,7 @@ class Run(Generic[Request_co]):
         scene = self.scene.keeping((mover, *others))
         return (scene.with_trail_named() if trail_named else scene).with_mover(mover)
 
-    def scene_of(self, grounding: Grounding, cue: Cue | None = None) -> Scene:
+    def scene_of(self, grounding: Grounding, cue: records.Cue | None = None) -> Scene:
         """The image as a grounding, and the cue of its motion, have it; its masks are those that were stored.
 
         A mask cut again from its box may differ from one that was cut around a point, or given.
@@ -230,7 +216,7 @@ class Run(Generic[Request_co]):
         given, image = self.request.depth, self.image.info
         if given is None:
             return None
-        assert isinstance(given.map, ImageArtifact), "the pictures of a request are kept before its stages run"
+        assert isinstance(given.map, records.ImageArtifact), "the pictures of a request are kept before its stages run"
         try:
             data = self.backends.artifacts.read(given.map.artifact)
             values = decode_depth(data, max_megapixels=image.width * image.height / 1e6)
@@ -251,12 +237,12 @@ class Run(Generic[Request_co]):
         return DepthMap(depth, given.scale, given.deviation, given.focal, source)
 
     @property
-    def focal(self) -> Estimate | None:
+    def focal(self) -> records.Estimate | None:
         """The focal length (px) that the depth map was made with, else the one of the image's EXIF."""
         mapped, exif = None if self.depth is None else self.depth.focal, self.image.info.focal
         if mapped is not None:
-            return Estimate(value=mapped, deviation=MAPPED_DEVIATION * mapped)
-        return None if exif is None else Estimate(value=exif, deviation=EXIF_DEVIATION * exif)
+            return records.Estimate(value=mapped, deviation=MAPPED_DEVIATION * mapped)
+        return None if exif is None else records.Estimate(value=exif, deviation=EXIF_DEVIATION * exif)
 
     @cached_property
     def words(self) -> WordsReading:
@@ -461,12 +447,12 @@ class Run(Generic[Request_co]):
             "reused": tuple(stage for stage in stages if stage in self.reused),
         }
 
-    def reader_info(self, *stages: Stage) -> ReaderInfo:
+    def reader_info(self, *stages: Stage) -> records.ReaderInfo:
         """Who read for some stages; a reader that none of them needed is named but was never loaded."""
         done = {stage: self.results[stage].reader for stage in stages if stage in self.results}
         infos = {stage: info for stage, info in done.items() if info is not None}
         if not infos:
-            return ReaderInfo(name=self.backends.reader_name)
+            return records.ReaderInfo(name=self.backends.reader_name)
         prompts = {name: version for info in infos.values() for name, version in info.prompts.items()}
         told = {"prompts": dict(sorted(prompts.items())), "stages": tuple(infos)}
         return next(iter(infos.values())).model_copy(update=told)

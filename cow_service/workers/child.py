@@ -30,7 +30,7 @@ from cow_service.jobs.readiness import warm_up
 from cow_service.observability import logging as context
 from cow_service.observability import tracing
 from cow_service.observability.metrics import gpu_memory
-from cow_service.requests import Stage
+from cow_service.records import Stage, is_ahead
 from cow_service.service import Service
 from cow_service.settings import WORKER_BYTES, Settings
 from cow_service.workers import messages
@@ -73,7 +73,8 @@ class _Job:
 
     def _progress(self, stage: Stage | None, done: float) -> None:
         self.active.check()
-        if stage is not None and (stage != self.active.at[0] or done >= min(1.0, self.active.at[1] + MIN_PROGRESS)):
+        current, reached = self.active.at
+        if is_ahead((stage, done), (current, reached if done >= 1.0 else reached + MIN_PROGRESS)):
             self.active.at = stage, done
             self._send(messages.Progressed(self.job.run, stage, done))
 

@@ -11,8 +11,7 @@ from pydantic import Field, TypeAdapter
 
 from cow_service.jobs.computing import JobOutcome
 from cow_service.jobs.job_table import TakenJob
-from cow_service.records import GpuMemory, WorkerLoad
-from cow_service.requests import Stage
+from cow_service.records import GpuMemory, Stage, WorkerLoad
 
 MAX_MESSAGE_BYTES = 512_000_000  # a larger one ends the connection
 

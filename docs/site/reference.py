@@ -142,7 +142,7 @@ def command(it: Any, parent: Any, path: str) -> Iterator[str]:
     if parent is not None and (it.callback or not below):
         usage = " ".join([path, *it.collect_usage_pieces(context)])
         yield f"## `{path}`\n\n{inspect.cleandoc(it.help or '')}\n\n```text\n{usage}\n```\n\n"
-        told = [each.get_help_record(context) for each in it.params if each.name != "help"]
+        told = [each.get_help_record(context) for each in it.get_params(context) if each.name != "help"]
         rows = ((f"`{names}`", words.replace("<", "&lt;")) for names, words in filter(None, told))
         yield table("option, meaning", rows)
     for name, each in below:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Any, Union, get_args, get_origin
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from drawn import Image, ball, block, floor, png_bytes
 from floors import TrueCamera, depth_png
 from pydantic import BaseModel
@@ -17,6 +20,7 @@ from tables import rows
 
 from cow_service.records import Answer, Estimate, ObjectPrior, PlaceRequest, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.requests.flat import FLAT, REQUESTS, flat_fields
 from cow_service.service import Service
 from cow_service.settings import Settings
 
@@ -238,3 +242,30 @@ def test_a_field_changes_something(path: str, results: Service) -> None:
         found.append(results.answer(AnswerRequest.model_validate(with_field(BASE | beside, path, value))))
     one, other = (told(each.model_dump(mode="json")) for each in found)
     assert one != other
+
+
+def test_the_tables_of_the_docs_say_what_the_fields_are() -> None:
+    """Defaults as they are, and examples that a server takes."""
+    ask, correct = ((ROOT / "docs" / name).read_text() for name in ("ask.md", "correct.md"))
+    table = ask.partition("| field | default | effect |")[2].partition("\n\n")[0]
+    told = re.findall(r"^\| `(\w+)` \| `?([^|`]+)`? \|", table, re.MULTILINE)
+    told += re.findall(r"`(\w+)`(?: times)? \(([\d.]+)\)", ask)
+    assert len(told) >= 8
+    for name, default in told:
+        known = AnswerRequest.model_fields[name].default
+        assert known is None or str(known).lower() == default.strip(), name
+    rows = re.findall(r"^\| [^|]+ \| `(\w+)`[^|]* \| ([^|]+) \|", correct, re.MULTILINE)
+    written = [
+        (name, text) for name, row in rows for text in re.findall(r"`([{\[].*?[}\]])`", row) if "..." not in text
+    ]
+    examples = [(name, json.loads(text)) for name, text in written]
+    assert {name for name, _ in examples} > {"grounding", "objects", "motion", "interventions", "asked"}
+    for name, example in examples:
+        SimulateRequest.model_validate(BASE | {name: example})
+
+
+def test_flat_names_are_of_fields_and_no_two_are_alike() -> None:
+    flat = [field for fields in FLAT.values() for field in fields]
+    for names in ([field.option for field in flat], [field.argument for field in flat]):
+        assert len({name for name in names if name}) == len([name for name in names if name])
+    assert {field.path for field in flat} == {field.path for kind in REQUESTS for field in flat_fields(kind)}

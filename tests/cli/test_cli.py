@@ -25,9 +25,9 @@ from waiting import TIME_LIMIT, eventually
 
 from cow_service import __version__
 from cow_service.cli.main import app
-from cow_service.cli.options import COMMANDS, FIELDS, GROUPS, printable, request_body
+from cow_service.cli.options import COMMANDS, WRITTEN, printable, request_reader
 from cow_service.records import Answer, Models, Simulation
-from cow_service.requests import AnswerRequest, SimulateRequest
+from cow_service.requests.flat import FLAT, FlatField, flat_fields
 
 QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 QUICK = ("--num-frames", "9", "--ensemble", "0", "--no-video")
@@ -154,14 +154,13 @@ def test_options_become_fields_of_a_request(tmp_path: Path) -> None:
     path.write_text('{"points": [[1, 2], [3, 4]]}')
     depth = tmp_path / "depth.png"
     depth.write_bytes(b"png")
-    moving = {"box": "105, 155,195,245", "name": "it", "direction": "0,-1", "kind": "projectile", "speed": 50.0}
+    moving = {"box": "105, 155,195,245", "object": "it", "direction": "0,-1", "kind": "projectile", "speed": 50.0}
     scene = {"other": ["blue cube=1,2,3,4", "a=b=5,6"], "remove": ["mug"], "depth": depth, "depth_scale": 0.001}
     place = ["apple in front of the bowl", "cube BETWEEN mug and vase"]
-    own = {"own": ["steps=4", "mode=fast"], "fields": '{"camera": {"pitch": 25}, "depth": {"focal": 240}}'}
-    body = request_body(**moving, **scene, **own, place=place, max_side=0, until="contact", distance=60.0)
+    own = {"option": ["steps=4", "mode=fast"], "request": '{"camera": {"pitch": 25}, "depth": {"focal": 240}}'}
+    read = request_reader("answer")
+    body = read(**moving, **scene, **own, place=place, max_side=0, until="contact", distance=60.0, choice=["a", "b"])
     assert body == {
-        **{"ensemble": 50, "num_frames": 81, "fps": 16, "seed": None, "reader": None, "generator": None},
-        "language": None,
         "grounding": {"bbox": [105, 155, 195, 245], "object": "it"},
         "motion": {"direction": [0, -1], "kind": "projectile", "speed": 50, "distance": 60, "until": "contact"},
         "objects": [{"object": "blue cube", "bbox": [1, 2, 3, 4]}, {"object": "a=b", "point": [5, 6]}],
@@ -172,50 +171,59 @@ def test_options_become_fields_of_a_request(tmp_path: Path) -> None:
         ],
         "depth": {"map": "data:image/png;base64,cG5n", "scale": 0.001, "focal": 240},
         "camera": {"pitch": 25},
-        "frames": {"policy": "events", "count": 4, "max_side": None},
+        "frames": {"max_side": None},
         "generator_options": {"steps": 4, "mode": "fast"},
+        "options": ["a", "b"],
     }
-    named = request_body(name="it", trajectory=path)
+    named = read(object="it", trajectory=path)
     assert named["grounding"] == {"object": "it", "point": [1, 2]}
     assert named["trajectory"] == {"points": [[1, 2], [3, 4]]}
 
 
-def test_options_have_the_defaults_of_the_fields() -> None:
-    sent = request_body()
-    default = SimulateRequest(image="data:", question="?").model_dump(mode="json")
-    for name in ("ensemble", "num_frames", "fps", "seed", "reader", "generator"):
-        assert sent[name] == default[name]
-    for name in ("count", "max_side"):
-        assert sent["frames"][name] == default["frames"][name]
-    for command, model in (("simulate", SimulateRequest), ("answer", AnswerRequest)):
-        own = {param.name: param.default for param in commands()[command].params}
-        fields = {name: field.default for name, field in model.model_fields.items() if name in own}
-        for name in ("image", "question", "frames"):
-            del fields[name]
-        assert fields.items() <= own.items()
-    for path in FIELDS.values():
-        record, _, field = path.partition("/")
-        assert field in SimulateRequest.model_json_schema()["$defs"][f"{record.capitalize()}Request"]["properties"]
+def test_options_are_fields_of_the_request() -> None:
+    """With their defaults and descriptions; what differs from the default is sent."""
+    names = {field.option for fields in FLAT.values() for field in fields}
+    assert WRITTEN.keys() < names | {"request"}
+    for kind, command in (("simulate", commands()["simulate"]), ("answer", commands()["answer"])):
+        own = {param.name: param for param in command.get_params(typer.Context(command))}
+        for field, schema in flat_fields(kind).items():
+            if field.option and field.option not in WRITTEN:
+                shown = own[field.option]
+                assert (shown.default, shown.help) == (schema.get("default"), schema["description"])
+        assert request_reader(kind)(**{name: param.default for name, param in own.items() if name in names}) == {}
+    read = request_reader("simulate")
+    assert read(object="it", point="1,2", law="contact", request='{"grounding": {"size": 0.1}, "motion": null}') == {
+        "grounding": {"object": "it", "point": [1, 2], "size": 0.1},
+        "motion": None,
+    }
+
+
+def test_a_field_of_several_forms_is_written_as_json_or_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    length = FlatField("motion/distance", "distance", "distance")
+    forms = {"anyOf": [{"type": "number"}, {"type": "object"}]}
+    monkeypatch.setattr("cow_service.requests.flat.flat_fields", lambda _: {length: forms})
+    for text, value in (("5", 5), ('{"value": 2, "unit": "m"}', {"value": 2, "unit": "m"}), ("2 m", "2 m")):
+        assert request_reader("simulate")(distance=text) == {"motion": {"distance": value}}
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"point": "1;2"}, "--point takes 2 numbers"),
-        ({"box": "1,2,3"}, "--box takes 4 numbers"),
-        ({"direction": "left"}, "-1,0 for to the left"),
+        ({"point": "1;2"}, "--point takes X,Y, numbers separated by commas"),
+        ({"box": "1,2,3"}, "--box takes X0,Y0,X1,Y1"),
+        ({"direction": "left"}, "--direction takes DX,DY"),
         ({"other": ["430,160"]}, "--other takes NAME=X0,Y0,X1,Y1"),
         ({"place": ["the ball near the box"]}, "--place takes an object"),
-        ({"name": "x"}, "--object needs --point, --box or --trajectory"),
+        ({"object": "x"}, "--object needs --point, --box or --trajectory"),
         ({"depth_scale": 0.001}, "--depth-scale needs --depth"),
-        ({"own": ["steps"]}, "--option takes NAME=VALUE"),
-        ({"fields": "r.json"}, "--request is not JSON"),
-        ({"fields": "[]"}, "--request must be an object, got list"),
+        ({"option": ["steps"]}, "--option takes NAME=VALUE"),
+        ({"request": "r.json"}, "--request is not JSON"),
+        ({"request": "[]"}, "--request must be an object, got list"),
     ],
 )
 def test_an_option_that_cannot_be_read_is_named(options: dict[str, Any], says: str) -> None:
     with refused("invalid-request") as caught:
-        request_body(**options)
+        request_reader("simulate")(**options)
     assert says in caught.value.detail
 
 
@@ -227,7 +235,7 @@ def test_an_option_that_cannot_be_read_is_named(options: dict[str, Any], says: s
     [
         (["If the pink car moves left, what?"], 1, "cannot-ground: "),
         (["If the red ball moves forward, what?"], 1, "Use --direction DX,DY (x right, y down)."),
-        ([QUESTION, "--until", "never"], 2, "'never' is not one of 'contact'. Choose one of these"),
+        ([QUESTION, "--until", "never"], 2, "'never' is not one of 'contact', 'out-of-view'. Choose one of these"),
         ([QUESTION, "--format", "gif", "--no-video"], 1, "--no-video"),
         ([QUESTION, "--request", '{"foo": 1}'], 1, "--request takes these fields: "),
         ([QUESTION, "--distance", "-5"], 1, "motion.distance: "),
@@ -362,4 +370,4 @@ def test_version_and_help(cow: Any) -> None:
     listed = re.findall(r"^  (\w+) ", shown.partition("Ask:")[2], re.M)
     assert sorted(listed) == sorted(name for name, each in commands().items() if not each.hidden)
     titles = re.findall(r"^(\w[\w ]+):$", cow("simulate", "--help").stdout, re.M)
-    assert titles == ["Arguments", "Options", *GROUPS]
+    assert titles == ["Arguments", "Options", *[*FLAT][1:-1]]

@@ -16,7 +16,7 @@ from servers import BODY, IMAGE, QUESTION, Served
 
 from cow_service import client as sdk
 from cow_service.client import AsyncClient
-from hatch_build import CLIENT, TWINS, twin_of
+from hatch_build import CLIENT, OPTIONS, TWINS, options_text, twin_of
 
 __all__ = ["address", "served"]  # fixtures
 
@@ -34,6 +34,7 @@ SMALL = {name: value for name, value in BODY.items() if name not in ("image", "q
 @pytest.mark.parametrize("source", TWINS)
 def test_the_blocking_twin_is_up_to_date(source: str) -> None:
     assert twin_of(CLIENT / source) == (CLIENT / TWINS[source]).read_text(), "install the package again"
+    assert options_text() == (CLIENT / OPTIONS).read_text(), "install the package again"
 
 
 def _signature(member: Any) -> str:

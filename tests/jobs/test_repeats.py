@@ -30,8 +30,8 @@ from cow_service.cli.console import answer_table
 from cow_service.client.display import answer_html
 from cow_service.jobs.computing import KeyLocks, Outages, StoredStep
 from cow_service.pipeline import answer
-from cow_service.records import Answer, Usage
-from cow_service.requests import AnswerRequest, Stage
+from cow_service.records import Answer, Stage, Usage
+from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
 

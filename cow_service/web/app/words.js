@@ -9,9 +9,11 @@ export const MEETS = { touches: "hits", occludes: "passes in front of", "occlude
 /** What a request can give instead of the reader, as the page calls it. */
 export const CORRECTED = { grounding: "what moves", motion: "its motion", trajectory: "its path", camera: "the camera", objects: "other objects", interventions: "what is changed before" };
 
+/** In their order, as `records/stages.py` has them; without those that run beside others. */
 export const STAGES = {
   gating: "First answers",
   grounding: "Find the object",
+  depth: "Measure the depth",
   motion: "Read the motion",
   trajectory: "Simulate the motion",
   generation: "Make the frames",
@@ -20,7 +22,7 @@ export const STAGES = {
 
 export const SIMULATE_STAGES = ["grounding", "motion", "trajectory", "generation"];
 
-/** The stages of a request, in their order. */
+/** The stages of a request, in their order; servers with a depth model have that of the depth, too. */
 export function stagesOf(settings) {
   if (settings.kind !== "answer") return SIMULATE_STAGES;
   const stages = settings.imagine === "never" ? [] : SIMULATE_STAGES;

@@ -4,12 +4,13 @@ import { html } from "../vendor/htm-preact.js";
 import { STAGES, percent, plural, seconds, stagesOf } from "../app/words.js";
 
 function running(run) {
-  const stages = stagesOf(run.settings);
-  const at = stages.indexOf(run.job.stage);
-  const done = run.done.length ? Math.max(...run.done.map((stage) => stages.indexOf(stage))) : -1;
-  return stages.map((stage, place) => {
-    if (place <= done || place < at) return { stage, state: "done", text: "" };
-    return place === at ? { stage, state: "now", text: "" } : { stage, state: "next", text: "" };
+  const order = Object.keys(STAGES);
+  const at = order.indexOf(run.job.stage);
+  const done = Math.max(-1, ...run.done.map((stage) => order.indexOf(stage)));
+  const shown = [...stagesOf(run.settings), run.job.stage];
+  return order.filter((stage) => shown.includes(stage)).map((stage) => {
+    const place = order.indexOf(stage);
+    return { stage, state: place <= done || place < at ? "done" : place === at ? "now" : "next", text: "" };
   });
 }
 
@@ -17,7 +18,7 @@ function ended(result) {
   const made = result.answer ?? result.simulation;
   const timings = { ...(result.simulation?.timings ?? {}), ...made.timings };
   const reused = new Set([...(result.simulation?.reused ?? []), ...made.reused]);
-  return stagesOf(result.settings).filter((stage) => stage in timings || reused.has(stage)).map((stage) => ({
+  return Object.keys(STAGES).filter((stage) => stage in timings || reused.has(stage)).map((stage) => ({
     stage,
     state: reused.has(stage) ? "kept" : "done",
     text: reused.has(stage) ? "kept" : seconds(timings[stage]),
