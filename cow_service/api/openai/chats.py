@@ -210,19 +210,28 @@ def locate_in_chat(error: CowError, own: Mapping[str, str]) -> CowError:
     return located
 
 
+class ChatMessage(BaseModel, extra="allow"):
+    """One message. Pictures by URL go on as data, and imagined frames are added behind the last one of a user."""
+
+    role: str | None = None
+    content: str | list[str | dict[str, Any]] | None = Field(default=None, description="Text, or parts.")
+
+
 class ChatRequest(BaseModel, extra="allow"):
     """A chat, as OpenAI's chat completions have it. All its other fields go on to the MLLM unchanged, and so do those
     that the server's operator lists (`COW_CHAT_FIELDS`); more are refused.
 
     A model without an MLLM behind it, such as `cow/embedded`, answers the last user message about exactly one image;
-    it uses these fields, `stream_options` and `seed`, and a warning names others that ask for something.
+    it uses no other field than these, and a warning names those that ask for something.
     """
 
     model: str = Field(description="One of `GET /v1/models`.")
-    messages: list[dict[str, Any]] = Field(
-        min_length=1, description="As OpenAI has them. Imagined frames are added behind the last one of a user."
-    )
+    messages: list[ChatMessage] = Field(min_length=1)
     stream: bool | None = Field(default=None, description="Answer with server-sent events.")
+    stream_options: dict[str, Any] | None = None
+    seed: int | None = Field(
+        default=None, description="Goes on to the MLLM; of `cow/embedded`, `seed` of `AnswerRequest`."
+    )
     cow: dict[str, Any] | None = Field(
         default=None, description="COW's own: fields of `SimulateRequest`; of `cow/embedded`, of `AnswerRequest`."
     )

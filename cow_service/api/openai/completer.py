@@ -169,10 +169,7 @@ class Completer:
             refused = isinstance(reply, ChatTurn) and not reply.succeeded
             if enriched.chat.stream and not refused:
                 return stream.Streamed(_events_of(reply, enriched), close=stack.pop_all().aclose)
-        if isinstance(reply, ChatTurn):
-            return reply
-        detail = "The server of the multimodal LLM streamed its reply, which the chat did not ask for."
-        raise errors.MllmBadReply(detail)
+        return _whole(reply)
 
     async def _ask(self, enriched: EnrichedChat, reader: ChatReader, stack: AsyncExitStack) -> ChatTurn | Events:
         """What the MLLM replies, with `cow` in a whole reply. A stream stays open until the stack is closed."""
@@ -212,6 +209,14 @@ class Completer:
         winner, votes, warnings = await to_thread.run_sync(elect, enriched.chat, replies)
         extension = enriched.extension(*winner.warnings, *warnings, votes=votes)
         return replace(winner, body=winner.body | {EXTENSION: extension})
+
+
+def _whole(reply: ChatTurn | Events) -> ChatTurn:
+    """The reply of a chat that asked for no stream. Raises `MllmBadReply` for one."""
+    if isinstance(reply, ChatTurn):
+        return reply
+    detail = "The server of the multimodal LLM streamed its reply, which the chat did not ask for."
+    raise errors.MllmBadReply(detail)
 
 
 def preferences_without_key(request: Request) -> submitting.Preferences:
