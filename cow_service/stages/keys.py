@@ -65,7 +65,7 @@ def digest_of(values: Mapping[str, Any]) -> str:
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 19  # of stored results; raised where what a stage means or stores changes
+FORMAT = 20  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from cow_service.records import BBox, Point
 from cow_service.vision.contrast import WORKING_SIDE, lab_gradients
 from cow_service.vision.masks import lab_of, scaled
-from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.vision.types import Floats, Image, Mask
 
 EDGE = 1.0, 2.2  # Lab units per px, and times the median gradient; the larger counts
 MAX_EDGES = 12_000  # edge pixels: an image with more is too cluttered to be searched
@@ -74,13 +74,7 @@ class Edges:
     @staticmethod
     def of(image: Image) -> Edges | None:
         """The edges of an RGB image [H, W, 3]; None if it is too cluttered, or plain."""
-        small = scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2])))
-        return Edges.at(lab_gradients(lab_of(small)), (image.shape[1], image.shape[0]))
-
-    @staticmethod
-    def at(gradients: tuple[Floats32, Floats32, Floats32], size: tuple[int, int]) -> Edges | None:
-        """The edges of an image of a size (width, height) by its `lab_gradients` at the working size, else as `of`."""
-        dx, dy, total = gradients
+        dx, dy, total = lab_gradients(lab_of(scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2])))))
         strong = total > max(EDGE[0], EDGE[1] * float(np.median(total[::2, ::2])))
         strong[:2] = strong[-2:] = False
         strong[:, :2] = strong[:, -2:] = False
@@ -105,7 +99,7 @@ class Edges:
         bend = np.maximum(2 * here - ahead - behind, 1e-6)
         points += np.clip(0.5 * (ahead - behind) / bend, -0.5, 0.5)[:, None] * normals
         down, (height, width) = np.argsort(points[:, 1], kind="stable"), total.shape
-        stretch = size[0] / width, size[1] / height
+        stretch = image.shape[1] / width, image.shape[0] / height
         return Edges(points[down], normals[down], (height, width), stretch)
 
     def circles(self) -> tuple[Circle, ...]:

@@ -68,7 +68,8 @@ Measured = dict[str, Any]
 """Cached properties of a `Scene` by their names."""
 PART_OF = 0.5  # of its area: what lies in a thing that was outlined is no thing of its own
 # Neither mover nor words decide them.
-OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "undrawn", "side_view", "_all_trails", "segments")
+OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "undrawn", "side_view", "segments")
+WITHOUT_TRAILS = ("clean", "regions", "faint")  # nor do they decide these, where no trail is named
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ class Scene:
 
     image: Image
     mover: BBox | None = None  # the present position of what moves, once it is known: it tells which end of a trail is
-    trail_named: bool = False  # the question speaks of a trail: balls that look alike, one after another, are one
+    trail_named: bool = False  # the question or the reader speaks of a trail: balls in a row are one over time
     _found: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], repr=False)
     _preset: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
 
@@ -139,16 +140,17 @@ class Scene:
         return np.zeros((0, 4)) if self.side_view else find_segments(self.undrawn, self.cues)
 
     @cached_property
-    def _all_trails(self) -> tuple[Trail, ...]:
-        return () if self.side_view else find_trails(self.undrawn, self._undrawn_view)
-
-    @cached_property
     def trails(self) -> tuple[Trail, ...]:
-        """Several positions of one ball each, the present one last: at the mover, or as it shows, or as a guess."""
-        found = [trail for trail in self._all_trails if trail.evident or self.trail_named]
+        """Several positions of one ball each, the present one last: at the mover, or as it shows, or as a guess.
+
+        None where nobody speaks of a trail.
+        """
+        if not self.trail_named or self.side_view:
+            return ()
+        found = find_trails(self.undrawn)
         own = None if self.mover is None else trail_ending_at(found, self.mover)
         if own is None:
-            return tuple(found)
+            return found
         return (own, *(trail for trail in found if set(trail.positions) != set(own.positions)))
 
     @cached_property
@@ -164,15 +166,7 @@ class Scene:
         return image
 
     @cached_property
-    def _undrawn_view(self) -> View:
-        return measure(self.undrawn)
-
-    @property
     def _view(self) -> View:
-        return self._undrawn_view if self.clean is self.undrawn else self._clean_view
-
-    @cached_property
-    def _clean_view(self) -> View:
         return measure(self.clean)
 
     @cached_property
@@ -239,14 +233,14 @@ class Scene:
 
     def measured(self) -> Measured:
         """The measurements so far that depend only on the image; read-only."""
-        alone = OF_THE_IMAGE
-        if self.__dict__.get("_all_trails") == ():  # then nothing depends on which end of one is meant
-            alone = (*alone, "clean", "regions", "faint")
+        alone = OF_THE_IMAGE if self.trail_named else (*OF_THE_IMAGE, *WITHOUT_TRAILS)
         return {key: self.__dict__[key] for key in alone if key in self.__dict__}
 
     def take(self, measured: Measured) -> None:
         """Takes over what another scene of the same image has measured."""
-        self.__dict__.update({key: value for key, value in measured.items() if key not in self.__dict__})
+        other = WITHOUT_TRAILS if self.trail_named else ()
+        new = {key: value for key, value in measured.items() if key not in self.__dict__ and key not in other}
+        self.__dict__.update(new)
 
     def arrows_near(self, bbox: BBox) -> list[Arrow]:
         """Arrows that start or end close to a box and at no other object, nearest first."""

@@ -1,8 +1,8 @@
 """Finds trails: three or more positions of one ball in one image, faded or as opaque as in a multiple exposure.
 
 Two circles that look alike are the start; others that look like them are sought between and beyond them, on a path
-along which place and size change smoothly. Balls that merely look alike are no trail by themselves: see
-`Trail.evident`.
+along which place and size change smoothly. Balls that merely look alike are no trail by themselves: only where the
+question or the reader speaks of one is a picture searched.
 """
 
 from __future__ import annotations
@@ -17,14 +17,12 @@ import numpy as np
 
 from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
-from cow_service.vision.contrast import View
 from cow_service.vision.masks import iou
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
 LEAST_OPACITY = 0.08
 MOST_UNREST = 12.0  # grey levels of a background's variation that are allowed for
-SCREENED_SUPPORT = 0.45, 0.2  # of the circumference of one at an end and of a third, on edges of a smoothed image
 END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
 PALE_SUPPORT, PREDICTED = 0.4, 0.2  # the same of one that a trail's path leads to, and how near to it, in radii
 SURE_SUPPORT = 0.3  # of the circumference: with more, no better circle is sought nearby
@@ -86,7 +84,6 @@ class Trail:
     """Positions of one ball along its path, the oldest first and the present one last."""
 
     positions: tuple[Position, ...]
-    evident: bool  # it shows by itself: its positions overlap or fade. Else they may be several balls that look alike
     end_known: bool  # which end is the present one: told by their opacity, or named
 
     @property
@@ -119,7 +116,7 @@ class Trail:
         else:
             return self
         is_last = gaps[1] <= gaps[0]
-        return Trail(self.positions if is_last else self.positions[::-1], self.evident, True)
+        return Trail(self.positions if is_last else self.positions[::-1], True)
 
 
 def trail_of(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
@@ -134,16 +131,12 @@ def trail_ending_at(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
     for trail in trails:
         for positions in (trail.positions, trail.positions[::-1]):
             if iou(positions[-1].bbox, bbox) >= SAME_POSITION_IOU:
-                return Trail(positions, trail.evident, True)
+                return Trail(positions, True)
     return None
 
 
-def find_trails(image: Image, view: View) -> tuple[Trail, ...]:
-    """Trails of balls in an RGB image [H, W, 3] without drawings on it, the longest first. `view` is that of it."""
-    # Most pictures end here: the view's edges are those of a smoothed image, which show circles, if not notches.
-    smooth = Edges.at((view.across, view.down, view.edges), (image.shape[1], image.shape[0]))
-    if smooth is None or not _Search(smooth, image).may_find(smooth.circles()):
-        return ()
+def find_trails(image: Image) -> tuple[Trail, ...]:
+    """Trails of balls in an RGB image [H, W, 3] without drawings on it, the longest first."""
     edges = Edges.of(image)
     if edges is None:
         return ()
@@ -173,19 +166,6 @@ class _Search:
     edges: Edges
     image: Image
 
-    def may_find(self, circles: Sequence[Circle]) -> bool:
-        """Whether three of some circles may be positions of one ball, two of them such as `trail_through` starts from.
-
-        Of a position that others cover in part, enough is seen to be among the circles that stand out.
-        """
-        seen = [c for c in circles if c.support >= SCREENED_SUPPORT[1]]
-        ends = [c for c in seen if c.support >= SCREENED_SUPPORT[0] and self.contrast(c) >= 0.8 * LEAST_CONTRAST]
-        for pair in _pairs(ends):
-            chains = [chain for each in seen if (chain := _joined(each, *pair)) is not None]
-            if chains and self.are_alike(pair) and any(self.are_alike(chain) for chain in chains):
-                return True
-        return False
-
     def trail_through(self, a: Circle, b: Circle) -> Trail | None:
         """The trail through two positions; None if fewer than three lie along a path.
 
@@ -210,12 +190,10 @@ class _Search:
             return None
         opacity = np.clip(shares / shares.max(), 0, 1)
         positions = tuple(Position(c.x, c.y, c.radius, float(o)) for c, o in zip(chain, opacity, strict=True))
-        overlap = all(math.dist(p.centre, q.centre) < 0.95 * (p.radius + q.radius) for p, q in pairwise(positions))
         known = abs(float(opacity[0] - opacity[-1])) > 1 - FADED
-        faded = known and float(np.sort(opacity)[:-1].max()) < FADED
         rank = (opacity[0], opacity[-1]) if known else (chain[0].support, chain[-1].support)
         ordered = positions if rank[1] >= rank[0] else positions[::-1]
-        return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
+        return Trail(ordered, known)
 
     def between(self, edges: Edges, a: Circle, b: Circle, inner: int) -> Chain | None:
         """Two circles with others between them, evenly along an arc that bulges to one side or the other."""
@@ -383,21 +361,6 @@ def _pairs(ends: Sequence[Circle]) -> Iterator[tuple[Circle, Circle]]:
         small, large = sorted((a.radius, b.radius))
         if 0.25 * mean < apart < MOST_GAP * 3 * mean and large < SIZES**3 * small:
             yield a, b
-
-
-def _joined(circle: Circle, a: Circle, b: Circle) -> Chain | None:
-    """Two positions and a circle that may be a third, in order: it is about as large, and between or beyond them."""
-    small, large = sorted((a.radius, b.radius))
-    x, y = b.x - a.x, b.y - a.y
-    along, aside = (
-        ((circle.x - a.x) * right + (circle.y - a.y) * down) / (x * x + y * y) for right, down in ((x, y), (y, -x))
-    )
-    if not small / SIZES**2 < circle.radius < large * SIZES**2 or not -SPACING[1] < along < 1 + SPACING[1]:
-        return None
-    near = any(math.dist(circle.centre, each.centre) < LEAST_GAP * small for each in (a, b))
-    if near or abs(aside) > MOST_SAG + max(0.0, -along, along - 1):
-        return None
-    return (circle, a, b) if along < 0 else (a, b, circle) if along > 1 else (a, circle, b)
 
 
 def _is_path(chain: Chain) -> bool:

@@ -170,7 +170,7 @@ MEASURED = {
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_what_is_measured_in_a_picture(name: str) -> None:
-    found = figures(Scene(PICTURES[name]()))
+    found = figures(Scene(PICTURES[name](), trail_named=name == "thrown"))
     assert [row[0] for row in found] == [row[0] for row in MEASURED[name]]
     for row, expected in zip(found, MEASURED[name], strict=True):
         assert row[1:] == pytest.approx(expected[1:], rel=0.004, abs=0.004), row
