@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox, Point
-from cow_service.vision.masks import lab_of
 from cow_service.vision.strokes import STROKE, Stroke, WorkingImage, drawing_mask
-from cow_service.vision.types import Floats, Image, Mask
+from cow_service.vision.types import Floats, Mask
 
 
 class ArrowRules(NamedTuple):
@@ -51,8 +50,6 @@ class BoxRules(NamedTuple):
     side: int = 14  # px at the working size
     on_outline: float = 0.93  # share of the stroke that lies on its own bounding rectangle
     covered: float = 0.85  # share of that rectangle's outline that the stroke covers: dashes are fine
-    fringe: int = 2  # px of what resampling blurs
-    between: float = 12.0  # Lab units within which a colour is a mixture of two others
 
 
 BOX = BoxRules()
@@ -253,20 +250,13 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox
         if stroke.hollow or min(h, w) < BOX.side:  # a box is drawn around something: its inside is not drawn
             continue
         sides = (patch[:, w // 2], patch[:, w // 2][::-1], patch[h // 2], patch[h // 2][::-1])
-        starts = [int(np.argmax(side)) for side in sides]  # the line begins within a fringe of 2 px
-        widths = [
-            start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0
-            for start, side in zip(starts, sides, strict=True)
-        ]
-        line = int(np.median(widths))
+        line = int(np.median([_line_width(side) for side in sides]))
         if not 1 <= line <= 0.2 * min(h, w):
             continue
         frame = np.ones((h, w), bool)
         frame[line + 1 : h - line - 1, line + 1 : w - line - 1] = False
         rim = [patch[:line].any(0), patch[-line:].any(0), patch[:, :line].any(1), patch[:, -line:].any(1)]
         if patch[frame].sum() < BOX.on_outline * patch.sum() or np.concatenate(rim).mean() < BOX.covered:
-            continue
-        if line <= BOX.fringe and _is_fringe(image.pixels, stroke):
             continue
         inner = (stroke.x + line, stroke.y + line, stroke.x + w - line, stroke.y + h - line)
         x0, y0, x1, y1 = (value / image.scale for value in inner)
@@ -275,21 +265,7 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox
     return tuple(sorted(boxes, key=lambda box: -(box.bbox[2] - box.bbox[0]) * (box.bbox[3] - box.bbox[1])))
 
 
-def _is_fringe(pixels: Image, stroke: Stroke) -> bool:
-    """Whether a thin frame is the fringe of a block: of a colour between that of the block and that around it."""
-    (h, w), far = stroke.patch.shape, 2 * BOX.fringe
-    window, patch = stroke.surroundings(pixels, far)
-    lab = lab_of(np.ascontiguousarray(pixels[window])).astype(np.float64)
-    inner, outer = np.zeros(patch.shape, bool), np.ones(patch.shape, bool)
-    top, left = min(far, stroke.y), min(far, stroke.x)
-    outer[max(0, top - BOX.fringe) : top + h + BOX.fringe, max(0, left - BOX.fringe) : left + w + BOX.fringe] = False
-    inner[top + far : top + h - far, left + far : left + w - far] = True
-    if not (inner.any() and outer.any()):
-        return False
-    inside, outside, own = (np.median(lab[where], axis=0) for where in (inner, outer, patch > 0))
-    across = inside - outside
-    length = float(np.linalg.norm(across))
-    if length < BOX.between:
-        return False
-    share = float((own - outside) @ across) / length**2
-    return 0 < share < 1 and float(np.linalg.norm(own - outside - share * across)) < BOX.between
+def _line_width(side: Mask) -> int:
+    """How wide the line is with which a cut [n] through a stroke begins; 0 for none within a fringe of 2 px."""
+    start = int(np.argmax(side))
+    return start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from cow_service.records import BBox, Point
-from cow_service.vision.contrast import WORKING_SIDE, lab_gradients
+from cow_service.vision.contrast import VIEW, lab_gradients
 from cow_service.vision.masks import lab_of, scaled
 from cow_service.vision.types import Floats, Image, Mask
 
@@ -91,7 +91,7 @@ class Edges:
     @staticmethod
     def of(image: Image) -> Edges | None:
         """The edges of an RGB image [H, W, 3]; None if it is too cluttered, or plain."""
-        dx, dy, total = lab_gradients(lab_of(scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2])))))
+        dx, dy, total = lab_gradients(lab_of(scaled(image, min(1.0, VIEW.working_side / max(image.shape[:2])))))
         strong = total > max(CIRCLE.edge[0], CIRCLE.edge[1] * float(np.median(total[::2, ::2])))
         strong[:2] = strong[-2:] = False
         strong[:, :2] = strong[:, -2:] = False

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from cow_service.records import BBox
-from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, EDGE_THRESHOLDS, View
-from cow_service.vision.masks import dilated, eroded, hull, outline_of, window_of
+from cow_service.vision.contrast import VIEW, View
+from cow_service.vision.masks import dilated, outline_of
 from cow_service.vision.types import Floats, Floats32, Mask
 
 TRIES = 120  # circles through three points of the outline
@@ -108,105 +108,6 @@ def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     return u, v, math.sqrt(max(w + u * u + v * v, 0.0)), float(close[best].mean())
 
 
-NECK_FLAT = 0.45  # of its width: a mouth seen from above is no higher
-OVERLAP = 0.6  # of the narrower one's width, that lies below the mouth
-MOST_GAP = 1.2  # of the mouth's width: the neck is no longer
-NECK_OFF_MIDDLE = 0.3  # of the mouth's width, by which the body's middle may lie beside it
-SHOULDER = 0.15  # of the body's height: the rows at which the neck ends
-NECK_STEP = 1.0  # Lab units between the neck and the floor beside it, in the mean: no floor is seen between the two
-
-
-def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
-    """The mask [h, w] of the neck between a mouth and a body [h, w]; None if they are no one thing's.
-
-    `lab` [h, w, 3] is the image in CIE Lab.
-    """
-    mouth_window, body_window = window_of(mouth), window_of(body)
-    if mouth_window is None or body_window is None:
-        return None
-    (rows, columns), (below, across) = mouth_window, body_window
-    width, gap = columns.stop - columns.start, below.start - rows.stop
-    shared = min(columns.stop, across.stop) - max(columns.start, across.start)
-    aside = abs(columns.start + columns.stop - across.start - across.stop) / 2
-    if rows.stop - rows.start > NECK_FLAT * width or not 0 < gap <= MOST_GAP * width:
-        return None
-    if shared < OVERLAP * min(width, across.stop - across.start) or aside > NECK_OFF_MIDDLE * width:
-        return None
-    shoulder = below.start + max(1, round(SHOULDER * (below.stop - below.start)))
-    upper = body.copy()
-    upper[shoulder:] = False
-    neck = hull(mouth | upper) & ~mouth & ~body
-    ends = np.nonzero(neck.any(axis=0))[0]
-    beside = np.zeros(neck.shape, bool)
-    beside[rows.stop : below.start, max(0, int(ends[0]) - width // 2) : int(ends[-1]) + width // 2] = True
-    beside &= ~dilated(neck | mouth | body, 5)
-    inner = eroded(neck, 5)
-    if not beside.any() or not inner.any():
-        return None
-    return neck if np.linalg.norm(lab[inner].mean(axis=0) - lab[beside].mean(axis=0)) > NECK_STEP else None
-
-
-WEIGHTS = np.array([1.0, 0.5, 0.5], np.float32)  # of L, a and b in a step: compression spreads colour, not lightness
-STEP, CLEAR_STEP = 2.0, 4.0  # Lab units from both sides: of every pixel, and in the median
-BLUR = 0.25  # of the largest steps: less is the blur of an edge
-SIDE = 0.5  # of the object's width: how far away the sides are looked at, and the width of what is searched
-LEAST_SIDE = 5  # px at the working size
-UPPER_ROWS = 0.15  # of the object's height: where its middle is taken
-OFF_MIDDLE = 0.15  # of the object's width, by which it may be off that middle
-SUNK = 0.25  # of the object's height: so far below the object's upper end its foot may lie
-LEAST_HEIGHT, MOST_HEIGHT = 3, 0.6  # px at the working size: less is blur; of the object's height: more is no part
-SHARP = 0.6  # share of its outline that lies on edges
-SHADE_HUE = 2.5  # Lab units in the a*b* plane: more is another colour, not a shadow
-DARK, SHADE_DEPTH = 20, 0.65  # the percentile of its lightness that counts, and of the sides' lightness: less is black
-
-
-def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | None:
-    """The mask [h, w] of objects on a part [h, w] that is not empty, or None. `taken` [h, w] are other objects.
-
-    `lab` [h, w, 3] is the image in CIE Lab, `edges` [h, w] is set on its edges.
-    """
-    rows, columns = window_of(part) or (slice(0, 1), slice(0, 1))
-    width, height = columns.stop - columns.start, rows.stop - rows.start
-    upper = np.nonzero(part[rows.start : rows.start + max(2, round(UPPER_ROWS * height))].any(axis=0))[0]
-    middle = (float(upper[0]) + float(upper[-1])) / 2
-    side = max(LEAST_SIDE, round(SIDE * width))
-    left, right = round(middle - side / 2), round(middle + side / 2) + 1
-    top, bottom = max(0, rows.start - round(MOST_HEIGHT * height)), rows.start + max(2, round(SUNK * height))
-    above = rows.start - top
-    if left < side or right + side > part.shape[1] or above < LEAST_HEIGHT:
-        return None
-    strip, *sides = (np.s_[top:bottom, left + shift : right + shift] for shift in (0, -side, side))
-    steps = np.min([np.linalg.norm((lab[strip] - lab[beside]) * WEIGHTS, axis=2) for beside in sides], axis=0)
-    free = [~(part[area] | taken[area]) for area in (strip, *sides)]
-    differs = (steps > STEP) & np.all(free, axis=0)
-    if differs.any():
-        differs &= steps > BLUR * np.percentile(steps[differs], 90)
-    if not differs[above - LEAST_HEIGHT : above].any():
-        return None
-    found = differs & _joined(differs | dilated(part[strip]), part[strip], 8)
-    # The rows above the object's rim, which may cross the whole strip and is low itself.
-    rim = np.nonzero(found[:above, 0] | found[:above, -1])[0]
-    seen = found[: int(rim[0]) if len(rim) else above]
-    high = np.nonzero(seen.any(axis=1))[0]
-    goes_on = not len(high) or high[0] == 0 or above - len(seen) > LEAST_HEIGHT
-    is_low = goes_on or above - int(high[0]) < LEAST_HEIGHT
-    if is_low or abs(float(np.nonzero(seen)[1].mean()) + left - middle) > OFF_MIDDLE * width:
-        return None
-    found &= cv2.dilate(np.any(seen, axis=0, keepdims=True).astype(np.uint8), np.ones((1, 3), np.uint8)) > 0
-    if np.median(steps[found]) < CLEAR_STEP or np.mean(edges[strip][outline_of(found)]) < SHARP:
-        return None
-    # A shadow has the colours of the sides, all three darkened by the same share.
-    own, *others = (lab[area][: len(seen)][seen] for area in (strip, *sides))
-    floor, (lightness, *hue) = np.median(np.concatenate(others), axis=0), np.median(own, axis=0)
-    share = float(lightness) / max(1.0, float(floor[0]))
-    darkest = float(np.percentile(own[:, 0], DARK)) / max(1.0, float(floor[0]))
-    if share < 1 and darkest > SHADE_DEPTH and float(np.hypot(*(hue - share * floor[1:]))) < SHADE_HUE:
-        return None
-    whole = np.zeros(part.shape, bool)
-    whole[strip] = found
-    return whole
-
-
 def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
     """The connected patches of a mask [h, w] in which seeds [h, w] lie."""
     _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
@@ -249,7 +150,7 @@ STRONG_EDGE = 3.0  # Lab units per px: no soft shadow ends in so strong an edge
 LIT_BLACK = 0.85  # of the surroundings' light: the lit face of something black
 LEAST_TOUCHED = 1.0  # of the side of a patch: so much of something black lies next to it
 TEXTURE_EDGE = 0.4  # of the surroundings' spread in lightness: weaker edges are texture
-WEAK_EDGES = (0.45, 1.8)  # as `EDGE_THRESHOLDS`: the sides of something surely white stand out by as little
+WEAK_EDGES = (0.45, 1.8)  # as `ViewRules.edges`: the sides of something surely white stand out by as little
 
 _Box = tuple[int, int, int, int]  # x, y, width, height
 
@@ -259,13 +160,15 @@ def white_sides(view: View, core: Mask) -> Mask:
 
     `core` [h, w] are the pixels that are surely of an object.
     """
-    neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
-    white = core & (view.bright > BRIGHT_STEP) & neutral
+    neutral = (view.chroma < 2 * VIEW.chroma_step) | (view.chroma_gap < VIEW.chroma_step)
+    white = core & (view.bright > VIEW.bright_step) & neutral
     _, labels, tops, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
     if not (tops[1:, 4] >= LEAST_TOP).any():
         return np.zeros(white.shape, bool)
     near_edges = dilated(view.edges > view.edge_threshold, 5)
-    lit_too = ((cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) & (view.chroma < 2 * CHROMA_STEP)) | white
+    lit_too = (
+        (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) & (view.chroma < 2 * VIEW.chroma_step)
+    ) | white
     sides, surely_white = np.zeros(white.shape, bool), set[int]()
     for top, (x, y, w, h, area) in enumerate(tops.tolist()):
         around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
@@ -277,7 +180,7 @@ def white_sides(view: View, core: Mask) -> Mask:
             window = slice(y, y + h + w), slice(x, x + w)
             sides[window] |= _joined(lit_too[window], labels[window] == top, 4)
         own = labels[y : y + h, x : x + w] == top
-        if area >= LEAST_WHITE and float(np.median(view.chroma[y : y + h, x : x + w][own])) < CHROMA_STEP:
+        if area >= LEAST_WHITE and float(np.median(view.chroma[y : y + h, x : x + w][own])) < VIEW.chroma_step:
             surely_white.add(top)
 
     def has_side(top: int, side: _Box, area: int, lit: bool) -> bool:
@@ -287,13 +190,13 @@ def white_sides(view: View, core: Mask) -> Mask:
         hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > HANGS * w and y >= ty
         return top_area >= LEAST_TOP and area < MAX_RATIO * top_area and (lit or hangs)
 
-    for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if surely_white else [])):
+    for thresholds in (*VIEW.edges, *([WEAK_EDGES] if surely_white else [])):
         weak = thresholds == WEAK_EDGES
         for near, patch, box in enclosed(view, *thresholds):
             is_shade = (
                 np.median(view.light[near][patch]) < SHADE and np.median(view.chroma_gap[near][patch]) < SAME_CHROMA
             )
-            if is_shade or (weak and float(np.median(view.chroma[near][patch])) > CHROMA_STEP):
+            if is_shade or (weak and float(np.median(view.chroma[near][patch])) > VIEW.chroma_step):
                 continue
             touched = set(np.unique(labels[near][dilated(patch, times=4)]).tolist()) - {0}
             lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > BRIGHT_REACH

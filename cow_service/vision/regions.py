@@ -5,7 +5,6 @@ does a patch enclosed by edges below a bright top: the shaded side of a white ob
 hue, are left out. Where the surroundings vary too much (most photographs), no region is returned instead of wrong ones.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,26 +15,13 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision import masks
 from cow_service.vision.completion import (
-    WEAK_EDGES,
     as_disc,
     black_faces,
-    enclosed,
     is_top,
     is_underside,
-    neck_between,
-    standing_on,
     white_sides,
 )
-from cow_service.vision.contrast import (
-    BRIGHT_STEP,
-    CHROMA_STEP,
-    STRONG_CHROMA_STEP,
-    WORKING_SIDE,
-    View,
-    colour_name,
-    colour_names,
-    view_of,
-)
+from cow_service.vision.contrast import VIEW, View, colour_name, colour_names, view_of
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats32, Image, Mask
 
@@ -62,9 +48,6 @@ MIN_REST = 0.05  # of a component: less is no part of its own
 HIDDEN = 0.2  # of its outline, along which something else lies in front
 OWN_WIDTH = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
 MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
-TOP_AREA = 0.3  # of a region: a larger one above it is another object, not what stands on it
-DARK = 28.0  # lightness below which a part may be the underside of another
-SAME_TOP = 0.6  # of a smaller region, taken up by what stands on another: it is no object of its own
 
 DISC = 0.93  # roundness from which a drawn shape is a disc
 RIM = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
@@ -118,21 +101,13 @@ class _Found:
         return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
 
 
-def measure(image: Image) -> View:
-    """The view of an RGB image [H, W, 3] at the working size."""
-    return view_of(masks.scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2]))))
-
-
-def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
-    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image.
-
-    `view` is what `measure` gives for the image, where that is known.
-    """
+def find_regions(image: Image) -> tuple[Region, ...]:
+    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
-    view = measure(image) if view is None else view
+    view = view_of(masks.scaled(image, min(1.0, VIEW.working_side / max(height, width))))
     # What is surely of an object: of another hue, clearly brighter, or nearly black.
-    coloured = view.chroma_gap > CHROMA_STEP
-    body = coloured | (view.bright > np.maximum(BRIGHT_STEP, BRIGHT_SPREADS * view.spread))
+    coloured = view.chroma_gap > VIEW.chroma_step
+    body = coloured | (view.bright > np.maximum(VIEW.bright_step, BRIGHT_SPREADS * view.spread))
     core = body | _black(view, body)
     # Blur and the compression of colour spread a thing by a few px: its outline lies halfway up to its own colour.
     step = np.maximum(view.chroma_gap, np.abs(view.bright))
@@ -166,10 +141,9 @@ def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
-    whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
-    balls = np.logical_or.reduce([border & False, *(one.mask for one in whole_ones if one.is_disc)])
-    whole_ones = [_without_rim(one, balls) for one in whole_ones]
-    each = zip(whole_ones, _hidden(whole_ones), strict=True)
+    balls = np.logical_or.reduce([border & False, *(one.mask for one in found if one.is_disc)])
+    found = [_without_rim(one, balls) for one in found]
+    each = zip(found, _hidden(found), strict=True)
     regions = [one.region((height, width), is_hidden) for one, is_hidden in each]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
 
@@ -216,7 +190,7 @@ def _black(view: View, body: Mask) -> Mask:
 
 def _stands_out(view: View, part: Mask) -> bool:
     """Whether the steps along its outline are larger than the texture of what is around it makes them."""
-    if float(np.median(view.chroma_gap[part])) > STRONG_CHROMA_STEP:
+    if float(np.median(view.chroma_gap[part])) > VIEW.strong_chroma_step:
         return True
     outline = masks.outline_of(part)
     steps = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))[outline]
@@ -261,7 +235,7 @@ def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
 def _is_wall(view: View, part: Mask, border: Mask) -> bool:
     """Whether a pale part runs along the image's border for much of its own length, as a strip of wall does."""
     along = part & border
-    if not along.any() or np.median(view.bright[part]) <= 0 or np.median(view.chroma[part]) >= 2 * CHROMA_STEP:
+    if not along.any() or np.median(view.bright[part]) <= 0 or np.median(view.chroma[part]) >= 2 * VIEW.chroma_step:
         return False
     (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
     wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
@@ -271,7 +245,7 @@ def _is_wall(view: View, part: Mask, border: Mask) -> bool:
 def _parts(view: View, component: Mask) -> list[Mask]:
     """Splits a component into white balls and by colour; wheels, necks and lights stay with what they sit on."""
     # Discs among the pale patches between the edges: white balls before or on something white.
-    pale = component & (np.minimum(view.chroma_gap, view.chroma) < CHROMA_STEP) & (view.bright > -12)
+    pale = component & (np.minimum(view.chroma_gap, view.chroma) < VIEW.chroma_step) & (view.bright > -12)
     balls, taken = list[Mask](), np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
         for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
@@ -300,7 +274,7 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     area = int(component.sum())
     lab, chroma = view.lab, view.chroma
     hue = np.degrees(np.arctan2(lab[..., 2], lab[..., 1]))
-    coloured = component & (view.chroma_gap > CHROMA_STEP) & (chroma > CHROMA_STEP)
+    coloured = component & (view.chroma_gap > VIEW.chroma_step) & (chroma > VIEW.chroma_step)
     least = min(0.12 * area, OWN_AREA)
     seeds: list[Mask] = []
     rest = coloured.copy()
@@ -380,126 +354,9 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
 
 
-def _with_mouths(view: View, found: Sequence[_Found]) -> list[_Found]:
-    """Joins the mouth of something white with its body."""
-    pale = [one for one in found if float(np.median(np.hypot(one.lab[:, 1], one.lab[:, 2]))) < CHROMA_STEP]
-    for mouth, body in itertools.permutations(pale, 2):
-        neck = None if mouth.is_disc else neck_between(mouth.mask, body.mask, view.lab)
-        if neck is not None:
-            lab = np.concatenate([mouth.lab, body.lab])
-            whole = _Found(mouth.mask | neck | body.mask, lab, min(mouth.confidence, body.confidence), False)
-            return _with_mouths(view, [whole, *(one for one in found if one is not mouth and one is not body)])
-    return list(found)
-
-
-def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
-    """Adds to each part the parts that stand on it; smaller parts absorbed in this way are left out."""
-    edges = masks.dilated(view.edges > view.edge_threshold)
-    areas = [int(np.count_nonzero(one.mask)) for one in found]
-    kept = dict(enumerate(found))
-    for i in sorted(kept, key=lambda i: -areas[i]):
-        if i not in kept or found[i].is_disc:
-            continue
-        small = [j for j in kept if areas[j] < min(TOP_AREA * areas[i], OWN_AREA) and not found[j].is_disc]
-        taken = np.zeros(edges.shape, bool)
-        for j, other in kept.items():
-            if j != i and j not in small:
-                taken |= other.mask
-        top = standing_on(found[i].mask, taken, view.lab, edges)
-        if top is None:
-            continue
-        kept[i] = replace(found[i], mask=found[i].mask | top)
-        for j in small:
-            if np.count_nonzero(found[j].mask & top) > SAME_TOP * areas[j]:
-                del kept[j]
-    return list(kept.values())
-
-
-def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
-    """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
-    dark: list[_Found] = []
-    whole: dict[int, _Found] = {}
-    for i, one in enumerate(found):
-        lightness, a, b = np.median(one.lab, axis=0).tolist()
-        if not one.is_disc and lightness < DARK and colour_name(lightness, a, b) in {"black", "brown"}:
-            dark.append(one)
-        else:
-            whole[i] = one
-    for part in dark:
-        box, near = masks.bbox_of(part.mask), masks.dilated(part.mask)
-        carried = [
-            i for i, one in whole.items() if (one.mask & near).any() and is_underside(box, masks.bbox_of(one.mask))
-        ]
-        if len(carried) == 1:
-            body = whole[carried[0]]
-            whole[carried[0]] = replace(body, mask=body.mask | part.mask)
-        else:
-            whole[len(found) + len(whole)] = part
-    return list(whole.values())
-
-
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
     """The name of the colour of pixels [N, 3] (Lab), and all that people may use for it."""
     chroma = np.hypot(lab[:, 1], lab[:, 2])
-    sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
+    sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > VIEW.chroma_step / 2 else lab
     lightness, a, b = np.median(sample, axis=0).tolist()
     return colour_name(lightness, a, b), colour_names(lightness, a, b)
-
-
-FAINT_AREA = 0.0008  # of the image
-COVERED = 0.25  # of a patch, by things that were found: it is a part of one
-SOLID = 0.8  # of its convex hull that a patch fills
-PALER, TINTED = 1.2, 3.0  # Lab lightness above the floor on every side of it, and Lab units from its hue
-FAINT_TEXTURE = 2.0  # of the spread in lightness of the floor around it: less is texture
-NEAR, BEYOND = 5, 12  # px at the working size: the floor around it, and that beyond the joint beside a tile
-DARKEST = -5.0  # Lab lightness against the floor on any side: what is darker is a shadow or a gap
-
-
-def find_faint(view: View, size: tuple[int, int], regions: Sequence[Region]) -> tuple[BBox, ...]:
-    """Boxes [x0, y0, x1, y1] (px) of what may be a thing of an image (width, height) although it hardly stands out.
-
-    Such as a white cone on a pale floor: a patch that a closed weak edge surrounds, paler than the floor on every side
-    of it or of another hue. What is darker and of the floor's hue may as well be a shadow. Such a patch is too faint to
-    be simulated, and too clear to be denied.
-    """
-    taken, found = np.zeros(size[::-1], bool), list[BBox]()
-    for region in regions:
-        region.mask.add_to(taken)
-    taken = masks.dilated(masks.resized_mask(taken, (view.lab.shape[1], view.lab.shape[0])), 7)
-    across, down = size[0] / taken.shape[1], size[1] / taken.shape[0]
-    for near, patch, (x, y, w, h) in enclosed(view, *WEAK_EDGES):
-        area = np.count_nonzero(patch)
-        if area < FAINT_AREA * taken.size or np.count_nonzero(taken[near] & patch) > COVERED * area:
-            continue
-        y0, x0 = max(0, near[0].start - BEYOND), max(0, near[1].start - BEYOND)
-        wide = slice(y0, near[0].stop + BEYOND), slice(x0, near[1].stop + BEYOND)
-        whole = np.zeros(taken.shape, bool)
-        whole[near] = patch
-        steps = _steps_around(view.lab[wide], whole[wide], taken[wide])
-        if steps is None:
-            continue
-        paler, tinted = steps
-        texture = FAINT_TEXTURE * float(np.median(view.spread[near]))
-        if paler > max(PALER, texture) or (tinted > TINTED and paler > max(DARKEST, texture - tinted)):
-            found.append((x * across, y * down, (x + w) * across, (y + h) * down))
-    return tuple(found)
-
-
-def _steps_around(lab: Floats32, patch: Mask, taken: Mask) -> tuple[float, float] | None:
-    """How much paler a patch [h, w] is than each quarter of the floor around it, and how far from its hue, at least.
-
-    None for a patch that is ragged, or beside which some quarter is not seen. `taken` [h, w] are things.
-    """
-    whole = masks.without_holes(masks.dilated(patch))
-    if np.count_nonzero(whole) < SOLID * np.count_nonzero(masks.hull(whole)):
-        return None
-    own, steps = np.median(lab[patch], axis=0), list[Floats32]()
-    for around in (masks.dilated(whole, 2 * NEAR + 1), masks.dilated(whole, 2 * BEYOND + 1) & ~taken):
-        rows, columns = np.nonzero(around & ~masks.dilated(whole, 5))
-        quarter = 2 * (rows > rows.mean()) + (columns > columns.mean()) if len(rows) else rows
-        sides = [lab[rows[quarter == i], columns[quarter == i]] for i in range(4)]
-        if min(len(side) for side in sides) == 0:
-            return None
-        steps += [own - np.median(side, axis=0) for side in sides]
-    lightness, *hue = np.array(steps).T
-    return float(lightness.min()), float(np.hypot(*hue).min())

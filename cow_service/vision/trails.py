@@ -145,18 +145,21 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     trails: list[Trail] = []
     tried = 0
     for a, b in _pairs(ends):
-        found = [position for trail in trails for position in trail.positions]
-        known = any(math.dist(c.centre, p.centre) < 0.6 * p.radius for c in (a, b) for p in found)
-        if tried < MAX_PAIRS and not known and search.are_alike((a, b)):
+        if tried < MAX_PAIRS and _are_apart((a, b), trails) and search.are_alike((a, b)):
             tried += 1
             trail = search.trail_through(a, b)
             trails += [] if trail is None else [trail]
     whole: list[Trail] = []
     for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
-        pairs = ((p, q) for other in whole for p in trail.positions for q in other.positions)
-        if not any(math.dist(p.centre, q.centre) < 0.6 * max(p.radius, q.radius) for p, q in pairs):
+        if _are_apart(trail.positions, whole):
             whole.append(trail)
     return tuple(whole)
+
+
+def _are_apart(places: Sequence[Circle | Position], trails: Sequence[Trail]) -> bool:
+    """Whether none of some places is a position of a trail."""
+    pairs = ((p, q) for trail in trails for p in places for q in trail.positions)
+    return all(math.dist(p.centre, q.centre) >= 0.6 * max(p.radius, q.radius) for p, q in pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,14 +226,7 @@ class _Search:
         the path of three or more leads.
         """
         while len(chain) < MAX_POSITIONS:
-            last, before = chain[-1], chain[-2]
-            dx, dy = last.x - before.x, last.y - before.y
-            seeds = [(2 * last.x - before.x, 2 * last.y - before.y)]
-            if len(chain) > 2:
-                seeds.insert(0, (3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y))
-            else:
-                turns = [(math.cos(angle), math.sin(angle)) for angle in (-0.35, 0.35, -0.7, 0.7)]
-                seeds += [(last.x + dx * c - dy * s, last.y + dx * s + dy * c) for c, s in turns]
+            last, before, seeds = chain[-1], chain[-2], _next_places(chain)
             for x, y in seeds if compared else seeds[:1]:
                 found = _fit_near(self.edges, x, y, last.radius**2 / before.radius if compared else last.radius)
                 if found is None or any(found.is_same(other) for other in chain) or not _is_path((*chain, found)):
@@ -361,6 +357,17 @@ def _pairs(ends: Sequence[Circle]) -> Iterator[tuple[Circle, Circle]]:
         small, large = sorted((a.radius, b.radius))
         if 0.25 * mean < apart < MOST_GAP * 3 * mean and large < SIZES**3 * small:
             yield a, b
+
+
+def _next_places(chain: Chain) -> list[Point]:
+    """Where the next circle of a chain may lie, the likeliest first: on along its bend, or straight on, or turned."""
+    last, before = chain[-1], chain[-2]
+    dx, dy = last.x - before.x, last.y - before.y
+    if len(chain) > 2:
+        bent = 3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y
+        return [bent, (last.x + dx, last.y + dy)]
+    turns = [(math.cos(angle), math.sin(angle)) for angle in (0, -0.35, 0.35, -0.7, 0.7)]
+    return [(last.x + dx * c - dy * s, last.y + dx * s + dy * c) for c, s in turns]
 
 
 def _is_path(chain: Chain) -> bool:
