@@ -322,7 +322,7 @@ def placement_goals(
 def _goal(scene: Scene, placed: Intervention, bodies: Sequence[SeenBody]) -> PlacementGoal:
     """Where a thing is put.
 
-    Raises `CannotGround` where it, or what it is put to, was not found; where both are one; where nothing says that it is open.
+    Raises `CannotGround` where it, or what it is put to, was not found; where both are one, or it may be closed.
     """
     if placed.relation is None or not placed.targets:
         raise _says_no_place(placed.object.object)

@@ -7,6 +7,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,34 +26,52 @@ from cow_service.vision.contrast import VIEW, View, colour_name, colour_names, v
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats32, Image, Mask
 
-SHARP_SHARE = 0.65  # of an outline that must lie on edges
-OUT_OF_TEXTURE = 1.7  # of the surroundings' spread in lightness: the least step in an outline, per px
-SPREADS, BRIGHT_SPREADS = 3.0, 3.7  # of that spread: what is so much darker, or brighter, is no texture
-# Of the surroundings' light: below it something may be black; the darker part of what is, and of what may be shadow.
-BLACK, BLACK_LIGHT, BLACKEST_LIGHT = 0.61, 0.47, 0.375
-BLACKEST = 16.5  # Lab lightness of the darker part of what is black and may be shadow
-SAME_LIGHT, SAME_CHROMA = 0.05, 4.0  # of two shadows, and Lab units between a shadow and the floor it lies on
-LEAST_SHADOW, MOST_SHADOW = 0.05, 3.0  # of the area of what may be another shadow, and of the thing that casts it
-BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
-HALFWAY = 0.35  # of the largest step nearby
-MIN_AREA = 0.0003  # of the image
-MAX_AREA = 0.25
-ALONG_BORDER = 0.5  # of the height or width of something bright and pale that runs along the image's border: a wall
-MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
-CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
-SPLIT_HUE = 36.0  # degrees: another colour, hence another object
-FILLED, ELLIPSE = 0.9, 0.95  # of its hull that a part fills; of a hull and the ellipse of its outline that both share
-OWN_AREA = 250  # px at the working size: a patch of another colour this large is no part of a thing
-EDGE_BAND = 4.0  # px: half the width of an edge as it is measured
-MIN_REST = 0.05  # of a component: less is no part of its own
-HIDDEN = 0.2  # of its outline, along which something else lies in front
-OWN_WIDTH = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
-MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
 
-DISC = 0.93  # roundness from which a drawn shape is a disc
-RIM = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
-SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
-SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
+class RegionRules(NamedTuple):
+    """When what differs from its surroundings is a thing, and where it ends.
+
+    Set by hand on the first family of rendered scenes, and on the textured floors and shadows of the second; no single
+    number has a measurement of its own.
+    """
+
+    sharp_share: float = 0.65  # of an outline that must lie on edges
+    out_of_texture: float = 1.7  # of the surroundings' spread in lightness: the least step in an outline, per px
+    spreads: float = 3.0  # of that spread: what is so much darker is no texture
+    bright_spreads: float = 3.7  # and what is so much brighter
+    black: float = 0.61  # of the surroundings' light: below it something may be black
+    black_light: float = 0.47  # the same of the darker part of what is black
+    blackest_light: float = 0.375  # the same of what may be shadow
+    blackest: float = 16.5  # Lab lightness of the darker part of what is black and may be shadow
+    same_light: float = 0.05  # of two shadows, at most
+    same_chroma: float = 4.0  # Lab units between a shadow and the floor that it lies on
+    least_shadow: float = 0.05  # of the area of what may be another shadow
+    most_shadow: float = 3.0  # of the area of the thing that casts it
+    black_share: float = 0.5  # of the surroundings' lightness: below it is black, not shade
+    halfway: float = 0.35  # of the largest step nearby
+    min_area: float = 0.0003  # of the image
+    max_area: float = 0.25  # the same, at most
+    # of the height or width of something bright and pale that runs along the image's border: a wall
+    along_border: float = 0.5
+    most: int = 40  # the largest are kept: the work that follows grows with their number
+    clutter: float = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
+    split_hue: float = 36.0  # degrees: another colour, hence another object
+    filled: float = 0.9  # of its hull: what a part fills
+    ellipse: float = 0.95  # of a hull and the ellipse of its outline: what both share
+    own_area: int = 250  # px at the working size: a patch of another colour this large is no part of a thing
+    edge_band: float = 4.0  # px: half the width of an edge as it is measured
+    min_rest: float = 0.05  # of a component: less is no part of its own
+    hidden: float = 0.2  # of its outline, along which something else lies in front
+    own_width: float = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
+    mask_sigma: float = 0.8  # px at the working size, smooths the stairs of an enlarged mask
+    disc: float = 0.93  # roundness from which a drawn shape is a disc
+    rim: int = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
+    # Lab units from the surroundings, from which contrast takes nothing from the confidence
+    sure_contrast: float = 20.0
+    sure_area: float = 300.0  # px at the working size, from which the size takes nothing
+
+
+REGION = RegionRules()
+
 
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
 
@@ -93,9 +112,9 @@ class _Found:
     def region(self, size: tuple[int, int], is_hidden: bool) -> Region:
         """It as a region of the image (height and width)."""
         soft = self.mask.astype(np.float32)
-        near = masks.window_of(self.mask, round(6 * MASK_SIGMA))
+        near = masks.window_of(self.mask, round(6 * REGION.mask_sigma))
         if near is not None:
-            soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
+            soft[near] = cv2.GaussianBlur(soft[near], (0, 0), REGION.mask_sigma)
         mask = masks.enlarged(soft, size)
         roundness = masks.roundness_of(mask.patch)
         return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
@@ -107,13 +126,13 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     view = view_of(masks.scaled(image, min(1.0, VIEW.working_side / max(height, width))))
     # What is surely of an object: of another hue, clearly brighter, or nearly black.
     coloured = view.chroma_gap > VIEW.chroma_step
-    body = coloured | (view.bright > np.maximum(VIEW.bright_step, BRIGHT_SPREADS * view.spread))
+    body = coloured | (view.bright > np.maximum(VIEW.bright_step, REGION.bright_spreads * view.spread))
     core = body | _black(view, body)
     # Blur and the compression of colour spread a thing by a few px: its outline lies halfway up to its own colour.
     step = np.maximum(view.chroma_gap, np.abs(view.bright))
-    low = step < HALFWAY * cv2.dilate(step, np.ones((7, 7), np.uint8))
+    low = step < REGION.halfway * cv2.dilate(step, np.ones((7, 7), np.uint8))
     core &= ~(low & masks.dilated(~core, 5))
-    if core.mean() > CLUTTER:
+    if core.mean() > REGION.clutter:
         return ()
     solid = (core | white_sides(view, core)).astype(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -124,7 +143,9 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     found: list[_Found] = []
     count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
     for i in range(1, count):
-        if not MIN_AREA * solid.size <= stats[i][4] <= MAX_AREA * solid.size or _is_background(stats[i], solid.shape):
+        if not REGION.min_area * solid.size <= stats[i][4] <= REGION.max_area * solid.size or _is_background(
+            stats[i], solid.shape
+        ):
             continue
         x, y, w, h = (int(v) for v in stats[i][:4])
         pad = 6 + max(w, h) // 3  # a ball may have lost as much to a highlight
@@ -136,7 +157,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
             disc = as_disc(part, near.edges, view.edge_threshold)
             # An object's outline lies on edges; that of a patch of light does not.
             strong = cv2.dilate(near.edges, np.ones((5, 5), np.uint8))[masks.outline_of(part)] > view.edge_threshold
-            if disc is not None or (float(np.mean(strong)) > SHARP_SHARE and _stands_out(near, part)):
+            if disc is not None or (float(np.mean(strong)) > REGION.sharp_share and _stands_out(near, part)):
                 whole = np.zeros(solid.shape, bool)
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
@@ -145,7 +166,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     found = [_without_rim(one, balls) for one in found]
     each = zip(found, _hidden(found), strict=True)
     regions = [one.region((height, width), is_hidden) for one, is_hidden in each]
-    return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
+    return tuple(sorted(regions, key=lambda region: -region.mask.area)[: REGION.most])
 
 
 def _black(view: View, body: Mask) -> Mask:
@@ -154,11 +175,11 @@ def _black(view: View, body: Mask) -> Mask:
     Outside it is the thing's shadow, unless it is as dark as black things are and large, or lies below it as wheels
     do. What is dark elsewhere is a shadow, too, if it gets as little light as those.
     """
-    dark = (view.light < BLACK).astype(np.uint8)
+    dark = (view.light < REGION.black).astype(np.uint8)
     dark = cv2.morphologyEx(dark, cv2.MORPH_OPEN, _DISC) > 0  # contact shadows are thin
     outlines, near, black = np.zeros((3, *body.shape), bool)
     things: list[tuple[Mask, int]] = []
-    for thing in _blobs(body, MIN_AREA * body.size):
+    for thing in _blobs(body, REGION.min_area * body.size):
         things.append((masks.dilated(thing, 7), int(np.count_nonzero(thing))))
         near |= things[-1][0]
         outlines |= masks.dilated(masks.hull(thing), 5)
@@ -166,15 +187,15 @@ def _black(view: View, body: Mask) -> Mask:
     alone: list[tuple[float, Mask]] = []
     for blob in _blobs(dark & ~outlines, 0):
         area, light, box = int(np.count_nonzero(blob)), float(np.percentile(view.light[blob], 30)), masks.bbox_of(blob)
-        beside = [masks.bbox_of(t) for t, size in things if area < MOST_SHADOW * size and (t & blob).any()]
-        is_texture = np.median(view.bright[blob]) > -SPREADS * np.median(view.spread[blob])
-        is_darkest = light < BLACKEST_LIGHT and np.percentile(view.lab[blob, 0], 30) < BLACKEST
-        if is_texture or light > BLACK_LIGHT:
+        beside = [masks.bbox_of(t) for t, size in things if area < REGION.most_shadow * size and (t & blob).any()]
+        is_texture = np.median(view.bright[blob]) > -REGION.spreads * np.median(view.spread[blob])
+        is_darkest = light < REGION.blackest_light and np.percentile(view.lab[blob, 0], 30) < REGION.blackest
+        if is_texture or light > REGION.black_light:
             shadows.append((light, area))
         elif (
-            np.median(view.chroma_gap[blob]) > SAME_CHROMA  # a shadow keeps the floor's hue
+            np.median(view.chroma_gap[blob]) > REGION.same_chroma  # a shadow keeps the floor's hue
             or any(is_top(box, thing) for thing in beside)
-            or (is_darkest and beside and (area > OWN_AREA or any(is_underside(box, thing) for thing in beside)))
+            or (is_darkest and beside and (area > REGION.own_area or any(is_underside(box, thing) for thing in beside)))
         ):
             black |= blob
         elif beside:
@@ -182,8 +203,8 @@ def _black(view: View, body: Mask) -> Mask:
         else:
             alone.append((light, blob))
     for light, blob in alone:
-        least = LEAST_SHADOW * np.count_nonzero(blob)
-        if not any(abs(light - shade) < SAME_LIGHT and area > least for shade, area in shadows):
+        least = REGION.least_shadow * np.count_nonzero(blob)
+        if not any(abs(light - shade) < REGION.same_light and area > least for shade, area in shadows):
             black |= blob
     return black | (black_faces(view, black) & ~near) | (dark & outlines)
 
@@ -194,7 +215,7 @@ def _stands_out(view: View, part: Mask) -> bool:
         return True
     outline = masks.outline_of(part)
     steps = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))[outline]
-    return float(np.median(steps)) > OUT_OF_TEXTURE * float(np.median(view.spread[outline]))
+    return float(np.median(steps)) > REGION.out_of_texture * float(np.median(view.spread[outline]))
 
 
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
@@ -213,7 +234,7 @@ def drawn_region(image: Image, shape: CroppedMask) -> Region:
     """A shape of a drawing, an RGB image [H, W, 3]."""
     roundness = masks.roundness_of(shape.patch)
     names = _names(masks.lab_of(image[shape.rows, shape.columns][shape.patch][None])[0])
-    return Region(shape, *names, roundness, confidence=1.0, is_disc=roundness > DISC)
+    return Region(shape, *names, roundness, confidence=1.0, is_disc=roundness > REGION.disc)
 
 
 def found_region(image: Image, mask: Mask, called: frozenset[str]) -> Region:
@@ -239,7 +260,7 @@ def _is_wall(view: View, part: Mask, border: Mask) -> bool:
         return False
     (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
     wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
-    return bool(np.ptp(edge_columns) > ALONG_BORDER * wide or np.ptp(edge_rows) > ALONG_BORDER * high)
+    return bool(np.ptp(edge_columns) > REGION.along_border * wide or np.ptp(edge_rows) > REGION.along_border * high)
 
 
 def _parts(view: View, component: Mask) -> list[Mask]:
@@ -248,17 +269,19 @@ def _parts(view: View, component: Mask) -> list[Mask]:
     pale = component & (np.minimum(view.chroma_gap, view.chroma) < VIEW.chroma_step) & (view.bright > -12)
     balls, taken = list[Mask](), np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
-        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
-            disc = as_disc(masks.dilated(patch, times=2), view.edges, view.edge_threshold, grow=EDGE_BAND)
+        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * REGION.own_area):
+            disc = as_disc(masks.dilated(patch, times=2), view.edges, view.edge_threshold, grow=REGION.edge_band)
             if disc is not None and not (disc & taken).any():
                 taken |= disc
                 balls.append(disc)
-    rest = _blobs(component & ~taken, MIN_REST * component.sum())
+    rest = _blobs(component & ~taken, REGION.min_rest * component.sum())
     if balls:  # what is left along the edge of a ball is blur
-        rest = [blob for blob in rest if _half_width(blob) > EDGE_BAND]
+        rest = [blob for blob in rest if _half_width(blob) > REGION.edge_band]
     parts = balls + [part for blob in rest for part in _coloured_parts(view, blob)]
     whole = masks.hull(component) if len(parts) > 1 else component
-    is_one = len(parts) > 1 and np.count_nonzero(component) > FILLED * np.count_nonzero(whole) and _is_ellipse(whole)
+    is_one = (
+        len(parts) > 1 and np.count_nonzero(component) > REGION.filled * np.count_nonzero(whole) and _is_ellipse(whole)
+    )
     return [whole] if is_one else parts  # a ball or an egg, and a shadow across it
 
 
@@ -267,7 +290,7 @@ def _is_ellipse(mask: Mask) -> bool:
     outline = np.argwhere(masks.outline_of(mask))[:, ::-1].astype(np.int32)
     ellipse = np.zeros(mask.shape, np.uint8)
     cv2.ellipse(ellipse, cv2.fitEllipse(outline), (1,), -1)
-    return float(np.count_nonzero(mask & (ellipse > 0)) / np.count_nonzero(mask | (ellipse > 0))) > ELLIPSE
+    return float(np.count_nonzero(mask & (ellipse > 0)) / np.count_nonzero(mask | (ellipse > 0))) > REGION.ellipse
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
@@ -275,7 +298,7 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     lab, chroma = view.lab, view.chroma
     hue = np.degrees(np.arctan2(lab[..., 2], lab[..., 1]))
     coloured = component & (view.chroma_gap > VIEW.chroma_step) & (chroma > VIEW.chroma_step)
-    least = min(0.12 * area, OWN_AREA)
+    least = min(0.12 * area, REGION.own_area)
     seeds: list[Mask] = []
     rest = coloured.copy()
     while rest.sum() > least and len(seeds) < 6:
@@ -283,16 +306,16 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
         histogram, _ = np.histogram(values % 360, bins=36, range=(0, 360), weights=chroma[rest])
         wrapped = histogram + np.roll(histogram, 1) + np.roll(histogram, -1)
         middle = 10 * int(wrapped.argmax()) + 5
-        alike = rest & (np.abs((hue - middle + 180) % 360 - 180) < SPLIT_HUE)
+        alike = rest & (np.abs((hue - middle + 180) % 360 - 180) < REGION.split_hue)
         seeds.extend(_blobs(alike, least))
         rest &= ~alike
     neutral = component & ~coloured
     bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
-    black = neutral & (lab[..., 0] < BLACK_SHARE * view.around)
-    dark = _blobs(black, min(0.35 * area, OWN_AREA))
+    black = neutral & (lab[..., 0] < REGION.black_share * view.around)
+    dark = _blobs(black, min(0.35 * area, REGION.own_area))
     broad = min((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
-    seeds.extend(_blobs(bright, min(0.3 * area, OWN_AREA)))
-    seeds += [seed for seed in dark if _half_width(seed) > OWN_WIDTH * broad or seed.sum() > 0.35 * area]
+    seeds.extend(_blobs(bright, min(0.3 * area, REGION.own_area)))
+    seeds += [seed for seed in dark if _half_width(seed) > REGION.own_width * broad or seed.sum() > 0.35 * area]
     if len(seeds) <= 1:
         return [component]
     distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
@@ -310,7 +333,7 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
 def _without_rim(one: _Found, balls: Mask) -> _Found:
     """Without the rim around balls [h, w], where their colour mixes with the floor's: a pale table's is like that."""
     broad = cv2.morphologyEx(one.mask.astype(np.uint8), cv2.MORPH_OPEN, _DISC) > 0
-    kept = one.mask & (broad | ~masks.dilated(balls, RIM))
+    kept = one.mask & (broad | ~masks.dilated(balls, REGION.rim))
     return one if one.is_disc or 2 * kept.sum() < one.mask.sum() else replace(one, mask=kept)
 
 
@@ -318,7 +341,10 @@ def _hidden(found: Sequence[_Found]) -> list[bool]:
     """Which of them have much of their outline along one thing of another colour that ends lower in the image."""
     things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
     return [
-        any(low > own[0] and not colours & own[1] and near[outline].mean() > HIDDEN for low, colours, near in things)
+        any(
+            low > own[0] and not colours & own[1] and near[outline].mean() > REGION.hidden
+            for low, colours, near in things
+        )
         for outline, own in zip((masks.outline_of(one.mask) for one in found), things, strict=True)
     ]
 
@@ -339,16 +365,18 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     """How sure it is that a part is one separable thing with this outline: a product of four shares, each 0..1.
 
     Edges: the share of its outline, image border aside, that lies on edges; a disc was fitted to them. Contrast: its
-    median distance from the surroundings in Lab over `SURE_CONTRAST`, but for a disc: a circle that fits is no chance.
-    Size: its area over `SURE_AREA`, of a disc over half of it (square roots of all). Border: 1 less half the share of
+    median distance from the surroundings in Lab over `sure_contrast`, but for a disc: a circle that fits is no chance.
+    Size: its area over `sure_area`, of a disc over half of it (square roots of all). Border: 1 less half the share of
     its outline along the image's border, beyond which it may go on.
     """
     outline = masks.outline_of(part)
     inner = outline & ~border
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
-    contrast = 1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / SURE_CONTRAST
-    size = float(np.count_nonzero(part)) / (SURE_AREA / 2 if is_disc else SURE_AREA)
+    contrast = (
+        1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / REGION.sure_contrast
+    )
+    size = float(np.count_nonzero(part)) / (REGION.sure_area / 2 if is_disc else REGION.sure_area)
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
     edges = max(sharp, 0.9) if is_disc else sharp
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
