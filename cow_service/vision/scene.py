@@ -29,7 +29,7 @@ from cow_service.vision.regions import (
 from cow_service.vision.segmentation import fault_of, is_bare, mask_from_bbox, mask_from_point
 from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
-from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
+from cow_service.vision.trail_removal import without_earlier_positions
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 from cow_service.vision.types import Floats, Image, Mask
 
@@ -152,14 +152,10 @@ class Scene:
 
     @cached_property
     def clean(self) -> Image:
-        """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail and their shadows."""
+        """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail."""
         image = self.undrawn
         for trail in self.trails:
             image = without_earlier_positions(image, trail)
-            objects = np.zeros((self.height, self.width), bool)
-            for region in find_regions(image):
-                region.mask.add_to(objects)
-            image = without_earlier_shadows(image, trail, objects)
         return image
 
     @cached_property

@@ -17,7 +17,6 @@ from cow_service.records import BBox
 from cow_service.vision.inpainting import quadratic_terms
 from cow_service.vision.masks import lab_of, resized_mask, scaled
 from cow_service.vision.scene import Scene
-from cow_service.vision.trail_removal import ROW, floor_means
 from cow_service.vision.types import Floats, Floats32, Mask
 
 
@@ -48,6 +47,11 @@ class ShadowRules(NamedTuple):
     least_pixels: int = 60  # of the floor about a patch, at the working size
     most_pixels: int = 700
     iterations: int = 8  # of the fit
+    least_shade: float = 0.025  # of the floor's lightness that shadows take away, at least
+    most_shade: float = 0.6  # the same: more is an object
+    # of the ball's width, from its foot down to the shadow's middle: nearer, the ball may touch the floor
+    nearest: float = 0.25
+    slant: float = 1.1  # px sideways per px down: light indoors falls steeper
 
 
 SHADOW = ShadowRules()
@@ -99,8 +103,8 @@ class _Floor:
         left, top, right, bottom = self.box
         width = right - left
         ys, xs = np.mgrid[: self.free.shape[0], : self.free.shape[1]]
-        below = (ys > bottom + ROW.nearest * width) & (
-            np.abs(xs - (left + right) / 2) < ROW.slant * (ys - (top + bottom) / 2) + 0.5 * width
+        below = (ys > bottom + SHADOW.nearest * width) & (
+            np.abs(xs - (left + right) / 2) < SHADOW.slant * (ys - (top + bottom) / 2) + 0.5 * width
         )
         best = np.zeros(self.free.shape, np.float32)
         which = np.zeros(self.free.shape, np.int64)
@@ -110,7 +114,7 @@ class _Floor:
             better = contrast > best
             best[better], which[better] = contrast[better], i
         best[~below] = 0
-        least, alone = 0.6 * ROW.least_shade, 0
+        least, alone = 0.6 * SHADOW.least_shade, 0
         for _ in range(SHADOW.tries):
             y, x = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
             if best[y, x] < least or alone == SHADOW.candidates:
@@ -183,7 +187,7 @@ class _Floor:
         shade = -dark / max(float(level), 1.0)
         width = self.box[2] - self.box[0]
         fits = (
-            ROW.least_shade < shade < ROW.most_shade
+            SHADOW.least_shade < shade < SHADOW.most_shade
             and explained > SHADOW.explained
             and SHADOW.softness[0]
             < soft
@@ -258,3 +262,14 @@ def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats)
         else:
             damping *= 5
     return parameters, dark
+
+
+def floor_means(values: Floats32, weight: Floats32, mask: Mask) -> tuple[Floats32, Floats32]:
+    """Mean value [h, w] of what may be floor in a mask about each pixel, and the share of the mask that may be.
+
+    `weight` [h, w] is 1 where there may be floor, else 0.
+    """
+    kernel = mask.astype(np.float32) / np.float32(max(1, np.count_nonzero(mask)))
+    total, share = (np.asarray(cv2.filter2D(layer, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT), np.float32)
+                    for layer in (values * weight, weight))  # fmt: skip
+    return np.asarray(total / np.maximum(share, 1e-3), np.float32), share
