@@ -79,6 +79,7 @@ VARIANTS: dict[str, tuple[Patch, ...]] = {
     "side view": (("vision.scene:find_side_view", nothing),),
     "segments": (("vision.scene:find_segments", lambda *_: np.zeros((0, 4))),),
     "discs": (("vision.regions:as_disc", nothing),),
+    "undersides": (("vision.regions:_with_undersides", list),),
     "rims": (("vision.regions:_without_rim", first),),
     "hidden": (("vision.regions:_hidden", lambda found: [False] * len(found)),),
     "white sides": (("vision.regions:white_sides", empty),),

@@ -65,6 +65,7 @@ class RegionRules(NamedTuple):
     mask_sigma: float = 0.8  # px at the working size, smooths the stairs of an enlarged mask
     disc: float = 0.93  # roundness from which a drawn shape is a disc
     rim: int = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
+    dark: float = 28.0  # lightness below which a part may be the underside of another
     # Lab units from the surroundings, from which contrast takes nothing from the confidence
     sure_contrast: float = 20.0
     sure_area: float = 300.0  # px at the working size, from which the size takes nothing
@@ -162,6 +163,7 @@ def find_regions(image: Image) -> tuple[Region, ...]:
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
+    found = _with_undersides(found)
     balls = np.logical_or.reduce([border & False, *(one.mask for one in found if one.is_disc)])
     found = [_without_rim(one, balls) for one in found]
     each = zip(found, _hidden(found), strict=True)
@@ -380,6 +382,29 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
     edges = max(sharp, 0.9) if is_disc else sharp
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
+
+
+def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
+    """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
+    dark: list[_Found] = []
+    whole: dict[int, _Found] = {}
+    for i, one in enumerate(found):
+        lightness, a, b = np.median(one.lab, axis=0).tolist()
+        if not one.is_disc and lightness < REGION.dark and colour_name(lightness, a, b) in {"black", "brown"}:
+            dark.append(one)
+        else:
+            whole[i] = one
+    for part in dark:
+        box, near = masks.bbox_of(part.mask), masks.dilated(part.mask)
+        carried = [
+            i for i, one in whole.items() if (one.mask & near).any() and is_underside(box, masks.bbox_of(one.mask))
+        ]
+        if len(carried) == 1:
+            body = whole[carried[0]]
+            whole[carried[0]] = replace(body, mask=body.mask | part.mask)
+        else:
+            whole[len(found) + len(whole)] = part
+    return list(whole.values())
 
 
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
