@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,11 +12,22 @@ from cow_service.records import BBox, Point
 from cow_service.vision.masks import CroppedMask, bbox_of, iou, mask_iou
 from cow_service.vision.types import Mask
 
-AGREE = 0.8  # IoU from which two masks are one
-LEAST_SCORE = 0.5  # of a candidate
-FILLS, IS_WHOLE = 0.5, 0.75  # IoU of a box that was given and that of its mask: less is something else, or a part
-RIVAL = 0.05  # of the score: a candidate that is so close to the best is meant as well
-MOST_SHARE = 0.95  # of the image: more is no thing
+
+class OutlineRules(NamedTuple):
+    """When a mask of a segmenter is trusted.
+
+    Set by hand with simulated segmenters, whose errors are known; real ones were not measured.
+    """
+
+    agree: float = 0.8  # IoU from which two masks are one
+    least_score: float = 0.5  # of a candidate
+    fills: float = 0.5  # IoU of a box that was given and that of its mask: less is something else
+    is_whole: float = 0.75  # the same: less is a part
+    rival: float = 0.05  # of the score: a candidate that is so close to the best is meant as well
+    most_share: float = 0.95  # of the image: more is no thing
+
+
+OUTLINE = OutlineRules()
 
 
 @dataclass(frozen=True)
@@ -49,10 +61,12 @@ def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
         if segment is None:
             outlines.append(None)
             continue
-        agrees = any(mask_iou(segment.mask, other.mask) >= AGREE for other in next(again))
+        agrees = any(mask_iou(segment.mask, other.mask) >= OUTLINE.agree for other in next(again))
         mask = segment.enlarged(*size)
         fills = iou(mask.bbox, box) if mask.area else 0.0
-        outlines.append(Outline(mask, segment.score, agrees and fills >= IS_WHOLE) if fills >= FILLS else None)
+        outlines.append(
+            Outline(mask, segment.score, agrees and fills >= OUTLINE.is_whole) if fills >= OUTLINE.fills else None
+        )
     return outlines
 
 
@@ -67,21 +81,23 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
     agreed = [
         each
         for each, found in zip(possible, again, strict=True)
-        if (best := _first(found)) is not None and mask_iou(each.mask, best.mask) >= AGREE
+        if (best := _first(found)) is not None and mask_iou(each.mask, best.mask) >= OUTLINE.agree
     ]
     agreed.sort(key=lambda each: -each.score)
     chosen: list[Segment] = []
     for each in agreed:
-        if all(mask_iou(each.mask, other.mask) < AGREE for other in chosen):
+        if all(mask_iou(each.mask, other.mask) < OUTLINE.agree for other in chosen):
             chosen.append(each)
-    close = [each for each in chosen if each.score >= chosen[0].score - RIVAL]
+    close = [each for each in chosen if each.score >= chosen[0].score - OUTLINE.rival]
     outlines = [Outline(each.enlarged(*image.size), each.score, True) for each in close]
     return [each for each in outlines if each.cropped.area]
 
 
 def _first(candidates: Sequence[Segment]) -> Segment | None:
     """The best of some candidates that is good enough to be a thing."""
-    good = (each for each in candidates if each.score >= LEAST_SCORE and 0 < each.mask.mean() <= MOST_SHARE)
+    good = (
+        each for each in candidates if each.score >= OUTLINE.least_score and 0 < each.mask.mean() <= OUTLINE.most_share
+    )
     return next(good, None)
 
 

@@ -141,8 +141,6 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     if query is not None and query.is_decidable and query.asked.form == "which" and query.asked.relation == "inside":
         query = replace(query, goals=_goals_of_each(situation, query, present))
     faint = situation.unlisted
-    if not situation.grounding.objects_complete:
-        faint = situation.scene.faint_beside([body.bbox for body in bodies])
     depth = None if level is not None or situation.follows_path else situation.depth
     is_ball_in_air = bodies[0].shape == "sphere" and in_air[0]
     shadow = find_shadow(situation.scene, bodies[0].bbox) if depth is None and is_ball_in_air else None
@@ -325,7 +323,7 @@ def placement_goals(
 def _goal(scene: Scene, placed: Intervention, bodies: Sequence[SeenBody]) -> PlacementGoal:
     """Where a thing is put.
 
-    Raises `CannotGround` where it, or what it is put to, was not found; where both are one; where there is no opening.
+    Raises `CannotGround` where it, or what it is put to, was not found; where both are one, or it may be closed.
     """
     if placed.relation is None or not placed.targets:
         raise _says_no_place(placed.object.object)
@@ -352,10 +350,9 @@ def _goal(scene: Scene, placed: Intervention, bodies: Sequence[SeenBody]) -> Pla
                 f"'{target.name}' is not an open container: nothing can go into it. Name a bowl, cup or box, or put it "
                 "`onto` it."
             )
-        opening = measure_opening(scene.clean, target.mask, square=form == "square")
-        if form is None and not opening.has_edge:
-            raise CannotGround(f"'{target.name}' shows no opening: call it what it is, such as a bowl, a cup or a box.")
-        opening = replace(opening, foot_hidden=is_hidden)
+        if form is None:
+            raise CannotGround(f"Whether '{target.name}' is open is not known: call it a bowl, a cup or a box.")
+        opening = replace(measure_opening(target.mask, square=form == "square"), foot_hidden=is_hidden)
     return PlacementGoal(placed.relation, tuple(targets), opening, side, body)
 
 

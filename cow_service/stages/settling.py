@@ -99,17 +99,15 @@ def _rival_of(
 
 
 def _by_trail(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest | None:
-    """Measured, where the reading goes by the trail and the words say nothing else."""
+    """Measured, where the reading or the words go by the trail, and the words say nothing else."""
     told = said.has_way and said.cue != "trail"
-    is_meant = "trail" in (read.cue, said.cue) and not told
-    return _along_trail(read, seen) if is_meant and seen.trail is not None else None
-
-
-def _along_trail(read: MotionRequest, seen: SeenWay) -> MotionRequest:
-    is_thrown = seen.is_thrown or read.kind in records.FALLING_KINDS
-    update = {"kind": "projectile" if is_thrown else "linear"} if read.direction is None else {}
-    direction = read.direction or seen.trail
-    return read.model_copy(update=update | {"direction": direction, "cue": "trail"})
+    if told or seen.trail is None or "trail" not in (read.cue, said.cue):
+        return None
+    update: dict[str, object] = {"direction": read.direction or seen.trail, "cue": "trail"}
+    if read.direction is None:
+        is_thrown = seen.is_thrown or read.kind in records.FALLING_KINDS
+        update["kind"] = "projectile" if is_thrown else "linear"
+    return read.model_copy(update=update)
 
 
 def _by_arrow(read: MotionRequest, said: MotionRequest, arrow: Vector | None) -> MotionRequest | None:
@@ -140,11 +138,9 @@ def _by_front(read: MotionRequest, said: MotionRequest, front: Vector | None) ->
 
 
 def _by_drawing(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest:
-    """On along the trail or the only arrow at the thing, where nothing at all is said; else as it was."""
+    """Along the only arrow at the thing, where nothing at all is said; else as it was."""
     if said.has_way:
         return read
-    if seen.trail is not None:
-        return _along_trail(read, seen)
     return read if seen.arrow is None or not seen.is_only_arrow else _taken(read, seen.arrow, "arrow", along=True)
 
 

@@ -11,22 +11,48 @@ import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox, Point
-from cow_service.vision.masks import lab_of
-from cow_service.vision.strokes import MIN_LENGTH, Stroke, WorkingImage, drawing_mask
-from cow_service.vision.types import Floats, Image, Mask
+from cow_service.vision.strokes import STROKE, Stroke, WorkingImage, drawing_mask
+from cow_service.vision.types import Floats, Mask
 
-MIN_FIT = 0.73  # intersection over union with the ideal arrow
-HEAD, HOLLOW_HEAD = 1.8, 1.3  # of the shaft's width: the least width of a head, and of a hollow drawing's
-MIN_HOLLOW_FIT = 0.88  # the same for a hollow drawing, whose head may be small
-SLENDER = 5.0  # of its shaft's width: an arrow without a rim is longer; the side of a can behind a ball is not
-FRINGE, BETWEEN = 2, 12.0  # px of what resampling blurs; Lab units within which a colour is a mixture of two others
-CERTAIN_FIT = 0.88  # from here on, later strokes at the same place are skipped
+
+class ArrowRules(NamedTuple):
+    """When a stroke is an arrow.
+
+    Set by hand on the open, filled and hollow arrows of 18 rendered scenes of the first family, and on bottles, cones,
+    pencils and cans that must not pass. No single number has a measurement of its own.
+    """
+
+    fit: float = 0.73  # intersection over union with the ideal arrow
+    certain_fit: float = 0.88  # from here on, later strokes at the same place are skipped
+    hollow_fit: float = 0.88  # the same for a hollow drawing, whose head may be small
+    head: float = 1.8  # of the shaft's width: the least width of a head
+    hollow_head: float = 1.3  # the same of a hollow drawing
+    # of the shaft's width: an arrow without a rim is longer; the side of a can behind a ball is not
+    slender: float = 5.0
+
+
+ARROW = ArrowRules()
+
+
+class BoxRules(NamedTuple):
+    """When a stroke is a drawn box.
+
+    Set by hand on boxes drawn into pictures; no single number has a measurement of its own.
+    """
+
+    side: int = 14  # px at the working size
+    on_outline: float = 0.93  # share of the stroke that lies on its own bounding rectangle
+    covered: float = 0.85  # share of that rectangle's outline that the stroke covers: dashes are fine
+
+
+BOX = BoxRules()
 
 
 @dataclass(frozen=True)
@@ -58,7 +84,7 @@ def find_arrows(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[Arrow, 
     found: list[tuple[float, _Profile, Stroke]] = []
     for stroke in strokes:
         corners = np.array([stroke.x, stroke.y, *stroke.patch.shape])  # drawings can be found twice
-        known = [other for fit, _, other in found if fit > CERTAIN_FIT]
+        known = [other for fit, _, other in found if fit > ARROW.certain_fit]
         if any((np.abs(corners - [other.x, other.y, *other.patch.shape]) <= 3).all() for other in known):
             continue
         fitted = fit_arrow(stroke.patch, stroke.hollow)
@@ -85,7 +111,7 @@ def fit_arrow(patch: Mask, hollow: bool) -> tuple[float, _Profile] | None:
     A `hollow` drawing has two flat colours, which no object of a scene has: its head need not be much wider than its
     shaft. Shaft and head are read off the width profile along an axis from tail to tip, which is refined on the shaft.
     """
-    least_head, least_fit = (HOLLOW_HEAD, MIN_HOLLOW_FIT) if hollow else (HEAD, MIN_FIT)
+    least_head, least_fit = (ARROW.hollow_head, ARROW.hollow_fit) if hollow else (ARROW.head, ARROW.fit)
     ys, xs = np.nonzero(patch)
     points = np.stack([xs, ys], axis=1).astype(np.float64)
     centre = points.mean(axis=0)
@@ -102,7 +128,7 @@ def fit_arrow(patch: Mask, hollow: bool) -> tuple[float, _Profile] | None:
                 profile = _profile(points, profile.centre, profile.axis, least_head)
         if profile is None or not profile.is_arrow_like():
             continue
-        if not hollow and len(profile.extent) < SLENDER * profile.thickness:
+        if not hollow and len(profile.extent) < ARROW.slender * profile.thickness:
             continue
         fit = max(profile.overlap(patch, filled) for filled in (True, False))
         if fit >= least_fit and (best is None or fit > best[0]):
@@ -176,7 +202,7 @@ def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) ->
     normal = np.array([-axis[1], axis[0]])
     along, across = (points - centre) @ axis, (points - centre) @ normal
     length = float(along.max() - along.min())
-    if length < MIN_LENGTH:
+    if length < STROKE.length:
         return None
     bins = np.clip((along - along.min()).astype(int), 0, int(length))
     n = int(length) + 1
@@ -208,11 +234,6 @@ def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) ->
     return _Profile(extent, tail, tip, thickness, head_width, peak, neck, middle, line, origin)
 
 
-MIN_SIDE = 14  # px at the working size
-ON_OUTLINE = 0.93  # share of the stroke that lies on its own bounding rectangle
-COVERED = 0.85  # share of that rectangle's outline that the stroke covers: dashes are fine
-
-
 @dataclass(frozen=True)
 class DrawnBox:
     """A rectangle drawn over the image to mark something. It does not say what."""
@@ -226,23 +247,16 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox
     boxes: list[DrawnBox] = []
     for stroke in strokes:
         patch, (h, w) = stroke.patch, stroke.patch.shape
-        if stroke.hollow or min(h, w) < MIN_SIDE:  # a box is drawn around something: its inside is not drawn
+        if stroke.hollow or min(h, w) < BOX.side:  # a box is drawn around something: its inside is not drawn
             continue
         sides = (patch[:, w // 2], patch[:, w // 2][::-1], patch[h // 2], patch[h // 2][::-1])
-        starts = [int(np.argmax(side)) for side in sides]  # the line begins within a fringe of 2 px
-        widths = [
-            start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0
-            for start, side in zip(starts, sides, strict=True)
-        ]
-        line = int(np.median(widths))
+        line = int(np.median([_line_width(side) for side in sides]))
         if not 1 <= line <= 0.2 * min(h, w):
             continue
         frame = np.ones((h, w), bool)
         frame[line + 1 : h - line - 1, line + 1 : w - line - 1] = False
         rim = [patch[:line].any(0), patch[-line:].any(0), patch[:, :line].any(1), patch[:, -line:].any(1)]
-        if patch[frame].sum() < ON_OUTLINE * patch.sum() or np.concatenate(rim).mean() < COVERED:
-            continue
-        if line <= FRINGE and _is_fringe(image.pixels, stroke):
+        if patch[frame].sum() < BOX.on_outline * patch.sum() or np.concatenate(rim).mean() < BOX.covered:
             continue
         inner = (stroke.x + line, stroke.y + line, stroke.x + w - line, stroke.y + h - line)
         x0, y0, x1, y1 = (value / image.scale for value in inner)
@@ -251,21 +265,7 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox
     return tuple(sorted(boxes, key=lambda box: -(box.bbox[2] - box.bbox[0]) * (box.bbox[3] - box.bbox[1])))
 
 
-def _is_fringe(pixels: Image, stroke: Stroke) -> bool:
-    """Whether a thin frame is the fringe of a block: of a colour between that of the block and that around it."""
-    (h, w), far = stroke.patch.shape, 2 * FRINGE
-    window, patch = stroke.surroundings(pixels, far)
-    lab = lab_of(np.ascontiguousarray(pixels[window])).astype(np.float64)
-    inner, outer = np.zeros(patch.shape, bool), np.ones(patch.shape, bool)
-    top, left = min(far, stroke.y), min(far, stroke.x)
-    outer[max(0, top - FRINGE) : top + h + FRINGE, max(0, left - FRINGE) : left + w + FRINGE] = False
-    inner[top + far : top + h - far, left + far : left + w - far] = True
-    if not (inner.any() and outer.any()):
-        return False
-    inside, outside, own = (np.median(lab[where], axis=0) for where in (inner, outer, patch > 0))
-    across = inside - outside
-    length = float(np.linalg.norm(across))
-    if length < BETWEEN:
-        return False
-    share = float((own - outside) @ across) / length**2
-    return 0 < share < 1 and float(np.linalg.norm(own - outside - share * across)) < BETWEEN
+def _line_width(side: Mask) -> int:
+    """How wide the line is with which a cut [n] through a stroke begins; 0 for none within a fringe of 2 px."""
+    start = int(np.argmax(side))
+    return start + int(np.argmin(side[start:])) if side[start] and start <= 2 else 0

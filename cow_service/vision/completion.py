@@ -6,29 +6,46 @@ By colour alone, a ball's region lacks its highlight and includes its contact sh
 import itertools
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from cow_service.records import BBox
-from cow_service.vision.contrast import BRIGHT_STEP, CHROMA_STEP, EDGE_THRESHOLDS, View
-from cow_service.vision.masks import dilated, eroded, hull, outline_of, window_of
+from cow_service.vision.contrast import VIEW, View
+from cow_service.vision.masks import dilated, outline_of
 from cow_service.vision.types import Floats, Floats32, Mask
 
-TRIES = 120  # circles through three points of the outline
-NEAR = 1.3  # px at the working size: an outline point this close lies on the circle
-ON_CIRCLE = 0.5  # share of the outline
-ON_BOTH = 1.17  # sum of that share and of the share of the rays from the middle whose strongest edge is the circle
-WHOLE, LEAST_ARC = 0.85, 0.25  # less of the outline than the first: so much of the circle must lie on edges in one run
-BEYOND_IMAGE = 0.85  # share of those rays for a circle that the image's border cuts
-RAY = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray is searched
-RAY_ERROR = (1.0, 0.03)  # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
-ON_EDGES = 0.8  # share of the circle
-FILLED, SPILLED = 0.72, 0.25  # share of the disc that the region fills; share of the region outside it
-CAP_FILLED, CAP_RAYS = 0.55, 0.9  # the same share where so many rays are strongest on the circle: a ball's lit cap
-BLED = 2.5  # px by which compression may have spread a colour beyond its outline
-SAMPLES = 72  # points tried on the circle
-LEAST_RADIUS = 5.0  # px
+
+class DiscRules(NamedTuple):
+    """When a part is a ball.
+
+    Set by hand on balls, cubes and mugs of the first family of rendered scenes; without it 7 of 120 answers are lost.
+    No single number has a measurement of its own.
+    """
+
+    tries: int = 120  # circles through three points of the outline
+    near: float = 1.3  # px at the working size: an outline point this close lies on the circle
+    on_circle: float = 0.5  # share of the outline
+    # sum of that share and of the share of the rays from the middle whose strongest edge is the circle
+    on_both: float = 1.17
+    whole: float = 0.85  # share of the outline on the circle: with less, the next counts
+    arc: float = 0.25  # so much of the circle must lie on edges in one run
+    beyond_image: float = 0.85  # share of those rays for a circle that the image's border cuts
+    ray: tuple[float, float] = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray is searched
+    # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
+    ray_error: tuple[float, float] = (1.0, 0.03)
+    on_edges: float = 0.8  # share of the circle
+    filled: float = 0.72  # share of the disc that the region fills
+    spilled: float = 0.25  # share of the region outside it
+    cap_filled: float = 0.55  # share of the disc that a ball's lit cap fills
+    cap_rays: float = 0.9  # where so many rays are strongest on the circle
+    bled: float = 2.5  # px by which compression may have spread a colour beyond its outline
+    samples: int = 72  # points tried on the circle
+    radius: float = 5.0  # px, at least
+
+
+DISC = DiscRules()
 
 
 def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.0) -> Mask | None:
@@ -45,38 +62,38 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
         return None
     x, y, radius, on_circle = circle
     # The radius with the strongest median edge.
-    radii = radius + np.arange(-BLED, max(0.5, grow) + 0.01, 0.5)
+    radii = radius + np.arange(-DISC.bled, max(0.5, grow) + 0.01, 0.5)
     radius = float(radii[int(np.median(_along_rays(edges, x, y, radii), axis=0).argmax())])
     height, width = part.shape
-    angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)
+    angles = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)
     columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
     seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     strong = dilated(edges > edge_threshold)
-    if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < ON_EDGES:
+    if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < DISC.on_edges:
         return None
     # On a ball's rays nothing is stronger than its outline; a circle around a cube or mug meets edges elsewhere.
-    offsets = np.arange(RAY[0] * radius, RAY[1] * radius + 0.01, 0.5)
+    offsets = np.arange(DISC.ray[0] * radius, DISC.ray[1] * radius + 0.01, 0.5)
     strongest = np.abs(offsets[_along_rays(edges, x, y, radius + offsets).argmax(axis=1)])
-    rays = strongest < max(RAY_ERROR[0], RAY_ERROR[1] * radius)
+    rays = strongest < max(DISC.ray_error[0], DISC.ray_error[1] * radius)
     sharpest = rays[seen].mean()
     # A polygon has many short runs of such rays; gaps of one ray are closed.
     twice = np.concatenate([rays, rays])
     closed = twice | (np.roll(twice, 1) & np.roll(twice, -1))
     longest = max((len(list(run)) for on, run in itertools.groupby(closed.tolist()) if on), default=0)
-    if on_circle < WHOLE and min(1.0, longest / len(rays)) < LEAST_ARC:
+    if on_circle < DISC.whole and min(1.0, longest / len(rays)) < DISC.arc:
         return None
-    if on_circle + sharpest < ON_BOTH or (not seen.all() and sharpest < BEYOND_IMAGE):
+    if on_circle + sharpest < DISC.on_both or (not seen.all() and sharpest < DISC.beyond_image):
         return None
     ys, xs = np.mgrid[:height, :width]
     disc = np.hypot(xs - x, ys - y) <= radius + 0.5
     both = (disc & part).sum()
-    filled = CAP_FILLED if sharpest > CAP_RAYS else FILLED
-    return disc if both > filled * disc.sum() and both > (1 - SPILLED) * part.sum() else None
+    filled = DISC.cap_filled if sharpest > DISC.cap_rays else DISC.filled
+    return disc if both > filled * disc.sum() and both > (1 - DISC.spilled) * part.sum() else None
 
 
 def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
-    """Values [SAMPLES, R] on rays from a place, at distances [R]."""
-    angles = np.linspace(0, 2 * np.pi, SAMPLES, endpoint=False)[:, None]
+    """Values [DISC.samples, R] on rays from a place, at distances [R]."""
+    angles = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)[:, None]
     columns, rows = x + np.cos(angles) * radii[None], y + np.sin(angles) * radii[None]
     values = cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
     return np.asarray(values, np.float32)
@@ -85,7 +102,9 @@ def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None if too few do."""
     rng = np.random.default_rng(0)  # the same outline must give the same circle
-    a, b, c = np.moveaxis(outline[rng.integers(0, len(outline), (TRIES, 3))], 1, 0)  # [T, 2] each: not finite on a line
+    a, b, c = np.moveaxis(
+        outline[rng.integers(0, len(outline), (DISC.tries, 3))], 1, 0
+    )  # [T, 2] each: not finite on a line
     ab, ac = b - a, c - a
     doubled = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
     ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
@@ -94,117 +113,18 @@ def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
         y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / doubled
     circles = np.column_stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)])
     reach = float(np.ptp(outline, axis=0).max())
-    circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] >= LEAST_RADIUS) & (circles[:, 2] <= reach)]
+    circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] >= DISC.radius) & (circles[:, 2] <= reach)]
     if not len(circles):
         return None
     gaps = np.linalg.norm(outline[None] - circles[:, None, :2], axis=2) - circles[:, 2:]
-    close = np.abs(gaps) < NEAR
+    close = np.abs(gaps) < DISC.near
     best = int(close.sum(axis=1).argmax())
-    if close[best].mean() < ON_CIRCLE:
+    if close[best].mean() < DISC.on_circle:
         return None
     chosen = outline[close[best]]
     terms = np.column_stack([2 * chosen, np.ones(len(chosen))])  # x^2 + y^2 = 2ax + 2by + c, least squares
     u, v, w = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0].tolist()
     return u, v, math.sqrt(max(w + u * u + v * v, 0.0)), float(close[best].mean())
-
-
-NECK_FLAT = 0.45  # of its width: a mouth seen from above is no higher
-OVERLAP = 0.6  # of the narrower one's width, that lies below the mouth
-MOST_GAP = 1.2  # of the mouth's width: the neck is no longer
-NECK_OFF_MIDDLE = 0.3  # of the mouth's width, by which the body's middle may lie beside it
-SHOULDER = 0.15  # of the body's height: the rows at which the neck ends
-NECK_STEP = 1.0  # Lab units between the neck and the floor beside it, in the mean: no floor is seen between the two
-
-
-def neck_between(mouth: Mask, body: Mask, lab: Floats32) -> Mask | None:
-    """The mask [h, w] of the neck between a mouth and a body [h, w]; None if they are no one thing's.
-
-    `lab` [h, w, 3] is the image in CIE Lab.
-    """
-    mouth_window, body_window = window_of(mouth), window_of(body)
-    if mouth_window is None or body_window is None:
-        return None
-    (rows, columns), (below, across) = mouth_window, body_window
-    width, gap = columns.stop - columns.start, below.start - rows.stop
-    shared = min(columns.stop, across.stop) - max(columns.start, across.start)
-    aside = abs(columns.start + columns.stop - across.start - across.stop) / 2
-    if rows.stop - rows.start > NECK_FLAT * width or not 0 < gap <= MOST_GAP * width:
-        return None
-    if shared < OVERLAP * min(width, across.stop - across.start) or aside > NECK_OFF_MIDDLE * width:
-        return None
-    shoulder = below.start + max(1, round(SHOULDER * (below.stop - below.start)))
-    upper = body.copy()
-    upper[shoulder:] = False
-    neck = hull(mouth | upper) & ~mouth & ~body
-    ends = np.nonzero(neck.any(axis=0))[0]
-    beside = np.zeros(neck.shape, bool)
-    beside[rows.stop : below.start, max(0, int(ends[0]) - width // 2) : int(ends[-1]) + width // 2] = True
-    beside &= ~dilated(neck | mouth | body, 5)
-    inner = eroded(neck, 5)
-    if not beside.any() or not inner.any():
-        return None
-    return neck if np.linalg.norm(lab[inner].mean(axis=0) - lab[beside].mean(axis=0)) > NECK_STEP else None
-
-
-WEIGHTS = np.array([1.0, 0.5, 0.5], np.float32)  # of L, a and b in a step: compression spreads colour, not lightness
-STEP, CLEAR_STEP = 2.0, 4.0  # Lab units from both sides: of every pixel, and in the median
-BLUR = 0.25  # of the largest steps: less is the blur of an edge
-SIDE = 0.5  # of the object's width: how far away the sides are looked at, and the width of what is searched
-LEAST_SIDE = 5  # px at the working size
-UPPER_ROWS = 0.15  # of the object's height: where its middle is taken
-OFF_MIDDLE = 0.15  # of the object's width, by which it may be off that middle
-SUNK = 0.25  # of the object's height: so far below the object's upper end its foot may lie
-LEAST_HEIGHT, MOST_HEIGHT = 3, 0.6  # px at the working size: less is blur; of the object's height: more is no part
-SHARP = 0.6  # share of its outline that lies on edges
-SHADE_HUE = 2.5  # Lab units in the a*b* plane: more is another colour, not a shadow
-DARK, SHADE_DEPTH = 20, 0.65  # the percentile of its lightness that counts, and of the sides' lightness: less is black
-
-
-def standing_on(part: Mask, taken: Mask, lab: Floats32, edges: Mask) -> Mask | None:
-    """The mask [h, w] of objects on a part [h, w] that is not empty, or None. `taken` [h, w] are other objects.
-
-    `lab` [h, w, 3] is the image in CIE Lab, `edges` [h, w] is set on its edges.
-    """
-    rows, columns = window_of(part) or (slice(0, 1), slice(0, 1))
-    width, height = columns.stop - columns.start, rows.stop - rows.start
-    upper = np.nonzero(part[rows.start : rows.start + max(2, round(UPPER_ROWS * height))].any(axis=0))[0]
-    middle = (float(upper[0]) + float(upper[-1])) / 2
-    side = max(LEAST_SIDE, round(SIDE * width))
-    left, right = round(middle - side / 2), round(middle + side / 2) + 1
-    top, bottom = max(0, rows.start - round(MOST_HEIGHT * height)), rows.start + max(2, round(SUNK * height))
-    above = rows.start - top
-    if left < side or right + side > part.shape[1] or above < LEAST_HEIGHT:
-        return None
-    strip, *sides = (np.s_[top:bottom, left + shift : right + shift] for shift in (0, -side, side))
-    steps = np.min([np.linalg.norm((lab[strip] - lab[beside]) * WEIGHTS, axis=2) for beside in sides], axis=0)
-    free = [~(part[area] | taken[area]) for area in (strip, *sides)]
-    differs = (steps > STEP) & np.all(free, axis=0)
-    if differs.any():
-        differs &= steps > BLUR * np.percentile(steps[differs], 90)
-    if not differs[above - LEAST_HEIGHT : above].any():
-        return None
-    found = differs & _joined(differs | dilated(part[strip]), part[strip], 8)
-    # The rows above the object's rim, which may cross the whole strip and is low itself.
-    rim = np.nonzero(found[:above, 0] | found[:above, -1])[0]
-    seen = found[: int(rim[0]) if len(rim) else above]
-    high = np.nonzero(seen.any(axis=1))[0]
-    goes_on = not len(high) or high[0] == 0 or above - len(seen) > LEAST_HEIGHT
-    is_low = goes_on or above - int(high[0]) < LEAST_HEIGHT
-    if is_low or abs(float(np.nonzero(seen)[1].mean()) + left - middle) > OFF_MIDDLE * width:
-        return None
-    found &= cv2.dilate(np.any(seen, axis=0, keepdims=True).astype(np.uint8), np.ones((1, 3), np.uint8)) > 0
-    if np.median(steps[found]) < CLEAR_STEP or np.mean(edges[strip][outline_of(found)]) < SHARP:
-        return None
-    # A shadow has the colours of the sides, all three darkened by the same share.
-    own, *others = (lab[area][: len(seen)][seen] for area in (strip, *sides))
-    floor, (lightness, *hue) = np.median(np.concatenate(others), axis=0), np.median(own, axis=0)
-    share = float(lightness) / max(1.0, float(floor[0]))
-    darkest = float(np.percentile(own[:, 0], DARK)) / max(1.0, float(floor[0]))
-    if share < 1 and darkest > SHADE_DEPTH and float(np.hypot(*(hue - share * floor[1:]))) < SHADE_HUE:
-        return None
-    whole = np.zeros(part.shape, bool)
-    whole[strip] = found
-    return whole
 
 
 def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
@@ -214,42 +134,67 @@ def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
     return np.isin(labels, touched[touched > 0])
 
 
-INSIDE = 0.8  # of a dark part's box that lies in the thing's, grown by `BESIDE` and by `LOW`
-BESIDE = 0.08  # of the thing's height
-LOW = 0.22  # of the thing's height: so far from its lower end the dark part ends at most
-NARROW = 0.7  # of the thing's width: what stands on it is narrower
-FLAT = 1.5  # width of a dark part over its height, at least
+class DarkRules(NamedTuple):
+    """Which dark part is a thing's wheels, or its top.
+
+    Set by hand on toy cars and bottles of the first family of rendered scenes; no single number has a measurement of
+    its own.
+    """
+
+    inside: float = 0.8  # of a dark part's box that lies in the thing's, grown by `beside` and by `low`
+    beside: float = 0.08  # of the thing's height
+    low: float = 0.22  # of the thing's height: so far from its lower end the dark part ends at most
+    narrow: float = 0.7  # of the thing's width: what stands on it is narrower
+    flat: float = 1.5  # width of a dark part over its height, at least
+
+
+DARK = DarkRules()
 
 
 def is_underside(part: BBox, thing: BBox) -> bool:
     """Whether the box [x0, y0, x1, y1] of a dark part lies at the lower end of a thing's, not before or next to it."""
     height = thing[3] - thing[1]
-    width = min(part[2], thing[2] + BESIDE * height) - max(part[0], thing[0] - BESIDE * height)
-    inside = width * (min(part[3], thing[3] + LOW * height) - max(part[1], thing[1]))
-    low = abs(part[3] - thing[3]) <= LOW * height and part[1] + part[3] > thing[1] + thing[3]
+    width = min(part[2], thing[2] + DARK.beside * height) - max(part[0], thing[0] - DARK.beside * height)
+    inside = width * (min(part[3], thing[3] + DARK.low * height) - max(part[1], thing[1]))
+    low = abs(part[3] - thing[3]) <= DARK.low * height and part[1] + part[3] > thing[1] + thing[3]
     wide, high = part[2] - part[0], part[3] - part[1]
-    return low and width > 0 and wide >= FLAT * high and inside >= INSIDE * wide * high
+    return low and width > 0 and wide >= DARK.flat * high and inside >= DARK.inside * wide * high
 
 
 def is_top(part: BBox, thing: BBox) -> bool:
     """Whether the box [x0, y0, x1, y1] of a dark part stands on a thing's, as the neck of a bottle does."""
     width, height = thing[2] - thing[0], thing[3] - thing[1]
-    within = part[0] >= thing[0] - BESIDE * width and part[2] <= thing[2] + BESIDE * width
-    return within and part[2] - part[0] < NARROW * width and part[3] < thing[1] + LOW * height
+    within = part[0] >= thing[0] - DARK.beside * width and part[2] <= thing[2] + DARK.beside * width
+    return within and part[2] - part[0] < DARK.narrow * width and part[3] < thing[1] + DARK.low * height
 
 
-BRIGHT_REACH = 1.6  # Lab lightness above the surroundings: another lit face
-LEAST_TOP, LEAST_WHITE = 20, 60  # px: a bright top, and one that is surely of something white
-LEAST_FACE_SIDE = 12  # px
-MAX_SIDE, MAX_RATIO = 0.1, 12  # of the image, and of the top's area: one shaded side
-HANGS = 0.7  # of a side's width that lies below the top
-SHARP_TOP = 0.7  # of a top's outline that lies on edges: with less it is a shine on the floor
-SHADE, SAME_CHROMA = 0.8, 4.0  # of the surroundings' light, and Lab units from their hue: a shadow
-STRONG_EDGE = 3.0  # Lab units per px: no soft shadow ends in so strong an edge
-LIT_BLACK = 0.85  # of the surroundings' light: the lit face of something black
-LEAST_TOUCHED = 1.0  # of the side of a patch: so much of something black lies next to it
-TEXTURE_EDGE = 0.4  # of the surroundings' spread in lightness: weaker edges are texture
-WEAK_EDGES = (0.45, 1.8)  # as `EDGE_THRESHOLDS`: the sides of something surely white stand out by as little
+class FaceRules(NamedTuple):
+    """Which patches between edges are faces of something white or black.
+
+    Set by hand on white and black things of the first family of rendered scenes; no single number has a measurement of
+    its own.
+    """
+
+    bright_reach: float = 1.6  # Lab lightness above the surroundings: another lit face
+    top: int = 20  # px of a bright top, at least
+    white: int = 60  # px of one that is surely of something white
+    face: int = 12  # px
+    side: float = 0.1  # of the image: one shaded side, at most
+    ratio: int = 12  # of the top's area: the same
+    hangs: float = 0.7  # of a side's width that lies below the top
+    sharp_top: float = 0.7  # of a top's outline that lies on edges: with less it is a shine on the floor
+    shade: float = 0.8  # of the surroundings' light: a shadow has less
+    same_chroma: float = 4.0  # Lab units from the surroundings' hue: a shadow has less
+    strong_edge: float = 3.0  # Lab units per px: no soft shadow ends in so strong an edge
+    lit_black: float = 0.85  # of the surroundings' light: the lit face of something black
+    touched: float = 1.0  # of the side of a patch: so much of something black lies next to it
+    texture_edge: float = 0.4  # of the surroundings' spread in lightness: weaker edges are texture
+    # as `ViewRules.edges`: the sides of something surely white stand out by as little
+    weak_edges: tuple[float, float] = (0.45, 1.8)
+
+
+FACE = FaceRules()
+
 
 _Box = tuple[int, int, int, int]  # x, y, width, height
 
@@ -259,44 +204,47 @@ def white_sides(view: View, core: Mask) -> Mask:
 
     `core` [h, w] are the pixels that are surely of an object.
     """
-    neutral = (view.chroma < 2 * CHROMA_STEP) | (view.chroma_gap < CHROMA_STEP)
-    white = core & (view.bright > BRIGHT_STEP) & neutral
+    neutral = (view.chroma < 2 * VIEW.chroma_step) | (view.chroma_gap < VIEW.chroma_step)
+    white = core & (view.bright > VIEW.bright_step) & neutral
     _, labels, tops, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
-    if not (tops[1:, 4] >= LEAST_TOP).any():
+    if not (tops[1:, 4] >= FACE.top).any():
         return np.zeros(white.shape, bool)
     near_edges = dilated(view.edges > view.edge_threshold, 5)
-    lit_too = ((cv2.GaussianBlur(view.bright, (0, 0), 1.5) > BRIGHT_REACH) & (view.chroma < 2 * CHROMA_STEP)) | white
+    lit_too = (
+        (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > FACE.bright_reach) & (view.chroma < 2 * VIEW.chroma_step)
+    ) | white
     sides, surely_white = np.zeros(white.shape, bool), set[int]()
     for top, (x, y, w, h, area) in enumerate(tops.tolist()):
         around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        if top == 0 or area < LEAST_TOP:
+        if top == 0 or area < FACE.top:
             continue
-        if float(np.mean(near_edges[around][outline_of(labels[around] == top)])) <= SHARP_TOP:
+        if float(np.mean(near_edges[around][outline_of(labels[around] == top)])) <= FACE.sharp_top:
             continue
         if 0.2 * w < h < 0.8 * w:  # slightly lit pixels joined to it, right below and no further down than it is wide
             window = slice(y, y + h + w), slice(x, x + w)
             sides[window] |= _joined(lit_too[window], labels[window] == top, 4)
         own = labels[y : y + h, x : x + w] == top
-        if area >= LEAST_WHITE and float(np.median(view.chroma[y : y + h, x : x + w][own])) < CHROMA_STEP:
+        if area >= FACE.white and float(np.median(view.chroma[y : y + h, x : x + w][own])) < VIEW.chroma_step:
             surely_white.add(top)
 
     def has_side(top: int, side: _Box, area: int, lit: bool) -> bool:
         """Whether a side belongs to a top: small compared with it, and lit or right below it."""
         x, y, w, _ = side
         tx, ty, tw, _, top_area = tops[top].tolist()
-        hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > HANGS * w and y >= ty
-        return top_area >= LEAST_TOP and area < MAX_RATIO * top_area and (lit or hangs)
+        hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > FACE.hangs * w and y >= ty
+        return top_area >= FACE.top and area < FACE.ratio * top_area and (lit or hangs)
 
-    for thresholds in (*EDGE_THRESHOLDS, *([WEAK_EDGES] if surely_white else [])):
-        weak = thresholds == WEAK_EDGES
+    for thresholds in (*VIEW.edges, *([FACE.weak_edges] if surely_white else [])):
+        weak = thresholds == FACE.weak_edges
         for near, patch, box in enclosed(view, *thresholds):
             is_shade = (
-                np.median(view.light[near][patch]) < SHADE and np.median(view.chroma_gap[near][patch]) < SAME_CHROMA
+                np.median(view.light[near][patch]) < FACE.shade
+                and np.median(view.chroma_gap[near][patch]) < FACE.same_chroma
             )
-            if is_shade or (weak and float(np.median(view.chroma[near][patch])) > CHROMA_STEP):
+            if is_shade or (weak and float(np.median(view.chroma[near][patch])) > VIEW.chroma_step):
                 continue
             touched = set(np.unique(labels[near][dilated(patch, times=4)]).tolist()) - {0}
-            lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > BRIGHT_REACH
+            lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > FACE.bright_reach
             area = int(np.count_nonzero(patch))
             if any(has_side(top, box, area, lit) for top in (touched & surely_white if weak else touched)):
                 sides[near] |= dilated(patch, times=2)
@@ -308,11 +256,11 @@ def black_faces(view: View, black: Mask) -> Mask:
     faces = black.copy()
     if not black.any():
         return faces
-    for near, patch, _ in enclosed(view, STRONG_EDGE, 0.0):
+    for near, patch, _ in enclosed(view, FACE.strong_edge, 0.0):
         touched = np.count_nonzero(dilated(patch, times=4) & black[near])
         if (
-            touched > LEAST_TOUCHED * math.sqrt(np.count_nonzero(patch))
-            and np.median(view.light[near][patch]) < LIT_BLACK
+            touched > FACE.touched * math.sqrt(np.count_nonzero(patch))
+            and np.median(view.light[near][patch]) < FACE.lit_black
         ):
             faces[near] |= dilated(patch, times=2)
     return faces
@@ -321,11 +269,11 @@ def black_faces(view: View, black: Mask) -> Mask:
 def enclosed(view: View, floor: float, factor: float) -> Iterator[tuple[tuple[slice, slice], Mask, _Box]]:
     """Patches between edges that do not reach the image's border: where they lie, their mask there, and their box."""
     height, width = view.edges.shape
-    edge_threshold = np.maximum(max(floor, factor * view.median_edge), TEXTURE_EDGE * view.spread)
+    edge_threshold = np.maximum(max(floor, factor * view.median_edge), FACE.texture_edge * view.spread)
     edges = cv2.morphologyEx((view.edges > edge_threshold).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(1 - edges, connectivity=4)
     for i, (x, y, w, h, area) in enumerate(stats.tolist()):
         at_border = x == 0 or y == 0 or x + w == width or y + h == height
-        if i and not at_border and LEAST_FACE_SIDE <= area <= MAX_SIDE * height * width:
+        if i and not at_border and FACE.face <= area <= FACE.side * height * width:
             near = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
             yield near, labels[near] == i, (x, y, w, h)

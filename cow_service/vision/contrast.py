@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,15 +15,29 @@ import numpy as np
 from cow_service.vision.masks import dilated, lab_of, scaled
 from cow_service.vision.types import Floats32, Image
 
-WORKING_SIDE = 512  # px: images are measured and searched at this size
-CHROMA_STEP = 9.0  # Lab units from the surroundings: an object
-BRIGHT_STEP = 5.0  # Lab lightness above the surroundings: an object
-STRONG_CHROMA_STEP = 18.0  # Lab units from the surroundings: no wall or floor
+
+class ViewRules(NamedTuple):
+    """How pixels are told from their surroundings.
+
+    Set by hand on rendered scenes of the first family; no single number has a measurement of its own.
+    """
+
+    working_side: int = 512  # px: images are measured and searched at this size
+    chroma_step: float = 9.0  # Lab units from the surroundings: an object
+    bright_step: float = 5.0  # Lab lightness above the surroundings: an object
+    strong_chroma_step: float = 18.0  # Lab units from the surroundings: no wall or floor
+    wide: float = 0.5  # of the image's shorter side: the window of the surroundings
+    strip: tuple[float, float] = (1.2, 0.16)  # of the same side, across and down: a lower window
+    median_side: int = 15  # px: windows are squeezed to this size
+    spread_limit: float = 25.0  # Lab lightness: what differs by more is no texture
+    # Lab units per px, and times the median gradient; the larger counts
+    edges: tuple[tuple[float, float], tuple[float, float]] = ((1.0, 4.0), (0.6, 2.5))
+
+
+VIEW = ViewRules()
+
+
 LIGHT_OFFSET = np.float32(16.0)  # L* + 16 is proportional to the cube root of the light, as a* and b* are
-WIDE, STRIP = 0.5, (1.2, 0.16)  # of the image's shorter side: the windows of the surroundings, across and down
-MEDIAN_SIDE = 15  # px: windows are squeezed to this size
-SPREAD_LIMIT = 25.0  # Lab lightness: what differs by more is no texture
-EDGE_THRESHOLDS = ((1.0, 4.0), (0.6, 2.5))  # Lab units per px, and times the median gradient; the larger counts
 
 
 @dataclass(frozen=True)
@@ -62,16 +77,16 @@ def view_of(small: Image) -> View:
     smooth = cv2.bilateralFilter(small, 5, 25, 5)
     lab = lab_of(np.asarray(smooth, np.uint8))
     coarse = scaled(np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.uint8), 0.25)
-    wide = _median(coarse, WIDE, WIDE)
+    wide = _median(coarse, VIEW.wide, VIEW.wide)
     # Strong colours, seen in a first pass, are left out: a large object would count as its own surroundings.
     off = np.hypot(*np.moveaxis(coarse[..., 1:].astype(np.float32) - wide[..., 1:], 2, 0))
-    plain = (~dilated(off > STRONG_CHROMA_STEP)).astype(np.float32)
+    plain = (~dilated(off > VIEW.strong_chroma_step)).astype(np.float32)
     if plain.mean() >= 0.5 and not plain.all():
         side = (min(coarse.shape[:2]),) * 2
         filled = cv2.blur(coarse * plain[..., None], side) / np.maximum(cv2.blur(plain, side)[..., None], 1e-3)
         coarse = np.where(plain[..., None] > 0, coarse, filled).astype(np.uint8)
-        wide = _median(coarse, WIDE, WIDE)
-    strip = _median(coarse, *STRIP)
+        wide = _median(coarse, VIEW.wide, VIEW.wide)
+    strip = _median(coarse, *VIEW.strip)
     planes = [np.asarray(plane, np.float32) for plane in cv2.split(lab)]
     distance, gap, around = _against(planes, wide)
     # The line is known to a pixel of the strip.
@@ -80,10 +95,10 @@ def view_of(small: Image) -> View:
         nearer = other[0] < distance
         distance, gap, around = (np.where(nearer, *pair) for pair in zip(other, (distance, gap, around), strict=True))
     bright = np.asarray(planes[0] - around, np.float32)
-    off_light = np.where(gap < CHROMA_STEP, np.minimum(np.abs(bright), SPREAD_LIMIT), 0)
-    deviation = scaled(np.asarray(off_light * (255 / SPREAD_LIMIT), np.uint8), 0.25)
-    typical = np.maximum(_median(deviation, WIDE, WIDE), _median(deviation, *STRIP)).astype(np.float32)
-    spread = cv2.resize(typical * np.float32(1.48 * SPREAD_LIMIT / 255), small.shape[1::-1])
+    off_light = np.where(gap < VIEW.chroma_step, np.minimum(np.abs(bright), VIEW.spread_limit), 0)
+    deviation = scaled(np.asarray(off_light * (255 / VIEW.spread_limit), np.uint8), 0.25)
+    typical = np.maximum(_median(deviation, VIEW.wide, VIEW.wide), _median(deviation, *VIEW.strip)).astype(np.float32)
+    spread = cv2.resize(typical * np.float32(1.48 * VIEW.spread_limit / 255), small.shape[1::-1])
     across, down, edges = lab_gradients(lab)
     median_edge = float(np.median(edges))
     return View(
@@ -97,7 +112,7 @@ def view_of(small: Image) -> View:
         down=down,
         edges=edges,
         median_edge=median_edge,
-        edge_threshold=max(EDGE_THRESHOLDS[1][0], EDGE_THRESHOLDS[1][1] * median_edge),
+        edge_threshold=max(VIEW.edges[1][0], VIEW.edges[1][1] * median_edge),
     )
 
 
@@ -126,25 +141,38 @@ def _median(coarse: Image, across: float, down: float) -> Image:
     height, width = coarse.shape[:2]
     shorter = min(height, width)
     squeezed = (
-        max(1, round(width * MEDIAN_SIDE / (across * shorter))),
-        max(1, round(height * MEDIAN_SIDE / (down * shorter))),
+        max(1, round(width * VIEW.median_side / (across * shorter))),
+        max(1, round(height * VIEW.median_side / (down * shorter))),
     )
     small = cv2.resize(coarse, (min(width, squeezed[0]), min(height, squeezed[1])), interpolation=cv2.INTER_AREA)
-    pad = MEDIAN_SIDE // 2
+    pad = VIEW.median_side // 2
     padded = cv2.copyMakeBorder(small, pad, pad, pad, pad, cv2.BORDER_REFLECT)
-    median = cv2.medianBlur(padded, MEDIAN_SIDE)[pad : pad + small.shape[0], pad : pad + small.shape[1]]
+    median = cv2.medianBlur(padded, VIEW.median_side)[pad : pad + small.shape[0], pad : pad + small.shape[1]]
     return np.asarray(cv2.resize(median, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-CHROMATIC = 9.0  # Lab chroma from which a surface has a hue
-BROWN_LIGHTNESS = 42.0  # below it and muted, orange is called brown
-BROWN_CHROMA = 36.0
-RED_CHROMA = 34.0  # a paler red is called pink
+class ColourRules(NamedTuple):
+    """Where the names of colours end, in CIE Lab.
 
-PURE_BLUE = (309.0, 1.6)  # degrees, chroma over L* + 16: Lab bends the hue of the purest blues towards purple
-DARK_REDS = 42.0  # lightness below which people may call red or orange brown
-OLIVE = 60.0  # lightness below which people may call yellow green
-GREYS = (28.0, 80.0)  # lightness of what people may call grey: white in shade too
+    Set by hand on the colours of rendered things and on the named colours of CSS, all of which keep their names.
+    """
+
+    chromatic: float = 9.0  # Lab chroma from which a surface has a hue
+    brown_lightness: float = 42.0  # below it and muted, orange is called brown
+    brown_chroma: float = 36.0  # below it
+    red_chroma: float = 34.0  # a paler red is called pink
+    # degrees, chroma over L* + 16: Lab bends the hue of the purest blues towards purple
+    pure_blue: tuple[float, float] = (309.0, 1.6)
+    dark_reds: float = 42.0  # lightness below which people may call red or orange brown
+    olive: float = 60.0  # lightness below which people may call yellow green
+    greys: tuple[float, float] = (28.0, 80.0)  # lightness of what people may call grey: white in shade too
+    hue_margin: float = 7.0  # degrees: near a border both names are valid
+    chroma_margin: float = 2.5  # the same
+    lightness_margin: float = 5.0  # the same
+
+
+COLOUR = ColourRules()
+
 
 # Upper end of each name's hue range, degrees in the a*b* plane.
 HUES = (
@@ -159,21 +187,19 @@ HUES = (
     (360.0, "pink"),
 )
 
-HUE_MARGIN, CHROMA_MARGIN, LIGHTNESS_MARGIN = 7.0, 2.5, 5.0  # degrees, Lab units: near a border both names are valid
-
 
 def colour_name(lightness: float, a: float, b: float) -> str:
     """The name of a Lab colour (lightness 0..100; a, b in CIE units)."""
     chroma = math.hypot(a, b)
-    if chroma < CHROMATIC:
+    if chroma < COLOUR.chromatic:
         return "black" if lightness < 28 else "white" if lightness > 52 else "grey"
     hue = math.degrees(math.atan2(b, a)) % 360
     name = next(name for end, name in HUES if hue <= end)
-    if name == "purple" and hue < PURE_BLUE[0] and chroma > PURE_BLUE[1] * (lightness + LIGHT_OFFSET):
+    if name == "purple" and hue < COLOUR.pure_blue[0] and chroma > COLOUR.pure_blue[1] * (lightness + LIGHT_OFFSET):
         return "blue"
-    if name == "red" and chroma < RED_CHROMA and lightness > 50:
+    if name == "red" and chroma < COLOUR.red_chroma and lightness > 50:
         return "pink"
-    if name in ("orange", "red") and chroma < BROWN_CHROMA and lightness < BROWN_LIGHTNESS:
+    if name in ("orange", "red") and chroma < COLOUR.brown_chroma and lightness < COLOUR.brown_lightness:
         return "brown"
     return name
 
@@ -181,13 +207,13 @@ def colour_name(lightness: float, a: float, b: float) -> str:
 def colour_names(lightness: float, a: float, b: float) -> frozenset[str]:
     """Every name that people may give a Lab colour: its own, and that across a border it lies next to."""
     chroma, hue = math.hypot(a, b), math.atan2(b, a)
-    names: set[str] = {"grey"} if chroma < CHROMATIC and GREYS[0] < lightness < GREYS[1] else set()
+    names: set[str] = {"grey"} if chroma < COLOUR.chromatic and COLOUR.greys[0] < lightness < COLOUR.greys[1] else set()
     for turn, more, lift in product((-1.0, 0.0, 1.0), repeat=3):
-        angle, radius = hue + math.radians(turn * HUE_MARGIN), max(0.0, chroma + more * CHROMA_MARGIN)
-        l_star = lightness + lift * LIGHTNESS_MARGIN
+        angle, radius = hue + math.radians(turn * COLOUR.hue_margin), max(0.0, chroma + more * COLOUR.chroma_margin)
+        l_star = lightness + lift * COLOUR.lightness_margin
         names.add(colour_name(l_star, radius * math.cos(angle), radius * math.sin(angle)))
-    if lightness < DARK_REDS and names & {"red", "orange"}:
+    if lightness < COLOUR.dark_reds and names & {"red", "orange"}:
         names.add("brown")
-    if lightness < OLIVE and "yellow" in names:
+    if lightness < COLOUR.olive and "yellow" in names:
         names.add("green")
     return frozenset(names)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,12 +11,23 @@ import numpy as np
 from cow_service.vision.masks import CroppedMask, dilated, scaled
 from cow_service.vision.types import Floats, Image, Mask
 
-WORKING_SIDE = 832  # px: longer images are searched at this size
-LEAST_LENGTH = 0.016  # of the longer side of the image
-OWN_GAP, OTHER_GAP = 4, 12  # px at the working size: nearer to a thing lie its own edges, farther those of others
-LEAST_BESIDE = 0.05  # of the longer side of the image, between things: shorter ones are texture
-SAMPLED = (0.1, 0.5, 0.9)  # of the way along a segment
-DRAWING_REACH = 9  # px: width of the square by which drawings are grown, over what was left of their edges
+
+class SegmentRules(NamedTuple):
+    """Which straight edges tell of the camera, and whose they are.
+
+    Set by hand on rendered scenes of the first family; no single number has a measurement of its own.
+    """
+
+    working_side: int = 832  # px: longer images are searched at this size
+    least_length: float = 0.016  # of the longer side of the image
+    own_gap: int = 4  # px at the working size: nearer to a thing lie its own edges
+    other_gap: int = 12  # px at the working size: farther from a thing lie the edges of others
+    least_beside: float = 0.05  # of the longer side of the image, between things: shorter ones are texture
+    sampled: tuple[float, float, float] = (0.1, 0.5, 0.9)  # of the way along a segment
+    drawing_reach: int = 9  # px: width of the square by which drawings are grown, over what was left of their edges
+
+
+SEGMENT = SegmentRules()
 
 
 def find_segments(image: Image, drawn: Mask) -> Floats:
@@ -25,16 +36,16 @@ def find_segments(image: Image, drawn: Mask) -> Floats:
     Those are left out that touch a mask [H, W] of what was drawn over the image.
     """
     longest = max(image.shape[:2])
-    scale = min(1.0, WORKING_SIDE / longest)
+    scale = min(1.0, SEGMENT.working_side / longest)
     grey = cv2.cvtColor(scaled(image, scale), cv2.COLOR_RGB2GRAY)
     found: Any = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD).detect(grey)[0]
     segments = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64).reshape(-1, 4) / scale
     lengths = lengths_of(segments)
     order = np.argsort(-lengths, kind="stable")
-    segments = segments[order[lengths[order] >= LEAST_LENGTH * longest]]
+    segments = segments[order[lengths[order] >= SEGMENT.least_length * longest]]
     if not len(segments) or not drawn.any():
         return segments
-    grown = dilated(drawn, DRAWING_REACH)
+    grown = dilated(drawn, SEGMENT.drawing_reach)
     x, y = np.clip(_samples(segments).astype(int), 0, np.array(drawn.shape[::-1]) - 1).transpose(2, 0, 1)
     return segments[~grown[y, x].any(axis=0)]
 
@@ -49,11 +60,11 @@ def divide(segments: Floats, masks: Sequence[CroppedMask]) -> tuple[list[Floats]
     own: list[Floats] = []
     beside = np.ones(len(segments), bool)
     for mask in masks:
-        scale = max(1.0, max(mask.shape) / WORKING_SIDE)
-        own.append(segments[_within(segments, mask, round(OWN_GAP * scale)).all(axis=0)])
-        beside &= ~_within(segments, mask, round(OTHER_GAP * scale)).any(axis=0)
+        scale = max(1.0, max(mask.shape) / SEGMENT.working_side)
+        own.append(segments[_within(segments, mask, round(SEGMENT.own_gap * scale)).all(axis=0)])
+        beside &= ~_within(segments, mask, round(SEGMENT.other_gap * scale)).any(axis=0)
     if masks:
-        beside &= lengths_of(segments) > LEAST_BESIDE * max(masks[0].shape)
+        beside &= lengths_of(segments) > SEGMENT.least_beside * max(masks[0].shape)
     return own, segments[beside]
 
 
@@ -69,4 +80,4 @@ def _within(segments: Floats, mask: CroppedMask, margin: int) -> Mask:
 def _samples(segments: Floats) -> Floats:
     """Points [3, N, 2] (px) along segments [N, 4] (px)."""
     along = segments[:, 2:] - segments[:, :2]
-    return np.stack([segments[:, :2] + share * along for share in SAMPLED])
+    return np.stack([segments[:, :2] + share * along for share in SEGMENT.sampled])

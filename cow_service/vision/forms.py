@@ -7,26 +7,41 @@ it than under the other nouns.
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from cow_service.records import Shape
 from cow_service.vision.masks import hull
 from cow_service.vision.regions import Region
-from cow_service.vision.types import Mask
 
 Range = tuple[float, float]
 
-# Natural logarithm, share of the hull, share of the width: so far off counts as 1.
-ASPECT_STEP, FILLED_STEP, WIDTH_STEP = 0.1, 0.02, 0.05
-LESS_THAN_ROUND = 3.0  # misfit above which a ball shows less than two thirds of its height; whole ones have none
-CONTRADICTS = 6.0  # misfit above which an object is not the named one; whole objects under their own name reach 5.1
-UNLIKE = -2.5  # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
-FITS = 2.0  # misfit below which an outline is well described
-_STEPS = (ASPECT_STEP, FILLED_STEP, *(WIDTH_STEP,) * 5)
-CIRCLE = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
-ODD = 0.05  # share of outlines that fit no shape: half hidden, or with a shadow
+
+class FormRules(NamedTuple):
+    """How outlines are compared with those of everyday things.
+
+    Whole objects of rendered scenes under their own name reach a misfit of 5.1, and balls are fitted by a circle in
+    95%. The other numbers were set by hand.
+    """
+
+    aspect_step: float = 0.1  # natural logarithm: so far off counts as 1
+    filled_step: float = 0.02  # share of the hull: the same
+    width_step: float = 0.05  # share of the width: the same
+    # misfit above which a ball shows less than two thirds of its height; whole ones have none
+    less_than_round: float = 3.0
+    contradicts: float = 6.0  # misfit above which an object is not the named one
+    # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
+    unlike: float = -2.5
+    fits: float = 2.0  # misfit below which an outline is well described
+    circle: float = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
+    odd: float = 0.05  # share of outlines that fit no shape: half hidden, or with a shadow
+
+
+FORM = FormRules()
+
+
+_STEPS = (FORM.aspect_step, FORM.filled_step, *(FORM.width_step,) * 5)
 
 # Rows over which a width is taken, from the upper end, as shares of the height.
 BANDS = ((0.08, 0.2), (0.2, 0.35), (0.35, 0.5), (0.5, 0.8), (0.8, 0.95))
@@ -45,14 +60,6 @@ OUTLINES: dict[str, tuple[Range, Range, Range, Range, Range, Range, Range]] = {
     "car": ((0.3, 0.9), (0.82, 0.96), (0.2, 0.9), (0.5, 0.97), (0.85, 1.0), (0.75, 1.0), (0.2, 0.97)),
     "box": ((0.4, 1.6), (0.95, 1.0), (0.4, 1.0), (0.85, 1.0), (0.93, 1.0), (0.9, 1.0), (0.5, 1.0)),
 }
-# Share of objects with a part that reaches out on one side between their ends, or a hole; for others `NO_HANDLE`.
-HANDLES = {"mug": 0.52, "cone": 0.45, "car": 0.3, "candle": 0.15}
-NO_HANDLE = 0.04
-_REACHES, _BARE = 0.15, 0.08  # of the width: so far out on one side at least, on the other at most
-_HOLE = 0.004  # of the area
-_SIDE = 0.25  # of the width: so far from the middle is the hole inside a handle, and not a window
-# The rows of the body beside a handle, at both ends, and those of the handle, as shares of the height.
-_UPPER, _LOWER, _BETWEEN = (0.06, 0.22), (0.72, 0.9), (0.2, 0.8)
 _ALIKE = {
     "ball": "sphere orb egg marble basketball football baseball balloon globe",
     "mug": "cup", "cone": "pyramid", "cylinder": "can jar", "box": "block brick cuboid",
@@ -79,8 +86,8 @@ def is_unlike(region: Region, form: str) -> bool:
         return False
     is_box = form == "box"  # which may be flat, or as high as a tower
     measured = [0.0, *_measures(region)[1:]] if is_box else _measures(region)
-    most = LESS_THAN_ROUND if form == "ball" else CONTRADICTS  # of a lit cap neither foot nor size are seen
-    return _misfit(measured, form) >= most or (not is_box and log_ratio(region, form) < UNLIKE)
+    most = FORM.less_than_round if form == "ball" else FORM.contradicts  # of a lit cap neither foot nor size are seen
+    return _misfit(measured, form) >= most or (not is_box and log_ratio(region, form) < FORM.unlike)
 
 
 def looks_like(region: Region) -> str | None:
@@ -97,23 +104,21 @@ def shape_seen(region: Region) -> Shape | None:
 
 
 def is_other_kind(region: Region, noun: str | None) -> bool:
-    """Whether an outline certainly belongs to another kind of object; not certain if it is torn or half hidden."""
+    """Whether an outline certainly belongs to another kind of object; not certain if it is torn."""
     form = form_of(noun)
     if form is None or is_cut(region, form):
         return False
     measured = _measures(region)
     misfits = {name: _misfit(measured, name) for name in OUTLINES}
-    return misfits[form] >= 2 * CONTRADICTS and min(misfits.values()) < FITS
+    return misfits[form] >= 2 * FORM.contradicts and min(misfits.values()) < FORM.fits
 
 
 def log_ratio(region: Region, form: str) -> float:
     """Natural logarithm of how much more likely an outline is under a row of `OUTLINES` than under the others."""
     rivals = OUTLINES.keys() - _SAME.get(form, {form, "box"})
-    measured, handle = _measures(region), _has_handle(region.mask.patch)
+    measured = _measures(region)
     densities = {
-        name: _density(measured, name)
-        * (CIRCLE if (name == "ball") == region.is_disc else 1 - CIRCLE)
-        * (HANDLES.get(name, NO_HANDLE) if handle else 1.0)  # one that is not seen may be behind the thing
+        name: _density(measured, name) * (FORM.circle if (name == "ball") == region.is_disc else 1 - FORM.circle)
         for name in (form, *rivals)
     }
     own = densities.pop(form)
@@ -125,7 +130,7 @@ def _density(measured: Sequence[float], form: str) -> float:
     (low, high), *shares = OUTLINES[form]
     sides = [math.log(high / low), *(end - start for start, end in shares)]
     integral = math.prod(side + 2 * step for side, step in zip(sides, _STEPS, strict=True))
-    return (1 - ODD) * math.exp(-_misfit(measured, form)) / integral + ODD
+    return (1 - FORM.odd) * math.exp(-_misfit(measured, form)) / integral + FORM.odd
 
 
 def is_cut(region: Region, form: str) -> bool:
@@ -160,36 +165,27 @@ def _measures(region: Region) -> list[float]:
     return [math.log(height / width), filled, *(each / max(1.0, *widths) for each in widths)]
 
 
-def _has_handle(mask: Mask) -> bool:
-    """Whether a mask [h, w] reaches out on one side alone between its ends, or has a hole at a side."""
-    outlines, levels = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    for hole, level in zip(outlines, levels[0], strict=True):
-        x, _, across, _ = cv2.boundingRect(hole)
-        at_side = abs((x + across / 2) / mask.shape[1] - 0.5) > _SIDE
-        if level[3] >= 0 and at_side and cv2.contourArea(hole) > _HOLE * np.count_nonzero(mask):
-            return True
-    # How far in it begins on the left and on the right [2, h], and from which line through its ends it reaches out.
-    width, filled = mask.shape[1], mask.any(axis=1)
-    sides = np.where(filled, [mask.argmax(axis=1), mask[:, ::-1].argmax(axis=1)], width)
-    down = (np.arange(len(mask)) + 0.5) / len(mask)
-    upper, lower = (
-        sides[:, (low <= down) & (down < high)].min(axis=1, initial=width) for low, high in (_UPPER, _LOWER)
-    )
-    share = (down - sum(_UPPER) / 2) / (sum(_LOWER) / 2 - sum(_UPPER) / 2)
-    lines = upper[:, None] + (lower - upper)[:, None] * share
-    between = (down > _BETWEEN[0]) & (down < _BETWEEN[1])
-    body = max(1.0, width - float(np.maximum(upper, lower).sum()))
-    out = (lines - sides)[:, between].max(axis=1, initial=0.0) / body
-    return bool(out.max() > _REACHES and out.min() < _BARE)
+class NamingRules(NamedTuple):
+    """What speaks for and against a region that a noun and a colour name, as log ratios.
+
+    Set by hand on rendered scenes of the first family and on drawn things; no single number has a measurement of its
+    own.
+    """
+
+    clearly_worse: float = 2.5  # what is so much less likely than the best, twelve times, is not meant
+    exact: float = 6.0  # of the name of a region's colour
+    near: float = 3.0  # of others that people may use for it
+    least: float = -2.0  # lowest evidence of an outline; the highest is `clearly_worse`
+    cut: float = 0.5  # share of its log ratio that an outline keeps which the border cuts
+    round: float = 0.76  # roundness from which a region passes for a ball; a cube has about 0.7
+    not_round: float = 0.6  # roundness below which nothing passes for a ball
+    called: float = 3.0  # if a detector found the noun: for its finds
+    not_called: float = -2.0  # the same for the rest
 
 
-CLEARLY_WORSE = 2.5  # log ratio: what is so much less likely than the best, twelve times, is not meant
-EXACT, NEAR = 6.0, 3.0  # log ratios of the name of a region's colour, and of others that people may use for it
-LEAST = -2.0  # log ratio of an outline: lowest evidence against it; the highest is `CLEARLY_WORSE`
-CUT = 0.5  # share of its log ratio that an outline keeps which the border cuts
-ROUND = 0.76  # roundness from which a region passes for a ball; a cube has about 0.7
-NOT_ROUND = 0.6  # roundness below which nothing passes for a ball, even half hidden
-CALLED, NOT_CALLED = 3.0, -2.0  # log ratios if a detector found the noun: for its finds, for the rest
+NAMING = NamingRules()
+
+
 IMPOSSIBLE = -math.inf
 SOLID = frozenset(
     ["glass", "chair", "book", "lamp", "robot", "pencil", "pen"]
@@ -202,13 +198,13 @@ def likeness(regions: Sequence[Region], noun: str | None, head: str | None, colo
     for region in regions:
         tint, shape = 0.0, shape_ratio(region, head, colour is not None)
         if colour is not None and region.colour != colour:
-            tint = NEAR if colour in region.colours else IMPOSSIBLE
+            tint = NAMING.near if colour in region.colours else IMPOSSIBLE
         elif colour is not None:
-            tint = EXACT
+            tint = NAMING.exact
         if noun in region.called:  # outlines of real things are of many forms
-            ratios.append(max(shape, LEAST) + tint + CALLED)
+            ratios.append(max(shape, NAMING.least) + tint + NAMING.called)
         else:
-            ratios.append(shape + tint + (NOT_CALLED if is_found else 0.0))
+            ratios.append(shape + tint + (NAMING.not_called if is_found else 0.0))
     return ratios
 
 
@@ -218,8 +214,10 @@ def shape_ratio(region: Region, head: str | None, has_colour: bool) -> float:
     # A region is round where the noun names something round, and not where it does not.
     can_be = not region.is_disc or (form is None and head not in SOLID)
     if form == "ball":
-        round_enough = region.roundness >= (NOT_ROUND if has_colour or region.is_hidden else ROUND)
+        round_enough = region.roundness >= (NAMING.not_round if has_colour or region.is_hidden else NAMING.round)
         can_be = round_enough or (region.is_hidden and has_colour)
     if form is None or not can_be:
         return 0.0 if can_be else IMPOSSIBLE
-    return (CUT if is_cut(region, form) else 1.0) * min(CLEARLY_WORSE, max(LEAST, log_ratio(region, form)))
+    return (NAMING.cut if is_cut(region, form) else 1.0) * min(
+        NAMING.clearly_worse, max(NAMING.least, log_ratio(region, form))
+    )

@@ -1,6 +1,7 @@
 """Inpainting: fills the hole after a thin drawing or a whole object is removed from an image."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -8,38 +9,55 @@ import numpy as np
 from cow_service.vision.masks import dilated, scaled_size, three_channels, window_of
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-INPAINT_RADIUS = 4  # px
-WIDE = 0.6  # of the hole's size: so far around it exemplars are looked for
-MARGIN = 8  # px around a drawing that inpainting may use
-TEXTURE_WIDTH, TEXTURE_LEAST = 0.2, 5.0  # of the hole's size, px: half of what finer detail is texture, not shading
-VARIED, STRUCTURED = 18.0, 4.0  # grey levels: deviation around a hole, there from a smooth surface: then exemplars
-MOST_UNREST = 1.5  # of the detail around the hole: with more, a place shows the edge of something
-RIM, RIM_LEAST = 0.04, 3.0  # of the hole's size, px: next to it the fill fades out, and nothing is learnt
-BESIDE, BESIDE_LEAST = 0.15, 6.0  # of the hole's size, px: so far around it shading is taken from
-MOST_SAMPLES = 1500  # pixels of a ring
-SHADOW_STEP = 14.0  # grey levels
-SHADOW_REACH = 0.15  # of the hole's size: so far around it its shadow is looked for
-LEAST_WEIGHT = 1e-3  # of a pyramid cell known: with less, the coarser level says more
-FADE = 0.14  # of the hole's size: how far out its shadow is taken away
-FADE_MOST = 0.011  # of the image's longer side: and no further
-SHIFTS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))  # in sizes of the hole
-COARSE_SIDE = 96  # px: the crop is searched at this size
-TILE = 9  # px at the coarse size: what one patch fills
-CONTEXT = 5  # px around a tile that must fit
-FEATHER = 3  # px over which patches overlap
-BLEND = 2  # px inside a hole over which a fill that was made elsewhere comes in
-SEAM = 6  # px on either side of a hole's rim whose colours are compared
-SEAM_WIDTH = 31  # px along the rim: so many are averaged, or texture would count as an error of the fill
-SEAM_NOISE, SEAM_MOST = 2.0, 24.0  # grey levels of such a difference that are left alone, and the most corrected
+
+class FillRules(NamedTuple):
+    """How a hole is filled.
+
+    Set by hand on rendered scenes. `benchmarks/backgrounds.py` measures the whole: 1.6 grey levels off behind the
+    moving objects of 40 scenes. No single number has a measurement of its own.
+    """
+
+    inpaint_radius: int = 4  # px
+    wide: float = 0.6  # of the hole's size: so far around it exemplars are looked for
+    margin: int = 8  # px around a drawing that inpainting may use
+    texture_width: float = 0.2  # of the hole's size: half of what finer detail is texture, not shading
+    texture_least: float = 5.0  # px, of the same
+    varied: float = 18.0  # grey levels of deviation around a hole: with more, exemplars are copied
+    structured: float = 4.0  # the same from a smooth surface
+    most_unrest: float = 1.5  # of the detail around the hole: with more, a place shows the edge of something
+    rim: float = 0.04  # of the hole's size: next to it the fill fades out, and nothing is learnt
+    rim_least: float = 3.0  # px, of the same
+    beside: float = 0.15  # of the hole's size: so far around it shading is taken from
+    beside_least: float = 6.0  # px, of the same
+    most_samples: int = 1500  # pixels of a ring
+    shadow_step: float = 14.0  # grey levels
+    shadow_reach: float = 0.15  # of the hole's size: so far around it its shadow is looked for
+    least_weight: float = 1e-3  # of a pyramid cell known: with less, the coarser level says more
+    fade: float = 0.14  # of the hole's size: how far out its shadow is taken away
+    fade_most: float = 0.011  # of the image's longer side: and no further
+    coarse_side: int = 96  # px: the crop is searched at this size
+    tile: int = 9  # px at the coarse size: what one patch fills
+    context: int = 5  # px around a tile that must fit
+    feather: int = 3  # px over which patches overlap
+    blend: int = 2  # px inside a hole over which a fill that was made elsewhere comes in
+    seam: int = 6  # px on either side of a hole's rim whose colours are compared
+    seam_width: int = 31  # px along the rim: so many are averaged, or texture would count as an error of the fill
+    seam_noise: float = 2.0  # grey levels of such a difference that are left alone
+    seam_most: float = 24.0  # grey levels of it that are corrected at most
+
+
+FILL = FillRules()
+# In sizes of the hole: where texture is looked for.
+SHIFTS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 
 
 def erase_drawing(image: Image, mask: Mask) -> Image:
     """The image [H, W, 3] with thin masked strokes inpainted by Telea's method."""
-    crop = window_of(mask, MARGIN)
+    crop = window_of(mask, FILL.margin)
     if crop is None:
         return image
     result = image.copy()
-    result[crop] = cv2.inpaint(image[crop], mask[crop].astype(np.uint8), INPAINT_RADIUS, cv2.INPAINT_TELEA)
+    result[crop] = cv2.inpaint(image[crop], mask[crop].astype(np.uint8), FILL.inpaint_radius, cv2.INPAINT_TELEA)
     return result
 
 
@@ -50,16 +68,16 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     shadow around the hole gives none either; it fades out over the few pixels next to it.
     """
     size = float(np.sqrt(np.count_nonzero(hole)))
-    reach = RIM * size + RIM_LEAST + max(BESIDE_LEAST, BESIDE * size)
-    around = _surroundings(image, hole, avoid, max(round(reach), round(FADE * size)) + 2)
+    reach = FILL.rim * size + FILL.rim_least + max(FILL.beside_least, FILL.beside * size)
+    around = _surroundings(image, hole, avoid, max(round(reach), round(FILL.fade * size)) + 2)
     if around is None or not around.trusted.any():
-        around = _surroundings(image, hole, avoid, max(24, int(WIDE * size)))
+        around = _surroundings(image, hole, avoid, max(24, int(FILL.wide * size)))
         reach = np.inf
     if around is None:
         return image
     varied = _is_varied(around.source, around.inside, around.trusted)
     if varied and np.isfinite(reach):
-        around = _surroundings(image, hole, avoid, max(24, int(WIDE * size))) or around
+        around = _surroundings(image, hole, avoid, max(24, int(FILL.wide * size))) or around
     beside = around.trusted & (around.away < reach)
     if not beside.any():
         beside = around.trusted
@@ -67,12 +85,12 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     if varied:
         filled = exemplar_inpaint(around.source, around.inside | (around.away <= around.rim), ~around.trusted, shading)
     else:
-        width = 2 * round(max(TEXTURE_LEAST, TEXTURE_WIDTH * size)) + 1
+        width = 2 * round(max(FILL.texture_least, FILL.texture_width * size)) + 1
         detail = np.abs(shading - cv2.blur(shading, (width, width)))[beside]
-        most = MOST_UNREST * float(np.percentile(detail, 99))
+        most = FILL.most_unrest * float(np.percentile(detail, 99))
         filled = shading + _texture(image, hole, avoid, around.crop, width, most)
     # It fades out next to the hole, and over a longer way in the object's shadow.
-    fade = min(max(3.0, FADE * size), FADE_MOST * max(image.shape[:2]))
+    fade = min(max(3.0, FILL.fade * size), FILL.fade_most * max(image.shape[:2]))
     reaches = np.where(dilated(around.shadow, 5), np.float32(max(fade, around.rim)), np.float32(around.rim))
     share = np.asarray(np.clip(1 - around.away / reaches, 0, 1) * around.known, np.float32)
     share[around.inside] = 1
@@ -87,7 +105,7 @@ def blend_fill(image: Image, filled: Image, hole: Mask, avoid: Mask) -> Image:
 
     Pixels of `avoid` (other objects) say nothing of the shading. Outside the hole nothing changes.
     """
-    crop = window_of(hole, SEAM + 1)
+    crop = window_of(hole, FILL.seam + 1)
     if crop is None:
         return image
     inside, source = hole[crop], image[crop].astype(np.float32)
@@ -97,14 +115,14 @@ def blend_fill(image: Image, filled: Image, hole: Mask, avoid: Mask) -> Image:
         cv2.distanceTransform((~there).astype(np.uint8), cv2.DIST_L2, 5) for there in (inside, known)
     )  # px from the hole, and from what is known around it
     (around, most), (own, least) = (
-        (_mean_along(values, band), cv2.boxFilter(band.astype(np.float32), -1, (SEAM_WIDTH,) * 2, normalize=False))
-        for values, band in ((source, known & (beyond <= SEAM)), (new, inside & (within <= SEAM)))
+        (_mean_along(values, band), cv2.boxFilter(band.astype(np.float32), -1, (FILL.seam_width,) * 2, normalize=False))
+        for values, band in ((source, known & (beyond <= FILL.seam)), (new, inside & (within <= FILL.seam)))
     )
-    seen = inside & (within <= SEAM) & (most > SEAM_WIDTH) & (least > SEAM_WIDTH)
+    seen = inside & (within <= FILL.seam) & (most > FILL.seam_width) & (least > FILL.seam_width)
     if seen.any():
         off = push_pull(np.asarray(around - own, np.float32), seen)
-        new += np.sign(off) * np.clip(np.abs(off) - SEAM_NOISE, 0, SEAM_MOST)
-    share = three_channels(np.asarray(np.clip(within / (BLEND + 1), 0, 1), np.float32))
+        new += np.sign(off) * np.clip(np.abs(off) - FILL.seam_noise, 0, FILL.seam_most)
+    share = three_channels(np.asarray(np.clip(within / (FILL.blend + 1), 0, 1), np.float32))
     result = image.copy()
     mixed = cv2.convertScaleAbs(np.maximum(source + (new - source) * share, 0))
     result[crop] = np.where(inside[..., None], mixed, image[crop])
@@ -114,15 +132,15 @@ def blend_fill(image: Image, filled: Image, hole: Mask, avoid: Mask) -> Image:
 def _mean_along(values: Floats32, band: Mask) -> Floats32:
     """Per pixel, the mean colour [h, w, 3] of what lies next to it in a band [h, w]."""
     weight = band.astype(np.float32)
-    total = cv2.boxFilter(values * weight[..., None], -1, (SEAM_WIDTH,) * 2, normalize=False)
-    count = cv2.boxFilter(weight, -1, (SEAM_WIDTH,) * 2, normalize=False)
+    total = cv2.boxFilter(values * weight[..., None], -1, (FILL.seam_width,) * 2, normalize=False)
+    count = cv2.boxFilter(weight, -1, (FILL.seam_width,) * 2, normalize=False)
     return np.asarray(total / np.maximum(count, 1)[..., None], np.float32)
 
 
 def shadow_beside(image: Image, hole: Mask, avoid: Mask) -> Mask:
     """What is much darker [H, W] than most right around a hole, not in `avoid`: the shadow of the removed object."""
     found = np.zeros_like(hole)
-    around = _surroundings(image, hole, avoid, round(SHADOW_REACH * float(np.sqrt(np.count_nonzero(hole)))) + 4)
+    around = _surroundings(image, hole, avoid, round(FILL.shadow_reach * float(np.sqrt(np.count_nonzero(hole)))) + 4)
     if around is not None:
         found[around.crop] = around.shadow
     return found
@@ -155,14 +173,14 @@ def _surroundings(image: Image, hole: Mask, avoid: Mask | None, margin: int) -> 
         return None
     source = image[crop].astype(np.float32)
     away = np.asarray(cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-    rim = max(RIM_LEAST, RIM * float(np.sqrt(np.count_nonzero(inside))))
+    rim = max(FILL.rim_least, FILL.rim * float(np.sqrt(np.count_nonzero(inside))))
     # What is much darker than most at the hole's rim is the object's own shadow, no shading to draw in.
-    width = 2 * max(3, int(SHADOW_REACH * np.sqrt(np.count_nonzero(inside)))) + 1
+    width = 2 * max(3, int(FILL.shadow_reach * np.sqrt(np.count_nonzero(inside)))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
     shadow = (cv2.dilate(inside.astype(np.uint8), kernel) > 0) & known
     if shadow.any():
         grey = source @ np.full(3, 1 / 3, np.float32)
-        shadow &= grey < np.percentile(grey[shadow], 65) - SHADOW_STEP
+        shadow &= grey < np.percentile(grey[shadow], 65) - FILL.shadow_step
     trusted = known & ~shadow & (away > rim)
     return _Surroundings(crop, source, inside, known, trusted if trusted.any() else known, shadow, away, rim)
 
@@ -173,15 +191,15 @@ def _is_varied(source: Floats32, inside: Mask, known: Mask) -> bool:
     ring = dilated(inside, reach) & known
     if not ring.any():
         return False
-    if float(source[ring].std(axis=0).max()) > VARIED:
+    if float(source[ring].std(axis=0).max()) > FILL.varied:
         return True
     ys, xs = np.nonzero(ring)
-    every = max(1, len(ys) // MOST_SAMPLES)
+    every = max(1, len(ys) // FILL.most_samples)
     ys, xs = ys[::every], xs[::every]
     values = np.asarray(cv2.blur(source, (7, 7)), np.float64)[ys, xs]
     terms = quadratic_terms((xs - xs.mean()) / max(1.0, float(xs.std())), (ys - ys.mean()) / max(1.0, float(ys.std())))
     rest = values - terms @ np.linalg.lstsq(terms, values, rcond=None)[0]
-    return float(rest.std(axis=0).max()) > STRUCTURED  # coarser than texture, from a quadratic surface
+    return float(rest.std(axis=0).max()) > FILL.structured  # coarser than texture, from a quadratic surface
 
 
 def quadratic_terms(u: Floats, v: Floats) -> Floats:
@@ -194,15 +212,15 @@ def push_pull(source: Floats32, known: Mask) -> Floats32:
     weight = known.astype(np.float32)
     kept = three_channels(weight)
     levels = [(source * kept, weight)]
-    while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > LEAST_WEIGHT).all():
+    while min(levels[-1][1].shape) > 1 and not (levels[-1][1] > FILL.least_weight).all():
         colours, weights = (np.asarray(cv2.pyrDown(layer), np.float32) for layer in levels[-1])
         levels.append((colours, weights))
     colours, weights = levels[-1]
-    value = colours / three_channels(np.maximum(weights, LEAST_WEIGHT))
+    value = colours / three_channels(np.maximum(weights, FILL.least_weight))
     for colours, weights in reversed(levels[:-1]):
         coarse = cv2.resize(value, (weights.shape[1], weights.shape[0]), interpolation=cv2.INTER_LINEAR)
-        trust = np.where(weights > LEAST_WEIGHT, np.minimum(weights, 1), 0)
-        own = np.asarray(trust / np.maximum(weights, LEAST_WEIGHT), np.float32)
+        trust = np.where(weights > FILL.least_weight, np.minimum(weights, 1), 0)
+        own = np.asarray(trust / np.maximum(weights, FILL.least_weight), np.float32)
         rest = np.asarray(1 - np.minimum(weights, 1), np.float32)
         value = colours * three_channels(own) + coarse * three_channels(rest)
     for _ in range(2):
@@ -251,19 +269,19 @@ def exemplar_inpaint(source: Floats32, unknown: Mask, forbidden: Mask, shading: 
     is found. After Criminisi, Perez, Toyama, "Region filling and object removal by exemplar-based inpainting", 2004.
     """
     height, width = unknown.shape
-    scale = min(1.0, COARSE_SIDE / max(height, width))
+    scale = min(1.0, FILL.coarse_side / max(height, width))
     size = scaled_size(width, height, scale)
     guess = np.where(unknown[..., None], shading, source)
     coarse = np.asarray(cv2.resize(guess, size, interpolation=cv2.INTER_AREA), np.float32)
     todo = cv2.resize(unknown.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
     barred = cv2.resize((unknown | forbidden).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
     result, weight = np.zeros_like(source), np.zeros(unknown.shape, np.float32)
-    inner, grow = todo.copy(), FEATHER / scale
+    inner, grow = todo.copy(), FILL.feather / scale
     while inner.any():
         depth = cv2.distanceTransform(np.pad(inner, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
         depth[~inner] = np.inf
         y, x = (int(v) for v in np.unravel_index(int(depth.argmin()), depth.shape))
-        tile = _around(y, TILE // 2, coarse.shape[0]), _around(x, TILE // 2, coarse.shape[1])
+        tile = _around(y, FILL.tile // 2, coarse.shape[0]), _around(x, FILL.tile // 2, coarse.shape[1])
         offset = _best_offset(coarse, inner, barred, y, x)
         if offset is not None:
             moved = tuple(slice(s.start + o, s.stop + o) for s, o in zip(tile, offset, strict=True))
@@ -295,13 +313,13 @@ def _around(centre: int, reach: int, length: int) -> slice:
 
 def _best_offset(coarse: Floats32, todo: Mask, barred: Mask, y: int, x: int) -> tuple[int, int] | None:
     """Rows and columns from a tile to the place that fits its surroundings best, or None if there is no place."""
-    reach = TILE // 2 + CONTEXT
+    reach = FILL.tile // 2 + FILL.context
     window = _around(y, reach, coarse.shape[0]), _around(x, reach, coarse.shape[1])
     template = coarse[window]
     trust = np.where(todo[window], 0.05, 1.0).astype(np.float32)  # the smooth guess counts a little
     error = cv2.matchTemplate(coarse, template, cv2.TM_SQDIFF, mask=np.repeat(trust[..., None], 3, axis=2))
     # A place may be used where the tile itself would take no barred pixel.
-    tile_y, tile_x = _around(y, TILE // 2, coarse.shape[0]), _around(x, TILE // 2, coarse.shape[1])
+    tile_y, tile_x = _around(y, FILL.tile // 2, coarse.shape[0]), _around(x, FILL.tile // 2, coarse.shape[1])
     top, left = tile_y.start - window[0].start, tile_x.start - window[1].start
     size = tile_x.stop - tile_x.start, tile_y.stop - tile_y.start
     taken = cv2.boxFilter(barred.astype(np.float32), -1, size, anchor=(0, 0), normalize=False)

@@ -5,9 +5,9 @@ does a patch enclosed by edges below a bright top: the shaded side of a white ob
 hue, are left out. Where the surroundings vary too much (most photographs), no region is returned instead of wrong ones.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,60 +16,63 @@ from numpy.typing import NDArray
 from cow_service.records import BBox
 from cow_service.vision import masks
 from cow_service.vision.completion import (
-    WEAK_EDGES,
     as_disc,
     black_faces,
-    enclosed,
     is_top,
     is_underside,
-    neck_between,
-    standing_on,
     white_sides,
 )
-from cow_service.vision.contrast import (
-    BRIGHT_STEP,
-    CHROMA_STEP,
-    STRONG_CHROMA_STEP,
-    WORKING_SIDE,
-    View,
-    colour_name,
-    colour_names,
-    view_of,
-)
+from cow_service.vision.contrast import VIEW, View, colour_name, colour_names, view_of
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats32, Image, Mask
 
-SHARP_SHARE = 0.65  # of an outline that must lie on edges
-OUT_OF_TEXTURE = 1.7  # of the surroundings' spread in lightness: the least step in an outline, per px
-SPREADS, BRIGHT_SPREADS = 3.0, 3.7  # of that spread: what is so much darker, or brighter, is no texture
-# Of the surroundings' light: below it something may be black; the darker part of what is, and of what may be shadow.
-BLACK, BLACK_LIGHT, BLACKEST_LIGHT = 0.61, 0.47, 0.375
-BLACKEST = 16.5  # Lab lightness of the darker part of what is black and may be shadow
-SAME_LIGHT, SAME_CHROMA = 0.05, 4.0  # of two shadows, and Lab units between a shadow and the floor it lies on
-LEAST_SHADOW, MOST_SHADOW = 0.05, 3.0  # of the area of what may be another shadow, and of the thing that casts it
-BLACK_SHARE = 0.5  # of the surroundings' lightness: below it is black, not shade
-HALFWAY = 0.35  # of the largest step nearby
-MIN_AREA = 0.0003  # of the image
-MAX_AREA = 0.25
-ALONG_BORDER = 0.5  # of the height or width of something bright and pale that runs along the image's border: a wall
-MAX_REGIONS = 40  # the largest are kept: the work that follows grows with their number
-CLUTTER = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
-SPLIT_HUE = 36.0  # degrees: another colour, hence another object
-FILLED, ELLIPSE = 0.9, 0.95  # of its hull that a part fills; of a hull and the ellipse of its outline that both share
-OWN_AREA = 250  # px at the working size: a patch of another colour this large is no part of a thing
-EDGE_BAND = 4.0  # px: half the width of an edge as it is measured
-MIN_REST = 0.05  # of a component: less is no part of its own
-HIDDEN = 0.2  # of its outline, along which something else lies in front
-OWN_WIDTH = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
-MASK_SIGMA = 0.8  # px at the working size, smooths the stairs of an enlarged mask
-TOP_AREA = 0.3  # of a region: a larger one above it is another object, not what stands on it
-DARK = 28.0  # lightness below which a part may be the underside of another
-SAME_TOP = 0.6  # of a smaller region, taken up by what stands on another: it is no object of its own
 
-DISC = 0.93  # roundness from which a drawn shape is a disc
-RIM = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
-SURE_CONTRAST = 20.0  # Lab units from the surroundings, from which contrast takes nothing from the confidence
-SURE_AREA = 300.0  # px at the working size, from which the size takes nothing
+class RegionRules(NamedTuple):
+    """When what differs from its surroundings is a thing, and where it ends.
+
+    Set by hand on the first family of rendered scenes, and on the textured floors and shadows of the second; no single
+    number has a measurement of its own.
+    """
+
+    sharp_share: float = 0.65  # of an outline that must lie on edges
+    out_of_texture: float = 1.7  # of the surroundings' spread in lightness: the least step in an outline, per px
+    spreads: float = 3.0  # of that spread: what is so much darker is no texture
+    bright_spreads: float = 3.7  # and what is so much brighter
+    black: float = 0.61  # of the surroundings' light: below it something may be black
+    black_light: float = 0.47  # the same of the darker part of what is black
+    blackest_light: float = 0.375  # the same of what may be shadow
+    blackest: float = 16.5  # Lab lightness of the darker part of what is black and may be shadow
+    same_light: float = 0.05  # of two shadows, at most
+    same_chroma: float = 4.0  # Lab units between a shadow and the floor that it lies on
+    least_shadow: float = 0.05  # of the area of what may be another shadow
+    most_shadow: float = 3.0  # of the area of the thing that casts it
+    black_share: float = 0.5  # of the surroundings' lightness: below it is black, not shade
+    halfway: float = 0.35  # of the largest step nearby
+    min_area: float = 0.0003  # of the image
+    max_area: float = 0.25  # the same, at most
+    # of the height or width of something bright and pale that runs along the image's border: a wall
+    along_border: float = 0.5
+    most: int = 40  # the largest are kept: the work that follows grows with their number
+    clutter: float = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
+    split_hue: float = 36.0  # degrees: another colour, hence another object
+    filled: float = 0.9  # of its hull: what a part fills
+    ellipse: float = 0.95  # of a hull and the ellipse of its outline: what both share
+    own_area: int = 250  # px at the working size: a patch of another colour this large is no part of a thing
+    edge_band: float = 4.0  # px: half the width of an edge as it is measured
+    min_rest: float = 0.05  # of a component: less is no part of its own
+    hidden: float = 0.2  # of its outline, along which something else lies in front
+    own_width: float = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
+    mask_sigma: float = 0.8  # px at the working size, smooths the stairs of an enlarged mask
+    disc: float = 0.93  # roundness from which a drawn shape is a disc
+    rim: int = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
+    dark: float = 28.0  # lightness below which a part may be the underside of another
+    # Lab units from the surroundings, from which contrast takes nothing from the confidence
+    sure_contrast: float = 20.0
+    sure_area: float = 300.0  # px at the working size, from which the size takes nothing
+
+
+REGION = RegionRules()
+
 
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
 
@@ -110,35 +113,27 @@ class _Found:
     def region(self, size: tuple[int, int], is_hidden: bool) -> Region:
         """It as a region of the image (height and width)."""
         soft = self.mask.astype(np.float32)
-        near = masks.window_of(self.mask, round(6 * MASK_SIGMA))
+        near = masks.window_of(self.mask, round(6 * REGION.mask_sigma))
         if near is not None:
-            soft[near] = cv2.GaussianBlur(soft[near], (0, 0), MASK_SIGMA)
+            soft[near] = cv2.GaussianBlur(soft[near], (0, 0), REGION.mask_sigma)
         mask = masks.enlarged(soft, size)
         roundness = masks.roundness_of(mask.patch)
         return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
 
 
-def measure(image: Image) -> View:
-    """The view of an RGB image [H, W, 3] at the working size."""
-    return view_of(masks.scaled(image, min(1.0, WORKING_SIDE / max(image.shape[:2]))))
-
-
-def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
-    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image.
-
-    `view` is what `measure` gives for the image, where that is known.
-    """
+def find_regions(image: Image) -> tuple[Region, ...]:
+    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
-    view = measure(image) if view is None else view
+    view = view_of(masks.scaled(image, min(1.0, VIEW.working_side / max(height, width))))
     # What is surely of an object: of another hue, clearly brighter, or nearly black.
-    coloured = view.chroma_gap > CHROMA_STEP
-    body = coloured | (view.bright > np.maximum(BRIGHT_STEP, BRIGHT_SPREADS * view.spread))
+    coloured = view.chroma_gap > VIEW.chroma_step
+    body = coloured | (view.bright > np.maximum(VIEW.bright_step, REGION.bright_spreads * view.spread))
     core = body | _black(view, body)
     # Blur and the compression of colour spread a thing by a few px: its outline lies halfway up to its own colour.
     step = np.maximum(view.chroma_gap, np.abs(view.bright))
-    low = step < HALFWAY * cv2.dilate(step, np.ones((7, 7), np.uint8))
+    low = step < REGION.halfway * cv2.dilate(step, np.ones((7, 7), np.uint8))
     core &= ~(low & masks.dilated(~core, 5))
-    if core.mean() > CLUTTER:
+    if core.mean() > REGION.clutter:
         return ()
     solid = (core | white_sides(view, core)).astype(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -149,7 +144,9 @@ def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
     found: list[_Found] = []
     count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
     for i in range(1, count):
-        if not MIN_AREA * solid.size <= stats[i][4] <= MAX_AREA * solid.size or _is_background(stats[i], solid.shape):
+        if not REGION.min_area * solid.size <= stats[i][4] <= REGION.max_area * solid.size or _is_background(
+            stats[i], solid.shape
+        ):
             continue
         x, y, w, h = (int(v) for v in stats[i][:4])
         pad = 6 + max(w, h) // 3  # a ball may have lost as much to a highlight
@@ -161,17 +158,17 @@ def find_regions(image: Image, view: View | None = None) -> tuple[Region, ...]:
             disc = as_disc(part, near.edges, view.edge_threshold)
             # An object's outline lies on edges; that of a patch of light does not.
             strong = cv2.dilate(near.edges, np.ones((5, 5), np.uint8))[masks.outline_of(part)] > view.edge_threshold
-            if disc is not None or (float(np.mean(strong)) > SHARP_SHARE and _stands_out(near, part)):
+            if disc is not None or (float(np.mean(strong)) > REGION.sharp_share and _stands_out(near, part)):
                 whole = np.zeros(solid.shape, bool)
                 whole[window] = part if disc is None else disc
                 confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
                 found.append(_Found(whole, near.lab[part], confidence, disc is not None))
-    whole_ones = _with_undersides(_with_tops(view, _with_mouths(view, found)))
-    balls = np.logical_or.reduce([border & False, *(one.mask for one in whole_ones if one.is_disc)])
-    whole_ones = [_without_rim(one, balls) for one in whole_ones]
-    each = zip(whole_ones, _hidden(whole_ones), strict=True)
+    found = _with_undersides(found)
+    balls = np.logical_or.reduce([border & False, *(one.mask for one in found if one.is_disc)])
+    found = [_without_rim(one, balls) for one in found]
+    each = zip(found, _hidden(found), strict=True)
     regions = [one.region((height, width), is_hidden) for one, is_hidden in each]
-    return tuple(sorted(regions, key=lambda region: -region.mask.area)[:MAX_REGIONS])
+    return tuple(sorted(regions, key=lambda region: -region.mask.area)[: REGION.most])
 
 
 def _black(view: View, body: Mask) -> Mask:
@@ -180,11 +177,11 @@ def _black(view: View, body: Mask) -> Mask:
     Outside it is the thing's shadow, unless it is as dark as black things are and large, or lies below it as wheels
     do. What is dark elsewhere is a shadow, too, if it gets as little light as those.
     """
-    dark = (view.light < BLACK).astype(np.uint8)
+    dark = (view.light < REGION.black).astype(np.uint8)
     dark = cv2.morphologyEx(dark, cv2.MORPH_OPEN, _DISC) > 0  # contact shadows are thin
     outlines, near, black = np.zeros((3, *body.shape), bool)
     things: list[tuple[Mask, int]] = []
-    for thing in _blobs(body, MIN_AREA * body.size):
+    for thing in _blobs(body, REGION.min_area * body.size):
         things.append((masks.dilated(thing, 7), int(np.count_nonzero(thing))))
         near |= things[-1][0]
         outlines |= masks.dilated(masks.hull(thing), 5)
@@ -192,15 +189,15 @@ def _black(view: View, body: Mask) -> Mask:
     alone: list[tuple[float, Mask]] = []
     for blob in _blobs(dark & ~outlines, 0):
         area, light, box = int(np.count_nonzero(blob)), float(np.percentile(view.light[blob], 30)), masks.bbox_of(blob)
-        beside = [masks.bbox_of(t) for t, size in things if area < MOST_SHADOW * size and (t & blob).any()]
-        is_texture = np.median(view.bright[blob]) > -SPREADS * np.median(view.spread[blob])
-        is_darkest = light < BLACKEST_LIGHT and np.percentile(view.lab[blob, 0], 30) < BLACKEST
-        if is_texture or light > BLACK_LIGHT:
+        beside = [masks.bbox_of(t) for t, size in things if area < REGION.most_shadow * size and (t & blob).any()]
+        is_texture = np.median(view.bright[blob]) > -REGION.spreads * np.median(view.spread[blob])
+        is_darkest = light < REGION.blackest_light and np.percentile(view.lab[blob, 0], 30) < REGION.blackest
+        if is_texture or light > REGION.black_light:
             shadows.append((light, area))
         elif (
-            np.median(view.chroma_gap[blob]) > SAME_CHROMA  # a shadow keeps the floor's hue
+            np.median(view.chroma_gap[blob]) > REGION.same_chroma  # a shadow keeps the floor's hue
             or any(is_top(box, thing) for thing in beside)
-            or (is_darkest and beside and (area > OWN_AREA or any(is_underside(box, thing) for thing in beside)))
+            or (is_darkest and beside and (area > REGION.own_area or any(is_underside(box, thing) for thing in beside)))
         ):
             black |= blob
         elif beside:
@@ -208,19 +205,19 @@ def _black(view: View, body: Mask) -> Mask:
         else:
             alone.append((light, blob))
     for light, blob in alone:
-        least = LEAST_SHADOW * np.count_nonzero(blob)
-        if not any(abs(light - shade) < SAME_LIGHT and area > least for shade, area in shadows):
+        least = REGION.least_shadow * np.count_nonzero(blob)
+        if not any(abs(light - shade) < REGION.same_light and area > least for shade, area in shadows):
             black |= blob
     return black | (black_faces(view, black) & ~near) | (dark & outlines)
 
 
 def _stands_out(view: View, part: Mask) -> bool:
     """Whether the steps along its outline are larger than the texture of what is around it makes them."""
-    if float(np.median(view.chroma_gap[part])) > STRONG_CHROMA_STEP:
+    if float(np.median(view.chroma_gap[part])) > VIEW.strong_chroma_step:
         return True
     outline = masks.outline_of(part)
     steps = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))[outline]
-    return float(np.median(steps)) > OUT_OF_TEXTURE * float(np.median(view.spread[outline]))
+    return float(np.median(steps)) > REGION.out_of_texture * float(np.median(view.spread[outline]))
 
 
 def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
@@ -239,7 +236,7 @@ def drawn_region(image: Image, shape: CroppedMask) -> Region:
     """A shape of a drawing, an RGB image [H, W, 3]."""
     roundness = masks.roundness_of(shape.patch)
     names = _names(masks.lab_of(image[shape.rows, shape.columns][shape.patch][None])[0])
-    return Region(shape, *names, roundness, confidence=1.0, is_disc=roundness > DISC)
+    return Region(shape, *names, roundness, confidence=1.0, is_disc=roundness > REGION.disc)
 
 
 def found_region(image: Image, mask: Mask, called: frozenset[str]) -> Region:
@@ -261,30 +258,32 @@ def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
 def _is_wall(view: View, part: Mask, border: Mask) -> bool:
     """Whether a pale part runs along the image's border for much of its own length, as a strip of wall does."""
     along = part & border
-    if not along.any() or np.median(view.bright[part]) <= 0 or np.median(view.chroma[part]) >= 2 * CHROMA_STEP:
+    if not along.any() or np.median(view.bright[part]) <= 0 or np.median(view.chroma[part]) >= 2 * VIEW.chroma_step:
         return False
     (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
     wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
-    return bool(np.ptp(edge_columns) > ALONG_BORDER * wide or np.ptp(edge_rows) > ALONG_BORDER * high)
+    return bool(np.ptp(edge_columns) > REGION.along_border * wide or np.ptp(edge_rows) > REGION.along_border * high)
 
 
 def _parts(view: View, component: Mask) -> list[Mask]:
     """Splits a component into white balls and by colour; wheels, necks and lights stay with what they sit on."""
     # Discs among the pale patches between the edges: white balls before or on something white.
-    pale = component & (np.minimum(view.chroma_gap, view.chroma) < CHROMA_STEP) & (view.bright > -12)
+    pale = component & (np.minimum(view.chroma_gap, view.chroma) < VIEW.chroma_step) & (view.bright > -12)
     balls, taken = list[Mask](), np.zeros(component.shape, bool)
     for factor in (1.0, 2.5):  # compression leaves weak edges across a ball
-        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * OWN_AREA):
-            disc = as_disc(masks.dilated(patch, times=2), view.edges, view.edge_threshold, grow=EDGE_BAND)
+        for patch in _blobs(pale & (view.edges < factor * view.edge_threshold), 0.5 * REGION.own_area):
+            disc = as_disc(masks.dilated(patch, times=2), view.edges, view.edge_threshold, grow=REGION.edge_band)
             if disc is not None and not (disc & taken).any():
                 taken |= disc
                 balls.append(disc)
-    rest = _blobs(component & ~taken, MIN_REST * component.sum())
+    rest = _blobs(component & ~taken, REGION.min_rest * component.sum())
     if balls:  # what is left along the edge of a ball is blur
-        rest = [blob for blob in rest if _half_width(blob) > EDGE_BAND]
+        rest = [blob for blob in rest if _half_width(blob) > REGION.edge_band]
     parts = balls + [part for blob in rest for part in _coloured_parts(view, blob)]
     whole = masks.hull(component) if len(parts) > 1 else component
-    is_one = len(parts) > 1 and np.count_nonzero(component) > FILLED * np.count_nonzero(whole) and _is_ellipse(whole)
+    is_one = (
+        len(parts) > 1 and np.count_nonzero(component) > REGION.filled * np.count_nonzero(whole) and _is_ellipse(whole)
+    )
     return [whole] if is_one else parts  # a ball or an egg, and a shadow across it
 
 
@@ -293,15 +292,15 @@ def _is_ellipse(mask: Mask) -> bool:
     outline = np.argwhere(masks.outline_of(mask))[:, ::-1].astype(np.int32)
     ellipse = np.zeros(mask.shape, np.uint8)
     cv2.ellipse(ellipse, cv2.fitEllipse(outline), (1,), -1)
-    return float(np.count_nonzero(mask & (ellipse > 0)) / np.count_nonzero(mask | (ellipse > 0))) > ELLIPSE
+    return float(np.count_nonzero(mask & (ellipse > 0)) / np.count_nonzero(mask | (ellipse > 0))) > REGION.ellipse
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     area = int(component.sum())
     lab, chroma = view.lab, view.chroma
     hue = np.degrees(np.arctan2(lab[..., 2], lab[..., 1]))
-    coloured = component & (view.chroma_gap > CHROMA_STEP) & (chroma > CHROMA_STEP)
-    least = min(0.12 * area, OWN_AREA)
+    coloured = component & (view.chroma_gap > VIEW.chroma_step) & (chroma > VIEW.chroma_step)
+    least = min(0.12 * area, REGION.own_area)
     seeds: list[Mask] = []
     rest = coloured.copy()
     while rest.sum() > least and len(seeds) < 6:
@@ -309,16 +308,16 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
         histogram, _ = np.histogram(values % 360, bins=36, range=(0, 360), weights=chroma[rest])
         wrapped = histogram + np.roll(histogram, 1) + np.roll(histogram, -1)
         middle = 10 * int(wrapped.argmax()) + 5
-        alike = rest & (np.abs((hue - middle + 180) % 360 - 180) < SPLIT_HUE)
+        alike = rest & (np.abs((hue - middle + 180) % 360 - 180) < REGION.split_hue)
         seeds.extend(_blobs(alike, least))
         rest &= ~alike
     neutral = component & ~coloured
     bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
-    black = neutral & (lab[..., 0] < BLACK_SHARE * view.around)
-    dark = _blobs(black, min(0.35 * area, OWN_AREA))
+    black = neutral & (lab[..., 0] < REGION.black_share * view.around)
+    dark = _blobs(black, min(0.35 * area, REGION.own_area))
     broad = min((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
-    seeds.extend(_blobs(bright, min(0.3 * area, OWN_AREA)))
-    seeds += [seed for seed in dark if _half_width(seed) > OWN_WIDTH * broad or seed.sum() > 0.35 * area]
+    seeds.extend(_blobs(bright, min(0.3 * area, REGION.own_area)))
+    seeds += [seed for seed in dark if _half_width(seed) > REGION.own_width * broad or seed.sum() > 0.35 * area]
     if len(seeds) <= 1:
         return [component]
     distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
@@ -336,7 +335,7 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
 def _without_rim(one: _Found, balls: Mask) -> _Found:
     """Without the rim around balls [h, w], where their colour mixes with the floor's: a pale table's is like that."""
     broad = cv2.morphologyEx(one.mask.astype(np.uint8), cv2.MORPH_OPEN, _DISC) > 0
-    kept = one.mask & (broad | ~masks.dilated(balls, RIM))
+    kept = one.mask & (broad | ~masks.dilated(balls, REGION.rim))
     return one if one.is_disc or 2 * kept.sum() < one.mask.sum() else replace(one, mask=kept)
 
 
@@ -344,7 +343,10 @@ def _hidden(found: Sequence[_Found]) -> list[bool]:
     """Which of them have much of their outline along one thing of another colour that ends lower in the image."""
     things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
     return [
-        any(low > own[0] and not colours & own[1] and near[outline].mean() > HIDDEN for low, colours, near in things)
+        any(
+            low > own[0] and not colours & own[1] and near[outline].mean() > REGION.hidden
+            for low, colours, near in things
+        )
         for outline, own in zip((masks.outline_of(one.mask) for one in found), things, strict=True)
     ]
 
@@ -365,54 +367,21 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     """How sure it is that a part is one separable thing with this outline: a product of four shares, each 0..1.
 
     Edges: the share of its outline, image border aside, that lies on edges; a disc was fitted to them. Contrast: its
-    median distance from the surroundings in Lab over `SURE_CONTRAST`, but for a disc: a circle that fits is no chance.
-    Size: its area over `SURE_AREA`, of a disc over half of it (square roots of all). Border: 1 less half the share of
+    median distance from the surroundings in Lab over `sure_contrast`, but for a disc: a circle that fits is no chance.
+    Size: its area over `sure_area`, of a disc over half of it (square roots of all). Border: 1 less half the share of
     its outline along the image's border, beyond which it may go on.
     """
     outline = masks.outline_of(part)
     inner = outline & ~border
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
-    contrast = 1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / SURE_CONTRAST
-    size = float(np.count_nonzero(part)) / (SURE_AREA / 2 if is_disc else SURE_AREA)
+    contrast = (
+        1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / REGION.sure_contrast
+    )
+    size = float(np.count_nonzero(part)) / (REGION.sure_area / 2 if is_disc else REGION.sure_area)
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
     edges = max(sharp, 0.9) if is_disc else sharp
     return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
-
-
-def _with_mouths(view: View, found: Sequence[_Found]) -> list[_Found]:
-    """Joins the mouth of something white with its body."""
-    pale = [one for one in found if float(np.median(np.hypot(one.lab[:, 1], one.lab[:, 2]))) < CHROMA_STEP]
-    for mouth, body in itertools.permutations(pale, 2):
-        neck = None if mouth.is_disc else neck_between(mouth.mask, body.mask, view.lab)
-        if neck is not None:
-            lab = np.concatenate([mouth.lab, body.lab])
-            whole = _Found(mouth.mask | neck | body.mask, lab, min(mouth.confidence, body.confidence), False)
-            return _with_mouths(view, [whole, *(one for one in found if one is not mouth and one is not body)])
-    return list(found)
-
-
-def _with_tops(view: View, found: Sequence[_Found]) -> list[_Found]:
-    """Adds to each part the parts that stand on it; smaller parts absorbed in this way are left out."""
-    edges = masks.dilated(view.edges > view.edge_threshold)
-    areas = [int(np.count_nonzero(one.mask)) for one in found]
-    kept = dict(enumerate(found))
-    for i in sorted(kept, key=lambda i: -areas[i]):
-        if i not in kept or found[i].is_disc:
-            continue
-        small = [j for j in kept if areas[j] < min(TOP_AREA * areas[i], OWN_AREA) and not found[j].is_disc]
-        taken = np.zeros(edges.shape, bool)
-        for j, other in kept.items():
-            if j != i and j not in small:
-                taken |= other.mask
-        top = standing_on(found[i].mask, taken, view.lab, edges)
-        if top is None:
-            continue
-        kept[i] = replace(found[i], mask=found[i].mask | top)
-        for j in small:
-            if np.count_nonzero(found[j].mask & top) > SAME_TOP * areas[j]:
-                del kept[j]
-    return list(kept.values())
 
 
 def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
@@ -421,7 +390,7 @@ def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
     whole: dict[int, _Found] = {}
     for i, one in enumerate(found):
         lightness, a, b = np.median(one.lab, axis=0).tolist()
-        if not one.is_disc and lightness < DARK and colour_name(lightness, a, b) in {"black", "brown"}:
+        if not one.is_disc and lightness < REGION.dark and colour_name(lightness, a, b) in {"black", "brown"}:
             dark.append(one)
         else:
             whole[i] = one
@@ -441,65 +410,6 @@ def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
     """The name of the colour of pixels [N, 3] (Lab), and all that people may use for it."""
     chroma = np.hypot(lab[:, 1], lab[:, 2])
-    sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > CHROMA_STEP / 2 else lab
+    sample = lab[chroma >= np.percentile(chroma, 40)] if np.median(chroma) > VIEW.chroma_step / 2 else lab
     lightness, a, b = np.median(sample, axis=0).tolist()
     return colour_name(lightness, a, b), colour_names(lightness, a, b)
-
-
-FAINT_AREA = 0.0008  # of the image
-COVERED = 0.25  # of a patch, by things that were found: it is a part of one
-SOLID = 0.8  # of its convex hull that a patch fills
-PALER, TINTED = 1.2, 3.0  # Lab lightness above the floor on every side of it, and Lab units from its hue
-FAINT_TEXTURE = 2.0  # of the spread in lightness of the floor around it: less is texture
-NEAR, BEYOND = 5, 12  # px at the working size: the floor around it, and that beyond the joint beside a tile
-DARKEST = -5.0  # Lab lightness against the floor on any side: what is darker is a shadow or a gap
-
-
-def find_faint(view: View, size: tuple[int, int], regions: Sequence[Region]) -> tuple[BBox, ...]:
-    """Boxes [x0, y0, x1, y1] (px) of what may be a thing of an image (width, height) although it hardly stands out.
-
-    Such as a white cone on a pale floor: a patch that a closed weak edge surrounds, paler than the floor on every side
-    of it or of another hue. What is darker and of the floor's hue may as well be a shadow. Such a patch is too faint to
-    be simulated, and too clear to be denied.
-    """
-    taken, found = np.zeros(size[::-1], bool), list[BBox]()
-    for region in regions:
-        region.mask.add_to(taken)
-    taken = masks.dilated(masks.resized_mask(taken, (view.lab.shape[1], view.lab.shape[0])), 7)
-    across, down = size[0] / taken.shape[1], size[1] / taken.shape[0]
-    for near, patch, (x, y, w, h) in enclosed(view, *WEAK_EDGES):
-        area = np.count_nonzero(patch)
-        if area < FAINT_AREA * taken.size or np.count_nonzero(taken[near] & patch) > COVERED * area:
-            continue
-        y0, x0 = max(0, near[0].start - BEYOND), max(0, near[1].start - BEYOND)
-        wide = slice(y0, near[0].stop + BEYOND), slice(x0, near[1].stop + BEYOND)
-        whole = np.zeros(taken.shape, bool)
-        whole[near] = patch
-        steps = _steps_around(view.lab[wide], whole[wide], taken[wide])
-        if steps is None:
-            continue
-        paler, tinted = steps
-        texture = FAINT_TEXTURE * float(np.median(view.spread[near]))
-        if paler > max(PALER, texture) or (tinted > TINTED and paler > max(DARKEST, texture - tinted)):
-            found.append((x * across, y * down, (x + w) * across, (y + h) * down))
-    return tuple(found)
-
-
-def _steps_around(lab: Floats32, patch: Mask, taken: Mask) -> tuple[float, float] | None:
-    """How much paler a patch [h, w] is than each quarter of the floor around it, and how far from its hue, at least.
-
-    None for a patch that is ragged, or beside which some quarter is not seen. `taken` [h, w] are things.
-    """
-    whole = masks.without_holes(masks.dilated(patch))
-    if np.count_nonzero(whole) < SOLID * np.count_nonzero(masks.hull(whole)):
-        return None
-    own, steps = np.median(lab[patch], axis=0), list[Floats32]()
-    for around in (masks.dilated(whole, 2 * NEAR + 1), masks.dilated(whole, 2 * BEYOND + 1) & ~taken):
-        rows, columns = np.nonzero(around & ~masks.dilated(whole, 5))
-        quarter = 2 * (rows > rows.mean()) + (columns > columns.mean()) if len(rows) else rows
-        sides = [lab[rows[quarter == i], columns[quarter == i]] for i in range(4)]
-        if min(len(side) for side in sides) == 0:
-            return None
-        steps += [own - np.median(side, axis=0) for side in sides]
-    lightness, *hue = np.array(steps).T
-    return float(lightness.min()), float(np.hypot(*hue).min())

@@ -13,29 +13,26 @@ import numpy as np
 
 from cow_service.records import BBox, Grounding, LocatedObject
 from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
-from cow_service.vision.contrast import View
+from cow_service.vision.contrast import VIEW
 from cow_service.vision.edges import find_segments
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, dilated, iou, is_among, is_same_object, without_holes
 from cow_service.vision.regions import (
-    WORKING_SIDE,
     Region,
     disc_region,
     drawn_region,
-    find_faint,
     find_regions,
     found_region,
-    measure,
     region_of,
 )
 from cow_service.vision.segmentation import fault_of, is_bare, mask_from_bbox, mask_from_point
 from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
-from cow_service.vision.trail_removal import without_earlier_positions, without_earlier_shadows
+from cow_service.vision.trail_removal import without_earlier_positions
 from cow_service.vision.trails import Trail, find_trails, trail_ending_at
 from cow_service.vision.types import Floats, Image, Mask
 
-SHARP_SIDE = 2 * WORKING_SIDE  # px: in a larger image the outlines of regions are coarse, and are cut again
+SHARP_SIDE = 2 * VIEW.working_side  # px: in a larger image the outlines of regions are coarse, and are cut again
 OWN_SHARE = 0.2  # of the mover's area: something smaller that touches it is its shadow or a part of it
 REACH = 1.5  # sizes of an object: an arrow further away is not its own
 RIVAL = 0.6  # of a rival's distance: what is nearer than that is clearly the nearest
@@ -67,7 +64,8 @@ Measured = dict[str, Any]
 """Cached properties of a `Scene` by their names."""
 PART_OF = 0.5  # of its area: what lies in a thing that was outlined is no thing of its own
 # Neither mover nor words decide them.
-OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "undrawn", "side_view", "_all_trails", "segments")
+OF_THE_IMAGE = ("_strokes", "arrows", "boxes", "cues", "undrawn", "side_view", "segments")
+WITHOUT_TRAILS = ("clean", "regions")  # nor do they decide these, where no trail is named
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +77,7 @@ class Scene:
 
     image: Image
     mover: BBox | None = None  # the present position of what moves, once it is known: it tells which end of a trail is
-    trail_named: bool = False  # the question speaks of a trail: balls that look alike, one after another, are one
+    trail_named: bool = False  # the question or the reader speaks of a trail: balls in a row are one over time
     _found: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], repr=False)
     _preset: dict[BBox, Callable[[], Mask]] = field(default_factory=dict, repr=False)
 
@@ -138,41 +136,26 @@ class Scene:
         return np.zeros((0, 4)) if self.side_view else find_segments(self.undrawn, self.cues)
 
     @cached_property
-    def _all_trails(self) -> tuple[Trail, ...]:
-        return () if self.side_view else find_trails(self.undrawn, self._undrawn_view)
-
-    @cached_property
     def trails(self) -> tuple[Trail, ...]:
-        """Several positions of one ball each, the present one last: at the mover, or as it shows, or as a guess."""
-        found = [trail for trail in self._all_trails if trail.evident or self.trail_named]
+        """Several positions of one ball each, the present one last: at the mover, or as it shows, or as a guess.
+
+        None where nobody speaks of a trail.
+        """
+        if not self.trail_named or self.side_view:
+            return ()
+        found = find_trails(self.undrawn)
         own = None if self.mover is None else trail_ending_at(found, self.mover)
         if own is None:
-            return tuple(found)
+            return found
         return (own, *(trail for trail in found if set(trail.positions) != set(own.positions)))
 
     @cached_property
     def clean(self) -> Image:
-        """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail and their shadows."""
+        """The image [H, W, 3] without its cues: neither drawings nor earlier positions of a trail."""
         image = self.undrawn
         for trail in self.trails:
             image = without_earlier_positions(image, trail)
-            objects = np.zeros((self.height, self.width), bool)
-            for region in find_regions(image):
-                region.mask.add_to(objects)
-            image = without_earlier_shadows(image, trail, objects)
         return image
-
-    @cached_property
-    def _undrawn_view(self) -> View:
-        return measure(self.undrawn)
-
-    @property
-    def _view(self) -> View:
-        return self._undrawn_view if self.clean is self.undrawn else self._clean_view
-
-    @cached_property
-    def _clean_view(self) -> View:
-        return measure(self.clean)
 
     @cached_property
     def regions(self) -> tuple[Region, ...]:
@@ -180,22 +163,11 @@ class Scene:
         if self.side_view is not None:
             drawn = (drawn_region(self.clean, shape) for shape in self.side_view.shapes)
             return tuple(sorted(drawn, key=lambda region: -region.mask.area))
-        found = find_regions(self.clean, self._view)
+        found = find_regions(self.clean)
         for trail in self.trails:
             if region_of(found, trail.present.bbox) is None:
                 found = (*found, disc_region(self.clean, trail.present.disc((self.height, self.width))))
         return tuple(sorted(found, key=lambda region: -region.mask.area))
-
-    @cached_property
-    def faint(self) -> tuple[BBox, ...]:
-        """Boxes [x0, y0, x1, y1] of what may be things of the image, too faint to tell."""
-        return () if self.side_view else find_faint(self._view, (self.width, self.height), self.regions)
-
-    def faint_beside(self, known: Sequence[BBox]) -> tuple[BBox, ...]:
-        """Those of `faint` whose middles are outside the boxes of all located objects, which are known even if pale."""
-        middles = [((x0 + x1) / 2, (y0 + y1) / 2) for x0, y0, x1, y1 in self.faint]
-        inside = [any(a < x < c and b < y < d for a, b, c, d in known) for x, y in middles]
-        return tuple(box for box, is_known in zip(self.faint, inside, strict=True) if not is_known)
 
     def with_mover(self, bbox: BBox) -> Scene:
         """This scene where its trails end as they are, else the scene in which the one in a box ends there."""
@@ -238,14 +210,14 @@ class Scene:
 
     def measured(self) -> Measured:
         """The measurements so far that depend only on the image; read-only."""
-        alone = OF_THE_IMAGE
-        if self.__dict__.get("_all_trails") == ():  # then nothing depends on which end of one is meant
-            alone = (*alone, "clean", "regions", "faint")
+        alone = OF_THE_IMAGE if self.trail_named else (*OF_THE_IMAGE, *WITHOUT_TRAILS)
         return {key: self.__dict__[key] for key in alone if key in self.__dict__}
 
     def take(self, measured: Measured) -> None:
         """Takes over what another scene of the same image has measured."""
-        self.__dict__.update({key: value for key, value in measured.items() if key not in self.__dict__})
+        other = WITHOUT_TRAILS if self.trail_named else ()
+        new = {key: value for key, value in measured.items() if key not in self.__dict__ and key not in other}
+        self.__dict__.update(new)
 
     def arrows_near(self, bbox: BBox) -> list[Arrow]:
         """Arrows that start or end close to a box and at no other object, nearest first."""
@@ -346,7 +318,7 @@ class Scene:
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
         other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
-        names = ("cues", "arrows", "boxes", "side_view", "regions", "faint")
+        names = ("cues", "arrows", "boxes", "side_view", "regions")
         # Where cached properties are kept.
         other.__dict__.update({name: getattr(self, name) for name in names}, clean=clean)
         return other
@@ -363,38 +335,28 @@ class Scene:
         Found once for the same arguments. Of known regions their own mask is taken, which is cheaper than another
         silhouette, unless a mask was given.
         """
+        return self.once(("obstacles", mover, tuple(named)), lambda: self._obstacles(mover, named))
 
-        def find() -> tuple[Obstacle, ...]:
-            body = self.silhouette(mover)
-            body_area, whole, near = np.count_nonzero(body), without_holes(body), dilated(body, 7)
-            obstacles: list[Obstacle] = []
-            for other in named:
-                if other.mask is not None or not is_same_object(other.bbox, mover):
-                    region = None if other.mask is not None else self.region_of(other.bbox)
-                    mask = self.cropped(other.bbox) if region is None else region.mask
-                    found = region is not None and region.bbox == other.bbox  # here, not by the request or a reader
-                    confidence = region.confidence if region is not None and found else 1.0
-                    obstacles.append(Obstacle(other.object, other.bbox, mask, confidence))
-            outlined = [self.cropped(other.bbox) for other in named if other.mask is not None]
-            for region in self.regions:
-                area = region.mask.area
-                if is_same_object(region.bbox, mover) or region.mask.shared_with(whole) > 0.5 * area:
-                    continue
-                if area < OWN_SHARE * body_area and region.mask.shared_with(near):
-                    continue
-                if is_among(region.bbox, (other.bbox for other in obstacles)):
-                    continue
-                near_ones = [mask.full() for mask in outlined if iou(mask.bbox, region.bbox)]
-                if any(region.mask.shared_with(mask) > PART_OF * area for mask in near_ones):
-                    continue
-                doubtful = region.confidence < DOUBTFUL
-                larger = [other.mask for other in obstacles if doubtful and area < OWN_SHARE * other.mask.area]
-                if any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger):
-                    continue
-                obstacles.append(Obstacle(f"{region.colour} object", region.bbox, region.mask, region.confidence))
-            return tuple(obstacles)
+    def _obstacles(self, mover: BBox, named: Sequence[LocatedObject]) -> tuple[Obstacle, ...]:
+        body = self.silhouette(mover)
+        least, whole, near = OWN_SHARE * np.count_nonzero(body), without_holes(body), dilated(body, 7)
+        apart = [each for each in named if each.mask is not None or not is_same_object(each.bbox, mover)]
+        obstacles = [self._obstacle_of(each) for each in apart]
+        outlined = [self.cropped(each.bbox) for each in named if each.mask is not None]
+        for region in self.regions:
+            mask, area = region.mask, region.mask.area
+            is_own = mask.shared_with(whole) > 0.5 * area or (area < least and mask.shared_with(near))
+            is_known = is_among(region.bbox, (mover, *(other.bbox for other in obstacles)))
+            if not is_own and not is_known and not _is_part(region, outlined, obstacles):
+                obstacles.append(Obstacle(f"{region.colour} object", region.bbox, mask, region.confidence))
+        return tuple(obstacles)
 
-        return self.once(("obstacles", mover, tuple(named)), find)
+    def _obstacle_of(self, named: LocatedObject) -> Obstacle:
+        region = None if named.mask is not None else self.region_of(named.bbox)
+        if region is None:
+            return Obstacle(named.object, named.bbox, self.cropped(named.bbox))
+        is_found = region.bbox == named.bbox  # here, not by the request or a reader
+        return Obstacle(named.object, named.bbox, region.mask, region.confidence if is_found else 1.0)
 
     def locate(self, point: tuple[float, float]) -> Cutout:
         """The object at a point [x, y]: the region there, else what can be cut out around it."""
@@ -415,6 +377,17 @@ class Scene:
         bbox = bbox_of(mask)
         self._found["mask", bbox] = CroppedMask.of(mask)
         return bbox
+
+
+def _is_part(region: Region, outlined: Sequence[CroppedMask], obstacles: Sequence[Obstacle]) -> bool:
+    """Whether a region lies in a thing that was outlined, or is small, doubtful and touches another."""
+    area = region.mask.area
+    near = [mask.full() for mask in outlined if iou(mask.bbox, region.bbox)]
+    if any(region.mask.shared_with(mask) > PART_OF * area for mask in near):
+        return True
+    larger = [other.mask for other in obstacles if area < OWN_SHARE * other.mask.area]
+    is_doubtful = region.confidence < DOUBTFUL
+    return is_doubtful and any(region.mask.shared_with(dilated(mask.full(), 7)) for mask in larger)
 
 
 def arrow_fault(scene: Scene, grounding: Grounding) -> str:

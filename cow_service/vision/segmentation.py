@@ -1,5 +1,7 @@
 """Segments an object with GrabCut: from its box, from a point on it, or from a first guess of its mask."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -8,36 +10,60 @@ from cow_service.records import BBox
 from cow_service.vision.masks import bbox_of, outer_contour, outline_of, scaled
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-WORKING_SIDE = 224  # px: crops are cut at this size, then enlarged
-POINT_SIDE = 1280  # px: an object is looked for around a point in an image of at most this size
-POINT_WORKING_SIDE = 144  # px: the same for the tries around a point
-ITERATIONS = 2
-GROW, SHRINK = 0.05, 0.04  # of its size: how far a guess may be from the object, outwards and inwards
-LEAST_BACKGROUND = 0.15  # of a crop, to learn the background from
-CORE, LARGE_CORE = 0.25, 0.6  # of the box: the central ellipse that is labelled as sure foreground
-SPAN = 0.7  # of the box's sides: boxes are tight, so a mask that spans less is cut again with the large core
-GAMMA = 0.5  # brightens what is cut: dark hair on a dark wall differs by few grey levels
-MARGIN = 0.25  # of the box, kept around it as sure background
-STABILITY_WEIGHT = 0.6  # in the score: how much a mask stays the same when more of the image is used
-POINT_REACHES = (0.07, 0.11, 0.16, 0.24, 0.34)  # half sides tried around a point, of the image's shorter side
 
-# What is cut out around a point is taken for an object from here on. Objects of scenes with known truth have an area
-# of 0.009 and more; of their good cuts one in twenty has less on edges, most tufts of fur or grass have.
-LEAST_AREA = 0.0025  # of the square of the image's shorter side
-LEAST_ON_EDGE = 0.75  # of the outline
-LEAST_SOLIDITY = 0.5  # its area as a share of that of its convex hull
-COLOUR_STEP, BARE = 6, 0.95  # 8-bit Lab: colours no further apart are alike; share of pixels whose like is around
-LEAST_CONTRAST = 10.0  # in 8-bit Lab: what lies inside and outside a piece of outline differs by at least this
+class CutRules(NamedTuple):
+    """How GrabCut is asked for an object.
+
+    Set by hand on rendered scenes and photographs; no single number has a measurement of its own.
+    """
+
+    working_side: int = 224  # px: crops are cut at this size, then enlarged
+    point_side: int = 1280  # px: an object is looked for around a point in an image of at most this size
+    point_working_side: int = 144  # px: the same for the tries around a point
+    iterations: int = 2  # of GrabCut
+    grow: float = 0.05  # of its size: how far a guess may be from the object, outwards
+    shrink: float = 0.04  # and inwards
+    least_background: float = 0.15  # of a crop, to learn the background from
+    core: float = 0.25  # of the box: the central ellipse that is labelled as sure foreground
+    large_core: float = 0.6  # the same for a second try
+    span: float = 0.7  # of the box's sides: boxes are tight, so a mask that spans less is cut again with the large core
+    gamma: float = 0.5  # brightens what is cut: dark hair on a dark wall differs by few grey levels
+    margin: float = 0.25  # of the box, kept around it as sure background
+    stability_weight: float = 0.6  # in the score: how much a mask stays the same when more of the image is used
+    # half sides tried around a point, of the image's shorter side
+    point_reaches: tuple[float, float, float, float, float] = (0.07, 0.11, 0.16, 0.24, 0.34)
+
+
+CUT = CutRules()
+
+
+class ObjectRules(NamedTuple):
+    """When what was cut out around a point, or lies in a box, is an object.
+
+    Objects of scenes with known truth have an area of 0.009 and more; of their good cuts one in twenty has less on
+    edges, most tufts of fur or grass have. Of 135 boxes of floors all are bare; of 32 things that no region shows,
+    four.
+    """
+
+    area: float = 0.0025  # of the square of the image's shorter side
+    on_edge: float = 0.75  # of the outline
+    solidity: float = 0.5  # its area as a share of that of its convex hull
+    colour_step: int = 6  # 8-bit Lab: colours no further apart are alike
+    bare: float = 0.95  # share of pixels whose like is around
+    contrast: float = 10.0  # in 8-bit Lab: what lies inside and outside a piece of outline differs by at least this
+
+
+OBJECT = ObjectRules()
 
 
 def fault_of(image: Image, mask: Mask) -> str | None:
     """Why a mask [H, W], not empty, that was cut from an image [H, W, 3] can be no whole object, in words."""
     height, width = mask.shape
     bbox = bbox_of(mask)
-    if np.count_nonzero(mask) / min(height, width) ** 2 < LEAST_AREA:
+    if np.count_nonzero(mask) / min(height, width) ** 2 < OBJECT.area:
         return f"what lies there is only {bbox[2] - bbox[0]:.0f} x {bbox[3] - bbox[1]:.0f} px large"
     rows, columns = _crop_around(bbox, width, height)
-    scale = min(1.0, WORKING_SIDE / max(rows.stop - rows.start, columns.stop - columns.start))
+    scale = min(1.0, CUT.working_side / max(rows.stop - rows.start, columns.stop - columns.start))
     lab = cv2.cvtColor(scaled(image[rows, columns], scale), cv2.COLOR_RGB2LAB).astype(np.float32)
     inside = scaled(mask[rows, columns].astype(np.uint8) * np.uint8(255), scale) >= 128
     reach = max(1.5, 0.04 * float(np.sqrt(inside.sum())))  # px on either side of the outline that are compared
@@ -47,12 +73,12 @@ def fault_of(image: Image, mask: Mask) -> str | None:
         summed = cv2.GaussianBlur(lab * weights[..., None], (0, 0), reach)
         means.append(np.asarray(summed / (cv2.GaussianBlur(weights, (0, 0), reach)[..., None] + 1e-4), np.float32))
     apart = np.linalg.norm(means[0] - means[1], axis=2)[outline_of(inside)]
-    on_edge = float(np.mean(apart >= LEAST_CONTRAST)) if apart.size else 0.0
-    if on_edge < LEAST_ON_EDGE:
+    on_edge = float(np.mean(apart >= OBJECT.contrast)) if apart.size else 0.0
+    if on_edge < OBJECT.on_edge:
         return f"only {on_edge:.0%} of the outline of what lies there can be seen"
     largest = outer_contour(inside)
     hull = cv2.contourArea(cv2.convexHull(largest))
-    if hull <= 0 or cv2.contourArea(largest) / hull < LEAST_SOLIDITY:
+    if hull <= 0 or cv2.contourArea(largest) / hull < OBJECT.solidity:
         return "what lies there is ragged, and looks like a part of something"
     return None
 
@@ -65,23 +91,23 @@ def is_bare(image: Image, bbox: BBox) -> bool:
     height, width = image.shape[:2]
     x0, y0, x1, y1 = _inside(bbox, width, height)
     rows, columns = _crop_around((x0, y0, x1, y1), width, height)
-    lab = cv2.cvtColor(image[rows, columns], cv2.COLOR_RGB2LAB) // COLOUR_STEP
+    lab = cv2.cvtColor(image[rows, columns], cv2.COLOR_RGB2LAB) // OBJECT.colour_step
     inner = _ellipse(height, width, (x0, y0, x1, y1))[rows, columns]
     around = np.ones(inner.shape, bool)
     around[int(y0) - rows.start : int(y1) + 1 - rows.start, int(x0) - columns.start : int(x1) + 1 - columns.start] = (
         False
     )
-    known = np.zeros((256 // COLOUR_STEP + 2,) * 3, bool)
+    known = np.zeros((256 // OBJECT.colour_step + 2,) * 3, bool)
     known[tuple(lab[around].T)] = True
     for axis in range(3):
         known |= np.roll(known, 1, axis) | np.roll(known, -1, axis)
-    return bool(known[tuple(lab[inner].T)].mean() >= BARE) if inner.any() and around.any() else False
+    return bool(known[tuple(lab[inner].T)].mean() >= OBJECT.bare) if inner.any() and around.any() else False
 
 
 def _crop_around(bbox: BBox, width: int, height: int) -> tuple[slice, slice]:
     """Rows and columns of an image around a box."""
     x0, y0, x1, y1 = bbox
-    pad = MARGIN * max(x1 - x0, y1 - y0) + 6
+    pad = CUT.margin * max(x1 - x0, y1 - y0) + 6
     rows = slice(max(0, int(y0 - pad)), min(height, int(np.ceil(y1 + pad))))
     return rows, slice(max(0, int(x0 - pad)), min(width, int(np.ceil(x1 + pad))))
 
@@ -95,22 +121,22 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
     x0, y0, x1, y1 = _inside(bbox, width, height)
     rows, columns = _crop_around((x0, y0, x1, y1), width, height)
     crop = image[rows, columns]
-    scale = min(1.0, WORKING_SIDE / max(crop.shape[:2]))
+    scale = min(1.0, CUT.working_side / max(crop.shape[:2]))
     small = scaled(crop, scale)
     h, w = small.shape[:2]
     box = np.array([x0 - columns.start, y0 - rows.start, x1 - columns.start, y1 - rows.start]) * scale
     if guess is None:
-        cut = _grabcut(small, _labels_from_box(h, w, box, CORE))
+        cut = _grabcut(small, _labels_from_box(h, w, box, CUT.core))
         inside = _tidy(cut, box)
         left, top, right, bottom = bbox_of(inside) if inside.any() else (0.0, 0.0, 0.0, 0.0)
-        if right - left < SPAN * (box[2] - box[0]) or bottom - top < SPAN * (box[3] - box[1]):
-            cut = _grabcut(small, _labels_from_box(h, w, box, LARGE_CORE))  # it was a part, such as a face
+        if right - left < CUT.span * (box[2] - box[0]) or bottom - top < CUT.span * (box[3] - box[1]):
+            cut = _grabcut(small, _labels_from_box(h, w, box, CUT.large_core))  # it was a part, such as a face
     else:
         near = cv2.resize(guess[rows, columns].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA)
         size = float(np.sqrt(near.sum()))
         outer, inner = (
             cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-            for reach in (max(2, int(GROW * size)), max(1, int(SHRINK * size)))
+            for reach in (max(2, int(CUT.grow * size)), max(1, int(CUT.shrink * size)))
         )
         labels = np.full(near.shape, cv2.GC_BGD, np.uint8)
         labels[cv2.dilate(near, outer) > 0] = cv2.GC_PR_BGD
@@ -118,7 +144,7 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
         labels[cv2.erode(near, inner, borderValue=1) > 0] = cv2.GC_FGD
         cut = _grabcut(small, labels)
         # A guess may have missed a highlight: its box is not the object's.
-        grow = GROW * float(np.sqrt((box[2] - box[0]) * (box[3] - box[1])))
+        grow = CUT.grow * float(np.sqrt((box[2] - box[0]) * (box[3] - box[1])))
         box = box + grow * np.array([-1, -1, 1, 1])
     soft = cv2.GaussianBlur(_tidy(cut, box).astype(np.float32), (0, 0), 0.7)
     mask = np.zeros((height, width), bool)
@@ -132,21 +158,21 @@ def mask_from_bbox(image: Image, bbox: BBox, guess: Mask | None = None) -> Mask:
 def mask_from_point(image: Image, point: tuple[float, float]) -> Mask:
     """Mask [H, W] of the object at a point [x, y]: of several sizes, the one whose outline lies best on edges.
 
-    The sizes are tried in an image of at most `POINT_SIDE`; the one that is taken is cut again in the image itself.
+    The sizes are tried in an image of at most `CutRules.point_side`; the best is cut again in the image itself.
     """
     height, width = image.shape[:2]
-    small = scaled(image, POINT_SIDE / max(height, width))
+    small = scaled(image, CUT.point_side / max(height, width))
     at = point[0] * (small.shape[1] / width), point[1] * (small.shape[0] / height)
-    tries = [_cut_around(small, at, reach * min(small.shape[:2])) for reach in POINT_REACHES]
+    tries = [_cut_around(small, at, reach * min(small.shape[:2])) for reach in CUT.point_reaches]
     guess, most = None, 0.0
     for (score, cut), (_, larger) in zip(tries, [*tries[1:], (0.0, None)], strict=True):
         if cut is None:
             continue
         stability = 0.0 if larger is None else np.count_nonzero(cut & larger) / np.count_nonzero(cut | larger)
-        if guess is None or score + STABILITY_WEIGHT * stability > most + 0.02:
-            guess, most = cut, score + STABILITY_WEIGHT * stability
+        if guess is None or score + CUT.stability_weight * stability > most + 0.02:
+            guess, most = cut, score + CUT.stability_weight * stability
     if guess is None:
-        half = POINT_REACHES[0] * min(height, width)
+        half = CUT.point_reaches[0] * min(height, width)
         box = (point[0] - half, point[1] - half, point[0] + half, point[1] + half)
         return _ellipse(height, width, _inside(box, width, height))
     if small is not image:
@@ -162,7 +188,7 @@ def _cut_around(image: Image, point: tuple[float, float], half: float) -> tuple[
     rows = slice(max(0, int(point[1] - outer)), min(height, int(point[1] + outer) + 1))
     columns = slice(max(0, int(point[0] - outer)), min(width, int(point[0] + outer) + 1))
     crop = image[rows, columns]
-    scale = min(1.0, POINT_WORKING_SIDE / max(crop.shape[:2]))
+    scale = min(1.0, CUT.point_working_side / max(crop.shape[:2]))
     small = scaled(crop, scale)
     h, w = small.shape[:2]
     x, y, r = (point[0] - columns.start) * scale, (point[1] - rows.start) * scale, half * scale
@@ -204,7 +230,7 @@ def _labels_from_box(height: int, width: int, box: Floats, core: float) -> NDArr
     cv2.ellipse(labels, centre, axes, 0, 0, 360, int(cv2.GC_PR_FGD), -1)
     inner = max(1, int(core * axes[0])), max(1, int(core * axes[1]))
     cv2.ellipse(labels, centre, inner, 0, 0, 360, int(cv2.GC_FGD), -1)
-    if np.mean(labels == cv2.GC_BGD) < LEAST_BACKGROUND:  # the box fills the image: its upper corners must serve
+    if np.mean(labels == cv2.GC_BGD) < CUT.least_background:  # the box fills the image: its upper corners must serve
         rise, run = max(2, (y1 - y0) // 7), max(2, (x1 - x0) // 7)
         for corner in (labels[: y0 + rise, : x0 + run], labels[: y0 + rise, x1 - run :]):
             corner[:] = cv2.GC_BGD
@@ -216,10 +242,10 @@ def _grabcut(image: Image, labels: NDArray[np.uint8]) -> Mask:
     sure = {int(value) for value in np.unique(labels)}
     foreground, background = {int(cv2.GC_FGD), int(cv2.GC_PR_FGD)}, {int(cv2.GC_BGD), int(cv2.GC_PR_BGD)}
     if sure & foreground and sure & background:
-        light = np.clip(255 * (image / 255.0) ** GAMMA, 0, 255).astype(np.uint8)
+        light = np.clip(255 * (image / 255.0) ** CUT.gamma, 0, 255).astype(np.uint8)
         cv2.setRNGSeed(0)  # its clustering draws random numbers: the same image must give the same mask
         no_box, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))  # labels say it all
-        cv2.grabCut(light, labels, no_box, *models, ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(light, labels, no_box, *models, CUT.iterations, cv2.GC_INIT_WITH_MASK)
     return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 

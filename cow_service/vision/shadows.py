@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,25 +17,47 @@ from cow_service.records import BBox
 from cow_service.vision.inpainting import quadratic_terms
 from cow_service.vision.masks import lab_of, resized_mask, scaled
 from cow_service.vision.scene import Scene
-from cow_service.vision.trail_removal import LEAST_SHADE, MOST_SHADE, NEAREST, SLANT, floor_means
 from cow_service.vision.types import Floats, Floats32, Mask
 
-WORKING_WIDTH = 32.0  # px: the image is searched at the size at which the object is so wide
-LEAST_WIDTH = 14.0  # px in the image: a smaller shadow is lost in the floor's texture
-LIKELY_WIDTH = 0.95  # of the object's width: shadows looked for; the fit settles the rest
-FLATNESS = (0.25, 0.36, 0.5, 0.66)  # of their own width: their heights, on a floor seen at a slant
-RING = (1.15, 1.5)  # of the ellipse: the floor about it that it is compared with
-MAX_TRIES, MAX_CANDIDATES = 40, 3  # the darkest patches are looked at, and so many that stand alone measured
-RIVAL_SHADE = 0.6  # of the darkest patch's shade: another one as dark leaves it open which is the shadow
-EXPLAINED = 0.5  # of what a smooth floor leaves unexplained around the patch, by a soft ellipse in it
-SOFTNESS = (0.02, 0.3)  # of the ellipse: the width of its edge. An object's is sharper, a smear of light wider
-# That of a thing high above the floor is as wide as a smear's; it is far darker than one, and an ellipse all the same.
-MOST_SOFT, DARK, WELL_EXPLAINED = 0.9, 0.15, 0.85
-SAME_HUE = 5.0  # Lab units in the a*b* plane, by which a shade may differ from the floor about it, darkened
-MIN_EVENNESS = 0.35  # of the mean step up to the floor on the four sides: the least of them
+
+class ShadowRules(NamedTuple):
+    """When a dark ellipse is the shadow of a ball in the air.
+
+    Set by hand on throws and falls of the first family of rendered scenes: without it three of 18 answers there are not
+    sure. No single number has a measurement of its own.
+    """
+
+    working_width: float = 32.0  # px: the image is searched at the size at which the object is so wide
+    least_width: float = 14.0  # px in the image: a smaller shadow is lost in the floor's texture
+    likely_width: float = 0.95  # of the object's width: shadows looked for; the fit settles the rest
+    # of their own width: their heights, on a floor seen at a slant
+    flatness: tuple[float, float, float, float] = (0.25, 0.36, 0.5, 0.66)
+    ring: tuple[float, float] = (1.15, 1.5)  # of the ellipse: the floor about it that it is compared with
+    tries: int = 40  # the darkest patches that are looked at
+    candidates: int = 3  # so many that stand alone are measured
+    rival_shade: float = 0.6  # of the darkest patch's shade: another one as dark leaves it open which is the shadow
+    explained: float = 0.5  # of what a smooth floor leaves unexplained around the patch, by a soft ellipse in it
+    # of the ellipse: the width of its edge. An object's is sharper, a smear of light wider
+    softness: tuple[float, float] = (0.02, 0.3)
+    most_soft: float = 0.9  # softness of that of a thing high above the floor, which is as wide as a smear's
+    dark: float = 0.15  # shade from which it may be: it is far darker than a smear
+    well_explained: float = 0.85  # and an ellipse all the same
+    same_hue: float = 5.0  # Lab units in the a*b* plane, by which a shade may differ from the floor about it, darkened
+    evenness: float = 0.35  # of the mean step up to the floor on the four sides: the least of them
+    least_pixels: int = 60  # of the floor about a patch, at the working size
+    most_pixels: int = 700
+    iterations: int = 8  # of the fit
+    least_shade: float = 0.025  # of the floor's lightness that shadows take away, at least
+    most_shade: float = 0.6  # the same: more is an object
+    # of the ball's width, from its foot down to the shadow's middle: nearer, the ball may touch the floor
+    nearest: float = 0.25
+    slant: float = 1.1  # px sideways per px down: light indoors falls steeper
+
+
+SHADOW = ShadowRules()
+
+
 QUARTERS = (0.0, np.pi / 2, np.pi, -np.pi / 2)  # radians
-LEAST_PIXELS, MOST_PIXELS = 60, 700  # of the floor about a patch, at the working size
-MAX_ITERATIONS = 8  # of the fit
 
 Ellipse = tuple[float, float, float, float]  # centre and half axes, px
 
@@ -62,7 +85,7 @@ class _Floor:
     @staticmethod
     def below(bbox: BBox, scene: Scene) -> _Floor:
         """The floor of a scene below an object in the air."""
-        scale = min(1.0, WORKING_WIDTH / (bbox[2] - bbox[0]))
+        scale = min(1.0, SHADOW.working_width / (bbox[2] - bbox[0]))
         small = scaled(scene.clean, scale)
         height, width = small.shape[:2]
         taken = np.zeros((scene.height, scene.width), bool)
@@ -80,21 +103,21 @@ class _Floor:
         left, top, right, bottom = self.box
         width = right - left
         ys, xs = np.mgrid[: self.free.shape[0], : self.free.shape[1]]
-        below = (ys > bottom + NEAREST * width) & (
-            np.abs(xs - (left + right) / 2) < SLANT * (ys - (top + bottom) / 2) + 0.5 * width
+        below = (ys > bottom + SHADOW.nearest * width) & (
+            np.abs(xs - (left + right) / 2) < SHADOW.slant * (ys - (top + bottom) / 2) + 0.5 * width
         )
         best = np.zeros(self.free.shape, np.float32)
         which = np.zeros(self.free.shape, np.int64)
-        sizes = [(LIKELY_WIDTH * width / 2, flat * LIKELY_WIDTH * width / 2) for flat in FLATNESS]
+        sizes = [(SHADOW.likely_width * width / 2, flat * SHADOW.likely_width * width / 2) for flat in SHADOW.flatness]
         for i, (a, b) in enumerate(sizes):
             contrast = self.contrast(a, b)
             better = contrast > best
             best[better], which[better] = contrast[better], i
         best[~below] = 0
-        least, alone = 0.6 * LEAST_SHADE, 0
-        for _ in range(MAX_TRIES):
+        least, alone = 0.6 * SHADOW.least_shade, 0
+        for _ in range(SHADOW.tries):
             y, x = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
-            if best[y, x] < least or alone == MAX_CANDIDATES:
+            if best[y, x] < least or alone == SHADOW.candidates:
                 return
             a, b = sizes[int(which[y, x])]
             if self.stands_alone((float(x), float(y), a, b)):
@@ -107,24 +130,27 @@ class _Floor:
     def stands_alone(self, seen: Ellipse) -> bool:
         """Whether the floor is lighter than the ellipse on each of its four sides, unlike next to an edge of light."""
         x, y, a, b = seen
-        rows = slice(max(0, int(y - RING[1] * b)), int(y + RING[1] * b) + 2)
-        columns = slice(max(0, int(x - RING[1] * a)), int(x + RING[1] * a) + 2)
+        rows = slice(max(0, int(y - SHADOW.ring[1] * b)), int(y + SHADOW.ring[1] * b) + 2)
+        columns = slice(max(0, int(x - SHADOW.ring[1] * a)), int(x + SHADOW.ring[1] * a) + 2)
         light, free = self.lab[rows, columns, 0], self.free[rows, columns]
         v, u = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float64)
         u, v = (u + columns.start - x) / a, (v + rows.start - y) / b
         radius, angle = np.hypot(u, v), np.arctan2(v, u)
         middle = float(light[free & (radius < 0.8)].mean())
-        ring = free & (radius > RING[0]) & (radius < RING[1])
+        ring = free & (radius > SHADOW.ring[0]) & (radius < SHADOW.ring[1])
         sides = [ring & (np.abs((angle - turn + np.pi) % (2 * np.pi) - np.pi) < np.pi / 4) for turn in QUARTERS]
         steps = [float(light[side].mean()) - middle for side in sides if side.any()]
-        return min(steps) > MIN_EVENNESS * float(np.mean(steps))
+        return min(steps) > SHADOW.evenness * float(np.mean(steps))
 
     def contrast(self, a: float, b: float) -> Floats32:
         """Per pixel [h, w] how much darker an ellipse there is than the ring about it, as a share; 0 near objects."""
-        ry, rx = int(np.ceil(RING[1] * b)), int(np.ceil(RING[1] * a))
+        ry, rx = int(np.ceil(SHADOW.ring[1] * b)), int(np.ceil(SHADOW.ring[1] * a))
         ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]
         radius = np.sqrt((xs / a) ** 2 + (ys / b) ** 2)
-        rings, weight = (radius <= 0.9, (radius >= RING[0]) & (radius <= RING[1])), self.free.astype(np.float32)
+        rings, weight = (
+            (radius <= 0.9, (radius >= SHADOW.ring[0]) & (radius <= SHADOW.ring[1])),
+            self.free.astype(np.float32),
+        )
         (inside, whole), (about, free) = (floor_means(self.lab[..., 0], weight, mask) for mask in rings)
         return np.where((whole > 0.97) & (free > 0.7), 1 - inside / np.maximum(about, 1.0), 0).astype(np.float32)
 
@@ -134,9 +160,9 @@ class _Floor:
         rows = slice(max(0, round(y - 2.2 * b - 2)), round(y + 2.2 * b + 3))
         columns = slice(max(0, round(x - 1.8 * a)), round(x + 1.8 * a + 1))
         free = self.free[rows, columns]
-        if free.sum() < LEAST_PIXELS:
+        if free.sum() < SHADOW.least_pixels:
             return None
-        every = max(1, int(free.sum()) // MOST_PIXELS)
+        every = max(1, int(free.sum()) // SHADOW.most_pixels)
         ys, xs = (axis[::every] for axis in np.nonzero(free))
         points = np.stack([xs + columns.start + 0.5, ys + rows.start + 0.5], axis=1).astype(np.float64)
         lab = self.lab[rows, columns][free][::every].astype(np.float64)
@@ -161,10 +187,12 @@ class _Floor:
         shade = -dark / max(float(level), 1.0)
         width = self.box[2] - self.box[0]
         fits = (
-            LEAST_SHADE < shade < MOST_SHADE
-            and explained > EXPLAINED
-            and SOFTNESS[0] < soft < (MOST_SOFT if shade > DARK and explained > WELL_EXPLAINED else SOFTNESS[1])
-            and float(np.hypot(*tint)) < SAME_HUE
+            SHADOW.least_shade < shade < SHADOW.most_shade
+            and explained > SHADOW.explained
+            and SHADOW.softness[0]
+            < soft
+            < (SHADOW.most_soft if shade > SHADOW.dark and explained > SHADOW.well_explained else SHADOW.softness[1])
+            and float(np.hypot(*tint)) < SHADOW.same_hue
             and 0.6 * width < 2 * wide < 1.6 * width
             and 0.15 < high / wide < 0.95
             and float(np.hypot((px - x) / a, (py - y) / b)) < 0.6
@@ -182,12 +210,12 @@ def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
     """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None if it has none or several patches could be it."""
 
     def find() -> Shadow | None:
-        if scene.region_of(bbox) is None or bbox[2] - bbox[0] < LEAST_WIDTH:
+        if scene.region_of(bbox) is None or bbox[2] - bbox[0] < SHADOW.least_width:
             return None
         floor = _Floor.below(bbox, scene)
         found = [shadow for ellipse in floor.candidates() if (shadow := floor.fit_ellipse(ellipse)) is not None]
         found.sort(key=lambda shadow: -shadow.shade)
-        if not found or (len(found) > 1 and found[1].shade > RIVAL_SHADE * found[0].shade):
+        if not found or (len(found) > 1 and found[1].shade > SHADOW.rival_shade * found[0].shade):
             return None
         return found[0]
 
@@ -217,7 +245,7 @@ def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats)
     parameters, damping = start, 1e-2
     rest, dark = residual(parameters)
     step = np.array([0.1, 0.1, 0.02, 0.02, 0.02, 0.05])
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(SHADOW.iterations):
         slopes = np.stack(
             [(residual(parameters + each)[0] - rest) / size for each, size in zip(np.diag(step), step, strict=True)],
             axis=1,
@@ -234,3 +262,14 @@ def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats)
         else:
             damping *= 5
     return parameters, dark
+
+
+def floor_means(values: Floats32, weight: Floats32, mask: Mask) -> tuple[Floats32, Floats32]:
+    """Mean value [h, w] of what may be floor in a mask about each pixel, and the share of the mask that may be.
+
+    `weight` [h, w] is 1 where there may be floor, else 0.
+    """
+    kernel = mask.astype(np.float32) / np.float32(max(1, np.count_nonzero(mask)))
+    total, share = (np.asarray(cv2.filter2D(layer, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT), np.float32)
+                    for layer in (values * weight, weight))  # fmt: skip
+    return np.asarray(total / np.maximum(share, 1e-3), np.float32), share

@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,21 +18,34 @@ from numpy.typing import NDArray
 from cow_service.vision.masks import eroded, scaled, without_holes
 from cow_service.vision.types import Image, Mask
 
-WORKING_SIDE = 896  # px: longer images are searched at this size
-THIN = 41  # px: side of the median window; narrower structures stand out from it
-STANDS_OUT = 28  # grey levels from that median, in any channel
-TOLERANCES = (26, 52)  # grey levels around a flat colour: strict first, then with the fringes that JPEG leaves
-FLAT = 14  # grey levels: median distance of a drawing's pixels from its colour
-SHARP = 56  # grey levels between a drawing and its surroundings
-SHARP_SHARE = 0.85  # of its surroundings
-GAP_SHARE = 0.25  # of the surroundings that have the colour of a patch which is a part of them
-FRINGE = 4  # px around a drawing that compression has mixed with it
-OUTLINE_MOST = 5  # px: maximum width of an outline
-MIN_LENGTH = 18.0  # px at the working size
-ALIKE = 0.04  # of the area: patches that differ less are the same, found with another tolerance
-LEAST_INSIDE = 0.12  # of a hollow drawing's area that its rim encloses
-BIN = 16  # grey levels: colours this close are tried as one
-MAX_COLOURS = 36  # flat colours tried per thin structure
+
+class StrokeRules(NamedTuple):
+    """What is drawn over a picture, and no part of the scene.
+
+    Set by hand on the arrows and boxes of 18 rendered scenes of the first family, as JPEG. No single number has a
+    measurement of its own.
+    """
+
+    working_side: int = 896  # px: longer images are searched at this size
+    thin: int = 41  # px: side of the median window; narrower structures stand out from it
+    stands_out: int = 28  # grey levels from that median, in any channel
+    # grey levels around a flat colour: strict first, then with the fringes that JPEG leaves
+    tolerances: tuple[int, int] = (26, 52)
+    flat: int = 14  # grey levels: median distance of a drawing's pixels from its colour
+    sharp: int = 56  # grey levels between a drawing and its surroundings
+    sharp_share: float = 0.85  # of its surroundings
+    gap_share: float = 0.25  # of the surroundings that have the colour of a patch which is a part of them
+    fringe: int = 4  # px around a drawing that compression has mixed with it
+    outline: int = 5  # px: maximum width of an outline
+    length: float = 18.0  # px at the working size
+    alike: float = 0.04  # of the area: patches that differ less are the same, found with another tolerance
+    inside: float = 0.12  # of a hollow drawing's area that its rim encloses
+    bin: int = 16  # grey levels: colours this close are tried as one
+    colours: int = 36  # flat colours tried per thin structure
+
+
+STROKE = StrokeRules()
+
 
 Box = tuple[int, int, int, int]  # x, y, width, height, px
 Colour = tuple[int, int, int]  # RGB
@@ -70,7 +84,7 @@ class WorkingImage:
     @staticmethod
     def of(image: Image) -> WorkingImage:
         """The image, scaled down where it is longer than the working size."""
-        scale = min(1.0, WORKING_SIDE / max(image.shape[:2]))
+        scale = min(1.0, STROKE.working_side / max(image.shape[:2]))
         return WorkingImage(scaled(image, scale), scale, (image.shape[0], image.shape[1]))
 
     def full(self, mask: Mask) -> Mask:
@@ -85,19 +99,19 @@ def find_strokes(image: Image) -> Iterator[Stroke]:
     # Where something narrow stands out from what is around it, and a little beyond.
     half = scaled(image, 0.5)
     # A median over so wide a window is as good of every second pixel, and takes a fifth of the time.
-    around = cv2.resize(cv2.medianBlur(scaled(half, 0.5), THIN // 4 | 1), half.shape[1::-1])
+    around = cv2.resize(cv2.medianBlur(scaled(half, 0.5), STROKE.thin // 4 | 1), half.shape[1::-1])
     red, green, blue = cv2.split(cv2.absdiff(half, around))
-    _, narrow = cv2.threshold(cv2.max(cv2.max(red, green), blue), STANDS_OUT, 255, cv2.THRESH_BINARY)
+    _, narrow = cv2.threshold(cv2.max(cv2.max(red, green), blue), STROKE.stands_out, 255, cv2.THRESH_BINARY)
     narrow = cv2.resize(cv2.dilate(narrow, _SQUARE), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     for (bx, by, bw, bh), _, _, thin in _patches(np.asarray(narrow, np.uint8), most=1.0):
         window = image[by : by + bh, bx : bx + bw]
         allowed = thin.astype(np.uint8) * np.uint8(255)
         known: dict[Box, int] = {}
-        for colour, tolerance in itertools.product(_flat_colours(window[thin]), TOLERANCES):
+        for colour, tolerance in itertools.product(_flat_colours(window[thin]), STROKE.tolerances):
             same = np.asarray(cv2.bitwise_and(_alike(window, colour, tolerance), allowed), np.uint8)
-            for box, area, flat, patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, FLAT)):
+            for box, area, flat, patch in _patches(same, most=0.30, flat=partial(_alike, window, colour, STROKE.flat)):
                 before = known.get(box)
-                if before is not None and abs(area - before) <= ALIKE * before:
+                if before is not None and abs(area - before) <= STROKE.alike * before:
                     continue
                 known[box] = area
                 stroke = Stroke(bx + box[0], by + box[1], patch, colour)
@@ -114,17 +128,17 @@ def _alike(image: Image, colour: Colour, tolerance: int) -> NDArray[np.uint8]:
 
 def drawing_mask(image: Image, stroke: Stroke) -> Mask:
     """Mask [h, w] of the stroke with the outline around it, if it has one, and the fringe that compression leaves."""
-    window, patch = stroke.surroundings(image, FRINGE + 2 * OUTLINE_MOST)
+    window, patch = stroke.surroundings(image, STROKE.fringe + 2 * STROKE.outline)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-    reach, grown = FRINGE, cv2.dilate(patch, kernel)
-    for width in range(1, OUTLINE_MOST + 1):
+    reach, grown = STROKE.fringe, cv2.dilate(patch, kernel)
+    for width in range(1, STROKE.outline + 1):
         wider = cv2.dilate(grown, kernel)
         ring = image[window][(wider > 0) & (grown == 0)].astype(np.float32)
         if len(ring):
             colour = np.median(ring, axis=0)
             is_ink = colour.min() > 225 or colour.max() < 30  # outlines are white or black
-            if is_ink and np.median(np.abs(ring - colour).max(axis=1)) < FLAT:
-                reach = width + FRINGE + 1
+            if is_ink and np.median(np.abs(ring - colour).max(axis=1)) < STROKE.flat:
+                reach = width + STROKE.fringe + 1
         grown = wider
     mask = np.zeros(image.shape[:2], bool)
     mask[window] = cv2.dilate(patch, kernel, iterations=reach) > 0
@@ -136,36 +150,36 @@ def _is_drawn(image: Image, stroke: Stroke) -> bool:
     window, inside = stroke.surroundings(image, 4)
     near = cv2.dilate(inside, _SQUARE, iterations=2)
     beyond = image[window][cv2.dilate(near, _SQUARE) > near].astype(np.int16)
-    sharp = (np.abs(beyond - np.array(stroke.colour, np.int16)) > SHARP).any(axis=1)
-    if np.count_nonzero(sharp) <= SHARP_SHARE * len(beyond):
+    sharp = (np.abs(beyond - np.array(stroke.colour, np.int16)) > STROKE.sharp).any(axis=1)
+    if np.count_nonzero(sharp) <= STROKE.sharp_share * len(beyond):
         return False
     # What has the colour of its surroundings is floor that is seen between two objects.
     around = image[stroke.surroundings(image, max(stroke.patch.shape))[0]]
-    alike = np.count_nonzero(_alike(around, stroke.colour, FLAT)) - np.count_nonzero(stroke.patch)
-    return alike <= GAP_SHARE * around.shape[0] * around.shape[1]
+    alike = np.count_nonzero(_alike(around, stroke.colour, STROKE.flat)) - np.count_nonzero(stroke.patch)
+    return alike <= STROKE.gap_share * around.shape[0] * around.shape[1]
 
 
 def _hollow(image: Image, stroke: Stroke) -> Iterator[Stroke]:
     """The hollow drawings whose rim, and whose inside, a stroke may be."""
     whole = without_holes(stroke.patch)
-    if np.count_nonzero(whole & ~stroke.patch) > LEAST_INSIDE * np.count_nonzero(whole):
+    if np.count_nonzero(whole & ~stroke.patch) > STROKE.inside * np.count_nonzero(whole):
         inside = eroded(whole & ~stroke.patch, beyond=0)
         pixels = image[stroke.surroundings(image, 0)[0]][inside].astype(np.int16)
-        if len(pixels) and np.median(np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)) <= TOLERANCES[1]:
+        if len(pixels) and np.median(np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)) <= STROKE.tolerances[1]:
             yield Stroke(stroke.x, stroke.y, whole, stroke.colour, hollow=True)
         return
-    if eroded(stroke.patch, beyond=0).sum() <= LEAST_INSIDE * stroke.patch.sum():
+    if eroded(stroke.patch, beyond=0).sum() <= STROKE.inside * stroke.patch.sum():
         return
     # The rim around a flat patch differs in colour from the patch and from its surroundings. Compression may have
     # broken it: then it is not found as a separate stroke.
-    pad = OUTLINE_MOST + FRINGE + 1
+    pad = STROKE.outline + STROKE.fringe + 1
     window, patch = stroke.surroundings(image, pad)
     near = image[window].astype(np.int16)
-    grown = [patch, *(cv2.dilate(patch, _CROSS, iterations=i) for i in (1, 3, OUTLINE_MOST + 1, pad - 2, pad))]
+    grown = [patch, *(cv2.dilate(patch, _CROSS, iterations=i) for i in (1, 3, STROKE.outline + 1, pad - 2, pad))]
     rim, beyond = (
         np.median(near[(grown[outer] > 0) & (grown[inner] == 0)], axis=0) for inner, outer in ((1, 2), (4, 5))
     )
-    if min(np.abs(rim - beyond).max(), np.abs(rim - np.array(stroke.colour)).max()) > SHARP:
+    if min(np.abs(rim - beyond).max(), np.abs(rim - np.array(stroke.colour)).max()) > STROKE.sharp:
         is_rim = (grown[3] > 0) & (2 * np.abs(near - rim).sum(axis=2) < np.abs(near - beyond).sum(axis=2))
         count, labels = cv2.connectedComponents(((patch > 0) | is_rim).astype(np.uint8), connectivity=4)
         kept = labels == np.bincount(labels[patch > 0], minlength=count).argmax()
@@ -177,21 +191,21 @@ def _flat_colours(pixels: NDArray[np.uint8]) -> list[Colour]:
     """Colours that many of the pixels [N, 3] share: a drawing has one, a shaded object spreads over many."""
     if len(pixels) < 40:
         return []
-    binned = np.ascontiguousarray((pixels // BIN + 1).T).astype(np.int16)  # [3, N]; a margin of one bin all around
-    side = 256 // BIN + 2
+    binned = np.ascontiguousarray((pixels // STROKE.bin + 1).T).astype(np.int16)  # [3, N]; a margin of one bin
+    side = 256 // STROKE.bin + 2
     flat = np.ravel_multi_index((binned[0], binned[1], binned[2]), (side, side, side))
     smooth = np.bincount(flat, minlength=side**3).reshape(side, side, side).astype(np.float32)
     for axis in range(3):
         smooth = smooth + 0.5 * (np.roll(smooth, 1, axis) + np.roll(smooth, -1, axis))
     colours: list[Colour] = []
-    for _ in range(MAX_COLOURS):
+    for _ in range(STROKE.colours):
         peak = np.unravel_index(int(smooth.argmax()), smooth.shape)
         if smooth[peak] < 30:
             break
         close = [np.abs(channel - np.int16(middle)) <= 1 for channel, middle in zip(binned, peak, strict=True)]
         near = pixels[close[0] & close[1] & close[2]]
         colour = np.median(near, axis=0).astype(np.int64)
-        if (np.abs(near - colour).max(axis=1) <= FLAT).sum() >= 24:
+        if (np.abs(near - colour).max(axis=1) <= STROKE.flat).sum() >= 24:
             colours.append((int(colour[0]), int(colour[1]), int(colour[2])))
         r, g, b = (slice(max(0, int(p) - 1), int(p) + 2) for p in peak)
         smooth[r, g, b] = 0
@@ -212,7 +226,7 @@ def _patches(
     window = slice(top, top + height), slice(left, left + width)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(same[window], connectivity=8)
     squared = stats[:, 2].astype(np.int64) ** 2 + stats[:, 3].astype(np.int64) ** 2
-    fitting = (stats[:, 4] >= 40) & (squared >= MIN_LENGTH**2) & (stats[:, 4] <= most * squared)
+    fitting = (stats[:, 4] >= 40) & (squared >= STROKE.length**2) & (stats[:, 4] <= most * squared)
     fitting[0] = False  # the background
     flats = np.zeros(len(stats), np.int64)
     if flat is not None and fitting.any():

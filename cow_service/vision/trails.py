@@ -1,8 +1,8 @@
 """Finds trails: three or more positions of one ball in one image, faded or as opaque as in a multiple exposure.
 
 Two circles that look alike are the start; others that look like them are sought between and beyond them, on a path
-along which place and size change smoothly. Balls that merely look alike are no trail by themselves: see
-`Trail.evident`.
+along which place and size change smoothly. Balls that merely look alike are no trail by themselves: only where the
+question or the reader speaks of one is a picture searched.
 """
 
 from __future__ import annotations
@@ -12,33 +12,48 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from cow_service.records import BBox, Point, Vector
 from cow_service.vision.circles import BINS, Circle, Edges
-from cow_service.vision.contrast import View
 from cow_service.vision.masks import iou
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
-UNLIKE, LEAST_CONTRAST = 0.3, 12.0  # difference of appearance over the contrast, at most; grey levels of that contrast
-LEAST_OPACITY = 0.08
-MOST_UNREST = 12.0  # grey levels of a background's variation that are allowed for
-SCREENED_SUPPORT = 0.45, 0.2  # of the circumference of one at an end and of a third, on edges of a smoothed image
-END_SUPPORT = 0.5  # of the circumference of a position at an end, on edges: what hides the rest is the next position
-PALE_SUPPORT, PREDICTED = 0.4, 0.2  # the same of one that a trail's path leads to, and how near to it, in radii
-SURE_SUPPORT = 0.3  # of the circumference: with more, no better circle is sought nearby
-SEEN_SUPPORT = 0.75  # of what the other positions leave to be seen of a circumference, on edges
-NOTCHED = 0.35  # of the depth that the outline of two overlapping circles has between them: less is a straight side
-SIZES = 1.35  # between the radii of neighbours, at most
-FADED = 0.85  # of the opacity of the most opaque: with less, a position was faded
-SPACING = 0.5, 2.0  # between neighbouring gaps
-BEND = math.radians(65)  # between neighbouring legs, at most
-LEAST_GAP, MOST_GAP = 0.35, 5.0  # radii between neighbours
-MOST_SAG = 0.3  # of the distance of two positions: how far those between may lie off the line
-MAX_POSITIONS = 12
-MAX_PAIRS = 6  # circles that look alike, between and beyond which others are sought
-SAME_POSITION_IOU = 0.4
+
+class TrailRules(NamedTuple):
+    """When circles are positions of one ball.
+
+    Set by hand on trails of the first family of rendered scenes and on drawn ones, with bottles and rows of balls that
+    must not pass; no single number has a measurement of its own.
+    """
+
+    unlike: float = 0.3  # difference of appearance over the contrast, at most
+    contrast: float = 12.0  # grey levels of that contrast, at least
+    opacity: float = 0.08  # at least
+    unrest: float = 12.0  # grey levels of a background's variation that are allowed for
+    # of the circumference of a position at an end, on edges: what hides the rest is the next position
+    end_support: float = 0.5
+    pale_support: float = 0.4  # of the circumference of a pale one that a path leads to
+    predicted: float = 0.2  # radii: how near to where a path leads a pale position must lie
+    sure_support: float = 0.3  # of the circumference: with more, no better circle is sought nearby
+    seen_support: float = 0.75  # of what the other positions leave to be seen of a circumference, on edges
+    # of the depth that the outline of two overlapping circles has between them: less is a straight side
+    notched: float = 0.35
+    sizes: float = 1.35  # between the radii of neighbours, at most
+    faded: float = 0.85  # of the opacity of the most opaque: with less, a position was faded
+    spacing: tuple[float, float] = (0.5, 2.0)  # between neighbouring gaps
+    bend: float = math.radians(65)  # between neighbouring legs, at most
+    least_gap: float = 0.35  # radii between neighbours, at least
+    most_gap: float = 5.0  # the same, at most
+    sag: float = 0.3  # of the distance of two positions: how far those between may lie off the line
+    positions: int = 12  # at most
+    pairs: int = 6  # circles that look alike, between and beyond which others are sought
+    same_iou: float = 0.4  # from which a box is that of a position
+
+
+TRAIL = TrailRules()
 
 
 Chain = tuple[Circle, ...]  # along a path, in order
@@ -86,7 +101,6 @@ class Trail:
     """Positions of one ball along its path, the oldest first and the present one last."""
 
     positions: tuple[Position, ...]
-    evident: bool  # it shows by itself: its positions overlap or fade. Else they may be several balls that look alike
     end_known: bool  # which end is the present one: told by their opacity, or named
 
     @property
@@ -119,51 +133,48 @@ class Trail:
         else:
             return self
         is_last = gaps[1] <= gaps[0]
-        return Trail(self.positions if is_last else self.positions[::-1], self.evident, True)
+        return Trail(self.positions if is_last else self.positions[::-1], True)
 
 
 def trail_of(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
     """The trail that has a position in a box [x0, y0, x1, y1]."""
-    return next(
-        (trail for trail in trails if any(iou(p.bbox, bbox) >= SAME_POSITION_IOU for p in trail.positions)), None
-    )
+    return next((trail for trail in trails if any(iou(p.bbox, bbox) >= TRAIL.same_iou for p in trail.positions)), None)
 
 
 def trail_ending_at(trails: Sequence[Trail], bbox: BBox) -> Trail | None:
     """The trail whose present position lies in a box, turned round where its first position does."""
     for trail in trails:
         for positions in (trail.positions, trail.positions[::-1]):
-            if iou(positions[-1].bbox, bbox) >= SAME_POSITION_IOU:
-                return Trail(positions, trail.evident, True)
+            if iou(positions[-1].bbox, bbox) >= TRAIL.same_iou:
+                return Trail(positions, True)
     return None
 
 
-def find_trails(image: Image, view: View) -> tuple[Trail, ...]:
-    """Trails of balls in an RGB image [H, W, 3] without drawings on it, the longest first. `view` is that of it."""
-    # Most pictures end here: the view's edges are those of a smoothed image, which show circles, if not notches.
-    smooth = Edges.at((view.across, view.down, view.edges), (image.shape[1], image.shape[0]))
-    if smooth is None or not _Search(smooth, image).may_find(smooth.circles()):
-        return ()
+def find_trails(image: Image) -> tuple[Trail, ...]:
+    """Trails of balls in an RGB image [H, W, 3] without drawings on it, the longest first."""
     edges = Edges.of(image)
     if edges is None:
         return ()
     search = _Search(edges, image)
-    ends = [c for c in edges.circles() if c.support >= END_SUPPORT and search.contrast(c) >= LEAST_CONTRAST]
+    ends = [c for c in edges.circles() if c.support >= TRAIL.end_support and search.contrast(c) >= TRAIL.contrast]
     trails: list[Trail] = []
     tried = 0
     for a, b in _pairs(ends):
-        found = [position for trail in trails for position in trail.positions]
-        known = any(math.dist(c.centre, p.centre) < 0.6 * p.radius for c in (a, b) for p in found)
-        if tried < MAX_PAIRS and not known and search.are_alike((a, b)):
+        if tried < TRAIL.pairs and _are_apart((a, b), trails) and search.are_alike((a, b)):
             tried += 1
             trail = search.trail_through(a, b)
             trails += [] if trail is None else [trail]
     whole: list[Trail] = []
     for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
-        pairs = ((p, q) for other in whole for p in trail.positions for q in other.positions)
-        if not any(math.dist(p.centre, q.centre) < 0.6 * max(p.radius, q.radius) for p, q in pairs):
+        if _are_apart(trail.positions, whole):
             whole.append(trail)
     return tuple(whole)
+
+
+def _are_apart(places: Sequence[Circle | Position], trails: Sequence[Trail]) -> bool:
+    """Whether none of some places is a position of a trail."""
+    pairs = ((p, q) for trail in trails for p in places for q in trail.positions)
+    return all(math.dist(p.centre, q.centre) >= 0.6 * max(p.radius, q.radius) for p, q in pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,19 +183,6 @@ class _Search:
 
     edges: Edges
     image: Image
-
-    def may_find(self, circles: Sequence[Circle]) -> bool:
-        """Whether three of some circles may be positions of one ball, two of them such as `trail_through` starts from.
-
-        Of a position that others cover in part, enough is seen to be among the circles that stand out.
-        """
-        seen = [c for c in circles if c.support >= SCREENED_SUPPORT[1]]
-        ends = [c for c in seen if c.support >= SCREENED_SUPPORT[0] and self.contrast(c) >= 0.8 * LEAST_CONTRAST]
-        for pair in _pairs(ends):
-            chains = [chain for each in seen if (chain := _joined(each, *pair)) is not None]
-            if chains and self.are_alike(pair) and any(self.are_alike(chain) for chain in chains):
-                return True
-        return False
 
     def trail_through(self, a: Circle, b: Circle) -> Trail | None:
         """The trail through two positions; None if fewer than three lie along a path.
@@ -195,7 +193,7 @@ class _Search:
         reach = 0.5 * math.dist(a.centre, b.centre) + 1.6 * max(a.radius, b.radius)
         low, high = (min(a.x, b.x) - reach, min(a.y, b.y) - reach), (max(a.x, b.x) + reach, max(a.y, b.y) + reach)
         near = self.edges.within((*low, *high))
-        for inner in range(3 * MAX_POSITIONS // 4):
+        for inner in range(3 * TRAIL.positions // 4):
             chain = self.between(near, a, b, inner)
             if chain is None:
                 continue
@@ -210,21 +208,19 @@ class _Search:
             return None
         opacity = np.clip(shares / shares.max(), 0, 1)
         positions = tuple(Position(c.x, c.y, c.radius, float(o)) for c, o in zip(chain, opacity, strict=True))
-        overlap = all(math.dist(p.centre, q.centre) < 0.95 * (p.radius + q.radius) for p, q in pairwise(positions))
-        known = abs(float(opacity[0] - opacity[-1])) > 1 - FADED
-        faded = known and float(np.sort(opacity)[:-1].max()) < FADED
+        known = abs(float(opacity[0] - opacity[-1])) > 1 - TRAIL.faded
         rank = (opacity[0], opacity[-1]) if known else (chain[0].support, chain[-1].support)
         ordered = positions if rank[1] >= rank[0] else positions[::-1]
-        return Trail(ordered, overlap or faded or (known and len(chain) > 3), known)
+        return Trail(ordered, known)
 
     def between(self, edges: Edges, a: Circle, b: Circle, inner: int) -> Chain | None:
         """Two circles with others between them, evenly along an arc that bulges to one side or the other."""
         apart = math.dist(a.centre, b.centre)
         gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
-        if not LEAST_GAP * mean < gap < MOST_GAP * mean:
+        if not TRAIL.least_gap * mean < gap < TRAIL.most_gap * mean:
             return None
         start, end, across = np.array(a.centre), np.array(b.centre), np.array([a.y - b.y, b.x - a.x]) / apart
-        most = MOST_SAG * apart if inner else 0.0
+        most = TRAIL.sag * apart if inner else 0.0
         for bulge in sorted([0.0, *np.arange(-most, most + 1e-9, 0.35 * mean).tolist()], key=abs):
             chain = [a]
             for t in np.arange(1, inner + 1) / (inner + 1):
@@ -244,21 +240,14 @@ class _Search:
         Where it is not compared with the others, for it may be too pale or too much overlaid, it must lie exactly where
         the path of three or more leads.
         """
-        while len(chain) < MAX_POSITIONS:
-            last, before = chain[-1], chain[-2]
-            dx, dy = last.x - before.x, last.y - before.y
-            seeds = [(2 * last.x - before.x, 2 * last.y - before.y)]
-            if len(chain) > 2:
-                seeds.insert(0, (3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y))
-            else:
-                turns = [(math.cos(angle), math.sin(angle)) for angle in (-0.35, 0.35, -0.7, 0.7)]
-                seeds += [(last.x + dx * c - dy * s, last.y + dx * s + dy * c) for c, s in turns]
+        while len(chain) < TRAIL.positions:
+            last, before, seeds = chain[-1], chain[-2], _next_places(chain)
             for x, y in seeds if compared else seeds[:1]:
                 found = _fit_near(self.edges, x, y, last.radius**2 / before.radius if compared else last.radius)
                 if found is None or any(found.is_same(other) for other in chain) or not _is_path((*chain, found)):
                     continue
-                is_predicted = math.dist(found.centre, (x, y)) < PREDICTED * found.radius
-                is_seen = found.support >= PALE_SUPPORT and self.contrast(found) >= LEAST_CONTRAST / 2
+                is_predicted = math.dist(found.centre, (x, y)) < TRAIL.predicted * found.radius
+                is_seen = found.support >= TRAIL.pale_support and self.contrast(found) >= TRAIL.contrast / 2
                 if self.are_alike((*chain, found)) if compared else is_predicted and is_seen:
                     chain = (*chain, found)
                     break
@@ -272,14 +261,14 @@ class _Search:
         Circles that were fitted into a bottle do not pass.
         """
         notches = [notch for a, b in pairwise(chain) if (notch := self.edges.notch(a, b)) is not None]
-        if notches and float(np.median(notches)) < NOTCHED:
+        if notches and float(np.median(notches)) < TRAIL.notched:
             return False
         for i, circle in enumerate(chain):
             seen = _is_free(chain, i, RIM, 1.0)
             on = np.isin(np.arange(BINS), list(circle.on_edges))
-            if np.count_nonzero(on & seen) < SEEN_SUPPORT * max(1, np.count_nonzero(seen)):
+            if np.count_nonzero(on & seen) < TRAIL.seen_support * max(1, np.count_nonzero(seen)):
                 return False
-        return min(chain[0].support, chain[-1].support) >= END_SUPPORT
+        return min(chain[0].support, chain[-1].support) >= TRAIL.end_support
 
     def contrast(self, circle: Circle) -> float:
         """Lower quartile of the steps from inside to outside over the edges on a circle, grey levels."""
@@ -340,16 +329,16 @@ def _opacity(seen: Floats, model: Floats, plain: Floats, unrest: float) -> float
     is how much that varies (grey levels), infinite where they are known to be alike.
     """
     contrast = float(np.median(np.linalg.norm(model, axis=1)))
-    if contrast < LEAST_CONTRAST:
+    if contrast < TRAIL.contrast:
         return None
-    if float(np.median(np.linalg.norm(plain, axis=1))) < UNLIKE * contrast / 2:
+    if float(np.median(np.linalg.norm(plain, axis=1))) < TRAIL.unlike * contrast / 2:
         return 1.0
     share = float((seen * model).sum() / (model**2).sum())
     rest = float(np.median(np.linalg.norm(seen - share * model, axis=1)))
     if math.isinf(unrest):
-        return min(max(share, LEAST_OPACITY), 1.0)
-    allowed = min(unrest, MOST_UNREST)
-    if not LEAST_OPACITY < share < 1.15 or rest > UNLIKE * contrast * share + allowed:
+        return min(max(share, TRAIL.opacity), 1.0)
+    allowed = min(unrest, TRAIL.unrest)
+    if not TRAIL.opacity < share < 1.15 or rest > TRAIL.unlike * contrast * share + allowed:
         return None
     return min(share, 1.0)
 
@@ -367,11 +356,11 @@ def _fit_near(edges: Edges, x: float, y: float, radius: float) -> Circle | None:
     near: list[Circle] = []
     for column, row in (np.array([x, y]) + radius * AROUND).tolist():
         found = edges.fit(column, row, radius)
-        if found is None or not 1 / SIZES < found.radius / radius < SIZES:
+        if found is None or not 1 / TRAIL.sizes < found.radius / radius < TRAIL.sizes:
             continue
         if math.dist(found.centre, (x, y)) < 0.6 * radius:
             near.append(found)
-            if found.support > SURE_SUPPORT:
+            if found.support > TRAIL.sure_support:
                 break
     return max(near, key=lambda circle: circle.support, default=None)
 
@@ -381,23 +370,19 @@ def _pairs(ends: Sequence[Circle]) -> Iterator[tuple[Circle, Circle]]:
     for a, b in itertools.combinations(ends, 2):
         apart, mean = math.dist(a.centre, b.centre), (a.radius + b.radius) / 2
         small, large = sorted((a.radius, b.radius))
-        if 0.25 * mean < apart < MOST_GAP * 3 * mean and large < SIZES**3 * small:
+        if 0.25 * mean < apart < TRAIL.most_gap * 3 * mean and large < TRAIL.sizes**3 * small:
             yield a, b
 
 
-def _joined(circle: Circle, a: Circle, b: Circle) -> Chain | None:
-    """Two positions and a circle that may be a third, in order: it is about as large, and between or beyond them."""
-    small, large = sorted((a.radius, b.radius))
-    x, y = b.x - a.x, b.y - a.y
-    along, aside = (
-        ((circle.x - a.x) * right + (circle.y - a.y) * down) / (x * x + y * y) for right, down in ((x, y), (y, -x))
-    )
-    if not small / SIZES**2 < circle.radius < large * SIZES**2 or not -SPACING[1] < along < 1 + SPACING[1]:
-        return None
-    near = any(math.dist(circle.centre, each.centre) < LEAST_GAP * small for each in (a, b))
-    if near or abs(aside) > MOST_SAG + max(0.0, -along, along - 1):
-        return None
-    return (circle, a, b) if along < 0 else (a, b, circle) if along > 1 else (a, circle, b)
+def _next_places(chain: Chain) -> list[Point]:
+    """Where the next circle of a chain may lie, the likeliest first: on along its bend, or straight on, or turned."""
+    last, before = chain[-1], chain[-2]
+    dx, dy = last.x - before.x, last.y - before.y
+    if len(chain) > 2:
+        bent = 3 * last.x - 3 * before.x + chain[-3].x, 3 * last.y - 3 * before.y + chain[-3].y
+        return [bent, (last.x + dx, last.y + dy)]
+    turns = [(math.cos(angle), math.sin(angle)) for angle in (0, -0.35, 0.35, -0.7, 0.7)]
+    return [(last.x + dx * c - dy * s, last.y + dx * s + dy * c) for c, s in turns]
 
 
 def _is_path(chain: Chain) -> bool:
@@ -407,13 +392,13 @@ def _is_path(chain: Chain) -> bool:
     gaps = np.linalg.norm(legs, axis=1)
     radii = np.array([c.radius for c in chain])
     ratio = radii[1:] / radii[:-1]
-    if (ratio > SIZES).any() or (ratio < 1 / SIZES).any() or (gaps < LEAST_GAP * radii[1:]).any():
+    if (ratio > TRAIL.sizes).any() or (ratio < 1 / TRAIL.sizes).any() or (gaps < TRAIL.least_gap * radii[1:]).any():
         return False
     if len(chain) < 3:
         return True
     turns = np.arctan2(legs[:-1, 0] * legs[1:, 1] - legs[:-1, 1] * legs[1:, 0], (legs[:-1] * legs[1:]).sum(axis=1))
-    if (np.abs(turns) > BEND).any() or ((turns > 0.15).any() and (turns < -0.15).any()):
+    if (np.abs(turns) > TRAIL.bend).any() or ((turns > 0.15).any() and (turns < -0.15).any()):
         return False
     uneven = np.abs(np.diff(np.log(radii), 2)).max()
     spread = gaps[1:] / gaps[:-1]
-    return bool(uneven < 0.12 and (spread > SPACING[0]).all() and (spread < SPACING[1]).all())
+    return bool(uneven < 0.12 and (spread > TRAIL.spacing[0]).all() and (spread < TRAIL.spacing[1]).all())

@@ -114,7 +114,7 @@ def test_what_stays_where_it_is_put_begins_at_rest(
     mover = RigidShape("sphere", 0.15, 0.15, 0.15, (-3.0, 0.15, 3.0))
     under = RigidShape(target, width, width, height, (0.0, height, 3.0))
     thing = RigidShape(shape, half, half, tall, (2.5, tall, 3.0))
-    opening = SeenOpening(0.9, 0.05, 0.7, None, False, has_edge=True) if relation == "into" else None
+    opening = SeenOpening(0.9, 0.05, 0.7, None, False) if relation == "into" else None
     places = PlacementGoal(relation, (1,), opening, body=2)
     draws = ensemble(3)
     settled = settle((places,), ((mover, under, thing),) * 3, draws, 24.0)

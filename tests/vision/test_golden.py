@@ -77,7 +77,6 @@ def figures(scene: Scene) -> list[tuple]:
         rows.append((f"{region.colour} {looks_like(region)}", *region.bbox, region.mask.area, *flags))
     rows += [("arrow", *arrow.tail, *arrow.tip, np.count_nonzero(arrow.mask), arrow.fit) for arrow in scene.arrows]
     rows += [("box", *box.bbox, np.count_nonzero(box.mask)) for box in scene.boxes]
-    rows += [("faint", *bbox) for bbox in scene.faint]
     rows += [("position", *p.centre, p.radius, p.opacity) for found in scene.trails for p in found.positions]
     changed = (scene.clean != scene.image).any(axis=2)
     if changed.any():
@@ -90,7 +89,7 @@ def figures(scene: Scene) -> list[tuple]:
     if shadow := find_shadow(scene, scene.regions[-1].bbox):
         rows.append(("shadow", *shadow.centre, *shadow.spread, shadow.shade))
     for region in scene.regions[1:2]:
-        opening, cut = measure_opening(scene.clean, region.mask), mask_from_bbox(scene.clean, region.bbox)
+        opening, cut = measure_opening(region.mask), mask_from_bbox(scene.clean, region.bbox)
         rows.append(("opening", opening.inner, opening.bottom, opening.rim is not None))
         rows.append(("cut", np.count_nonzero(cut), np.count_nonzero(mask_from_point(scene.clean, region.centre))))
     return rows
@@ -98,13 +97,13 @@ def figures(scene: Scene) -> list[tuple]:
 
 MEASURED = {
     "ball-and-mug": [
-        ("white mug", 325, 257, 413, 348, 5632, 0, 0, 0.5955, 0.5261, -8.611),
-        ("blue mug", 440, 216, 522, 299, 4868, 0, 0, 0.7335, 1, -9.291),
+        ("white mug", 325, 257, 413, 348, 5632, 0, 0, 0.5955, 0.5261, -6.07),
+        ("blue mug", 440, 216, 522, 299, 4868, 0, 0, 0.7335, 1, -7.222),
         ("yellow ball", 245, 195, 305, 255, 2743, 1, 0, 0.9546, 1, -14.63),
         ("arrow", 241.2, 217.1, 146.9, 199.7, 1704, 0.8682),
         ("painted", 1701, 159.1, 154.9, 152.2, 3.948),
         ("edges", 2537),
-        ("opening", 0.5781, 0.7292, 1),
+        ("opening", 0.7032, 0.7292, 1),
         ("cut", 4661, 4994),
     ],
     "thrown-ball": [
@@ -115,25 +114,26 @@ MEASURED = {
         ("painted", 1500, 150.7, 133.4, 129.9, 17.77),
         ("edges", 2215),
         ("shadow", 352.5, 273.2, 312.9, 25.76, -5.265, 0.07065),
-        ("opening", 0.921, 0.9661, 1),
+        ("opening", 0.9184, 0.9661, 1),
         ("cut", 4818, 4978),
     ],
     "vase": [
         ("blue None", 174, 330, 385, 480, 26340, 0, 0, 0.6036, 0.9969, -7.92),
-        ("white vase", 263, 151, 349, 293, 7159, 0, 0, 0.3465, 0.6875, 2.155),
         ("purple ball", 522, 24, 613, 116, 6567, 1, 0, 0.9663, 1, -14.63),
+        ("white car", 263, 220, 327, 293, 2790, 0, 0, 0.5564, 0.6875, -2.744),
+        ("white car", 263, 151, 349, 177, 2021, 0, 0, 0.33, 1, -4.074),
         ("arrow", 614, 74.41, 733, 85.62, 1855, 0.8926),
         ("painted", 1850, 129.1, 127.2, 125.3, 8.225),
         ("edges", 2621),
-        ("opening", 0.9084, 0.3419, 1),
-        ("cut", 8964, 8931),
+        ("opening", 0.8789, 0.8182, 1),
+        ("cut", 6411, 6598),
     ],
     "shelf": [
         ("purple None", 639, 130, 861, 270, 28550, 0, 0, 0.5996, 1, -6.478),
         ("cyan None", 60, 79, 191, 261, 21760, 0, 0, 0.56, 1, -9.579),
         ("white None", 300, 68, 519, 201, 18520, 0, 0, 0.4623, 1, -0.2078),
         ("green bowl", 60, 373, 242, 514, 18510, 0, 0, 0.7034, 1, -7.419),
-        ("blue mug", 699, 400, 838, 541, 14440, 0, 0, 0.6285, 1, -9.342),
+        ("blue mug", 699, 400, 838, 541, 14440, 0, 0, 0.6285, 1, -6.822),
         ("pink None", 399, 559, 561, 640, 13110, 0, 0, 0.5146, 0.9941, -4.461),
         ("white cone", 311, 389, 411, 542, 9006, 0, 0, 0.3987, 0.4901, -7.08),
         ("orange ball", 99, 9, 201, 109, 7973, 1, 0, 0.9679, 1, -14.64),
@@ -151,9 +151,8 @@ MEASURED = {
         ("position", 226, 110, 25.95, 0.4726),
         ("position", 292, 106.1, 25.95, 0.732),
         ("position", 357.9, 138, 25.97, 1),
-        ("painted", 12180, 160.8, 138.8, 116.4, 18.24),
+        ("painted", 7377, 160.5, 138.5, 116.3, 18.17),
         ("edges", 613.2),
-        ("shadow", 378, 300, 167.9, 30.45, 0.05388, 0.189),
     ],
     "drawing": [
         ("blue cone", 403, 199, 602, 329, 13120, 0, 0, 0.2946, 1, -5.13),
@@ -170,7 +169,7 @@ MEASURED = {
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_what_is_measured_in_a_picture(name: str) -> None:
-    found = figures(Scene(PICTURES[name]()))
+    found = figures(Scene(PICTURES[name](), trail_named=name == "thrown"))
     assert [row[0] for row in found] == [row[0] for row in MEASURED[name]]
     for row, expected in zip(found, MEASURED[name], strict=True):
         assert row[1:] == pytest.approx(expected[1:], rel=0.004, abs=0.004), row

@@ -37,21 +37,26 @@ def test_other_questions_about_an_image_measure_nothing_again(monkeypatch: pytes
     alone = [told(asked(question, None)) for question in QUESTIONS]
     seen = SeenImages()
     assert told(asked(QUESTIONS[0], seen)) == alone[0]
-    for name in ("find_strokes", "find_trails", "find_regions"):
+    for name in ("find_strokes", "find_regions"):
         monkeypatch.setattr(scenes, name, lambda *_: pytest.fail("it was measured before"))
     assert told(asked(QUESTIONS[1], seen)) == alone[1]
 
 
 def test_a_trail_leaves_what_depends_on_its_end_to_each_question() -> None:
     places = [(120.0, 250.0), (190.0, 250.0), (260.0, 250.0), (330.0, 250.0)]
-    scene = Scene(trail(floor(), places, [26.0] * 4, (200, 40, 40), [0.3, 0.5, 0.75, 1.0]))
+    scene = Scene(trail(floor(), places, [26.0] * 4, (200, 40, 40), [0.3, 0.5, 0.75, 1.0]), trail_named=True)
     assert scene.trails
     assert scene.regions
-    seen, other = SeenImages(), Scene(scene.image)
+    seen, other = SeenImages(), Scene(scene.image, trail_named=True)
     seen.keep(("mine", "a"), scene)
     seen.recall(("mine", "a"), other)
     assert other.measured() == scene.measured() != {}
     assert not {"clean", "regions", "trails"} & set(other.measured())
+    without = Scene(scene.image)
+    assert len(without.regions) > len(scene.regions)
+    seen.keep(("mine", "a"), without)
+    seen.recall(("mine", "a"), again := Scene(scene.image, trail_named=True))
+    assert len(again.regions) == len(scene.regions)
 
 
 def recalled(seen: SeenImages, owner: str | None, digest: str) -> bool:

@@ -22,17 +22,12 @@ from cow_service.stages.grounding import ground
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
 from cow_service.vision.circles import Edges
-from cow_service.vision.regions import measure
 from cow_service.vision.scene import Scene
-from cow_service.vision.trails import Position, Trail, find_trails
+from cow_service.vision.trails import Position, find_trails
 
 ORANGE, GREEN, PURPLE = (220, 120, 30), (40, 160, 60), (120, 50, 160)
 PLACES = thrown_past((300, 110), (36, -2), 12, 4)  # the oldest first
 QUESTION = "If the orange ball flies on along the trail of positions that is shown{}, will it hit the green cube?"
-
-
-def trails_of(image: np.ndarray) -> tuple[Trail, ...]:
-    return find_trails(image, measure(image))
 
 
 SCENE = block(floor(), (460, 230, 530, 300), GREEN)
@@ -40,11 +35,11 @@ OPAQUE = jpeg(trail(SCENE, PLACES, [26.0] * 4, ORANGE, [1.0] * 4), 95)
 
 
 def test_a_multiple_exposure_is_found_whole_and_leaves_its_end_to_the_words() -> None:
-    (found,) = trails_of(OPAQUE)
+    (found,) = find_trails(OPAQUE)
     seen = sorted(position.centre for position in found.positions)
     assert np.abs(np.array(seen) - np.array(sorted(PLACES))).max() < 1.5
     assert all(abs(position.radius - 26) < 1 for position in found.positions)
-    assert (found.evident, found.end_known) == (True, False)
+    assert not found.end_known
     for ended, place in (
         (found.ending(near=(460, 230, 530, 300)), PLACES[-1]),
         (found.ending(side=(1.0, 0.0)), PLACES[-1]),
@@ -59,18 +54,18 @@ def test_what_is_no_trail() -> None:
     for x, rgb in ((150, ORANGE), (210, GREEN), (270, PURPLE)):
         three = ball(three, (x, 200), 24, rgb)
     for image in (capsule, three, *(example(name).pixels("image.jpg") for name in ("ball-and-mug", "car-forward"))):
-        assert trails_of(image) == ()
+        assert find_trails(image) == ()
 
 
-def test_three_balls_that_stand_apart_are_a_trail_only_where_the_question_says_so() -> None:
+def test_three_balls_are_a_trail_only_where_the_question_says_so() -> None:
     image = trail(floor(), thrown_past((420, 120), (110, 6), 8, 3), [24.0] * 3, ORANGE, [1.0] * 3)
-    for scene, trails, regions in ((Scene(image), 0, 3), (Scene(image, trail_named=True), 1, 1)):
+    for scene, trails, regions in ((Scene(image), 0, 3), (Scene(image).with_trail_named(), 1, 1)):
         assert (len(scene.trails), len(scene.regions)) == (trails, regions)
 
 
 def test_the_earlier_positions_are_taken_out_and_the_present_one_is_whole() -> None:
     x, y = PLACES[0]
-    scene = Scene(OPAQUE).with_mover((x - 26, y - 26, x + 26, y + 26))
+    scene = Scene(OPAQUE, trail_named=True).with_mover((x - 26, y - 26, x + 26, y + 26))
     wanted = ball(SCENE, (x, y), 26, ORANGE)
     off = np.abs(scene.clean.astype(int) - wanted).max(axis=2)
     ys, xs = np.mgrid[: off.shape[0], : off.shape[1]]

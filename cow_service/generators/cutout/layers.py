@@ -209,7 +209,7 @@ def _containers(
         mask = masks[index]
         # Below the nearer edge of its opening; without a rim, below the mask's upper third.
         cropped = CroppedMask.of(mask)
-        seen, (x0, y0, x1, y1) = measure_opening(image, cropped), cropped.bbox
+        seen, (x0, y0, x1, y1) = measure_opening(cropped), cropped.bbox
         x, y, half, tall = seen.rim or ((x0 + x1) / 2, y0 + (y1 - y0) / 6, (x1 - x0) / 2, (y1 - y0) / 6)
         inner = min(1.0, seen.inner * (x1 - x0) / 2 / half)
         rows, columns = np.ogrid[: mask.shape[0], : mask.shape[1]]

@@ -85,7 +85,7 @@ def _foremost(regions: Sequence[Region], phrase: ObjectPhrase, count: int = 1) -
     """The given number of regions that fit a phrase best, and those not clearly worse than the last of them."""
     ratios = forms.likeness(regions, phrase.noun, phrase.head, phrase.colour)
     ranked = sorted((ratio for ratio in ratios if ratio > forms.IMPOSSIBLE), reverse=True)
-    least = ranked[min(count, len(ranked)) - 1] - forms.CLEARLY_WORSE if ranked else 0.0
+    least = ranked[min(count, len(ranked)) - 1] - forms.NAMING.clearly_worse if ranked else 0.0
     fitting = [region for region, ratio in zip(regions, ratios, strict=True) if ratio > max(forms.IMPOSSIBLE, least)]
     # A detector called it so, its outline is that of the noun, or it has the colour and is not clearly another kind of
     # thing, such as a candle where a cone of its colour was not seen.
