@@ -177,7 +177,7 @@ def _supports(
     """What each body stands on: what is beneath its middle and ends where it begins; as seen, where that is unknown."""
     found = list(seen)
     for index, (body, own) in enumerate(zip(bodies, footprints, strict=True)):
-        if own is None or (body.prior is not None and body.prior.stands_on is not None):
+        if own is None or body.prior.stands_on is not None:
             continue
         allowed = ON_TOP * (own.top - own.bottom) + deviation / 2 * own.distance
         under = {
@@ -424,7 +424,7 @@ def _upright(view: _View, points: Floats, edge: float, bend: float, share: float
     low, high = np.percentile(points[:, [0, 2]] @ turn.T, (TRIM, 100 - TRIM), axis=0)
     half_width, half_depth = ((high - low) / 2).tolist()
     half_width += edge
-    is_cube = body.prior is not None and body.prior.equal_sided
+    is_cube = body.prior.equal_sided
     if is_round or is_cube:
         half_depth, bend = half_width, 0.0
         high[1] = low[1] + 2 * half_width

@@ -211,7 +211,7 @@ class _Picture:
     def body_at(self, index: int, cameras: Cameras, depth: Floats, depth_share: Floats | None = None) -> LiftedBody:
         """A body where it stands, or else in the air, about at the depth [K] (m) of the mover."""
         body = self.bodies[index]
-        said = None if body.prior is None else body.prior.height
+        said = body.prior.height
         if body.is_flying and said is not None:
             height = np.clip(said.value + said.deviation * self.draws[:, COLUMN["foot"]], 0, 0.95 * cameras.height)
             hanging = above(cameras, body.core, body.shape, self.draws, height)
