@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -168,29 +168,21 @@ class _EventsOf(dict[int, Events]):
         self.worlds, self.bodies, self.draws, self.paths = worlds, bodies, draws, paths
 
     def __missing__(self, subject: int) -> Events:
+        worlds, path = self.worlds, self.paths[subject]
+        on, count = worlds.layout.supports[subject], len(self.bodies)
+        beneath = [] if on is None else [on]
+        eligible = np.ones(count, bool)
+        eligible[[0, subject, *beneath, *worlds.layout.absent]] = False
+        ignored = {subject, *beneath, *worlds.layout.loads_of(subject)}
+        touches = self.touches(subject, ignored)
+        times, partly, most = ({kind: np.full(touches.shape, none) for kind in KINDS} for none in (NEVER, NEVER, 0.0))
+        times["touches"] = partly["touches"] = touches
         enough = COVERED * np.exp(COVERED_SIGMA * self.draws[:, COLUMN["outline"]])[:, None]
-        eligible, count = np.ones(len(self.bodies), bool), len(self.bodies)
-        on, loads = self.worlds.layout.supports[subject], self.worlds.layout.loads_of(subject)
-        eligible[[0, subject, *([] if on is None else [on]), *self.worlds.layout.absent]] = False
-        times: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
-        partly: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
-        most: PerKind = {kind: np.zeros((len(self.draws), count)) for kind in KINDS}
-        # When it first touches each other one, once it moves itself.
-        for k, (shapes, run) in enumerate(zip(self.worlds.shapes, self.worlds.runs, strict=True)):
-            since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
-            for meeting in run.meetings:
-                if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
-                    other = meeting.b if meeting.a == subject else meeting.a
-                    if other != on and other not in loads:
-                        times["touches"][k, other] = min(times["touches"][k, other], meeting.time)
-        partly["touches"] = times["touches"]
-        path, step = self.paths[subject], self.worlds.every / self.worlds.fps
+        step = worlds.every / worlds.fps
         clock = np.arange(path.depth.shape[1]) * step
-        for other in range(count):
-            if other in (subject, on, *self.worlds.layout.absent) or other in loads:
-                continue
+        for other in set(range(count)) - ignored - worlds.layout.absent:
             found = shares(self.bodies[subject].mask, path, self.bodies[other].mask, self.paths[other])
-            before = clock[None] <= times["touches"][:, other : other + 1] + step
+            before = clock[None] <= touches[:, other : other + 1] + step
             for kind, values in zip(KINDS[1:], (found.covers, found.covered), strict=True):
                 seen = np.where(before, values, 0.0)
                 most[kind][:, other] = seen.max(axis=1)
@@ -198,6 +190,19 @@ class _EventsOf(dict[int, Events]):
                 partly[kind][:, other] = np.where(seen >= ANY_PART, clock[None], NEVER).min(axis=1)
         self[subject] = Events(times, most, eligible, partly, subject)
         return self[subject]
+
+    def touches(self, subject: int, ignored: Collection[int]) -> Floats:
+        """[K, B] s: when it first touches each other one that is not ignored, once it moves itself."""
+        times = np.full((len(self.draws), len(self.bodies)), NEVER)
+        for k, (shapes, run) in enumerate(zip(self.worlds.shapes, self.worlds.runs, strict=True)):
+            since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
+            for meeting in run.meetings:
+                if meeting.b is None or subject not in (meeting.a, meeting.b) or meeting.time < since:
+                    continue
+                other = meeting.b if meeting.a == subject else meeting.a
+                if other not in ignored:
+                    times[k, other] = min(times[k, other], meeting.time)
+        return times
 
 
 @dataclass(frozen=True)

@@ -413,19 +413,19 @@ def _upright(view: _View, points: Floats, edge: float, bend: float, share: float
     is_round = body.is_form_known and body.shape in ("cylinder", "cone")
     right, ahead = (float(value) for value in np.median(points[:, [0, 2]], axis=0))
     bottom, top = (float(value) for value in np.percentile(points[:, 1], (TRIM, 100 - TRIM)))
-    across = math.atan2(ahead, right) - math.pi / 2  # the direction across the line of sight
-    yaw = across
+    yaw = math.atan2(ahead, right) - math.pi / 2  # across the line of sight
     if not is_round:
         _, sides, degrees = cv2.minAreaRect(np.asarray(_core(points[:, [0, 2]]), np.float32))
         # Of its two sides the one that lies across the line of sight.
         turned = math.radians(degrees)
-        yaw = turned + math.pi / 2 * round((across - turned) / (math.pi / 2)) if max(sides) > 0 else across
+        yaw = turned + math.pi / 2 * round((yaw - turned) / (math.pi / 2)) if max(sides) > 0 else yaw
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     low, high = np.percentile(points[:, [0, 2]] @ turn.T, (TRIM, 100 - TRIM), axis=0)
     half_width, half_depth = ((high - low) / 2).tolist()
     half_width += edge
     is_cube = body.prior.equal_sided
-    if is_round or is_cube:
+    is_deep_as_wide = is_round or is_cube
+    if is_deep_as_wide:
         half_depth, bend = half_width, 0.0
         high[1] = low[1] + 2 * half_width
     elif bend > BENT * 2 * half_width:  # how deep it is cannot be distinguished from the error
@@ -438,7 +438,7 @@ def _upright(view: _View, points: Floats, edge: float, bend: float, share: float
     foot = bottom if view.flies else 0.0
     tall = half_width if is_cube else max((top + edge - foot) / 2, 1e-6)
     shape = body.shape if body.is_form_known else "box"
-    is_seen = (is_seen or is_round or is_cube) and half_depth > 0
+    is_seen = (is_seen or is_deep_as_wide) and half_depth > 0
     centre = x, foot + tall, z
     return Footprint(shape, centre, half_width, half_depth, tall, yaw, bottom, is_seen, deviation, bend, share)
 

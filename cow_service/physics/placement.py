@@ -188,23 +188,16 @@ def settle(
         current = [_made_room(bodies, goal.body, free) for bodies in current]
         placements.append(Placements(goal.meant, results, np.array(clearance), np.array(above), 0.0))
     put_bodies = {goal.body for goal in goals}
-    begun = tuple(
-        tuple(
-            replace(
-                body,
-                position=rest.position,
-                turn=rest.turn,
-                half_width=rest.half_width,
-                half_depth=rest.half_depth,
-                half_height=rest.half_height,
-                hollow=rest.hollow,
-                falls=i in put_bodies or body.falls,
-            )
-            for i, (body, rest) in enumerate(zip(bodies, resting, strict=True))
-        )
-        for bodies, resting in zip(shapes, current, strict=True)
-    )
-    return Settled(begun, tuple(placements))
+    begun = (_settled(*pair, put_bodies) for pair in zip(shapes, current, strict=True))
+    return Settled(tuple(begun), tuple(placements))
+
+
+def _settled(bodies: Shapes, resting: Shapes, put: Collection[int]) -> Shapes:
+    """Bodies as they set out, where they have come to rest, and as large and hollow as they are there."""
+    names = ("position", "turn", "half_width", "half_depth", "half_height", "hollow")
+    changes = [{name: getattr(rest, name) for name in names} for rest in resting]
+    pairs = enumerate(zip(bodies, changes, strict=True))
+    return tuple(replace(body, falls=i in put or body.falls, **change) for i, (body, change) in pairs)
 
 
 def new_supports(goals: Sequence[PlacementGoal], supports: Sequence[int | None]) -> Mapping[int, int | None]:
@@ -327,30 +320,42 @@ def _on_target(
     """As `classify`, for bodies put into or onto something."""
     body, target = released[goal.body], released[goal.targets[0]]
     (there, turn), (middle, lean) = ((run.positions[i, -1], run.turns[i, -1]) for i in (goal.body, goal.targets[0]))
-    tall, tipped, hollow = _half_height(body, turn), _upright(lean) < TIPPED, target.hollow
+    tall, tipped = _half_height(body, turn), _upright(lean) < TIPPED
     low, high = there[1] - tall, there[1] + tall
     off = math.hypot(there[0] - middle[0], there[2] - middle[2])
-    if hollow is None or goal.relation == "onto":
-        tipped &= target.shape != "sphere"
-        sunk = low < middle[1] + _half_height(target, lean) - SUNK * min(body.half_height, target.half_height)
-        if sunk or off > target.half_width + body.half_width:
-            return ("tips" if tipped else "falls-off"), math.nan, math.nan
-        tipped |= body.shape != "sphere" and _upright(turn) < TIPPED
-        return ("tips" if tipped else "on-top"), math.nan, math.nan
-    half = body.half_width  # with which it goes through the opening: of a box through a round one, its diagonal
-    if body.shape == "box":
-        square = hollow.sides == BOX_SIDES
-        half = max(half, body.half_depth) if square else math.hypot(half, body.half_depth)
-    clearance, rim = 1 - half / hollow.opening, middle[1] + target.half_height
-    above = float(np.clip((high - rim) / max(high - low, 1e-9), 0.0, 1.0))
-    result: PlacementResult = "sticks-out" if high - rim > STICKS_OUT * hollow.depth else "inside"
-    if tipped:
-        result = "tips"
-    elif off > target.half_width and low < rim:
-        result = "falls-off"
-    elif clearance <= 0 or rim - low < GONE_IN * hollow.depth:
-        result = "on-the-rim"
-    return result, clearance, above
+    if target.hollow is not None and goal.relation == "into":
+        rim = middle[1] + target.half_height
+        clearance, above = 1 - _half_across(body, target.hollow) / target.hollow.opening, (high - rim) / (high - low)
+        result = _in_container(target, tipped, clearance, low - rim, high - rim, off)
+        return result, clearance, float(np.clip(above, 0.0, 1.0))
+    tipped &= target.shape != "sphere"
+    sunk = low < middle[1] + _half_height(target, lean) - SUNK * min(body.half_height, target.half_height)
+    if sunk or off > target.half_width + body.half_width:
+        return ("tips" if tipped else "falls-off"), math.nan, math.nan
+    tipped |= body.shape != "sphere" and _upright(turn) < TIPPED
+    return ("tips" if tipped else "on-top"), math.nan, math.nan
+
+
+def _half_across(body: RigidShape, hollow: Hollow) -> float:
+    """Half the width with which a body goes through an opening: of a box through a round one, its diagonal."""
+    if body.shape != "box":
+        return body.half_width
+    is_square = hollow.sides == BOX_SIDES
+    return max(body.half_width, body.half_depth) if is_square else math.hypot(body.half_width, body.half_depth)
+
+
+def _in_container(
+    target: RigidShape, is_tipped: bool, clearance: float, low: float, high: float, off: float
+) -> PlacementResult:
+    """What becomes of a body whose ends are so far above the rim of a container, and so far off its axis (m)."""
+    depth = 0.0 if target.hollow is None else target.hollow.depth
+    if is_tipped:
+        return "tips"
+    if off > target.half_width and low < 0:
+        return "falls-off"
+    if clearance <= 0 or -low < GONE_IN * depth:
+        return "on-the-rim"
+    return "sticks-out" if high > STICKS_OUT * depth else "inside"
 
 
 def _half_height(body: RigidShape, turn: Floats) -> float:

@@ -163,13 +163,13 @@ def query_of(situation: Situation, stance: Stance) -> Query | None:
         return None
     known = tuple(dict.fromkeys(body for meant in among for body in meant))
     asked = asked.model_copy(update={"among": tuple(situation.bodies[body].name for body in known)})
-    sure, sure_of_miss = _shares_of_sure(situation, asked)
+    sure, sure_of_miss = shares_of_sure(situation, asked)
     query = Query(asked, targets[0], subjects[0], known, sure=sure, sure_of_miss=sure_of_miss)
-    query = replace(query, is_decidable=_is_decidable(situation, stance, query))
-    return query if known or asked.form not in OF_EACH else _of_any(situation, query)
+    query = replace(query, is_decidable=is_decidable(situation, stance, query))
+    return query if known or asked.form not in OF_EACH else with_candidates(situation, query)
 
 
-def _shares_of_sure(situation: Situation, asked: Asked) -> tuple[float, float]:
+def shares_of_sure(situation: Situation, asked: Asked) -> tuple[float, float]:
     """The shares of the worlds from which it is answered that something happens, and that it does not."""
     motion = situation.motion
     if situation.carried is not None and asked.relation == "inside":
@@ -178,7 +178,7 @@ def _shares_of_sure(situation: Situation, asked: Asked) -> tuple[float, float]:
     return SURE, SURE_OF_MISS if is_guess and motion.depth_deviation > 0 else SURE
 
 
-def _is_decidable(situation: Situation, stance: Stance, query: Query) -> bool:
+def is_decidable(situation: Situation, stance: Stance, query: Query) -> bool:
     """Whether worlds decide it: not of what is removed, nor that something lands that stands on the floor."""
     asked = query.asked
     if situation.carried is not None and asked.relation == "inside":
@@ -191,7 +191,7 @@ def _is_decidable(situation: Situation, stance: Stance, query: Query) -> bool:
     return asked.form != "which" or asked.relation not in OF_ITSELF
 
 
-def _of_any(situation: Situation, query: Query) -> Query:
+def with_candidates(situation: Situation, query: Query) -> Query:
     """With the candidates of a question that names none: what it names besides, and what is met."""
     others = [index for index in range(1, situation.count) if index != query.subject]
     if query.is_of_removal:
@@ -238,10 +238,10 @@ def goals_of(situation: Situation, query: Query | None) -> Goals:
             )
         by_heading = 0 in goal.targets and motion.kind == "linear" and goal.relation in ("in-front-of", "behind")
         before.append(replace(goal, place=where, by_heading=by_heading))
-    return Goals(own, tuple(before), _goals_instead(situation, query))
+    return Goals(own, tuple(before), goals_instead(situation, query))
 
 
-def _goals_instead(situation: Situation, query: Query | None) -> tuple[PlacementGoal, ...]:
+def goals_instead(situation: Situation, query: Query | None) -> tuple[PlacementGoal, ...]:
     """Where the mover is put to each of several things instead. Raises `CannotGround` as `_goal`."""
     if query is None or not query.is_decidable or (query.asked.form, query.asked.relation) != ("which", "inside"):
         return ()
@@ -266,7 +266,7 @@ def _goal(situation: Situation, placed: Intervention) -> PlacementGoal:
         raise CannotGround(f"'{placed.targets[0].object}' and '{placed.targets[1].object}' were found at one place.")
     target = bodies[targets[0]]
     beside = [each for index, each in enumerate(bodies) if index not in (body, targets[0])]
-    opening = _opening(situation, target, beside) if placed.relation == "into" else None
+    opening = opening_of(situation, target, beside) if placed.relation == "into" else None
     side = _free_side(bodies[body].bbox, target.bbox, beside, situation.size[0])
     return PlacementGoal(placed.relation, tuple(targets), opening, side, body)
 
@@ -278,7 +278,7 @@ def _found(bodies: Sequence[SeenBody], thing: LocatedObject) -> int:
     return best
 
 
-def _opening(situation: Situation, target: SeenBody, beside: Sequence[SeenBody]) -> SeenOpening:
+def opening_of(situation: Situation, target: SeenBody, beside: Sequence[SeenBody]) -> SeenOpening:
     """The opening of a container, by what is said of it and by its rim in the image."""
     said, opening = target.prior.opening, situation.openings[target.bbox]
     if said == "none":

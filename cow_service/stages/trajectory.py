@@ -36,7 +36,7 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
         trajectory = simulate_world(situation, world, query, path)
         live = live_worlds(world, query, run.request.ensemble) if run.request.live else None
         for body, told in zip(world.bodies, [] if live is None else live["bodies"], strict=False):
-            told["sprite"] = _sprite(scene.undrawn, body)
+            told["sprite"] = cut_out(scene.undrawn, body)
     warnings = warnings_of(run.request, grounding, trajectory)
     if live is None:
         return StageResult(value=trajectory, warnings=warnings)
@@ -46,7 +46,7 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     return StageResult(value=trajectory, warnings=warnings, artifacts=(kept.sha256,))
 
 
-def _sprite(image: Image, body: SeenBody) -> dict[str, Any]:
+def cut_out(image: Image, body: SeenBody) -> dict[str, Any]:
     """A body cut out of the image without what is drawn over it: a PNG as data URL, and its box (px)."""
     mask = body.mask
     cut = np.dstack([image[mask.rows, mask.columns], mask.patch.astype(np.uint8) * np.uint8(255)])
@@ -85,10 +85,14 @@ def judge(situation: Situation, result: EnsembleResult) -> Outcome | None:
     )
     if world.depth is not None and not world.depth.is_of_scene:
         return outcome.model_copy(update={"depends_on": ("depth",)})
-    return outcome if result.decided is None or query is None else _decided(situation, result, query, outcome, names)
+    return (
+        outcome
+        if result.decided is None or query is None
+        else decided_outcome(situation, result, query, outcome, names)
+    )
 
 
-def _decided(
+def decided_outcome(
     situation: Situation, result: EnsembleResult, query: Query, outcome: Outcome, names: Sequence[str]
 ) -> Outcome:
     """The outcome as worlds decide it, for the whole and for each candidate as sure as what it rests on."""
