@@ -175,8 +175,12 @@ class _EventsOf(dict[int, Events]):
         eligible[[0, subject, *beneath, *worlds.layout.absent]] = False
         ignored = {subject, *beneath, *worlds.layout.loads_of(subject)}
         touches = self.touches(subject, ignored)
-        times, partly, most = ({kind: np.full(touches.shape, none) for kind in KINDS} for none in (NEVER, NEVER, 0.0))
-        times["touches"] = partly["touches"] = touches
+        times: PerKind = {"touches": touches}
+        partly: PerKind = {"touches": touches}
+        most: PerKind = {"touches": np.zeros(touches.shape)}
+        for kind in KINDS[1:]:
+            times[kind], partly[kind] = (np.full(touches.shape, NEVER) for _ in range(2))
+            most[kind] = np.zeros(touches.shape)
         enough = COVERED * np.exp(COVERED_SIGMA * self.draws[:, COLUMN["outline"]])[:, None]
         step = worlds.every / worlds.fps
         clock = np.arange(path.depth.shape[1]) * step
