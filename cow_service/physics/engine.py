@@ -118,6 +118,7 @@ GAP = 1e-3  # m inside the engine: height above its support at which a body star
 FLOOR = (-1, -1)  # its owner
 LEAST_WAIST = 0.05  # of the height: a thinner foot would let its edge through the floor
 AT_REST = 0.05  # of a body's half width, per second: what moves more slowly is at rest
+TIPPED = math.cos(math.radians(45))  # upright component of an axis: with less it has tipped over
 AT_START = 0.1  # s: what stands on a body meets it then, which is no end of gliding over it
 
 

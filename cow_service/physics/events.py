@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.physics.ballistic import NEAREST_FREE, has_passed
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import AT_START, RigidShape, WorldRun
+from cow_service.physics.engine import AT_START, TIPPED, RigidShape, WorldRun
 from cow_service.physics.layout import Layout
 from cow_service.physics.world import Worlds
 from cow_service.records import Encounter, EncounterKind
@@ -19,13 +20,11 @@ from cow_service.vision.types import Floats, Mask
 
 NEVER = math.inf
 DISPLACED = 0.1  # of a body's half width: what is displaced less was not set in motion
-TIPPED = math.radians(45)  # an upright axis that leans more has tipped over
 COVERED = 0.3  # share of a silhouette from which it counts as covered
 ANY_PART = 0.06  # share from which a part of it is covered: less is an inexact outline
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 PerKind = dict[EncounterKind, Floats]  # [K, B] each
-PASSED = 0.08  # of its first depth: closer than this, a body has passed the camera
 SAMPLES = 96  # points of a silhouette that are looked up in the other
 CHUNK = 2048  # draws and frames at a time, to bound the memory
 
@@ -56,7 +55,7 @@ def seen_paths(worlds: Worlds, body: int) -> SeenPaths:
         before, first = worlds.layout.cameras.project(shown[:, None])
         before = before[:, 0]
     first = np.maximum(first, 1e-9)
-    return SeenPaths(points, depth, first / np.maximum(depth, PASSED * first), depth <= PASSED * first, before)
+    return SeenPaths(points, depth, first / np.maximum(depth, NEAREST_FREE * first), has_passed(depth, first), before)
 
 
 def turned(turns: Floats, vector: Floats) -> Floats:
@@ -240,7 +239,7 @@ def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats,
     if which:
         turns = np.concatenate([runs[k].turns[i] for k, i in which])
         upright = turned(turns, np.array([0.0, 1.0, 0.0]))[:, 1].reshape(len(which), -1)
-        leans[tuple(np.array(which).T)] = upright < math.cos(TIPPED)
+        leans[tuple(np.array(which).T)] = upright < TIPPED
     landed = np.full((len(runs), count), NEVER)
     for k, run in enumerate(runs):
         for meeting in run.meetings:

@@ -77,11 +77,16 @@ class Layout:
         kept = self.without(range(count, len(self.bodies)))
         return replace(kept, bodies=kept.bodies[:count], supports=kept.supports[:count], absent=self.absent)
 
+    def loosened(self, gone: Collection[int]) -> set[int]:
+        """What stood on bodies that are gone: what stands on something that falls falls, too."""
+        loose: set[int] = set()
+        for _ in self.supports:
+            loose |= {i for i, on in enumerate(self.supports) if i not in gone and (on in gone or on in loose)}
+        return loose
+
     def without(self, taken: Collection[int]) -> Layout:
         """With some bodies taken away: what stood on them has no support."""
-        loose: set[int] = set()
-        for _ in self.supports:  # what stands on something that falls falls, too
-            loose |= {i for i, on in enumerate(self.supports) if i not in taken and (on in taken or on in loose)}
+        loose = self.loosened(taken)
         supports = tuple(None if on in taken else on for on in self.supports)
         unsupported = (self.unsupported | loose).difference(taken)
         return replace(self, supports=supports, unsupported=unsupported, absent=self.absent.union(taken))
@@ -92,9 +97,7 @@ class Layout:
 
     def rearranged(self, on: Mapping[int, int | None]) -> Layout:
         """With some bodies put elsewhere, where they stand `on` others or the floor: what stood on them falls."""
-        loose: set[int] = set()
-        for _ in self.supports:
-            loose |= {i for i, at in enumerate(self.supports) if i not in on and (at in on or at in loose)}
+        loose = self.loosened(on)
         supports = tuple(None if i in loose else on.get(i, at) for i, at in enumerate(self.supports))
         bodies = tuple(replace(body, stands=True) if i in on else body for i, body in enumerate(self.bodies))
         unsupported = (self.unsupported - on.keys()) | loose

@@ -39,7 +39,7 @@ CONSTANTS: dict[str, float] = {
     "at_rest": engine.AT_REST,
     "at_start": engine.AT_START,
     "rests": engine.RESTS,
-    "tipped": math.cos(events.TIPPED),
+    "tipped": engine.TIPPED,
     "displaced": events.DISPLACED,
     "low": lift.LOW,
     "rise": lift.RISE,

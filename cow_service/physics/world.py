@@ -18,8 +18,7 @@ from cow_service.physics.geometry import Measurement
 from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out
 from cow_service.physics.lift import speed_factors
 from cow_service.physics.placement import (
-    CARRIED,
-    MOST_CARRIED,
+    PLACING,
     PlacementGoal,
     Placements,
     Settled,
@@ -191,7 +190,7 @@ class DrawnWorlds:
             settled = settle(goals, seen, draws, fps, flying)
         shapes, placements = settled.shapes, None
         if given.placement is not None:
-            carried = min(CARRIED, MOST_CARRIED * (given.num_frames - 1) / given.fps)
+            carried = min(PLACING.carried, PLACING.most_carried * (given.num_frames - 1) / given.fps)
             shapes, runs, placements = carry(given.placement, shapes, draws, carried, frames, fps, every)
         else:
 
