@@ -70,7 +70,11 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
     stance = Stance.of(situation)
     query = query_of(situation, stance)
     goals = goals_of(situation, query)
-    query = query_of_goals(situation, query, goals)
+    if query is not None:
+        query = replace(query, goals=goals.instead)
+    elif situation.asked is None and goals.carried is not None:
+        # Nothing is asked but whether it gets there: shown is what it does in most worlds.
+        query = Query(Asked(relation="inside"), goals.carried.targets[0])
     fit, measured = measure_camera(situation, stance)
     world = world_of(situation, query, goals, fit, measured)
     if not situation.follows_path:
@@ -198,14 +202,6 @@ def with_candidates(situation: Situation, query: Query) -> Query:
         said = {each.bbox for each in situation.located if each.role == "target"}
         others = [index for index in others if situation.bodies[index].bbox in said]
     return replace(query, among=tuple(others), meets_more=query.is_of_removal)
-
-
-def query_of_goals(situation: Situation, query: Query | None, goals: Goals) -> Query | None:
-    """The query, with the worlds in which the mover is put elsewhere instead."""
-    if query is None and situation.grounding.asked is None and goals.carried is not None:
-        # Nothing is asked but whether it gets there: shown is what it does in most worlds.
-        return Query(Asked(relation="inside"), goals.carried.targets[0])
-    return query if query is None or not goals.instead else replace(query, goals=goals.instead)
 
 
 # --- what is put somewhere

@@ -35,21 +35,16 @@ class Situation:
     size: tuple[int, int]  # px, of the image: width and height
     bodies: tuple[SeenBody, ...]  # the mover, what else is there, then what is removed
     count: int  # of the bodies without those that are removed
+    follows_path: bool = False  # the mover follows a path that no contact changes: a given or a ballistic one
     is_separated: bool = True  # the surroundings could be told apart into objects
     level: float | None = None  # px: height in the image of the floor of a drawing that has no depth
     faint: tuple[BBox, ...] = ()  # px: where the image may show things, but not for certain
-    openings: Mapping[BBox, SeenOpening] = field(
-        default_factory=dict[BBox, SeenOpening]
-    )  # of what something may be put into, by its box
+    # Of what something may be put into, by its box.
+    openings: Mapping[BBox, SeenOpening] = field(default_factory=dict[BBox, SeenOpening])
     lines: Floats = field(default_factory=no_edges)  # [N, 4] px: straight edges beside all bodies
     shadow: Shadow | None = None  # of a ball in the air
     depth: DepthMap | None = None
     focal: Estimate | None = None  # px, by what else than the request tells it
-
-    @property
-    def follows_path(self) -> bool:
-        """Whether the mover follows a path that no contact changes."""
-        return follows_path(self.request, self.motion)
 
     @property
     def present(self) -> tuple[SeenBody, ...]:
@@ -82,11 +77,6 @@ class Situation:
         return tuple(index for index, body in enumerate(self.bodies) if index and body.bbox in boxes)
 
 
-def follows_path(request: SimulateRequest, motion: Motion) -> bool:
-    """Whether the mover follows a path that no contact changes: one that is given, or has the ballistic law."""
-    return request.trajectory is not None or (motion.law == "ballistic" and motion.kind != "place")
-
-
 def located_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
     """What was located beside the mover, what is removed last."""
     return (*others_of(grounding), *removed_of(grounding))
@@ -94,7 +84,8 @@ def located_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
 
 def see(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: Motion) -> Situation:
     """The situation that a scene shows. Raises `InvalidRequest` for a depth map that is none of the image."""
-    request, on_path = run.request, follows_path(run.request, motion)
+    request = run.request
+    on_path = request.trajectory is not None or (motion.law == "ballistic" and motion.kind != "place")
     side_view = None if on_path else scene.side_view
     obstacles, removed = obstacles_of(scene, grounding)
     bodies = see_bodies(scene, grounding, motion, (*obstacles, *removed), side_view is not None)
@@ -105,6 +96,7 @@ def see(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: M
         size=(scene.width, scene.height),
         bodies=bodies,
         count=1 + len(obstacles),
+        follows_path=on_path,
         is_separated=bool(scene.regions or obstacles or removed),
         level=None if side_view is None else side_view.level,
         faint=see_faint(scene, grounding, request, bodies),
