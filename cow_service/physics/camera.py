@@ -123,6 +123,9 @@ FLAT = math.sqrt(3)  # half the width of a uniform distribution, in its deviatio
 GRID = 20, 10  # pitches, and focal lengths, that are weighed
 ROLLS = np.array([-1, 0, 1]) * math.sqrt(3), np.array([1, 4, 1]) / 6  # in deviations, and weights: moments of a normal
 SEEN_RIM = 0.8  # of the tops that look round: the others were seen amiss
+CUBE_SIGMA = 0.1  # of a cube's height in the image against its width
+CUBE_AMISS = 0.02  # likelihood of any height, where a cube was seen amiss
+TURNED = np.linspace(1.0, math.sqrt(2), 6)  # widths, in its side, of a cube whose yaw is not known
 OUT_OF_SIGHT = 50.0  # penalty of a foot above the horizon: such a camera loses against any without one
 FAR_END = 0.3  # of the image's width: a level line so long above all things is the far end of the floor, as a rule
 FAR_END_SLOPE = 0.35
@@ -172,6 +175,7 @@ class Standing:
 
     bbox: BBox
     rim: tuple[float, float] | None = None  # of a round top: minor to major axis as seen, and its deviation
+    is_cube: bool = False
     shape: Shape | None = None  # where it is known
     edges: Floats = field(default_factory=no_edges)  # ends [S, 4] (px) of its straight edges, longest first
 
@@ -180,12 +184,13 @@ class Standing:
         """What a body shows."""
         shape = body.shape if body.is_form_known else None
         rim = body.rim if shape == "cylinder" else None
-        return Standing(body.core, rim, shape, body.edges)
+        return Standing(body.core, rim, body.prior.equal_sided, shape, body.edges)
 
     def explained(self, views: Views, size: tuple[int, int]) -> Floats:
         """Log likelihood [K], to a constant, of what it shows in an image of a size (px) to each of some cameras.
 
-        A circle is seen as an ellipse whose axes have the ratio of the sine of the angle at which it is looked down on.
+        A circle is seen as an ellipse whose axes have the ratio of the sine of the angle at which it is looked down
+        on; a cube shows the more of its top the larger that angle is.
         """
         x0, y0, x1, y1 = self.bbox
         ends = np.array([((x0 + x1) / 2, y0), ((x0 + x1) / 2, y1)])
@@ -195,6 +200,10 @@ class Standing:
             seen, deviation = self.rim
             off = (at_top - seen) / deviation
             fits += np.log(SEEN_RIM * np.exp(-0.5 * off**2) / (deviation * math.sqrt(2 * math.pi)) + 1 - SEEN_RIM)
+        if self.is_cube:
+            heights = np.sqrt(1 - np.clip(sine, 0, 1) ** 2)[:, None] / TURNED + sine[:, None]
+            off = ((y1 - y0) / (x1 - x0) - heights) / CUBE_SIGMA
+            fits += np.log(np.exp(-0.5 * off**2).mean(axis=1) + CUBE_AMISS)
         if len(self.edges) and self.shape != "sphere":
             fits += views.explain(Segments.of(self.edges, size), self.bbox, self.shape, size)
         return fits

@@ -17,6 +17,7 @@ from cow_service.vision.types import Floats
 DIRECTION_SIGMA = math.radians(0.7)  # of a segment, however long
 END_SIGMA = 0.0012  # of the image's longer side, of a segment's direction times its length
 UPRIGHT_SIGMA = math.radians(2.5)  # of a side against the upright: things lean and taper, and pictures are cropped
+APEX_SIGMA = math.radians(2.0)  # of a side of a cone against the way to the middle of its box's upper edge
 RIM_SIGMA = math.radians(4.0)  # of a segment that approximates an arc
 UPRIGHT, LEVEL, NEITHER = 0.3, 0.3, 0.4  # of the segments of a thing
 END_OF_RIM = 0.93  # of half a thing's width: beyond it a rim is too curved for segments
@@ -77,7 +78,7 @@ class Views:
         if bbox is not None and shape != "box":
             box = (np.array(bbox).reshape(2, 2) - np.array(size) / 2) / size[0]  # its corners
             arcs = self._arcs(segments, down, box)
-            for form, sides in (("cylinder", upright), ("cone", (UPRIGHT + NEITHER) / math.pi)):
+            for form, sides in (("cylinder", upright), ("cone", _slanted(segments, box))):
                 if shape in (None, form):
                     likely.append(np.log(sides + arcs).sum(axis=1))
         logs = WEIGHT * np.logaddexp.reduce(likely)
@@ -115,6 +116,14 @@ class Views:
         sigma = np.hypot(segments.sigma, RIM_SIGMA)
         near, far = (_normal((downwards + side * sideways) / np.hypot(1, slope), sigma) for side in (slope, -slope))
         return LEVEL / 2 * (near + far) * (np.abs(place) < END_OF_RIM)
+
+
+def _slanted(segments: Segments, box: Floats) -> Floats:
+    """Likelihoods [1, S] of segments as sides of a cone in a box with corners [2, 2], or as not belonging to it."""
+    apex = np.array([box[:, 0].mean(), box[0, 1]])
+    way = apex - segments.middle
+    way /= np.linalg.norm(way, axis=1, keepdims=True) + 1e-12
+    return (UPRIGHT * _normal(_cross(segments.along, way), APEX_SIGMA) + NEITHER / math.pi)[None]
 
 
 def _cross(one: Floats, other: Floats) -> Floats:
