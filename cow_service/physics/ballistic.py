@@ -58,7 +58,7 @@ class Camera:
         return points, self.depth / z
 
 
-def has_passed(depths: Floats, first: float) -> Mask:
+def has_passed(depths: Floats, first: Floats | float) -> Mask:
     """Which of the depths [F] of an object are so small, against its first one, that the camera has been passed."""
     return depths <= NEAREST_FREE * first
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,12 @@ RIM = 0.9  # of half the width of its upper edge: what lies further out rises to
 LEAST_RIM = 12  # px across
 RIM_SIGMA, RIM_OFF = 0.08, 0.08  # of half its width: its deviation at best, and that of what is no ellipse
 LEAST_OVERLAP = 0.1  # of the narrower box: with less of it above the other, it is next to that
+NOTHING_SAID = ObjectPrior()
+
+
+def no_edges() -> Floats:
+    """No straight edges [0, 4]."""
+    return np.zeros((0, 4))
 
 
 @dataclass(frozen=True)
@@ -35,7 +41,7 @@ class SeenBody:
     shape: Shape
     source: Source = "embedded"
     confidence: float = 1.0
-    prior: ObjectPrior | None = None
+    prior: ObjectPrior = NOTHING_SAID
     elongated: bool = False  # a vehicle: longer along its heading than across
     equal_sided: bool = False  # a cube: as wide as high
     is_form_known: bool = True  # its shape was seen or said; else how deep it is, is not known
@@ -43,12 +49,13 @@ class SeenBody:
     taper: float = 1.0  # its width at its lower end, of that at its upper end
     bbox_deviation: float = 0.0  # of the edges of its box, in its sides
     point: Point | None = None  # px: of the mover, the one it was grounded at
+    edges: Floats = field(default_factory=no_edges)  # ends [S, 4] (px) of its straight edges, longest first
 
     @property
     def is_depth_known(self) -> bool:
         """Whether its shape determines its depth along the line of sight: that of bricks and boxes is unknown."""
         said = self.prior
-        is_any_box = said is not None and said.shape == "box" and not (said.equal_sided or said.elongated)
+        is_any_box = said.shape == "box" and not (said.equal_sided or said.elongated)
         return self.is_form_known and not is_any_box
 
     @property
@@ -161,13 +168,11 @@ class SeenBody:
     @property
     def is_flying(self) -> bool:
         """Said to be in the air."""
-        return self.prior is not None and self.prior.stands_on == "air"
+        return self.prior.stands_on == "air"
 
     def flies(self, motion: Motion) -> bool:
         """Whether it is in the air at the first frame, as far as is said, if it is what moves."""
-        if self.prior is not None and self.prior.stands_on is not None:
-            return self.is_flying
-        return motion.kind in FALLING_KINDS
+        return motion.kind in FALLING_KINDS if self.prior.stands_on is None else self.is_flying
 
 
 TOUCHING = 6  # px: so far apart are shapes of a drawing that touch
@@ -195,7 +200,7 @@ def supports_of(bodies: Sequence[SeenBody], level: float | None = None) -> list[
         return _drawn_supports(bodies, level)
     found: list[int | None] = []
     for body in bodies:
-        said = None if body.prior is None else body.prior.stands_on
+        said = body.prior.stands_on
         named = [i for i, other in enumerate(bodies) if other is not body and other.name == said]
         if said in ("floor", "air") or named:
             found.append(named[0] if said not in ("floor", "air") else None)

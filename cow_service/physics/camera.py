@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cow_service.physics.bodies import SeenBody
+from cow_service.physics.bodies import SeenBody, no_edges
 from cow_service.physics.vanishing import Segments, Views
 from cow_service.records import BBox, CameraEstimate, CameraSource, Estimate, Shape, Vector
 from cow_service.requests import CameraRequest
@@ -169,11 +169,6 @@ _FAR = np.array([0.0, math.log(20.0), math.log(HEIGHT_RADII), *SLANT])
 SIDE_VIEW = CameraFit(_FAR, 1e-12 * np.eye(5), roll=0.0, roll_sigma=0.0, source="side-view")
 
 
-def no_segments() -> Floats:
-    """No line segments [0, 4]."""
-    return np.zeros((0, 4))
-
-
 @dataclass(frozen=True)
 class Standing:
     """What one thing that stands on the floor shows of the camera."""
@@ -182,15 +177,36 @@ class Standing:
     rim: tuple[float, float] | None = None  # of a round top: minor to major axis as seen, and its deviation
     is_cube: bool = False
     shape: Shape | None = None  # where it is known
-    segments: Floats = field(default_factory=no_segments)  # ends [S, 4] (px) of its straight edges, longest first
+    edges: Floats = field(default_factory=no_edges)  # ends [S, 4] (px) of its straight edges, longest first
 
     @staticmethod
-    def of(body: SeenBody, segments: Floats) -> Standing:
-        """What a body shows, with the segments [S, 4] (px) of its straight edges."""
+    def of(body: SeenBody) -> Standing:
+        """What a body shows."""
         shape = body.shape if body.is_form_known else None
         rim = body.rim if shape == "cylinder" else None
-        is_cube = body.prior is not None and body.prior.equal_sided
-        return Standing(body.core, rim, is_cube, shape, segments)
+        return Standing(body.core, rim, body.prior.equal_sided, shape, body.edges)
+
+    def explained(self, views: Views, size: tuple[int, int]) -> Floats:
+        """Log likelihood [K], to a constant, of what it shows in an image of a size (px) to each of some cameras.
+
+        A circle is seen as an ellipse whose axes have the ratio of the sine of the angle at which it is looked down
+        on; a cube shows the more of its top the larger that angle is.
+        """
+        x0, y0, x1, y1 = self.bbox
+        ends = np.array([((x0 + x1) / 2, y0), ((x0 + x1) / 2, y1)])
+        at_top, sine = views.sines_down((ends - np.array(size) / 2) / size[0]).T
+        fits = -OUT_OF_SIGHT * (sine < HORIZON)
+        if self.rim is not None:
+            seen, deviation = self.rim
+            off = (at_top - seen) / deviation
+            fits += np.log(SEEN_RIM * np.exp(-0.5 * off**2) / (deviation * math.sqrt(2 * math.pi)) + 1 - SEEN_RIM)
+        if self.is_cube:
+            heights = np.sqrt(1 - np.clip(sine, 0, 1) ** 2)[:, None] / TURNED + sine[:, None]
+            off = ((y1 - y0) / (x1 - x0) - heights) / CUBE_SIGMA
+            fits += np.log(np.exp(-0.5 * off**2).mean(axis=1) + CUBE_AMISS)
+        if len(self.edges) and self.shape != "sphere":
+            fits += views.explain(Segments.of(self.edges, size), self.bbox, self.shape, size)
+        return fits
 
 
 GIVEN_PITCH_SIGMA, GIVEN_ROLL_SIGMA = math.radians(1.0), math.radians(0.5)
@@ -242,7 +258,7 @@ def camera_of(
 
     `lines` are segments [N, 4] (px) that lie between things; `metres_per_pixel` holds at the mover.
     """
-    said = None if flying is None or flying.prior is None else flying.prior.height
+    said = None if flying is None else flying.prior.height
     if flying is not None and said is not None:
         radius = flying.radius * metres_per_pixel
         height = 1 + said.value / radius  # of its middle, in its radii
@@ -258,11 +274,10 @@ def narrowed(
 ) -> CameraFit:
     """The camera from objects on the floor of an image of a size (width, height; px), and from lines of the floor.
 
-    All feet lie below the horizon. A circle is seen as an ellipse whose axes have the ratio of the sine of the angle at
-    which it is looked down on; a cube shows the more of its top the larger that angle is. Upright edges meet in one
-    vanishing point, the level edges of a thing in two on the horizon. `floor` has segments [N, 4] (px) beside things.
+    All feet lie below the horizon. Upright edges meet in one vanishing point, the level edges of a thing in two on the
+    horizon. `floor` has segments [N, 4] (px) beside things.
     """
-    floor = no_segments() if floor is None else floor
+    floor = no_edges() if floor is None else floor
     if not things and not len(floor):
         return fit
     sigma = np.sqrt(np.diag(fit.covariance))[:2]
@@ -270,34 +285,12 @@ def narrowed(
     axes = fit.mean[0] + steps[0], fit.mean[1] + steps[1], fit.roll + fit.roll_sigma * ROLLS[0]
     pitch, log_focal, roll = (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
     views = Views(np.exp(log_focal), axes_of(pitch, roll))
-    boxes = np.array([thing.bbox for thing in things]).reshape(-1, 4)
-    middle = (boxes[:, 0] + boxes[:, 2]) / 2
-
-    def sinks(points: Floats) -> Floats:
-        """Sines [K, N] of the angles at which rays through image points [N, 2] (px) lead down."""
-        return views.sines_down((points - np.array(size) / 2) / size[0])
-
-    sine, at_top = (sinks(np.stack([middle, boxes[:, edge]], axis=1)) for edge in (3, 1))
-    fits = np.tile(np.log(ROLLS[1]), math.prod(GRID)) - OUT_OF_SIGHT * (sine < HORIZON).sum(axis=1)
-    for index, thing in enumerate(things):
-        if thing.rim is not None:
-            seen, deviation = thing.rim
-            off = (at_top[:, index] - seen) / deviation
-            fits += np.log(SEEN_RIM * np.exp(-0.5 * off**2) / (deviation * math.sqrt(2 * math.pi)) + 1 - SEEN_RIM)
-        if thing.is_cube:
-            x0, y0, x1, y1 = thing.bbox
-            heights = np.sqrt(1 - np.clip(sine[:, index], 0, 1) ** 2)[:, None] / TURNED + sine[:, index, None]
-            off = ((y1 - y0) / (x1 - x0) - heights) / CUBE_SIGMA
-            fits += np.log(np.exp(-0.5 * off**2).mean(axis=1) + CUBE_AMISS)
-        if len(thing.segments) and thing.shape != "sphere":
-            fits += views.explain(Segments.of(thing.segments, size), thing.bbox, thing.shape, size)
+    fits = np.tile(np.log(ROLLS[1]), math.prod(GRID))
+    for thing in things:
+        fits += thing.explained(views, size)
     if len(floor) > 1:
         fits += views.explain(Segments.of(floor, size), None, None, size)
-    end = _far_end(floor, float(boxes[:, 3].min(initial=size[1])), size[0])
-    if end is not None:
-        down = sinks(end[None])[:, 0]
-        likely = np.exp(-0.5 * (down / FAR_END_SIGMA) ** 2) / (FAR_END_SIGMA * math.sqrt(math.pi / 2))
-        fits += np.log(FAR_END_SEEN * likely + 1 - FAR_END_SEEN) - OUT_OF_SIGHT * (down < 0)
+    fits += _far_end(floor, min((thing.bbox[3] for thing in things), default=size[1]), views, size)
     weight = np.exp(fits - fits.max())
     found = np.stack([pitch, log_focal])
     mean, covariance = fit.mean.copy(), fit.covariance.copy()
@@ -309,11 +302,17 @@ def narrowed(
     return replace(fit, mean=mean, covariance=covariance, source="edges" if is_measured else fit.source)
 
 
-def _far_end(floor: Floats, above: float, width: int) -> Floats | None:
-    """Middle [2] (px) of the uppermost long and level segment above a height in the image; None without one."""
+def _far_end(floor: Floats, above: float, views: Views, size: tuple[int, int]) -> Floats:
+    """Log likelihood [K] to each camera that the uppermost long and level segment above a height is the floor's far
+    end, which lies on the horizon."""
     middle, across = (floor[:, :2] + floor[:, 2:]) / 2, np.abs(floor[:, 2:] - floor[:, :2])
-    is_end = (across[:, 0] > FAR_END * width) & (across[:, 1] < FAR_END_SLOPE * across[:, 0]) & (middle[:, 1] < above)
-    return min(middle[is_end], key=lambda point: point[1], default=None)
+    is_end = (across[:, 0] > FAR_END * size[0]) & (across[:, 1] < FAR_END_SLOPE * across[:, 0]) & (middle[:, 1] < above)
+    if not is_end.any():
+        return np.zeros(len(views.focal))
+    end = min(middle[is_end], key=lambda point: point[1])
+    down = views.sines_down((end[None] - np.array(size) / 2) / size[0])[:, 0]
+    likely = np.exp(-0.5 * (down / FAR_END_SIGMA) ** 2) / (FAR_END_SIGMA * math.sqrt(math.pi / 2))
+    return np.asarray(np.log(FAR_END_SEEN * likely + 1 - FAR_END_SEEN) - OUT_OF_SIGHT * (down < 0), np.float64)
 
 
 def fit_shadow(start: CameraFit, ball: BBox, shadow: Shadow, size: tuple[int, int]) -> CameraFit | None:

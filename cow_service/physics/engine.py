@@ -9,6 +9,7 @@ are made; gravity is scaled alike, so that times stay seconds.
 from __future__ import annotations
 
 import math
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -77,6 +78,22 @@ class RigidShape:
         """Whether it passes through everything."""
         return self.ghost or self.follows is not None
 
+    @property
+    def slow(self) -> float:
+        """The speed (m/s) below which it is at rest; what glides slowly from the start is not."""
+        glides = math.hypot(*self.velocity) if self.glides else 0.0
+        return min(AT_REST * self.half_width, glides / 2) if glides else AT_REST * self.half_width
+
+    @property
+    def rotation(self) -> tuple[float, float, float]:
+        """Its axis times its angle, radians."""
+        if self.turn is None:
+            return 0.0, self.yaw, 0.0
+        a, b, c, w = self.turn
+        length = math.sqrt(a * a + b * b + c * c)
+        angle = 2 * math.atan2(length, w) / max(length, 1e-12)
+        return a * angle, b * angle, c * angle
+
     def stands_on(self, other: RigidShape) -> bool:
         """Whether its lower end is, at the start, about where the upper end of another body is."""
         low, top = self.position[1] - self.half_height, other.position[1] + other.half_height
@@ -101,6 +118,7 @@ GAP = 1e-3  # m inside the engine: height above its support at which a body star
 FLOOR = (-1, -1)  # its owner
 LEAST_WAIST = 0.05  # of the height: a thinner foot would let its edge through the floor
 AT_REST = 0.05  # of a body's half width, per second: what moves more slowly is at rest
+TIPPED = math.cos(math.radians(45))  # upright component of an axis: with less it has tipped over
 AT_START = 0.1  # s: what stands on a body meets it then, which is no end of gliding over it
 
 
@@ -176,43 +194,30 @@ class _Engine:
         self.frames = range(0, num_frames, every)
         self.substeps = max(1, math.ceil((LEAST_STEPS if self.is_alone else LEAST_STEPS_OF_MANY) / fps))
         self.scale = ENGINE_SIZE / worlds[0][0].half_width
-        self.world = rapier.PhysicsWorld(gravity=(0.0, -min(GRAVITY * self.scale, MOST_GRAVITY), 0.0))
-        self.world.set_num_threads(1)
-        parameters = self.world.integration_parameters
-        parameters.dt = 1 / (fps * self.substeps)
-        parameters.normalized_max_corrective_velocity = 1.0  # m/s: bodies that overlap part slowly
+        self.world = _empty_world(self.scale, 1 / (fps * self.substeps))
         self.collector = rapier.ChannelEventCollector()
         self.world.event_handler = self.collector  # pyright: ignore[reportAttributeAccessIssue]
-        floor = rapier.Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
-        self.world.add_collider(_combined(floor))
         self.owner: dict[int, tuple[int, int]] = {}  # world and body by the collider's index
-        side = math.ceil(math.sqrt(len(worlds)))
-        self.origin = np.array([[(k % side) * SPACING, 0.0, (k // side) * SPACING] for k in range(len(worlds))])
-        self.origin -= np.array([1.0, 0.0, 1.0]) * (side - 1) / 2 * SPACING
-        # Each first body stands in the middle of its cell: small ones are many of their sizes away from the camera.
-        self.middle = np.array([bodies[0].position for bodies in worlds]) * [self.scale, 0.0, self.scale]
-        self.origin -= self.middle
-        cells = [k % side % COLOURS * COLOURS + k // side % COLOURS for k in range(len(worlds))]
-        self.groups = [rapier.Group(1 << cell) for cell in cells]
-        everything = [((k, i), body) for k, bodies in enumerate(worlds) for i, body in enumerate(bodies)]
+        self.cells = _Cells.of(worlds, self.scale)
+        everything = {(k, i): body for k, bodies in enumerate(worlds) for i, body in enumerate(bodies)}
         steps = (np.arange((num_frames - 1) * self.substeps) + 1) / (fps * self.substeps)  # s, at their ends
         self.followers = {
-            (k, i): _along(body.follows, steps * path_fps) * self.scale + self.origin[k]
-            for (k, i), body in everything
+            (k, i): _along(body.follows, steps * path_fps) * self.scale + self.cells.origin[k]
+            for (k, i), body in everything.items()
             if body.follows is not None
         }
-        self.courses = {which: body.course for which, body in everything if body.course is not None}
+        self.courses = {which: body.course for which, body in everything.items() if body.course is not None}
         self.turns_of_courses = sorted({time for course in self.courses.values() for time in course.ends})
-        self.handles = [[self.add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
-        self.bodies = [[self.world.rigid_bodies[handle] for handle in row] for row in self.handles]
+        self.bodies = [[self.add(k, i, body) for i, body in enumerate(bodies)] for k, bodies in enumerate(worlds)]
         shape = len(worlds), len(worlds[0]), len(self.frames)
         self.positions, self.velocities, self.turns = (np.zeros((*shape, size)) for size in (3, 3, 4))
-        self.meetings: list[list[Meeting]] = [[] for _ in worlds]
+        self.meetings: dict[int, list[Meeting]] = defaultdict(list)  # by world
         self.awake = [{i for i, body in enumerate(bodies) if body.is_active} for bodies in worlds]
-        self.slow = np.array([[_slow(body) for body in bodies] for bodies in worlds])  # [K, B] m/s: less is at rest
+        slow = np.array([body.slow for body in everything.values()])
+        self.slow = slow.reshape(shape[:2])  # [K, B] m/s: less is at rest
         self.drift = np.zeros(shape[:2], bool)  # taken out: they go on in a straight line
-        self.touching: list[dict[int, set[int]]] = [{} for _ in worlds]
-        self.joined: dict[frozenset[tuple[int, int]], int] = {}  # pairs of colliders that touch, per pair of bodies
+        self.touching: dict[tuple[int, int], set[int]] = defaultdict(set)  # by world and body: its others
+        self.joined = Counter[frozenset[tuple[int, int]]]()  # pairs of colliders that touch, per pair of bodies
         self.recorded: _Recorded | None = None  # None: another body moves since the last frame
         self.kept: list[_Frame] = []  # what was recorded since the last check
 
@@ -245,20 +250,14 @@ class _Engine:
         still &= np.linalg.norm(self.velocities[:, :, row - 1], axis=2) < self.slow
         return bool((still | self.drift).all())
 
-    def add(self, k: int, i: int, body: RigidShape) -> rapier.RigidBodyHandle:
+    def add(self, k: int, i: int, body: RigidShape) -> rapier.RigidBody:
         """Adds a body; what neither moves nor is touched costs nothing."""
-        x, y, z = (np.array(body.position) * self.scale + self.origin[k]).tolist()
+        x, y, z = (np.array(body.position) * self.scale + self.cells.origin[k]).tolist()
         builder = rapier.RigidBody.fixed() if body.fixed else rapier.RigidBody.dynamic()
         if body.follows is not None:
             builder = rapier.RigidBody.kinematic_position_based()
         lift = GAP if body.falls and not body.ghost else 0.0
-        rotation = (0.0, body.yaw, 0.0)  # axis times angle, radians
-        if body.turn is not None:
-            a, b, c, w = body.turn
-            length = math.sqrt(a * a + b * b + c * c)
-            angle = 2 * math.atan2(length, w) / max(length, 1e-12)
-            rotation = (a * angle, b * angle, c * angle)
-        builder = builder.translation((x, y + lift, z)).rotation(rotation)
+        builder = builder.translation((x, y + lift, z)).rotation(body.rotation)
         builder = builder.gravity_scale(1.0 if body.falls else 0.0).enabled(not body.absent)
         if body.is_active:
             x, y, z = (v * self.scale for v in body.velocity)
@@ -269,7 +268,7 @@ class _Engine:
                 builder = builder.angvel((z / radius, 0.0, -x / radius))
         else:
             builder = builder.sleeping(True)
-        group = rapier.InteractionGroups(self.groups[k], self.groups[k])
+        group = rapier.InteractionGroups(self.cells.groups[k], self.cells.groups[k])
         colliders: list[rapier.Collider | rapier.ColliderBuilder] = [
             _combined(part.friction(0.0 if body.glides else body.friction))
             .restitution(body.restitution)
@@ -281,9 +280,9 @@ class _Engine:
         if body.middle is not None and body.hollow is None:
             builder = builder.additional_mass_properties(_mass_properties(body, self.scale))
         handle = self.world.add_body(builder, colliders=colliders)
-        for collider in self.world.rigid_bodies[handle].colliders:
-            self.owner[collider.index] = k, i
-        return handle
+        added = self.world.rigid_bodies[handle]
+        self.owner.update({collider.index: (k, i) for collider in added.colliders})
+        return added
 
     def advance(self, frame: int) -> None:
         """From one recorded frame to the next."""
@@ -298,7 +297,7 @@ class _Engine:
                 first, second = event.collider1.index, event.collider2.index
                 # Containers have many colliders: bodies begin to touch with the first pair of them.
                 pair = frozenset((self.owner.get(first, FLOOR), self.owner.get(second, FLOOR)))
-                touching = self.joined.get(pair, 0)
+                touching = self.joined[pair]
                 self.joined[pair] = touching + 1 if event.started else max(0, touching - 1)
                 if event.started and touching == 0:
                     self.meet(time, first, second, before)
@@ -341,20 +340,23 @@ class _Engine:
         self.meetings[k].append(Meeting(time, a, b, impulse))
         if b is None or self.worlds[k][a].is_ghostly or self.worlds[k][b].is_ghostly:
             return
-        self.touching[k].setdefault(a, set()).add(b)
-        self.touching[k].setdefault(b, set()).add(a)
+        self.touching[k, a].add(b)
+        self.touching[k, b].add(a)
         if not {a, b} & self.awake[k]:  # bodies that stand close together touch when nothing moves
             return
         self.wake(k, {a, b})
         one, other = self.worlds[k][a], self.worlds[k][b]
-        if time < AT_START and (one.stands_on(other) or other.stands_on(one)):
-            return
-        for i in (a, b):
+        if time >= AT_START or not (one.stands_on(other) or other.stands_on(one)):
+            self.end_gliding(k, (a, b))
+
+    def end_gliding(self, k: int, met: tuple[int, int]) -> None:
+        """Of two bodies that meet, releases what glides; where its course ends at a contact, both stop."""
+        for i in met:
             if self.worlds[k][i].glides:
                 course = self.courses.get((k, i))
                 self.release(k, i)
                 if course is not None and course.halts:
-                    for stopped in (self.bodies[k][each] for each in (a, b)):
+                    for stopped in (self.bodies[k][each] for each in met):
                         stopped.linvel = stopped.angvel = rapier.Vec3(0.0, 0.0, 0.0)
 
     def wake(self, k: int, bodies: set[int]) -> None:
@@ -364,7 +366,7 @@ class _Engine:
             i = waiting.pop()
             self.awake[k].add(i)
             self.recorded = None
-            waiting += self.touching[k].get(i, set()) - self.awake[k]
+            waiting += self.touching[k, i] - self.awake[k]
 
     def record(self, which: _Recorded) -> None:
         """Keeps where some bodies are."""
@@ -382,13 +384,13 @@ class _Engine:
                 continue
             k, i = which.places
             positions, velocities = (np.array([value.to_tuple() for value in values]) for values in moving_points)
-            self.positions[k, i, at] = (positions - self.origin[k]) / self.scale
+            self.positions[k, i, at] = (positions - self.cells.origin[k]) / self.scale
             self.velocities[k, i, at] = velocities / self.scale
             if self.records_turns:
                 self.turns[k, i, at] = np.array([(turn.i, turn.j, turn.k, turn.w) for turn in turns])
         self.kept.clear()
         ahead = self.velocities[:, :, row] * (CHECKED * self.every / self.fps)  # until the next check
-        away = (self.positions[:, :, row] + ahead) * self.scale - self.middle[:, None]
+        away = (self.positions[:, :, row] + ahead) * self.scale - self.cells.middle[:, None]
         far = (np.abs(away[..., [0, 2]]).max(axis=2) > REACH) & ~self.drift
         for k, i in np.argwhere(far).tolist():
             if i in self.awake[k]:
@@ -403,6 +405,37 @@ class _Engine:
             self.bodies[k][i].is_enabled = False
             self.drift[k, i], self.recorded = True, None
             self.velocities[k, i, row, 1] = 0.0
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Where worlds stand side by side inside the engine, each with its first body in the middle."""
+
+    origin: Floats  # [K, 3] m inside the engine
+    middle: Floats  # [K, 3] m inside the engine, from the origin: small bodies are far away from the camera
+    groups: tuple[rapier.Group, ...]  # of collisions
+
+    @staticmethod
+    def of(worlds: Sequence[Sequence[RigidShape]], scale: float) -> _Cells:
+        """In a square."""
+        side = math.ceil(math.sqrt(len(worlds)))
+        places = [(k % side, k // side) for k in range(len(worlds))]
+        origin = np.array([[x * SPACING, 0.0, z * SPACING] for x, z in places])
+        origin -= np.array([1.0, 0.0, 1.0]) * (side - 1) / 2 * SPACING
+        middle = np.array([bodies[0].position for bodies in worlds]) * [scale, 0.0, scale]
+        groups = tuple(rapier.Group(1 << (x % COLOURS * COLOURS + z % COLOURS)) for x, z in places)
+        return _Cells(origin - middle, middle, groups)
+
+
+def _empty_world(scale: float, step: float) -> rapier.PhysicsWorld:
+    """A floor under gravity, in steps of so many seconds."""
+    world = rapier.PhysicsWorld(gravity=(0.0, -min(GRAVITY * scale, MOST_GRAVITY), 0.0))
+    world.set_num_threads(1)
+    world.integration_parameters.dt = step
+    world.integration_parameters.normalized_max_corrective_velocity = 1.0  # m/s: bodies that overlap part slowly
+    floor = rapier.Collider.halfspace((0.0, 1.0, 0.0)).friction(FLOOR_FRICTION).restitution(FLOOR_RESTITUTION)
+    world.add_collider(_combined(floor))
+    return world
 
 
 @dataclass(frozen=True)
@@ -436,12 +469,6 @@ def _combined(collider: rapier.ColliderBuilder) -> rapier.ColliderBuilder:
     return collider.friction_combine_rule(rule).restitution_combine_rule(rule)
 
 
-def _slow(body: RigidShape) -> float:
-    """The speed (m/s) below which a body is at rest; what glides slowly from the start is not."""
-    glides = math.hypot(*body.velocity) if body.glides else 0.0
-    return min(AT_REST * body.half_width, glides / 2) if glides else AT_REST * body.half_width
-
-
 def _mass_properties(body: RigidShape, scale: float) -> rapier.MassProperties:
     """Of a solid body whose centre of mass is not in its middle: as heavy as if it were of one stuff."""
     width, depth, height = (half * scale for half in (body.half_width, body.half_depth, body.half_height))
@@ -455,27 +482,31 @@ def _mass_properties(body: RigidShape, scale: float) -> rapier.MassProperties:
 
 
 def _colliders(body: RigidShape, scale: float) -> list[rapier.ColliderBuilder]:
-    """Of one solid piece, or a container's floor and the convex segments of the wall that stands on it."""
-    width, height, hollow = body.half_width * scale, body.half_height * scale, body.hollow
+    """Of one solid piece, of the convex pieces of a drawing, or of a container."""
     if body.pieces:
         ends = np.array([-1.0, 1.0]) * body.half_depth
         solids = [[(x, y, z) for x, y in corners.tolist() for z in ends] for corners in body.pieces]
         return [rapier.Collider.convex_hull(np.array(each) * scale).density(body.density) for each in solids]
-    if hollow is None:
-        if body.shape == "sphere":
-            solid = rapier.Collider.ball(width)
-        elif body.shape == "box":
-            solid = rapier.Collider.cuboid(width, height, body.half_depth * scale)
-        elif body.shape == "cone":
-            solid = rapier.Collider.cone(height, width)
-        elif body.base < 1:
-            low = max(body.waist, LEAST_WAIST) * height
-            foot = rapier.Collider.cylinder(low, body.base * width).translation((0.0, low - height, 0.0))
-            rest = rapier.Collider.cylinder(height - low, width).translation((0.0, low, 0.0))
-            return [part.density(0.0 if body.middle is not None else body.density) for part in (foot, rest)]
-        else:
-            solid = rapier.Collider.cylinder(height, width)
-        return [solid.density(0.0 if body.middle is not None else body.density)]
+    if body.hollow is not None:
+        return _walls(body, body.hollow, scale)
+    width, height = body.half_width * scale, body.half_height * scale
+    if body.shape == "sphere":
+        solids = [rapier.Collider.ball(width)]
+    elif body.shape == "box":
+        solids = [rapier.Collider.cuboid(width, height, body.half_depth * scale)]
+    elif body.shape == "cone":
+        solids = [rapier.Collider.cone(height, width)]
+    elif body.base < 1:
+        low = max(body.waist, LEAST_WAIST) * height
+        foot = rapier.Collider.cylinder(low, body.base * width).translation((0.0, low - height, 0.0))
+        solids = [foot, rapier.Collider.cylinder(height - low, width).translation((0.0, low, 0.0))]
+    else:
+        solids = [rapier.Collider.cylinder(height, width)]
+    return [solid.density(0.0 if body.middle is not None else body.density) for solid in solids]
+
+
+def _walls(body: RigidShape, hollow: Hollow, scale: float) -> list[rapier.ColliderBuilder]:
+    """A container's floor and the convex segments of the wall that stands on it."""
     half_width, half_height = body.half_width, body.half_height
     foot = hollow.bottom + half_width - hollow.opening  # m: outer radius of the floor, or half its side
     turn = math.pi / hollow.sides

@@ -162,13 +162,10 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
     What is shown must not contradict what is answered: where an answer is sure and the likeliest world differs from
     it, the likeliest world of those that agree is shown.
     """
-    given, queries, of_shown = (world,), [query], None if query is None else query.of_shown(world)
+    of_shown = None if query is None else query.of_shown(world)
+    given, queries = (world,), [query]
     if world.removed or world.placed_before:
-        as_it_is = of_shown
-        if query is not None and query.asked.form == "changes":  # of the unchanged world: what would change
-            form = "what-happens" if query.target is None else "whether"
-            as_it_is = replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
-        given, queries = (world, world.as_it_is()), [query, as_it_is]
+        given, queries = (world, world.as_it_is()), [query, None if query is None else _of_unchanged(query, world)]
     if size == 0:
         pairs = zip(given, queries, strict=True)
         return tuple(EnsembleResult(each, _run(each, likeliest()), None, asked, None) for each, asked in pairs)
@@ -178,14 +175,26 @@ def run_ensemble(world: WorldInput, query: Query | None, size: int) -> tuple[Ens
         worlds, decided, queries[0] = _run_until_settled(given, queries, rows)
         shown = likely.result()
     rows = rows[: len(worlds[0].worlds.runs)]
-    if of_shown is not None and any(each is not None and each.sure for each in decided):
+    if of_shown is not None:
         shown = _agreeing(given, of_shown, decided, rows, worlds, shown)
-    for place, (each, world_shown) in enumerate(zip(decided, shown, strict=True)):
-        if of_shown is not None and each is not None and each.time_band is not None:
-            time, (early, late) = float(_happens(of_shown, world_shown.events)[0]), each.time_band
-            # One time for one event: that of what is shown, unless most others have it much earlier, or later.
-            decided[place] = replace(each, time=time) if early <= time <= late else each
+        decided = [_at_shown_time(*each, of_shown) for each in zip(decided, shown, strict=True)]
     return tuple(EnsembleResult(*parts) for parts in zip(given, shown, worlds, queries, decided, strict=True))
+
+
+def _of_unchanged(query: Query, world: WorldInput) -> Query:
+    """What is asked of the world as it is: as of the changed one but, where a change is asked about, what changes."""
+    if query.asked.form != "changes":
+        return query.of_shown(world)
+    form = "what-happens" if query.target is None else "whether"
+    return replace(query, asked=query.asked.model_copy(update={"form": form, "negated": False}))
+
+
+def _at_shown_time(decided: Decided | None, shown: ObservedWorlds, query: Query) -> Decided | None:
+    """With one time for one event: that of what is shown, unless most others have it much earlier, or later."""
+    if decided is None or decided.time_band is None:
+        return decided
+    time, (early, late) = float(_happens(query, shown.events)[0]), decided.time_band
+    return replace(decided, time=time) if early <= time <= late else decided
 
 
 def batches(size: int) -> tuple[int, ...]:
@@ -204,10 +213,7 @@ def _run_until_settled(
         part = slice(count, most)
         run = [each.run(part) for each in drawn]
         if query is not None and query.is_decidable and query.has_own_worlds:
-            there = _observed(given[0], run[0], rows[part])
-            query = _with_met(query, there) if query.meets_more else query
-            more = [_told_of(query, each, drawn[0], there, part) for each in query.among]
-            told = [one.joined(other) for one, other in zip(told, more, strict=True)] if count else more
+            query, told = _tell_candidates(query, told, drawn[0], _observed(given[0], run[0], rows[part]), part)
         if count:
             layouts = [each.layout.of(slice(0, most)) for each in drawn]
             run = [each.worlds.joined(*more) for each, more in zip(worlds, zip(run, layouts, strict=True), strict=True)]
@@ -218,6 +224,15 @@ def _run_until_settled(
         if len(verdicts) == len(decided) and all(is_settled(each, query, count, len(rows)) for each in verdicts):
             break
     return worlds, decided, query
+
+
+def _tell_candidates(
+    query: Query, told: Sequence[Told], drawn: DrawnWorlds, there: ObservedWorlds, part: slice
+) -> tuple[Query, list[Told]]:
+    """The query with all its candidates, and what some more worlds tell of each, beside what was told before."""
+    query = _with_met(query, there) if query.meets_more else query
+    more = [_told_of(query, each, drawn, there, part) for each in query.among]
+    return query, [one.joined(other) for one, other in zip(told, more, strict=True)] if told else more
 
 
 def _with_met(query: Query, there: ObservedWorlds) -> Query:
@@ -313,6 +328,8 @@ def _agreeing(
 ) -> list[ObservedWorlds]:
     """The likeliest world, with its counterpart, that shows what most of the ensemble does."""
     sure = [each is not None and each.sure for each in decided]
+    if not any(sure):
+        return shown
     found = _verdicts(query, sure, worlds)
     wanted = tuple(Counter(column).most_common(1)[0][0] for column in zip(*found, strict=True))
     if _verdicts(query, sure, shown)[0] == wanted:

@@ -2,15 +2,16 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.physics.ballistic import NEAREST_FREE, has_passed
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import AT_START, RigidShape, WorldRun
+from cow_service.physics.engine import AT_START, TIPPED, RigidShape, WorldRun
 from cow_service.physics.layout import Layout
 from cow_service.physics.world import Worlds
 from cow_service.records import Encounter, EncounterKind
@@ -19,13 +20,11 @@ from cow_service.vision.types import Floats, Mask
 
 NEVER = math.inf
 DISPLACED = 0.1  # of a body's half width: what is displaced less was not set in motion
-TIPPED = math.radians(45)  # an upright axis that leans more has tipped over
 COVERED = 0.3  # share of a silhouette from which it counts as covered
 ANY_PART = 0.06  # share from which a part of it is covered: less is an inexact outline
 COVERED_SIGMA = 0.2  # of its logarithm: outlines are inexact, and so is what people call hidden
 KINDS: tuple[EncounterKind, ...] = ("touches", "occludes", "occluded-by")
 PerKind = dict[EncounterKind, Floats]  # [K, B] each
-PASSED = 0.08  # of its first depth: closer than this, a body has passed the camera
 SAMPLES = 96  # points of a silhouette that are looked up in the other
 CHUNK = 2048  # draws and frames at a time, to bound the memory
 
@@ -56,7 +55,7 @@ def seen_paths(worlds: Worlds, body: int) -> SeenPaths:
         before, first = worlds.layout.cameras.project(shown[:, None])
         before = before[:, 0]
     first = np.maximum(first, 1e-9)
-    return SeenPaths(points, depth, first / np.maximum(depth, PASSED * first), depth <= PASSED * first, before)
+    return SeenPaths(points, depth, first / np.maximum(depth, NEAREST_FREE * first), has_passed(depth, first), before)
 
 
 def turned(turns: Floats, vector: Floats) -> Floats:
@@ -168,29 +167,25 @@ class _EventsOf(dict[int, Events]):
         self.worlds, self.bodies, self.draws, self.paths = worlds, bodies, draws, paths
 
     def __missing__(self, subject: int) -> Events:
+        worlds, path = self.worlds, self.paths[subject]
+        on, count = worlds.layout.supports[subject], len(self.bodies)
+        beneath = [] if on is None else [on]
+        eligible = np.ones(count, bool)
+        eligible[[0, subject, *beneath, *worlds.layout.absent]] = False
+        ignored = {subject, *beneath, *worlds.layout.loads_of(subject)}
+        touches = self.touches(subject, ignored)
+        times: PerKind = {"touches": touches}
+        partly: PerKind = {"touches": touches}
+        most: PerKind = {"touches": np.zeros(touches.shape)}
+        for kind in KINDS[1:]:
+            times[kind], partly[kind] = (np.full(touches.shape, NEVER) for _ in range(2))
+            most[kind] = np.zeros(touches.shape)
         enough = COVERED * np.exp(COVERED_SIGMA * self.draws[:, COLUMN["outline"]])[:, None]
-        eligible, count = np.ones(len(self.bodies), bool), len(self.bodies)
-        on, loads = self.worlds.layout.supports[subject], self.worlds.layout.loads_of(subject)
-        eligible[[0, subject, *([] if on is None else [on]), *self.worlds.layout.absent]] = False
-        times: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
-        partly: PerKind = {kind: np.full((len(self.draws), count), NEVER) for kind in KINDS}
-        most: PerKind = {kind: np.zeros((len(self.draws), count)) for kind in KINDS}
-        # When it first touches each other one, once it moves itself.
-        for k, (shapes, run) in enumerate(zip(self.worlds.shapes, self.worlds.runs, strict=True)):
-            since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
-            for meeting in run.meetings:
-                if meeting.b is not None and subject in (meeting.a, meeting.b) and meeting.time >= since:
-                    other = meeting.b if meeting.a == subject else meeting.a
-                    if other != on and other not in loads:
-                        times["touches"][k, other] = min(times["touches"][k, other], meeting.time)
-        partly["touches"] = times["touches"]
-        path, step = self.paths[subject], self.worlds.every / self.worlds.fps
+        step = worlds.every / worlds.fps
         clock = np.arange(path.depth.shape[1]) * step
-        for other in range(count):
-            if other in (subject, on, *self.worlds.layout.absent) or other in loads:
-                continue
+        for other in set(range(count)) - ignored - worlds.layout.absent:
             found = shares(self.bodies[subject].mask, path, self.bodies[other].mask, self.paths[other])
-            before = clock[None] <= times["touches"][:, other : other + 1] + step
+            before = clock[None] <= touches[:, other : other + 1] + step
             for kind, values in zip(KINDS[1:], (found.covers, found.covered), strict=True):
                 seen = np.where(before, values, 0.0)
                 most[kind][:, other] = seen.max(axis=1)
@@ -198,6 +193,19 @@ class _EventsOf(dict[int, Events]):
                 partly[kind][:, other] = np.where(seen >= ANY_PART, clock[None], NEVER).min(axis=1)
         self[subject] = Events(times, most, eligible, partly, subject)
         return self[subject]
+
+    def touches(self, subject: int, ignored: Collection[int]) -> Floats:
+        """[K, B] s: when it first touches each other one that is not ignored, once it moves itself."""
+        times = np.full((len(self.draws), len(self.bodies)), NEVER)
+        for k, (shapes, run) in enumerate(zip(self.worlds.shapes, self.worlds.runs, strict=True)):
+            since = set_off(shapes, run).get(subject, NEVER) if subject else 0.0
+            for meeting in run.meetings:
+                if meeting.b is None or subject not in (meeting.a, meeting.b) or meeting.time < since:
+                    continue
+                other = meeting.b if meeting.a == subject else meeting.a
+                if other not in ignored:
+                    times[k, other] = min(times[k, other], meeting.time)
+        return times
 
 
 @dataclass(frozen=True)
@@ -231,7 +239,7 @@ def find_world_events(worlds: Worlds, bodies: Sequence[SeenBody], draws: Floats,
     if which:
         turns = np.concatenate([runs[k].turns[i] for k, i in which])
         upright = turned(turns, np.array([0.0, 1.0, 0.0]))[:, 1].reshape(len(which), -1)
-        leans[tuple(np.array(which).T)] = upright < math.cos(TIPPED)
+        leans[tuple(np.array(which).T)] = upright < TIPPED
     landed = np.full((len(runs), count), NEVER)
     for k, run in enumerate(runs):
         for meeting in run.meetings:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,34 +22,50 @@ from cow_service.records import BBox, DepthEstimate, Shape
 from cow_service.vision.masks import CroppedMask, eroded
 from cow_service.vision.types import Floats, Floats32, Mask
 
-SAMPLES = 6000  # pixels that the floor is sought in
-TRIES = 300  # planes through three of them
-LEVEL = math.radians(20)  # largest roll of the floor against the assumed vertical
-STEEPEST, FLATTEST = math.radians(79), math.radians(-10)  # pitches at which a floor is a floor
-LEAST_TOLERANCE = 0.01  # of the depth: how far a pixel of the floor may lie off its plane
-BELOW = 3.0  # how much more a pixel that would lie under the floor counts than one on it
-LEAST_FLOOR = 0.1  # smallest share of floor among the pixels that show no body
-FARTHEST = 8.0  # of the nearest depths: what lies beyond tells little of the floor that things stand on
-CELLS = 3, 4  # rows and columns: errors of a depth map are alike within such a part of the image
-SURE = 0.003  # of the depth: no map is more exact
-LEAST_SEEN = 0.3  # of a body's pixels: with fewer known depths it is not measured
-LEAST_PIXELS = 24
-EDGE = 5  # px across: at outlines depths are those of neither side
-SMOOTHED = 2.5  # px: standard deviation over which the depths of a body are averaged
-TRIM = 2.0  # percent of the points at either end that are left out
-FROM_ABOVE = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
-TOUCHES = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
-AROUND = 0.3  # of a body's width and height: so far around its foot the floor is looked at
-ALIKE = 0.3  # share of the depth error that remains if the error of the floor next to it is known
-GRAIN = 6  # over such a part of the width of an image the errors of depth maps change altogether
-BENT = 0.5  # of its width: with so much doubt of how deep a body is, the map does not tell
-ON_TOP = 0.3  # of a body's height: largest distance of its lower end from the top of its support
-BREAK = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
-SPARSE = 0.02  # of a body's pixels: hardly more lie in such a gap
-LEAST_PART = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
-AT_FOOT = 0.15  # of the distance of a body's foot: so far from it may begin what stands there
-LEAST_TOP = 4  # edges that outlines lose: a top that would fill more if it were half as deep as wide shows its depth
-RAISED = 0.2  # of the pixels of a thing are nearer than the floor behind it
+
+class FloorSearch(NamedTuple):
+    """How the floor is found in a depth map."""
+
+    samples: int = 6000  # pixels that the floor is sought in
+    tries: int = 300  # planes through three of them
+    level: float = math.radians(20)  # largest roll of the floor against the assumed vertical
+    steepest: float = math.radians(79)  # pitches at which a floor is a floor
+    flattest: float = math.radians(-10)
+    least_tolerance: float = 0.01  # of the depth: how far a pixel of the floor may lie off its plane
+    below: float = 3.0  # how much more a pixel that would lie under the floor counts than one on it
+    least_floor: float = 0.1  # smallest share of floor among the pixels that show no body
+    farthest: float = 8.0  # of the nearest depths: what lies beyond tells little of the floor that things stand on
+    cells: tuple[int, int] = (3, 4)  # rows and columns: errors of a depth map are alike within such a part of the image
+    sure: float = 0.003  # of the depth: no map is more exact
+
+
+FLOOR = FloorSearch()
+
+
+class BodyReading(NamedTuple):
+    """How bodies are measured in a depth map."""
+
+    least_seen: float = 0.3  # of a body's pixels: with fewer known depths it is not measured
+    least_pixels: int = 24
+    edge: int = 5  # px across: at outlines depths are those of neither side
+    smoothed: float = 2.5  # px: standard deviation over which the depths of a body are averaged
+    trim: float = 2.0  # percent of the points at either end that are left out
+    from_above: float = 0.12  # sine of the angle at which a top is looked down on: then it shows how deep a body is
+    touches: float = 0.05  # of the depth of a ball: so much nearer or farther than on the floor it may lie on it
+    around: float = 0.3  # of a body's width and height: so far around its foot the floor is looked at
+    alike: float = 0.3  # share of the depth error that remains if the error of the floor next to it is known
+    grain: int = 6  # over such a part of the width of an image the errors of depth maps change altogether
+    bent: float = 0.5  # of its width: with so much doubt of how deep a body is, the map does not tell
+    on_top: float = 0.3  # of a body's height: largest distance of its lower end from the top of its support
+    gap: float = 0.3  # of the longer side of a body: a gap in depth so wide lies between two things
+    sparse: float = 0.02  # of a body's pixels: hardly more lie in such a gap
+    least_part: float = 0.15  # of a body's pixels: fewer on one side of a gap are no thing
+    at_foot: float = 0.15  # of the distance of a body's foot: so far from it may begin what stands there
+    least_top: int = 4  # edges that outlines lose: a top that, half as deep as wide, fills more shows its depth
+    raised: float = 0.2  # of the pixels of a thing are nearer than the floor behind it
+
+
+BODY = BodyReading()
 
 
 @dataclass(frozen=True)
@@ -67,7 +83,7 @@ class DepthMap:
         x0, y0, x1, y1 = bbox
         across, down = (x1 - x0) / 4, (y1 - y0) / 4
         inner = self.depth[int(y0 + down) : math.ceil(y1 - down), int(x0 + across) : math.ceil(x1 - across)]
-        if self.scale is None or not inner.size or np.isfinite(inner).mean() < LEAST_SEEN:
+        if self.scale is None or not inner.size or np.isfinite(inner).mean() < BODY.least_seen:
             return None
         return float(np.nanmedian(inner)) * self.scale / focal
 
@@ -177,9 +193,9 @@ def _supports(
     """What each body stands on: what is beneath its middle and ends where it begins; as seen, where that is unknown."""
     found = list(seen)
     for index, (body, own) in enumerate(zip(bodies, footprints, strict=True)):
-        if own is None or (body.prior is not None and body.prior.stands_on is not None):
+        if own is None or body.prior.stands_on is not None:
             continue
-        allowed = ON_TOP * (own.top - own.bottom) + deviation / 2 * own.distance
+        allowed = BODY.on_top * (own.top - own.bottom) + deviation / 2 * own.distance
         under = {
             other: abs(own.bottom - each.top)
             for other, each in enumerate(footprints)
@@ -199,7 +215,7 @@ def rise_above(given: DepthMap, measured: Measurement, boxes: Sequence[BBox]) ->
         y, x = np.nonzero(np.isfinite(depth))
         rays = _rays(x + x0, y + y0, given.depth.shape[1], given.depth.shape[0], measured.focal)
         off = depth[y, x] * (rays @ -measured.floor.axes[1]) / measured.floor.height
-        if not len(y) or np.percentile(off, 100 * RAISED) < 1 - LEAST_TOLERANCE - measured.deviation:
+        if not len(y) or np.percentile(off, 100 * BODY.raised) < 1 - FLOOR.least_tolerance - measured.deviation:
             found.append(box)
     return tuple(found)
 
@@ -215,24 +231,24 @@ def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], rol
     for body in bodies:
         body.add_to(covered)
     free = np.flatnonzero(~covered & np.isfinite(given.depth))
-    if len(free) < LEAST_PIXELS:
+    if len(free) < BODY.least_pixels:
         return None
     rng = np.random.default_rng(0)  # the same map must give the same floor
-    chosen = np.stack(np.unravel_index(free[rng.integers(0, len(free), SAMPLES)], (height, width)), axis=1)
+    chosen = np.stack(np.unravel_index(free[rng.integers(0, len(free), FLOOR.samples)], (height, width)), axis=1)
     depth = given.depth[tuple(chosen.T)].astype(np.float64)
-    near = depth < FARTHEST * np.percentile(depth, 5)
+    near = depth < FLOOR.farthest * np.percentile(depth, 5)
     chosen, depth = chosen[near], depth[near]
     rays = _rays(chosen[:, 1], chosen[:, 0], width, height, focal)
     rows = rays * depth[:, None]  # a plane N has rows @ N = 1
-    tolerance = LEAST_TOLERANCE + given.deviation / 2
-    threes = rows[rng.integers(0, len(rows), (TRIES, 3))]
+    tolerance = FLOOR.least_tolerance + given.deviation / 2
+    threes = rows[rng.integers(0, len(rows), (FLOOR.tries, 3))]
     threes = threes[np.abs(np.linalg.det(threes)) > 1e-9 * np.median(depth) ** 3]
     planes = np.linalg.solve(threes, np.ones((len(threes), 3, 1)))[..., 0]
     planes = planes[[_is_level(plane, roll) for plane in planes]]
     if not len(planes):
         return None
     off = planes @ rows.T - 1  # how much farther than the plane a pixel is, of its depth
-    score = (np.abs(off) < tolerance).sum(axis=1) - BELOW * (off > 3 * tolerance).sum(axis=1)
+    score = (np.abs(off) < tolerance).sum(axis=1) - FLOOR.below * (off > 3 * tolerance).sum(axis=1)
     plane = planes[int(score.argmax())]
     for _ in range(6):
         off = rows @ plane - 1
@@ -242,13 +258,13 @@ def find_floor(given: DepthMap, focal: float, bodies: Sequence[CroppedMask], rol
     off = rows @ plane - 1
     near = np.abs(off) < 2 * tolerance
     share = float(near.mean())
-    if share < LEAST_FLOOR or not _is_level(plane, roll) or float(score.max()) <= 0:
+    if share < FLOOR.least_floor or not _is_level(plane, roll) or float(score.max()) <= 0:
         return None
     # Neighbouring pixels have the same error: this sums over parts of the image with one error each.
-    used, places = rows[near], chosen[near] * np.array(CELLS) // np.array([height, width])
+    used, places = rows[near], chosen[near] * np.array(FLOOR.cells) // np.array([height, width])
     inverse = np.linalg.inv(used.T @ used)
     parts = [used[(places == cell).all(axis=1)].sum(axis=0) for cell in np.unique(places, axis=0)]
-    spread = max(SURE, given.deviation, float(np.std(off[near])))
+    spread = max(FLOOR.sure, given.deviation, float(np.std(off[near])))
     root = np.stack(parts) @ inverse * spread
     pitch, found_roll, distance = _of_plane(plane)
     steps = np.stack([np.array(_of_plane(plane + each)) - [pitch, found_roll, distance] for each in root])
@@ -271,7 +287,7 @@ def _of_plane(plane: Floats) -> tuple[float, float, float]:
 
 def _is_level(plane: Floats, roll: float) -> bool:
     pitch, found, _ = _of_plane(plane)
-    return FLATTEST < pitch < STEEPEST and abs(math.remainder(found - roll, math.tau)) < LEVEL
+    return FLOOR.flattest < pitch < FLOOR.steepest and abs(math.remainder(found - roll, math.tau)) < FLOOR.level
 
 
 def camera_over(floor: Floor, fit: CameraFit) -> CameraFit:
@@ -292,12 +308,12 @@ def measure(
     for body in bodies:
         body.mask.add_to(covered)
     filled = np.where(known, given.depth, np.float32(0)).astype(np.float32, copy=False)
-    smooth = np.asarray(cv2.medianBlur(filled, EDGE), np.float32)
+    smooth = np.asarray(cv2.medianBlur(filled, BODY.edge), np.float32)
     known &= smooth > 0
     size, free, found = (known.shape[1], known.shape[0]), known & ~covered, list[Footprint | None]()
     for body, flies in zip(bodies, in_air, strict=True):
         off = None if flies else _floor_error(body, smooth, free, focal, floor, given.deviation)
-        deviation = SURE + (1.0 if off is None else ALIKE) * given.deviation
+        deviation = FLOOR.sure + (1.0 if off is None else BODY.alike) * given.deviation
         view = _View(body, flies, size, focal, floor, deviation, given.deviation)
         flat = _is_flat(view, smooth, known, off or 1.0)
         found.append(None if flat else _footprint(view, smooth, known, off or 1.0))
@@ -312,15 +328,15 @@ def _floor_error(
     Errors of a map are alike in neighbouring pixels: the body is off by the same. None if no floor is seen there.
     """
     (x0, y0, x1, y1), (height, width) = body.bbox, depth.shape
-    across, down = AROUND * (x1 - x0), AROUND * (y1 - y0)
+    across, down = BODY.around * (x1 - x0), BODY.around * (y1 - y0)
     rows = slice(max(0, int(y1 - down)), min(height, math.ceil(y1 + down)))
     columns = slice(max(0, int(x0 - across)), min(width, math.ceil(x1 + across)))
     y, x = np.nonzero(free[rows, columns])
     y, x = y + rows.start, x + columns.start
     lower = -floor.axes[1]  # the unit vector downwards
     off = depth[y, x] * (_rays(x, y, width, height, focal) @ lower) / floor.height
-    on_floor = off[np.abs(off - 1) < 3 * (LEAST_TOLERANCE + deviation)]
-    return float(np.median(on_floor)) if len(on_floor) >= max(LEAST_PIXELS, 0.3 * len(off)) else None
+    on_floor = off[np.abs(off - 1) < 3 * (FLOOR.least_tolerance + deviation)]
+    return float(np.median(on_floor)) if len(on_floor) >= max(BODY.least_pixels, 0.3 * len(off)) else None
 
 
 @dataclass(frozen=True)
@@ -347,28 +363,28 @@ def _is_flat(view: _View, depth: Floats32, known: Mask, off: float) -> bool:
     rows = slice(max(middle.start, mask.rows.start), min(middle.stop, mask.rows.stop))
     inside = mask.patch[rows.start - mask.rows.start : rows.stop - mask.rows.start] & known[rows, mask.columns]
     y, x = np.nonzero(inside)
-    if len(y) < LEAST_PIXELS:
+    if len(y) < BODY.least_pixels:
         return False
     lower = -view.floor.axes[1]
     rays = _rays(x + mask.columns.start, y + rows.start, width, height, view.focal)
     sink = rays @ lower / view.floor.height  # of what lies on the floor, one over the depth
     ratio = depth[rows, mask.columns][inside] / off * sink
     foot = float(_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], width, height, view.focal)[0] @ lower) / view.floor.height
-    tolerance = LEAST_TOLERANCE + view.deviation
+    tolerance = FLOOR.least_tolerance + view.deviation
     # How much nearer than the floor behind it what stands upright at the foot of the body would be.
     rises = 1.0 if view.flies else 1 - float(np.median(sink)) / max(foot, 1e-9)
-    return rises > 2 * tolerance and float(np.percentile(ratio, 100 * RAISED)) > 1 - min(tolerance, rises / 3)
+    return rises > 2 * tolerance and float(np.percentile(ratio, 100 * BODY.raised)) > 1 - min(tolerance, rises / 3)
 
 
 def _footprint(view: _View, depth: Floats32, known: Mask, off: float) -> Footprint | None:
     """Of one body, by depths [H, W] that are too large by a factor, and where they are known [H, W]."""
     body, focal, floor, (width, height) = view.body, view.focal, view.floor, view.size
     mask = body.mask
-    inner = eroded(np.pad(mask.patch, EDGE), EDGE)[EDGE:-EDGE, EDGE:-EDGE]
-    inner = inner if np.count_nonzero(inner) >= LEAST_PIXELS else mask.patch
+    inner = eroded(np.pad(mask.patch, BODY.edge), BODY.edge)[BODY.edge : -BODY.edge, BODY.edge : -BODY.edge]
+    inner = inner if np.count_nonzero(inner) >= BODY.least_pixels else mask.patch
     there = inner & known[mask.rows, mask.columns]
     share = np.count_nonzero(there) / max(1, np.count_nonzero(inner))
-    if share < LEAST_SEEN or np.count_nonzero(there) < LEAST_PIXELS:
+    if share < BODY.least_seen or np.count_nonzero(there) < BODY.least_pixels:
         return None
     y, x = np.nonzero(there)
     depth = depth[mask.rows, mask.columns] / np.float32(off)
@@ -386,9 +402,9 @@ def _footprint(view: _View, depth: Floats32, known: Mask, off: float) -> Footpri
         front = float(np.median(z[near] if near.any() else z))
         return _ball(view, front, share)
     points = floor.coordinates(_rays(x, y, width, height, focal) * z[:, None])
-    edge = EDGE / 2 * float(np.median(z)) / focal  # what the outline lost
+    edge = BODY.edge / 2 * float(np.median(z)) / focal  # what the outline lost
     # The error of the map is another one at the other side of a body, the more the wider that is seen.
-    bend = view.map_deviation * float(np.median(z)) * (body.bbox[2] - body.bbox[0]) / (width / GRAIN)
+    bend = view.map_deviation * float(np.median(z)) * (body.bbox[2] - body.bbox[0]) / (width / BODY.grain)
     return _upright(view, points, edge, bend, share)
 
 
@@ -400,7 +416,7 @@ def _ball(view: _View, front: float, share: float) -> Footprint:
     # Where it may as well touch the floor it does: then the floor tells its depth more exactly.
     sink = radius - float(ray[0] @ floor.axes[1])
     may_lie = not view.flies and sink > HORIZON
-    if may_lie and abs(floor.height / sink / depth - 1) < TOUCHES + view.deviation:
+    if may_lie and abs(floor.height / sink / depth - 1) < BODY.touches + view.deviation:
         depth = floor.height / sink
     across, up, ahead = floor.coordinates(ray * depth)[0].tolist()
     half = radius * depth
@@ -412,33 +428,33 @@ def _upright(view: _View, points: Floats, edge: float, bend: float, share: float
     body, floor, deviation = view.body, view.floor, view.deviation
     is_round = body.is_form_known and body.shape in ("cylinder", "cone")
     right, ahead = (float(value) for value in np.median(points[:, [0, 2]], axis=0))
-    bottom, top = (float(value) for value in np.percentile(points[:, 1], (TRIM, 100 - TRIM)))
-    across = math.atan2(ahead, right) - math.pi / 2  # the direction across the line of sight
-    yaw = across
+    bottom, top = (float(value) for value in np.percentile(points[:, 1], (BODY.trim, 100 - BODY.trim)))
+    yaw = math.atan2(ahead, right) - math.pi / 2  # across the line of sight
     if not is_round:
         _, sides, degrees = cv2.minAreaRect(np.asarray(_core(points[:, [0, 2]]), np.float32))
         # Of its two sides the one that lies across the line of sight.
         turned = math.radians(degrees)
-        yaw = turned + math.pi / 2 * round((across - turned) / (math.pi / 2)) if max(sides) > 0 else across
+        yaw = turned + math.pi / 2 * round((yaw - turned) / (math.pi / 2)) if max(sides) > 0 else yaw
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    low, high = np.percentile(points[:, [0, 2]] @ turn.T, (TRIM, 100 - TRIM), axis=0)
+    low, high = np.percentile(points[:, [0, 2]] @ turn.T, (BODY.trim, 100 - BODY.trim), axis=0)
     half_width, half_depth = ((high - low) / 2).tolist()
     half_width += edge
-    is_cube = body.prior is not None and body.prior.equal_sided
-    if is_round or is_cube:
+    is_cube = body.prior.equal_sided
+    is_deep_as_wide = is_round or is_cube
+    if is_deep_as_wide:
         half_depth, bend = half_width, 0.0
         high[1] = low[1] + 2 * half_width
-    elif bend > BENT * 2 * half_width:  # how deep it is cannot be distinguished from the error
+    elif bend > BODY.bent * 2 * half_width:  # how deep it is cannot be distinguished from the error
         half_depth = 0.0
     x, z = ((low + high) / 2 @ turn).tolist()
     distance = math.hypot(right, ahead, floor.height)
     near = max(float(low[1]), edge)
     shown = (floor.height - top) * (distance / near - distance / (near + half_width))  # of a top half as deep as wide
-    is_seen = (floor.height - top) / distance > FROM_ABOVE or shown > LEAST_TOP * edge
+    is_seen = (floor.height - top) / distance > BODY.from_above or shown > BODY.least_top * edge
     foot = bottom if view.flies else 0.0
     tall = half_width if is_cube else max((top + edge - foot) / 2, 1e-6)
     shape = body.shape if body.is_form_known else "box"
-    is_seen = (is_seen or is_round or is_cube) and half_depth > 0
+    is_seen = (is_seen or is_deep_as_wide) and half_depth > 0
     centre = x, foot + tall, z
     return Footprint(shape, centre, half_width, half_depth, tall, yaw, bottom, is_seen, deviation, bend, share)
 
@@ -452,30 +468,29 @@ def _of_one_thing(view: _View, points: Floats) -> Mask:
     floor, focal, deviation, steps = view.floor, view.focal, view.deviation, 4  # of a gap
     (x0, y0, x1, y1), away = view.body.bbox, np.hypot(points[:, 0], points[:, 2])
     middle = float(np.median(away))
-    step = max(BREAK * max(x1 - x0, y1 - y0) * middle / focal, 3 * deviation * middle) / steps
-    place = (np.clip(away - away.min(), 0, FARTHEST * middle) / step).astype(int)
+    step = max(BODY.gap * max(x1 - x0, y1 - y0) * middle / focal, 3 * deviation * middle) / steps
+    place = (np.clip(away - away.min(), 0, FLOOR.farthest * middle) / step).astype(int)
     shares = np.bincount(place, minlength=steps) / len(away)
-    is_gap = np.convolve(np.convolve(shares, np.ones(steps), "valid") < SPARSE, np.ones(steps)) > 0.5
+    is_gap = np.convolve(np.convolve(shares, np.ones(steps), "valid") < BODY.sparse, np.ones(steps)) > 0.5
     part = np.where(is_gap, 0, np.cumsum(np.diff(np.where(is_gap, 0, 1), prepend=0) > 0))[place]  # 0: in a gap
     parts = [part == number for number in range(1, int(part.max(initial=0)) + 1)]
-    parts = [each for each in parts if each.mean() > LEAST_PART]
+    parts = [each for each in parts if each.mean() > BODY.least_part]
     down = -_rays([(x0 + x1 - 1) / 2], [y1 - 0.5], *view.size, focal)[0] @ floor.axes.T
     foot = floor.height * math.hypot(down[0], down[2]) / max(down[1], HORIZON)
 
-    begins = [float(np.percentile(away[each], TRIM)) for each in parts]
-    fits = [
-        (abs(start / foot - 1) < AT_FOOT + deviation, each.sum()) for start, each in zip(begins, parts, strict=True)
-    ]
+    begins = [float(np.percentile(away[each], BODY.trim)) for each in parts]
+    near = [abs(start / foot - 1) < BODY.at_foot + deviation for start in begins]
+    fits = [(is_near, each.sum()) for is_near, each in zip(near, parts, strict=True)]
     return parts[fits.index(max(fits))] if parts else np.ones(len(away), bool)
 
 
 def blurred(values: Floats) -> Floats:
     """Values [h, w] smoothed over a few pixels."""
-    return np.asarray(cv2.GaussianBlur(values, (0, 0), SMOOTHED), np.float64)
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), BODY.smoothed), np.float64)
 
 
 def _core(spots: Floats) -> Floats:
     """Points [N, 2] without the few that lie far out."""
-    low, high = np.percentile(spots, (TRIM, 100 - TRIM), axis=0)
+    low, high = np.percentile(spots, (BODY.trim, 100 - BODY.trim), axis=0)
     kept = spots[((spots >= low) & (spots <= high)).all(axis=1)]
-    return kept if len(kept) >= LEAST_PIXELS // 2 else spots
+    return kept if len(kept) >= BODY.least_pixels // 2 else spots

@@ -77,11 +77,16 @@ class Layout:
         kept = self.without(range(count, len(self.bodies)))
         return replace(kept, bodies=kept.bodies[:count], supports=kept.supports[:count], absent=self.absent)
 
+    def loosened(self, gone: Collection[int]) -> set[int]:
+        """What stood on bodies that are gone: what stands on something that falls falls, too."""
+        loose: set[int] = set()
+        for _ in self.supports:
+            loose |= {i for i, on in enumerate(self.supports) if i not in gone and (on in gone or on in loose)}
+        return loose
+
     def without(self, taken: Collection[int]) -> Layout:
         """With some bodies taken away: what stood on them has no support."""
-        loose: set[int] = set()
-        for _ in self.supports:  # what stands on something that falls falls, too
-            loose |= {i for i, on in enumerate(self.supports) if i not in taken and (on in taken or on in loose)}
+        loose = self.loosened(taken)
         supports = tuple(None if on in taken else on for on in self.supports)
         unsupported = (self.unsupported | loose).difference(taken)
         return replace(self, supports=supports, unsupported=unsupported, absent=self.absent.union(taken))
@@ -92,9 +97,7 @@ class Layout:
 
     def rearranged(self, on: Mapping[int, int | None]) -> Layout:
         """With some bodies put elsewhere, where they stand `on` others or the floor: what stood on them falls."""
-        loose: set[int] = set()
-        for _ in self.supports:
-            loose |= {i for i, at in enumerate(self.supports) if i not in on and (at in on or at in loose)}
+        loose = self.loosened(on)
         supports = tuple(None if i in loose else on.get(i, at) for i, at in enumerate(self.supports))
         bodies = tuple(replace(body, stands=True) if i in on else body for i, body in enumerate(self.bodies))
         unsupported = (self.unsupported - on.keys()) | loose
@@ -119,35 +122,21 @@ def lay_out(
     cameras, parameters = Cameras.drawn(fit, size, draws)
     supports = supports_of(bodies, level) if measured is None else list(measured.supports)
     if measured is not None:
-        cameras, placed = _Measured(bodies, supports, motion, draws, measured).placed(cameras, parameters, fit)
+        view = _Measured(bodies, supports, motion, draws, measured)
     elif level is None:
-        cameras, placed = _Picture(bodies, supports, motion, draws).placed(cameras, parameters, fit)
+        view = _Picture(bodies, supports, motion, draws)
     else:
-        depth = cameras.focal * motion.metres_per_pixel.value
-        cameras = cameras.at_height((level - size[1] / 2) * depth / cameras.focal)
-        stands = [on != HANGS for on in supports]  # what is released may lie on a slope
-        stands[0] = stands[0] if motion.kind == "fall" else not bodies[0].flies(motion)
-        placed = [in_the_air(cameras, body.bbox, body.shape, depth) for body in bodies]
-        placed = [replace(body, stands=each) for body, each in zip(placed, stands, strict=True)]
+        view = _Drawing(bodies, supports, motion, draws, level - size[1] / 2)
+    cameras, placed = view.placed(cameras, parameters, fit)
     if motion.rises:
         placed[0] = replace(placed[0], stands=False)
-    places = {body.bbox: each for body, each in zip(bodies, placed, strict=True)}
-
-    def velocity_of(body: int, motion: Motion, speed_name: str = "speed") -> Floats:
-        goal = None if motion.towards is None else places.get(motion.towards.bbox)
-        others = [each for index, each in enumerate(placed) if index != body]
-        if level is not None:
-            return velocity_in_side_view(placed[body], motion, draws, goal, speed_name)
-        return velocity_towards(placed[body], motion, cameras, draws, goal, others, speed_name)
-
-    velocity = velocity_of(0, motion)
     turned = {"towards": None, "rises": motion.rises}
     legs = [motion.model_copy(update=turned | {"direction": s.direction, "depth": s.depth}) for s in motion.steps]
-    further = tuple(velocity_of(0, leg) for leg in legs)
-    also = {i: velocity_of(i, each, "other_speed") for i, each in others.items()}
+    velocity, *further = [view.velocity(cameras, placed, 0, leg, "speed") for leg in (motion, *legs)]
+    also = {i: view.velocity(cameras, placed, i, each, "other_speed") for i, each in others.items()}
     placed = placed if level is not None else _apart(placed)
     resting = tuple(on if each.stands and on != HANGS else None for on, each in zip(supports, placed, strict=True))
-    return Layout(cameras, tuple(placed), resting, velocity, further, also, parameters[:, 3:5])
+    return Layout(cameras, tuple(placed), resting, velocity, tuple(further), also, parameters[:, 3:5])
 
 
 def drawn_depths(body: SeenBody, draws: Floats) -> Floats:
@@ -197,6 +186,21 @@ class _Picture:
         flying = in_the_air(cameras, mover.bbox, mover.shape, depth)
         return cameras, [flying, *(self.body_at(i, cameras, depth) for i in range(1, len(bodies)))]
 
+    def velocity(
+        self, cameras: Cameras, placed: Sequence[LiftedBody], index: int, motion: Motion, speed_name: str
+    ) -> Floats:
+        """[K, 3] m/s right, up and ahead, with which one of the placed bodies sets out."""
+        others = [each for other, each in enumerate(placed) if other != index]
+        goal = self.goal_of(motion, placed)
+        return velocity_towards(placed[index], motion, cameras, self.draws, goal, others, speed_name)
+
+    def goal_of(self, motion: Motion, placed: Sequence[LiftedBody]) -> LiftedBody | None:
+        """What a motion leads towards, if it is a body."""
+        if motion.towards is None:
+            return None
+        goals = {body.bbox: each for body, each in zip(self.bodies, placed, strict=True)}
+        return goals.get(motion.towards.bbox)
+
     def below(self) -> int | None:
         """The body that is seen below the mover: of several, the one that lies beneath its middle the most."""
         x = (self.bodies[0].bbox[0] + self.bodies[0].bbox[2]) / 2
@@ -211,7 +215,7 @@ class _Picture:
     def body_at(self, index: int, cameras: Cameras, depth: Floats, depth_share: Floats | None = None) -> LiftedBody:
         """A body where it stands, or else in the air, about at the depth [K] (m) of the mover."""
         body = self.bodies[index]
-        said = None if body.prior is None else body.prior.height
+        said = body.prior.height
         if body.is_flying and said is not None:
             height = np.clip(said.value + said.deviation * self.draws[:, COLUMN["foot"]], 0, 0.95 * cameras.height)
             hanging = above(cameras, body.core, body.shape, self.draws, height)
@@ -263,6 +267,28 @@ class _Picture:
         along = np.abs((way * sight).sum(axis=1))
         across = np.sqrt(np.maximum(0.0, 1 - along**2))
         return (along + VEHICLE_WIDTH * across) / (across + VEHICLE_WIDTH * along)
+
+
+@dataclass(frozen=True)
+class _Drawing(_Picture):
+    """A drawing that is seen from the side: all bodies are equally far away."""
+
+    level: float  # px below the middle of the image: its floor
+
+    def placed(self, cameras: Cameras, parameters: Floats, fit: CameraFit) -> tuple[Cameras, list[LiftedBody]]:
+        """The cameras above the floor, and the bodies."""
+        depth = cameras.focal * self.motion.metres_per_pixel.value
+        cameras = cameras.at_height(self.level * depth / cameras.focal)
+        stands = [on != HANGS for on in self.supports]  # what is released may lie on a slope
+        stands[0] = stands[0] if self.motion.kind == "fall" else not self.bodies[0].flies(self.motion)
+        placed = (in_the_air(cameras, body.bbox, body.shape, depth) for body in self.bodies)
+        return cameras, [replace(body, stands=each) for body, each in zip(placed, stands, strict=True)]
+
+    def velocity(
+        self, cameras: Cameras, placed: Sequence[LiftedBody], index: int, motion: Motion, speed_name: str
+    ) -> Floats:
+        """[K, 3] m/s right and up."""
+        return velocity_in_side_view(placed[index], motion, self.draws, self.goal_of(motion, placed), speed_name)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from cow_service.physics.draws import COLUMN, ensemble, likeliest, quantiles
 from cow_service.physics.engine import RigidShape
 from cow_service.physics.ensemble import EVERY, OF_EACH, SURE, SURE_OF_MISS, Query
 from cow_service.physics.layout import FARTHEST
+from cow_service.physics.lift import LiftedBody
 from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
 from cow_service.vision.types import Floats
 
@@ -38,7 +39,7 @@ CONSTANTS: dict[str, float] = {
     "at_rest": engine.AT_REST,
     "at_start": engine.AT_START,
     "rests": engine.RESTS,
-    "tipped": math.cos(events.TIPPED),
+    "tipped": engine.TIPPED,
     "displaced": events.DISPLACED,
     "low": lift.LOW,
     "rise": lift.RISE,
@@ -70,9 +71,7 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
     draws = likeliest() if size == 0 else np.concatenate([likeliest(), ensemble(size)])
     drawn = DrawnWorlds.of(world, draws, EVERY)
     layout, shapes = drawn.layout, drawn.shapes(slice(0, len(draws)))
-    cameras, mover = layout.cameras, layout.bodies[0]
-    courses = [shape[0].course for shape in shapes]
-    factors = lift.speed_factors(motion, draws, "speed")
+    cameras, courses = layout.cameras, [shape[0].course for shape in shapes]
     return {
         "size": list(world.size),
         "fps": world.fps,
@@ -88,25 +87,31 @@ def live_worlds(world: WorldInput, query: Query | None, size: int) -> dict[str, 
         "bodies": [
             _body(seen, [shape[i] for shape in shapes], layout.supports[i]) for i, seen in enumerate(world.bodies)
         ],
-        "mover": {
-            "start": list(world.bodies[0].start),
-            "foot": list(world.bodies[0].foot),
-            "kind": motion.kind,
-            "stands": mover.stands,
-            "rises": motion.rises,
-            "is_side_view": world.level is not None,
-            "seen_half_width": _column(mover.half_width),
-            "depth_share": _column(np.broadcast_to(mover.depth_share, len(draws))),
-            "direction": list(motion.direction),
-            "depth": motion.depth,
-            "metres_per_pixel": motion.metres_per_pixel.value,
-            "depth_sigma": math.radians(motion.depth_deviation),
-            "speed": _column(motion.speed * motion.metres_per_pixel.value * factors),
-            "turn": _column(draws[:, COLUMN["turn"]]),
-            "heading": _column(quantiles(draws[:, COLUMN["depth"]])),
-        },
+        "mover": _mover(world, layout.bodies[0], draws),
         "course": _course([course for course in courses if course is not None]),
-        "asked": None if query is None or not query.is_decidable or query.asked.form in OF_EACH else _asked(query),
+        "asked": _asked(query),
+    }
+
+
+def _mover(world: WorldInput, mover: LiftedBody, draws: Floats) -> dict[str, Any]:
+    """How the mover sets out in each world."""
+    motion, factors = world.motion, lift.speed_factors(world.motion, draws, "speed")
+    return {
+        "start": list(world.bodies[0].start),
+        "foot": list(world.bodies[0].foot),
+        "kind": motion.kind,
+        "stands": mover.stands,
+        "rises": motion.rises,
+        "is_side_view": world.level is not None,
+        "seen_half_width": _column(mover.half_width),
+        "depth_share": _column(np.broadcast_to(mover.depth_share, len(draws))),
+        "direction": list(motion.direction or ()),
+        "depth": motion.depth,
+        "metres_per_pixel": motion.metres_per_pixel.value,
+        "depth_sigma": math.radians(motion.depth_deviation),
+        "speed": _column(motion.speed * motion.metres_per_pixel.value * factors),
+        "turn": _column(draws[:, COLUMN["turn"]]),
+        "heading": _column(quantiles(draws[:, COLUMN["depth"]])),
     }
 
 
@@ -150,7 +155,10 @@ def _course(courses: list[Course]) -> dict[str, Any] | None:
     }
 
 
-def _asked(query: Query) -> dict[str, Any]:
+def _asked(query: Query | None) -> dict[str, Any] | None:
+    """What is asked, where the worlds themselves can tell."""
+    if query is None or not query.is_decidable or query.asked.form in OF_EACH:
+        return None
     asked = query.asked.model_dump(include={"relation", "form", "negated", "every", "within"})
     return asked | {"target": query.target, "subject": query.subject, "among": list(query.among)}
 

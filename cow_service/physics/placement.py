@@ -11,36 +11,45 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from cow_service.physics.draws import COLUMN
-from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, run_worlds
+from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, TIPPED, Hollow, RigidShape, WorldRun, run_worlds
 from cow_service.records import PlacementResult, PlaceRelation
 from cow_service.vision.openings import SeenOpening
 from cow_service.vision.types import Floats, Mask
 
-CARRIED = 1.0  # s that it takes, at most
-MOST_CARRIED = 0.5  # of the clip
-SETTLES = 2.0  # s, at least, for which what is released is followed, whatever the clip shows
-DROP = 0.06  # of its half width: from so high it is released
-BESIDE_GAP = 0.5  # of its half width: the gap to the object that it is put next to
-WIDTH_SIGMA, TURNED_SIGMA = 0.08, 0.25  # of the logarithm of a body's width against that of an opening
-AIM_SIGMA = 0.03  # of its half width, along and across: where it is released
-AIM_OFF = 0.01  # of its half width, to the right
-OFF_TOP = 0.1  # the same on a ball or a tip: nothing is put there so exactly that it stays
-HIDDEN_HEIGHT = 0.5  # of a container's width: its height at least, where its foot is hidden
-CLEARANCE = 0.5  # of its half width: the height at which it passes over objects
-LEAST_RISE = 0.3  # of the way that it is carried
-STICKS_OUT = 1.0  # of the container's depth: how far the upper end is above the rim
-GONE_IN = 0.1  # of the container's depth: how far below the rim the lower end of what is inside is
-TIPPED = math.cos(math.radians(45))  # upright component of an axis that was upright
-SUNK = 0.1  # of the smaller half height: how far below a top the lower end of what lies on it may seem to be
-THINNEST = 0.03  # of the half width: a thinner wall would let fast things through
-LEAST_OPENING = 0.3  # of the half width
-FLOOR_SHARE = 0.08  # of the height: how thick the floor of a container is
-NARROWEST = 0.3  # of the opening: its floor
-OVERLAPPING = 0.02  # of the half width: bodies that overlap less than this are taken to touch
+
+class Placing(NamedTuple):
+    """How things are put somewhere, and what counts as being there."""
+
+    carried: float = 1.0  # s that it takes, at most
+    most_carried: float = 0.5  # of the clip
+    settles: float = 2.0  # s, at least, for which what is released is followed, whatever the clip shows
+    drop: float = 0.06  # of its half width: from so high it is released
+    beside_gap: float = 0.5  # of its half width: the gap to the object that it is put next to
+    width_sigma: float = 0.08  # of the logarithm of a body's width against that of an opening
+    turned_sigma: float = 0.25
+    aim_sigma: float = 0.03  # of its half width, along and across: where it is released
+    aim_off: float = 0.01  # of its half width, to the right
+    off_top: float = 0.1  # the same on a ball or a tip: nothing is put there so exactly that it stays
+    hidden_height: float = 0.5  # of a container's width: its height at least, where its foot is hidden
+    clearance: float = 0.5  # of its half width: the height at which it passes over objects
+    least_rise: float = 0.3  # of the way that it is carried
+    sticks_out: float = 1.0  # of the container's depth: how far the upper end is above the rim
+    gone_in: float = 0.1  # of the container's depth: how far below the rim the lower end of what is inside is
+    sunk: float = 0.1  # of the smaller half height: how far below a top the lower end of what lies on it may seem to be
+    thinnest: float = 0.03  # of the half width: a thinner wall would let fast things through
+    least_opening: float = 0.3  # of the half width
+    floor_share: float = 0.08  # of the height: how thick the floor of a container is
+    narrowest: float = 0.3  # of the opening: its floor
+    overlapping: float = 0.02  # of the half width: bodies that overlap less than this are taken to touch
+
+
+PLACING = Placing()
+
 
 STAYING: tuple[PlacementResult, ...] = ("inside", "sticks-out", "on-the-rim", "on-top", "beside")
 Shapes = tuple[RigidShape, ...]  # the bodies of one world
@@ -121,7 +130,7 @@ def carry(
     """
     # An even number of frames, as worlds are recorded every second frame.
     carried = 2 * max(1, int(seconds * fps / 2))
-    to_run, rows = max(num_frames - carried, math.ceil(SETTLES * fps)) + 2, len(range(0, num_frames, every))
+    to_run, rows = max(num_frames - carried, math.ceil(PLACING.settles * fps)) + 2, len(range(0, num_frames, every))
     released = [_released(goal, bodies, row) for bodies, row in zip(shapes, draws, strict=True)]
     settled = run_worlds(released, to_run, fps, every, turns_wanted=True)
     found = [classify(goal, *each) for each in zip(released, settled, shapes, strict=True)]
@@ -139,8 +148,8 @@ def carry(
         # A Bezier curve up, over and down that leaves and arrives upright and passes over the objects on the way.
         start, end = np.array(bodies[goal.body].position), np.array(body.position)
         top = max(then[i].position[1] + then[i].half_height for i in goal.targets)
-        over = top + body.half_height + CLEARANCE * body.half_width - (start[1] + end[1]) / 2
-        rise = max(over, LEAST_RISE * math.hypot(end[0] - start[0], end[2] - start[2]), 1e-6) * 4 / 3
+        over = top + body.half_height + PLACING.clearance * body.half_width - (start[1] + end[1]) / 2
+        rise = max(over, PLACING.least_rise * math.hypot(end[0] - start[0], end[2] - start[2]), 1e-6) * 4 / 3
         high, rest = np.array([0.0, rise, 0.0]), 1 - share
         way = (
             rest**3 * start + 3 * rest**2 * share * (start + high) + 3 * rest * share**2 * (end + high) + share**3 * end
@@ -165,7 +174,7 @@ def settle(
     What is `flying` hangs in the air meanwhile. A body that reaches beyond its middle overlaps it; above one that does
     not it makes room, so that nothing begins inside another thing.
     """
-    frames = math.ceil(SETTLES * fps) + 2
+    frames = math.ceil(PLACING.settles * fps) + 2
     still = {"starts": False, "glides": False, "course": None, "follows": None}
     current: list[Shapes] = [
         tuple(
@@ -188,23 +197,16 @@ def settle(
         current = [_made_room(bodies, goal.body, free) for bodies in current]
         placements.append(Placements(goal.meant, results, np.array(clearance), np.array(above), 0.0))
     put_bodies = {goal.body for goal in goals}
-    begun = tuple(
-        tuple(
-            replace(
-                body,
-                position=rest.position,
-                turn=rest.turn,
-                half_width=rest.half_width,
-                half_depth=rest.half_depth,
-                half_height=rest.half_height,
-                hollow=rest.hollow,
-                falls=i in put_bodies or body.falls,
-            )
-            for i, (body, rest) in enumerate(zip(bodies, resting, strict=True))
-        )
-        for bodies, resting in zip(shapes, current, strict=True)
-    )
-    return Settled(begun, tuple(placements))
+    begun = (_settled(*pair, put_bodies) for pair in zip(shapes, current, strict=True))
+    return Settled(tuple(begun), tuple(placements))
+
+
+def _settled(bodies: Shapes, resting: Shapes, put: Collection[int]) -> Shapes:
+    """Bodies as they set out, where they have come to rest, and as large and hollow as they are there."""
+    names = ("position", "turn", "half_width", "half_depth", "half_height", "hollow")
+    changes = [{name: getattr(rest, name) for name in names} for rest in resting]
+    pairs = enumerate(zip(bodies, changes, strict=True))
+    return tuple(replace(body, falls=i in put or body.falls, **change) for i, (body, change) in pairs)
 
 
 def new_supports(goals: Sequence[PlacementGoal], supports: Sequence[int | None]) -> Mapping[int, int | None]:
@@ -220,11 +222,11 @@ def new_supports(goals: Sequence[PlacementGoal], supports: Sequence[int | None])
 def hollow_of(seen: SeenOpening, half_width: float, half_height: float, row: Floats) -> Hollow:
     """The space inside a body of outer half width and height (m), as a draw [P] has the width of the opening."""
     drawn = seen.inner * math.exp(seen.deviation * float(row[COLUMN["opening"]]))
-    opening = half_width * min(max(drawn, LEAST_OPENING), 1 - THINNEST)
+    opening = half_width * min(max(drawn, PLACING.least_opening), 1 - PLACING.thinnest)
     wall = half_width - opening
-    bottom = min(opening, max(NARROWEST * opening, seen.bottom * half_width - wall))
+    bottom = min(opening, max(PLACING.narrowest * opening, seen.bottom * half_width - wall))
     sides = BOX_SIDES if seen.square else ROUND_SIDES
-    return Hollow(opening, bottom, 2 * half_height * (1 - FLOOR_SHARE), sides)
+    return Hollow(opening, bottom, 2 * half_height * (1 - PLACING.floor_share), sides)
 
 
 def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
@@ -236,7 +238,7 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
     if goal.opening is not None:
         target = bodies[goal.targets[0]]
         # A container whose foot is hidden is at least as high as common ones of its width.
-        least = HIDDEN_HEIGHT * target.half_width if goal.opening.foot_hidden else 0.0
+        least = PLACING.hidden_height * target.half_width if goal.opening.foot_hidden else 0.0
         half, (x, y, z) = max(target.half_height, least), target.position
         hollow = hollow_of(goal.opening, target.half_width, half, row)
         whole = replace(target, half_height=half, position=(x, y + half - target.half_height, z), hollow=hollow)
@@ -244,15 +246,15 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
     body = bodies[goal.body]
     if goal.opening is not None:
         # Its width relative to the opening is measured by two outlines at two depths, for a box by a corner that turns.
-        sigma = TURNED_SIGMA if body.shape == "box" and not goal.opening.square else WIDTH_SIGMA
+        sigma = PLACING.turned_sigma if body.shape == "box" and not goal.opening.square else PLACING.width_sigma
         wider = math.exp(sigma * float(row[COLUMN["outline"]]))
         sides = {name: wider * getattr(body, name) for name in ("half_width", "half_depth")}
         round_too = {"half_height": wider * body.half_height} if body.shape == "sphere" else {}
         bodies[goal.body] = body = replace(body, **sides, **round_too)
     x, y, z = _place_of_release(goal, bodies)
-    aim = body.half_width * AIM_SIGMA
+    aim = body.half_width * PLACING.aim_sigma
     tip = goal.relation == "onto" and bodies[goal.targets[0]].shape in ("sphere", "cone")
-    x += body.half_width * (OFF_TOP if tip else AIM_OFF) + aim * float(row[COLUMN["let_go_right"]])
+    x += body.half_width * (PLACING.off_top if tip else PLACING.aim_off) + aim * float(row[COLUMN["let_go_right"]])
     z += aim * float(row[COLUMN["let_go_ahead"]])
     still = (0.0, 0.0, 0.0)
     bodies[goal.body] = replace(body, position=(x, y, z), velocity=still, starts=True, falls=True, glides=False)
@@ -262,7 +264,7 @@ def _released(goal: PlacementGoal, shapes: Shapes, row: Floats) -> Shapes:
 def _place_of_release(goal: PlacementGoal, bodies: Sequence[RigidShape]) -> tuple[float, float, float]:
     """Where the middle of a body is released (m)."""
     body, target = bodies[goal.body], bodies[goal.targets[0]]
-    up = body.half_height + DROP * body.half_width
+    up = body.half_height + PLACING.drop * body.half_width
     x, y, z = target.position
     if goal.relation in ("into", "onto"):
         return x, y + target.half_height + up, z
@@ -279,7 +281,7 @@ def _place_of_release(goal: PlacementGoal, bodies: Sequence[RigidShape]) -> tupl
         right, ahead = sign * (x / distance), sign * (z / distance)
     else:
         right, ahead = sign * (z / distance), sign * (-x / distance)
-    away = _reach(target, right, ahead) + _reach(body, right, ahead) + BESIDE_GAP * body.half_width
+    away = _reach(target, right, ahead) + _reach(body, right, ahead) + PLACING.beside_gap * body.half_width
     return x + away * right, bottom + up, z + away * ahead
 
 
@@ -314,7 +316,7 @@ def classify(
         away = max(math.hypot(right, ahead), 1e-9)
         reach = _reach(here, right / away, ahead / away) + _reach(other, right / away, ahead / away)
         level = abs(here.position[1] - other.position[1]) < here.half_height + other.half_height
-        overlaps |= level and away < reach - OVERLAPPING * here.half_width
+        overlaps |= level and away < reach - PLACING.overlapping * here.half_width
     if overlaps:
         return "overlaps", clearance, math.nan
     tips = released[body].shape != "sphere" and _upright(run.turns[body, -1]) < TIPPED
@@ -327,30 +329,42 @@ def _on_target(
     """As `classify`, for bodies put into or onto something."""
     body, target = released[goal.body], released[goal.targets[0]]
     (there, turn), (middle, lean) = ((run.positions[i, -1], run.turns[i, -1]) for i in (goal.body, goal.targets[0]))
-    tall, tipped, hollow = _half_height(body, turn), _upright(lean) < TIPPED, target.hollow
+    tall, tipped = _half_height(body, turn), _upright(lean) < TIPPED
     low, high = there[1] - tall, there[1] + tall
     off = math.hypot(there[0] - middle[0], there[2] - middle[2])
-    if hollow is None or goal.relation == "onto":
-        tipped &= target.shape != "sphere"
-        sunk = low < middle[1] + _half_height(target, lean) - SUNK * min(body.half_height, target.half_height)
-        if sunk or off > target.half_width + body.half_width:
-            return ("tips" if tipped else "falls-off"), math.nan, math.nan
-        tipped |= body.shape != "sphere" and _upright(turn) < TIPPED
-        return ("tips" if tipped else "on-top"), math.nan, math.nan
-    half = body.half_width  # with which it goes through the opening: of a box through a round one, its diagonal
-    if body.shape == "box":
-        square = hollow.sides == BOX_SIDES
-        half = max(half, body.half_depth) if square else math.hypot(half, body.half_depth)
-    clearance, rim = 1 - half / hollow.opening, middle[1] + target.half_height
-    above = float(np.clip((high - rim) / max(high - low, 1e-9), 0.0, 1.0))
-    result: PlacementResult = "sticks-out" if high - rim > STICKS_OUT * hollow.depth else "inside"
-    if tipped:
-        result = "tips"
-    elif off > target.half_width and low < rim:
-        result = "falls-off"
-    elif clearance <= 0 or rim - low < GONE_IN * hollow.depth:
-        result = "on-the-rim"
-    return result, clearance, above
+    if target.hollow is not None and goal.relation == "into":
+        rim = middle[1] + target.half_height
+        clearance, above = 1 - _half_across(body, target.hollow) / target.hollow.opening, (high - rim) / (high - low)
+        result = _in_container(target, tipped, clearance, low - rim, high - rim, off)
+        return result, clearance, float(np.clip(above, 0.0, 1.0))
+    tipped &= target.shape != "sphere"
+    sunk = low < middle[1] + _half_height(target, lean) - PLACING.sunk * min(body.half_height, target.half_height)
+    if sunk or off > target.half_width + body.half_width:
+        return ("tips" if tipped else "falls-off"), math.nan, math.nan
+    tipped |= body.shape != "sphere" and _upright(turn) < TIPPED
+    return ("tips" if tipped else "on-top"), math.nan, math.nan
+
+
+def _half_across(body: RigidShape, hollow: Hollow) -> float:
+    """Half the width with which a body goes through an opening: of a box through a round one, its diagonal."""
+    if body.shape != "box":
+        return body.half_width
+    is_square = hollow.sides == BOX_SIDES
+    return max(body.half_width, body.half_depth) if is_square else math.hypot(body.half_width, body.half_depth)
+
+
+def _in_container(
+    target: RigidShape, is_tipped: bool, clearance: float, low: float, high: float, off: float
+) -> PlacementResult:
+    """What becomes of a body whose ends are so far above the rim of a container, and so far off its axis (m)."""
+    depth = 0.0 if target.hollow is None else target.hollow.depth
+    if is_tipped:
+        return "tips"
+    if off > target.half_width and low < 0:
+        return "falls-off"
+    if clearance <= 0 or -low < PLACING.gone_in * depth:
+        return "on-the-rim"
+    return "sticks-out" if high > PLACING.sticks_out * depth else "inside"
 
 
 def _half_height(body: RigidShape, turn: Floats) -> float:

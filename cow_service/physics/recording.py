@@ -52,26 +52,9 @@ def record_trajectory(
     not stay where it is put.
     """
     shown, world = _Shown(result), result.world
-    worlds, light = shown.worlds, shown.worlds.layout.light
-    camera = shown.record_camera()
-    placement = None
-    if worlds.placements is not None and (world.depth is None or world.depth.is_of_scene):
-        others = None if shown.ensemble is None else shown.ensemble.placements
-        placement = _placement(world.bodies[0].name, worlds.placements, others)
+    camera, light = shown.record_camera(), shown.worlds.layout.light
     placed = shown.record_placed()
     paths = shown.record_paths() if path is None else (shown.record_free_path(path, given),)
-    until = moving_until(paths, world.fps)
-    contacts = shown.record_contacts(camera)
-    # Points off every body and off the way of all that moves, unless the request gives them.
-    anchors = None if given is None else given.anchors
-    if anchors is None:
-        starts = [
-            np.array(each.points[0] if each.body in shown.put else shown.bodies[each.body].start) for each in paths
-        ]
-        movable = swept([shown.bodies[each.body].mask for each in paths], starts, paths)
-        for body in shown.bodies:
-            body.mask.add_to(movable)
-        anchors = spread_anchors(movable)
     trajectory = Trajectory(
         law="contact" if path is None else "ballistic",
         fps=world.fps,
@@ -80,11 +63,11 @@ def record_trajectory(
         surfaces=shown.record_surfaces(camera),
         bodies=shown.record_bodies(),
         paths=paths,
-        contacts=contacts,
+        contacts=shown.record_contacts(camera),
         light=(float(light[0, 0]), float(light[0, 1])) if world.fit.source == "shadow" else None,
-        moving_until=until,
+        moving_until=moving_until(paths, world.fps),
         tracks_given=given is not None and given.tracks is not None,
-        anchors=anchors,
+        anchors=shown.free_points(paths) if given is None or given.anchors is None else given.anchors,
         encounters=events.encounters(
             result.shown.events,
             None if result.ensemble is None else result.ensemble.events,
@@ -95,7 +78,7 @@ def record_trajectory(
         ),
         encounters_known=encounters_known,
         outcome=outcome,
-        placement=placement,
+        placement=shown.record_placement(),
         placed=placed,
         faint=world.faint,
         ensemble=0 if shown.ensemble is None else len(shown.ensemble.runs),
@@ -335,7 +318,23 @@ class _Shown:
         times = {"moved_at": self.events.moved, "tipped_at": self.events.tipped}
         return {name: time for name, each in times.items() if math.isfinite(time := float(each[0, index]))}
 
+    def free_points(self, paths: Sequence[Path]) -> tuple[Point, ...]:
+        """Points off every body and off the way of all that moves."""
+        starts = [np.array(path.points[0] if path.body in self.put else self.bodies[path.body].start) for path in paths]
+        movable = swept([self.bodies[path.body].mask for path in paths], starts, paths)
+        for body in self.bodies:
+            body.mask.add_to(movable)
+        return spread_anchors(movable)
+
     # --- what was put somewhere
+
+    def record_placement(self) -> Placement | None:
+        """What becomes of the mover, where it is put somewhere and no depth map of another scene says where."""
+        worlds, depth = self.worlds, self.world.depth
+        if worlds.placements is None or (depth is not None and not depth.is_of_scene):
+            return None
+        others = None if self.ensemble is None else self.ensemble.placements
+        return _placement(self.seen[0].name, worlds.placements, others)
 
     def record_placed(self) -> tuple[records.PlacedBefore, ...]:
         """The result for each object put somewhere before the motion; empty for the unchanged world."""

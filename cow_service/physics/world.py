@@ -18,8 +18,7 @@ from cow_service.physics.geometry import Measurement
 from cow_service.physics.layout import BOX_SIDE, FARTHEST, VEHICLE_WIDTH, Layout, lay_out
 from cow_service.physics.lift import speed_factors
 from cow_service.physics.placement import (
-    CARRIED,
-    MOST_CARRIED,
+    PLACING,
     PlacementGoal,
     Placements,
     Settled,
@@ -191,7 +190,7 @@ class DrawnWorlds:
             settled = settle(goals, seen, draws, fps, flying)
         shapes, placements = settled.shapes, None
         if given.placement is not None:
-            carried = min(CARRIED, MOST_CARRIED * (given.num_frames - 1) / given.fps)
+            carried = min(PLACING.carried, PLACING.most_carried * (given.num_frames - 1) / given.fps)
             shapes, runs, placements = carry(given.placement, shapes, draws, carried, frames, fps, every)
         else:
 
@@ -220,44 +219,7 @@ class _Draw:
     def shapes(self) -> tuple[RigidShape, ...]:
         """Its bodies at the start."""
         given, layout, k, row = self.given, self.layout, self.k, self.draws[self.k]
-        friction = FRICTION * math.exp(FRICTION_SIGMA * row[COLUMN["friction"]])
-        restitution = min(1.0, max(0.0, RESTITUTION + RESTITUTION_SIGMA * row[COLUMN["restitution"]]))
-        yaw = YAW_SIGMA * float(row[COLUMN["yaw"]])
-        unit = float(layout.bodies[0].half_width[k])
-        low, high = LEAST_HALF * unit, MOST_HALF * unit
-        bodies: list[RigidShape] = []
-        for seen, body in zip(given.bodies, layout.bodies, strict=True):
-            half = float(np.clip(body.half_width[k], low, high))
-            tall = half if body.shape == "sphere" else float(np.clip(body.half_height[k], low, high))
-            side = half if body.shape != "box" else BOX_SIDE * half
-            if given.placement is not None and body.shape == "box" and seen.equal_sided:
-                side = min(max(tall, half / math.sqrt(2)), half)  # it is seen between its face's width and its diagonal
-            x, y, z = body.centre[k].tolist()
-            shape, deep, turn = body.shape, side, yaw if body.shape == "box" and not seen.elongated else 0.0
-            if body.yaw is not None:
-                side, turn = half, -body.yaw
-                deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
-            elif not seen.is_depth_known:  # it shows its width, which nothing says is that of something round
-                shape, side, turn = "box", half, math.atan2(x, z)
-                deep = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
-            rigid = RigidShape(
-                shape=shape,
-                half_width=side,
-                half_depth=deep,
-                half_height=tall,
-                position=(x, y, z),
-                yaw=turn,
-                # What its outline would turn to about its axis, of the volume of the cylinder around it.
-                density=float(np.mean(seen.widths**2)) if shape == "cylinder" else 1.0,
-                friction=friction,
-                restitution=restitution,
-                falls=body.stands,
-                **self.balance(seen, shape, tall, (x, y, z)),
-            )
-            if given.level is not None:  # all are as deep, and what hangs, or is cut off by the border, stays
-                fixed = bool(bodies) and (not body.stands or self.is_cut(seen))
-                rigid = replace(rigid, half_depth=unit, yaw=0.0, middle=None, pieces=self.pieces(seen), fixed=fixed)
-            bodies.append(rigid)
+        bodies = [self.shape(index) for index in range(len(given.bodies))]
         weight = math.exp(WEIGHT_SIGMA * float(row[COLUMN["weight"]]))
         bodies[0] = replace(bodies[0], density=bodies[0].density * weight)
         velocities = [legs[k] for legs in (layout.velocity, *layout.further)]
@@ -270,6 +232,45 @@ class _Draw:
         for taken in layout.absent:
             bodies[taken] = replace(bodies[taken], absent=True)
         return tuple(bodies)
+
+    def shape(self, index: int) -> RigidShape:
+        """A body where it stands or hangs, before it is set going."""
+        given, k, row = self.given, self.k, self.draws[self.k]
+        seen, body, unit = given.bodies[index], self.layout.bodies[index], float(self.layout.bodies[0].half_width[k])
+        low, high = LEAST_HALF * unit, MOST_HALF * unit
+        half = float(np.clip(body.half_width[k], low, high))
+        tall = half if body.shape == "sphere" else float(np.clip(body.half_height[k], low, high))
+        x, y, z = body.centre[k].tolist()
+        shape, side = body.shape, half if body.shape != "box" else BOX_SIDE * half
+        if given.placement is not None and shape == "box" and seen.equal_sided:
+            side = min(max(tall, half / math.sqrt(2)), half)  # it is seen between its face's width and its diagonal
+        deep, turn = side, 0.0
+        along = half * float(np.broadcast_to(body.depth_share, len(self.draws))[k])
+        if body.yaw is not None:
+            side, deep, turn = half, along, -body.yaw
+        elif not seen.is_depth_known:  # it shows its width, which nothing says is that of something round
+            shape, side, deep, turn = "box", half, along, math.atan2(x, z)
+        elif shape == "box" and not seen.elongated:
+            turn = YAW_SIGMA * float(row[COLUMN["yaw"]])
+        rigid = RigidShape(
+            shape=shape,
+            half_width=side,
+            half_depth=deep,
+            half_height=tall,
+            position=(x, y, z),
+            yaw=turn,
+            # What its outline would turn to about its axis, of the volume of the cylinder around it.
+            density=float(np.mean(seen.widths**2)) if shape == "cylinder" else 1.0,
+            friction=FRICTION * math.exp(FRICTION_SIGMA * row[COLUMN["friction"]]),
+            restitution=min(1.0, max(0.0, RESTITUTION + RESTITUTION_SIGMA * row[COLUMN["restitution"]])),
+            falls=body.stands,
+            **self.balance(seen, shape, tall, (x, y, z)),
+        )
+        if given.level is None:
+            return rigid
+        # In a drawing all are as deep, and what hangs, or is cut off by the border, stays.
+        fixed = index > 0 and (not body.stands or self.is_cut(seen))
+        return replace(rigid, half_depth=unit, yaw=0.0, middle=None, pieces=self.pieces(seen), fixed=fixed)
 
     def pieces(self, seen: SeenBody) -> tuple[Floats, ...]:
         """A body of a drawing as convex pieces: corners [N, 2] each, m right of its middle and above it."""

@@ -17,8 +17,8 @@ from cow_service.media.overlay import DARK, LIGHT, Label, Replaced, draw_labels,
 from cow_service.records import Clip, Frame, GeneratorInfo, Grounding, Motion, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
 from cow_service.stages.keys import StageResult
-from cow_service.stages.reconstruction import obstacles_of
 from cow_service.stages.run import Run
+from cow_service.stages.seeing import obstacles_of
 from cow_service.vision.types import Image
 
 

@@ -1,124 +1,65 @@
-"""What stage 3 simulates: the bodies that the image shows, the camera that sees them, and what is put where first."""
+"""What stage 3 simulates: the camera, the bodies, what is asked of them, and what is put where first."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from cow_service.errors import CannotGround
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
-from cow_service.narration.words import place_words, same_name
+from cow_service.narration.words import place_words
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.physics.camera import SIDE_VIEW, Standing, camera_of, given_camera, no_segments
+from cow_service.physics.camera import SIDE_VIEW, CameraFit, Standing, camera_of, given_camera
 from cow_service.physics.ensemble import BY_EVENTS, OF_EACH, SURE, SURE_OF_FIT, SURE_OF_MISS, Query
-from cow_service.physics.geometry import DepthMap, measure_scene, rise_above
+from cow_service.physics.geometry import Measurement, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import PrescribedMotion, WorldInput
-from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion, ObjectPrior
-from cow_service.requests import SimulateRequest
-from cow_service.stages.grounding import others_of, placed_mover, removed_of
-from cow_service.stages.run import Run
-from cow_service.vision.edges import divide
-from cow_service.vision.forms import shape_seen
+from cow_service.records import Asked, BBox, Intervention, LocatedObject, Motion
+from cow_service.stages.seeing import Situation
 from cow_service.vision.masks import iou, is_same_object
-from cow_service.vision.openings import measure_opening
-from cow_service.vision.scene import CLEAR_CUT, Obstacle, Scene
-from cow_service.vision.shadows import find_shadow
-from cow_service.vision.side_view import SideView
+from cow_service.vision.openings import SeenOpening
 
-PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 BELOW = 4  # px below the outline of a body in which another one that hides it begins
 HIDDEN = 0.25  # of the columns of a body: with so many ending at another one, its foot is hidden
 
 
 @dataclass(frozen=True)
-class Situation:
-    """What stage 3 starts from: the image and its objects, how one of them moves, and what the request wants."""
+class Stance:
+    """What each body stands on at the first frame."""
 
-    scene: Scene
-    grounding: Grounding
-    motion: Motion
-    request: SimulateRequest
-    obstacles: Sequence[Obstacle]
-    removed: Sequence[Obstacle] = ()
-    unlisted: tuple[BBox, ...] = ()  # of what is seen beside a list that says that it is complete
-    depth: DepthMap | None = None
-    focal: Estimate | None = None  # px, by what else than the request tells it
+    supports: tuple[int | None, ...]  # the body beneath, as the picture alone shows it; None: the floor, or nothing
+    in_air: tuple[bool, ...]
 
     @staticmethod
-    def of(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: Motion) -> Situation:
-        """With the obstacles that the scene shows."""
-        obstacles, removed = obstacles_of(scene, grounding)
-        said = run.request
-        is_estimate = not said.objects_complete or any(each.source != "request" for each in said.objects)
-        unlisted = unlisted_of(scene, grounding) if grounding.objects_complete and is_estimate else ()
-        return Situation(scene, grounding, motion, run.request, obstacles, removed, unlisted, run.depth, run.focal)
+    def of(situation: Situation) -> Stance:
+        """As stated, or by the places of feet."""
+        mover, *others = situation.bodies
+        in_air = (mover.flies(situation.motion), *(body.is_flying for body in others))
+        return Stance(tuple(supports_of(situation.bodies, situation.level)), in_air)
 
     @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the image, px."""
-        return self.scene.width, self.scene.height
+    def on_floor(self) -> tuple[bool, ...]:
+        """Whether each stands on the floor itself."""
+        return tuple(on is None and not flies for on, flies in zip(self.supports, self.in_air, strict=True))
+
+
+@dataclass(frozen=True)
+class Goals:
+    """What is put where."""
+
+    carried: PlacementGoal | None = None  # of the mover, where that is seen as its motion
+    before: tuple[PlacementGoal, ...] = ()  # before the motion, in this order
+    instead: tuple[PlacementGoal, ...] = ()  # of the mover, into each of the things that are asked about
 
     @property
-    def is_separated(self) -> bool:
-        """Whether the surroundings could be told apart into objects."""
-        return bool(self.scene.regions or self.obstacles or self.removed)
-
-    @property
-    def follows_path(self) -> bool:
-        """Whether the mover follows a path that no contact changes: one that is given, or has the ballistic law."""
-        return self.request.trajectory is not None or (self.motion.law == "ballistic" and self.motion.kind != "place")
-
-    @property
-    def side_view(self) -> SideView | None:
-        """The drawing without depth that the image is, unless its mover follows a path through space."""
-        return None if self.follows_path else self.scene.side_view
-
-    @cached_property
-    def located(self) -> tuple[LocatedObject, ...]:
-        """What was located beside the mover, what is removed last."""
-        return (*others_of(self.grounding), *removed_of(self.grounding))
-
-    @cached_property
-    def carried(self) -> Intervention | None:
-        """What puts the mover somewhere, where that is seen as its motion."""
-        return placed_mover(self.grounding) if self.motion.kind == "place" else None
-
-    @cached_property
-    def placed_before(self) -> tuple[Intervention, ...]:
-        """What puts something somewhere before the motion."""
-        return tuple(each for each in self.grounding.interventions if each.kind == "place" and each is not self.carried)
-
-
-def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ...], tuple[Obstacle, ...]]:
-    """What stands beside the mover, and what of it is removed before the motion; no more than is listed where a list
-    says that it is complete."""
-    removed, others = removed_of(grounding), others_of(grounding)
-    found = scene.obstacles(grounding.bbox, (*others, *removed))
-    gone, named = {each.bbox for each in removed}, {other.bbox for other in others}
-    if grounding.objects_complete:
-        found = tuple(each for each in found if each.bbox in gone | named)
-    taken = tuple(each for each in found if each.bbox in gone)
-    masks = [each.mask.full() for each in taken]
-    # A part of what is removed, such as its lit top, may have been found as a region of its own.
-    parts = {each.bbox for each in found if any(each.mask.shared_with(m) > PART * each.mask.area for m in masks)}
-    kept = (each for each in found if each.bbox not in gone and (each.bbox in named or each.bbox not in parts))
-    return tuple(kept), taken
-
-
-def unlisted_of(scene: Scene, grounding: Grounding) -> tuple[BBox, ...]:
-    """Boxes of what is clearly seen as one thing, and is no part of what a complete list has."""
-    listed = (*others_of(grounding), *removed_of(grounding))
-    known = np.zeros((scene.height, scene.width), bool)
-    for x0, y0, x1, y1 in (grounding.bbox, *(each.bbox for each in listed)):
-        known[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1] = True
-    seen = scene.obstacles(grounding.bbox, listed)
-    clear = (each for each in seen if each.confidence >= CLEAR_CUT)
-    return tuple(each.bbox for each in clear if each.mask.shared_with(known) < PART * each.mask.area)
+    def bottoms(self) -> dict[int, float]:
+        """Of what something is put into: its width at its lower end, as its opening was measured."""
+        goals = (*self.before, *([] if self.carried is None else [self.carried]), *self.instead)
+        openings = ((goal.targets[0], goal.opening) for goal in goals)
+        return {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
 
 
 def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePath | None]:
@@ -126,173 +67,148 @@ def reconstruct(situation: Situation) -> tuple[WorldInput, Query | None, FreePat
 
     Raises `CannotGround` for what cannot be put where the question or the request puts it.
     """
-    motion, request = situation.motion, situation.request
-    bodies = seen_bodies(situation)
-    present = bodies[: 1 + len(situation.obstacles)]
-    level = None if situation.side_view is None else situation.side_view.level
-    in_air = [body.is_flying if index else body.flies(motion) for index, body in enumerate(bodies)]
-    supports = supports_of(bodies, level)
-    on_floor = [on is None and not flies for on, flies in zip(supports, in_air, strict=True)]
-    query = query_of(situation, bodies, on_floor)
-    carried, before = placement_goals(situation, present)
-    if query is None and situation.grounding.asked is None and carried is not None:
+    stance = Stance.of(situation)
+    query = query_of(situation, stance)
+    goals = goals_of(situation, query)
+    if query is not None:
+        query = replace(query, goals=goals.instead)
+    elif situation.asked is None and goals.carried is not None:
         # Nothing is asked but whether it gets there: shown is what it does in most worlds.
-        query = Query(Asked(relation="inside"), carried.targets[0])
-    if query is not None and query.is_decidable and query.asked.form == "which" and query.asked.relation == "inside":
-        query = replace(query, goals=_goals_of_each(situation, query, present))
-    faint = situation.unlisted
-    depth = None if level is not None or situation.follows_path else situation.depth
-    is_ball_in_air = bodies[0].shape == "sphere" and in_air[0]
-    shadow = find_shadow(situation.scene, bodies[0].bbox) if depth is None and is_ball_in_air else None
-    own, lines = (
-        divide(situation.scene.segments, [body.mask for body in bodies]) if depth is None else ([], no_segments())
-    )
-    fit = given_camera(situation.size, motion.down, request.camera, situation.focal, situation.follows_path)
-    measured = None
-    if depth is None:
-        parts = zip(bodies, own, on_floor, strict=True)
-        standing = [Standing.of(body, segments) for body, segments, stands in parts if stands]
-        flying = bodies[0] if in_air[0] else None
-        fit = camera_of(fit, situation.size, standing, lines, flying, motion.metres_per_pixel.value, shadow)
-    else:
-        fit, measured = measure_scene(depth, fit, bodies, supports, in_air)
-        faint = faint if measured is None else rise_above(depth, measured, faint)
-    # What something is put into is as wide at its lower end as its opening was measured.
-    goals = (*before, *([] if carried is None else [carried]), *(() if query is None else query.goals))
-    openings = ((each.targets[0], each.opening) for each in goals)
-    bottoms = {body: opening.bottom for body, opening in openings if opening is not None and not opening.foot_hidden}
-    # What else moves has a way and a speed of its own, and no end but what it meets.
-    fields = ("kind", "direction", "direction_deviation", "depth", "towards", "speed", "speed_deviation")
-    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": (), "rises": False,
-             "other_direction": None}  # fmt: skip
-    others = {
-        index: motion.model_copy(update=alone | {name: getattr(each, name) for name in fields})
-        for each in motion.others
-        for index, body in enumerate(bodies)
-        if index and not situation.follows_path and body.bbox == each.object.bbox
-    }
+        query = Query(Asked(relation="inside"), goals.carried.targets[0])
+    fit, measured = measure_camera(situation, stance)
+    world = world_of(situation, query, goals, fit, measured)
+    if not situation.follows_path:
+        return world, query, None
+    path = path_of(situation, world)
+    to_foot = np.array(world.bodies[0].foot) - np.array(situation.grounding.point)
+    prescribed = PrescribedMotion(path.states[:, :3], path.points + to_foot)
+    return replace(world, prescribed=prescribed), query, path.cut(world.num_frames)
+
+
+def measure_camera(situation: Situation, stance: Stance) -> tuple[CameraFit, Measurement | None]:
+    """The camera, and what a depth map says of the scene: by the map, or else by the picture."""
+    if situation.level is not None:
+        return SIDE_VIEW, None
+    motion, bodies, given = situation.motion, situation.bodies, situation.request.camera
+    fit = given_camera(situation.size, motion.down, given, situation.focal, situation.follows_path)
+    if situation.depth is not None:
+        return measure_scene(situation.depth, fit, bodies, stance.supports, stance.in_air)
+    standing = [Standing.of(body) for body, stands in zip(bodies, stance.on_floor, strict=True) if stands]
+    flying = bodies[0] if stance.in_air[0] else None
+    scale, lines, shadow = motion.metres_per_pixel.value, situation.lines, situation.shadow
+    return camera_of(fit, situation.size, standing, lines, flying, scale, shadow), None
+
+
+def world_of(
+    situation: Situation, query: Query | None, goals: Goals, fit: CameraFit, measured: Measurement | None
+) -> WorldInput:
+    """The world, without a path that is followed."""
+    request, depth, faint, bottoms = situation.request, situation.depth, situation.faint, goals.bottoms
+    if depth is not None and measured is not None:
+        faint = rise_above(depth, measured, faint)
     given = request.trajectory
-    world = WorldInput(
-        bodies=tuple(replace(body, taper=bottoms.get(index, body.taper)) for index, body in enumerate(present)),
-        motion=motion,
-        fit=fit if level is None else SIDE_VIEW,
+    return WorldInput(
+        bodies=tuple(replace(body, taper=bottoms.get(i, body.taper)) for i, body in enumerate(situation.present)),
+        motion=situation.motion,
+        fit=fit,
         size=situation.size,
         num_frames=request.num_frames,
         fps=request.fps,
         lasts=0.0 if given is None else (len(given.points) - 1) / given.fps,
-        others=others,
-        removed=bodies[len(present) :],
+        others=motions_of_others(situation),
+        removed=situation.bodies[situation.count :],
         turns_wanted=query is not None and query.asked.relation == "tips",
-        placement=carried,
-        placed_before=before,
-        level=level,
+        placement=goals.carried,
+        placed_before=goals.before,
+        level=situation.level,
         measured=measured,
-        depth=None if situation.depth is None or situation.follows_path else situation.depth.estimate(fit, measured),
+        depth=None if depth is None else depth.estimate(fit, measured),
         faint=faint,
     )
-    if not situation.follows_path:
-        return world, query, None
-    camera = Camera(*situation.size, motion.metres_per_pixel.value)
-    times = np.arange(world.frames) / request.fps
+
+
+def motions_of_others(situation: Situation) -> dict[int, Motion]:
+    """What else moves, by its body: it has a way and a speed of its own, and no end but what it meets."""
+    if situation.follows_path:
+        return {}
+    motion, index_of = situation.motion, {body.bbox: i for i, body in enumerate(situation.bodies) if i}
+    fields = ("kind", "direction", "direction_deviation", "depth", "towards", "speed", "speed_deviation")
+    alone = {"distance": None, "duration": None, "until": None, "steps": (), "others": (), "trail": (), "rises": False,
+             "other_direction": None}  # fmt: skip
+    return {
+        index_of[each.object.bbox]: motion.model_copy(update=alone | {name: getattr(each, name) for name in fields})
+        for each in motion.others
+        if each.object.bbox in index_of
+    }
+
+
+def path_of(situation: Situation, world: WorldInput) -> FreePath:
+    """The path that no contact changes: the given one, else the one of the ballistic law."""
+    given, times = situation.request.trajectory, np.arange(world.frames) / world.fps
+    camera = Camera(*situation.size, situation.motion.metres_per_pixel.value)
     if given is not None:
-        path = given_path(camera, given, times)
-    else:
-        path = ballistic_path(camera, situation.grounding, motion, times)
-    to_foot = np.array(bodies[0].foot) - np.array(situation.grounding.point)
-    prescribed = PrescribedMotion(path.states[:, :3], path.points + to_foot)
-    return replace(world, prescribed=prescribed), query, path.cut(request.num_frames)
+        return given_path(camera, given, times)
+    return ballistic_path(camera, situation.grounding, situation.motion, times)
 
 
-# --- bodies
+# --- what is asked
 
 
-def seen_bodies(situation: Situation) -> tuple[SeenBody, ...]:
-    """The mover, then the obstacles, then what is removed."""
-    scene, grounding, bodies = situation.scene, situation.grounding, list[SeenBody]()
-    located = {each.bbox: each for each in situation.located}
-    mover = LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior, source=grounding.source)
-    first = Obstacle(mover.object, mover.bbox, scene.cropped(mover.bbox))
-    # What is asked to fall off a thing stands on it.
-    asked, carrier, carried = grounding.asked, None, ""
-    if asked is not None and asked.relation == "lands" and situation.motion.kind == "linear":
-        carrier = next((each.object for each in situation.located if same_name(each.object, asked.target or "")), None)
-        carried = asked.subject or grounding.object
-    for seen in (first, *situation.obstacles, *situation.removed):
-        thing = located.get(seen.bbox) if bodies else mover
-        said, region = None if thing is None else thing.prior, scene.region_of(seen.bbox)
-        if carrier and same_name(seen.name, carried) and (said is None or said.stands_on is None):
-            said = (said or ObjectPrior()).model_copy(update={"stands_on": carrier})
-        shape = None if said is None else said.shape
-        if shape is None:
-            shape = None if region is None else shape_seen(region)
-            shape = "box" if situation.side_view is not None and shape != "sphere" else shape
-        body = SeenBody(
-            name=seen.name,
-            bbox=seen.bbox,
-            mask=seen.mask,
-            shape=shape or "cylinder",  # it stands upright
-            is_form_known=shape is not None,
-            source=(None if thing is None else thing.source) or "embedded",
-            confidence=seen.confidence,
-            prior=said,
-            bbox_deviation=grounding.bbox_deviation if not bodies else 0.0 if thing is None else thing.bbox_deviation,
-            point=None if bodies else grounding.point,
-            stands_out=region is not None or situation.side_view is not None,
-        )
-        if said is not None and not bodies:
-            body = replace(body, elongated=said.elongated, equal_sided=said.equal_sided)
-        bodies.append(body)
-    return tuple(bodies)
-
-
-def query_of(situation: Situation, bodies: Sequence[SeenBody], on_floor: Sequence[bool]) -> Query | None:
+def query_of(situation: Situation, stance: Stance) -> Query | None:
     """What is asked of bodies; None where nothing is, or one that is named was not found under that name."""
-    asked, motion = situation.grounding.asked, situation.motion
+    asked = situation.asked
     if asked is None:
         return None
-    if situation.carried is not None and asked.relation == "moves":  # whether it stays where it is put
-        asked = asked.model_copy(update={"relation": "inside", "negated": not asked.negated, "target": None})
-
-    def named(words: str) -> tuple[int, ...]:
-        if same_name(words, situation.grounding.object):
-            return (0,)
-        boxes = {each.bbox for each in situation.located if same_name(each.object, words)}
-        return tuple(index for index, body in enumerate(bodies) if index and body.bbox in boxes)
-
-    subjects = (0,) if asked.subject is None else named(asked.subject)
-    targets = (None,) if asked.target is None else named(asked.target)
-    among = [named(name) for name in asked.among]
+    subjects = (0,) if asked.subject is None else situation.named(asked.subject)
+    targets = (None,) if asked.target is None else situation.named(asked.target)
+    among = [situation.named(name) for name in asked.among]
     is_of_itself = targets[:1] == subjects[:1] and asked.relation not in (*OF_TARGET, *OF_ITSELF)
     if not subjects or not targets or not all(among) or is_of_itself:
         return None
-    known, present = tuple(dict.fromkeys(body for meant in among for body in meant)), 1 + len(situation.obstacles)
-    asked = asked.model_copy(update={"among": tuple(bodies[body].name for body in known)})
-    is_guess = motion.kind == "projectile" and motion.cue != "trail" and motion.towards is None
-    sure_of_miss = SURE_OF_MISS if is_guess and motion.depth_deviation > 0 else SURE
-    query = Query(asked, targets[0], subjects[0], known, sure_of_miss=sure_of_miss)
-    is_of_each = asked.form in OF_EACH
-    if is_of_each and not known:  # to be taken away: what the question names, and what is met
-        others = [i for i in range(1, present) if i != query.subject]
-        said = {each.bbox for each in situation.located if each.role == "target"}
-        chosen = [i for i in others if bodies[i].bbox in said] if query.is_of_removal else others
-        query = replace(query, among=tuple(chosen), meets_more=query.is_of_removal)
+    known = tuple(dict.fromkeys(body for meant in among for body in meant))
+    asked = asked.model_copy(update={"among": tuple(situation.bodies[body].name for body in known)})
+    sure, sure_of_miss = shares_of_sure(situation, asked)
+    query = Query(asked, targets[0], subjects[0], known, sure=sure, sure_of_miss=sure_of_miss)
+    query = replace(query, is_decidable=is_decidable(situation, stance, query))
+    return query if known or asked.form not in OF_EACH else with_candidates(situation, query)
+
+
+def shares_of_sure(situation: Situation, asked: Asked) -> tuple[float, float]:
+    """The shares of the worlds from which it is answered that something happens, and that it does not."""
+    motion = situation.motion
     if situation.carried is not None and asked.relation == "inside":
-        can_tell = not is_of_each or (bool(known) and not query.is_of_removal and not query.subject)
-        return replace(query, sure=SURE_OF_FIT, sure_of_miss=SURE_OF_FIT, is_decidable=can_tell)
-    # Worlds decide nothing of what is removed, and not that something lands that stands on the floor.
-    is_present = situation.is_separated and query.subject < present
-    is_seen = asked.relation in BY_EVENTS and not (on_floor[query.subject] and asked.relation == "lands")
-    is_seen &= asked.form != "which" or asked.relation not in OF_ITSELF
-    return replace(query, is_decidable=is_present and is_seen)
+        return SURE_OF_FIT, SURE_OF_FIT
+    is_guess = motion.kind == "projectile" and motion.cue != "trail" and motion.towards is None
+    return SURE, SURE_OF_MISS if is_guess and motion.depth_deviation > 0 else SURE
+
+
+def is_decidable(situation: Situation, stance: Stance, query: Query) -> bool:
+    """Whether worlds decide it: not of what is removed, nor that something lands that stands on the floor."""
+    asked = query.asked
+    if situation.carried is not None and asked.relation == "inside":
+        is_of_each = asked.form in OF_EACH
+        return not is_of_each or (bool(query.among) and not query.is_of_removal and not query.subject)
+    if not situation.is_separated or query.subject >= situation.count or asked.relation not in BY_EVENTS:
+        return False
+    if asked.relation == "lands" and stance.on_floor[query.subject]:
+        return False
+    return asked.form != "which" or asked.relation not in OF_ITSELF
+
+
+def with_candidates(situation: Situation, query: Query) -> Query:
+    """With the candidates of a question that names none: what it names besides, and what is met."""
+    others = [index for index in range(1, situation.count) if index != query.subject]
+    if query.is_of_removal:
+        said = {each.bbox for each in situation.located if each.role == "target"}
+        others = [index for index in others if situation.bodies[index].bbox in said]
+    return replace(query, among=tuple(others), meets_more=query.is_of_removal)
 
 
 # --- what is put somewhere
 
 
-def placement_goals(
-    situation: Situation, bodies: Sequence[SeenBody]
-) -> tuple[PlacementGoal | None, tuple[PlacementGoal, ...]]:
-    """Where the mover is seen going, if it is put somewhere, and what is put somewhere before, in its order.
+def goals_of(situation: Situation, query: Query | None) -> Goals:
+    """Where things are put.
 
     Raises `CannotGround` where nothing says where to, for what is put to the mover while that is put somewhere itself,
     for a mover that is put elsewhere and follows a path, and as `_goal`.
@@ -300,68 +216,75 @@ def placement_goals(
     motion, carried = situation.motion, situation.carried
     if motion.kind == "place" and carried is None:
         raise _says_no_place(situation.grounding.object)
-    goals: list[PlacementGoal] = []
-    placed = (*([] if carried is None else [carried]), *situation.placed_before)
-    for each, where in [(each, place_words(each)) for each in placed]:
-        name = each.object.object
-        goal = replace(_goal(situation.scene, each, bodies), place=where)
-        if each is not carried and motion.kind == "place" and 0 in goal.targets:
+    own = None if carried is None else replace(_goal(situation, carried), place=place_words(carried))
+    before: list[PlacementGoal] = []
+    for each in situation.grounding.interventions:
+        if each.kind != "place" or each is carried:
+            continue
+        name, where, goal = each.object.object, place_words(each), _goal(situation, each)
+        if motion.kind == "place" and 0 in goal.targets:
             raise CannotGround(
                 f"'{name}' is put {where}, which is put somewhere itself, and seen going there last. Ask "
                 "of one change at a time."
             )
-        if each is not carried and situation.follows_path and goal.body == 0:
+        if situation.follows_path and goal.body == 0:
             raise CannotGround(
                 f"'{name}' cannot be put {where} before it moves: its path, which is given or follows the "
                 "ballistic law, begins where the image shows it. Leave the path out, or ask for the law `contact`."
             )
-        sets_out = 0 in goal.targets and motion.kind == "linear"
-        goals.append(replace(goal, by_heading=sets_out and goal.relation in ("in-front-of", "behind")))
-    return (None, tuple(goals)) if carried is None else (goals[0], tuple(goals[1:]))
+        by_heading = 0 in goal.targets and motion.kind == "linear" and goal.relation in ("in-front-of", "behind")
+        before.append(replace(goal, place=where, by_heading=by_heading))
+    return Goals(own, tuple(before), goals_instead(situation, query))
 
 
-def _goal(scene: Scene, placed: Intervention, bodies: Sequence[SeenBody]) -> PlacementGoal:
+def goals_instead(situation: Situation, query: Query | None) -> tuple[PlacementGoal, ...]:
+    """Where the mover is put to each of several things instead. Raises `CannotGround` as `_goal`."""
+    if query is None or not query.is_decidable or (query.asked.form, query.asked.relation) != ("which", "inside"):
+        return ()
+    carried = situation.carried
+    assert carried is not None  # else it is not asked what the mover fits into
+    targets = (LocatedObject(object=body.name, bbox=body.bbox) for body in (situation.bodies[i] for i in query.among))
+    return tuple(_goal(situation, carried.model_copy(update={"targets": (each,)})) for each in targets)
+
+
+def _goal(situation: Situation, placed: Intervention) -> PlacementGoal:
     """Where a thing is put.
 
-    Raises `CannotGround` where it, or what it is put to, was not found; where both are one, or it may be closed.
+    Raises `CannotGround` where it, or what it is put to, was not found; where both are one; where there is no opening.
     """
     if placed.relation is None or not placed.targets:
         raise _says_no_place(placed.object.object)
-    found: list[int] = []
-    for thing in (placed.object, *placed.targets):
-        best = max(range(len(bodies)), key=lambda index: iou(thing.bbox, bodies[index].bbox))
-        if not is_same_object(thing.bbox, bodies[best].bbox):
-            raise CannotGround(f"'{thing.object}' was not found as an object of its own.")
-        found.append(best)
-    body, *targets = found
+    bodies = situation.present
+    body, *targets = (_found(bodies, thing) for thing in (placed.object, *placed.targets))
     if body in targets:
         raise CannotGround(f"'{bodies[body].name}' cannot be put into, onto or next to itself.")
     if len(set(targets)) < len(targets):
         raise CannotGround(f"'{placed.targets[0].object}' and '{placed.targets[1].object}' were found at one place.")
-    target, opening = bodies[targets[0]], None
+    target = bodies[targets[0]]
     beside = [each for index, each in enumerate(bodies) if index not in (body, targets[0])]
-    is_hidden = placed.relation == "into" and _has_hidden_foot(target, beside)
-    side = _free_side(bodies[body].bbox, target.bbox, beside, scene.width)
-    if placed.relation == "into":
-        # The opening of a container, by what is said of it and by its rim in the image.
-        form = None if target.prior is None else target.prior.opening
-        if form == "none":
-            raise CannotGround(
-                f"'{target.name}' is not an open container: nothing can go into it. Name a bowl, cup or box, or put it "
-                "`onto` it."
-            )
-        if form is None:
-            raise CannotGround(f"Whether '{target.name}' is open is not known: call it a bowl, a cup or a box.")
-        opening = replace(measure_opening(target.mask, square=form == "square"), foot_hidden=is_hidden)
+    opening = opening_of(situation, target, beside) if placed.relation == "into" else None
+    side = _free_side(bodies[body].bbox, target.bbox, beside, situation.size[0])
     return PlacementGoal(placed.relation, tuple(targets), opening, side, body)
 
 
-def _goals_of_each(situation: Situation, query: Query, bodies: Sequence[SeenBody]) -> tuple[PlacementGoal, ...]:
-    """Those of the mover, if it is put to each of several things instead. Raises `CannotGround` as `_goal`."""
-    carried = situation.carried
-    assert carried is not None  # else it is not asked what the mover fits into
-    targets = (LocatedObject(object=body.name, bbox=body.bbox) for body in (bodies[each] for each in query.among))
-    return tuple(_goal(situation.scene, carried.model_copy(update={"targets": (each,)}), bodies) for each in targets)
+def _found(bodies: Sequence[SeenBody], thing: LocatedObject) -> int:
+    best = max(range(len(bodies)), key=lambda index: iou(thing.bbox, bodies[index].bbox))
+    if not is_same_object(thing.bbox, bodies[best].bbox):
+        raise CannotGround(f"'{thing.object}' was not found as an object of its own.")
+    return best
+
+
+def opening_of(situation: Situation, target: SeenBody, beside: Sequence[SeenBody]) -> SeenOpening:
+    """The opening of a container. Raises `CannotGround` for what is closed, or may be."""
+    said, opening = target.prior.opening, situation.openings[target.bbox]
+    if said == "none":
+        raise CannotGround(
+            f"'{target.name}' is not an open container: nothing can go into it. Name a bowl, cup or box, or put it "
+            "`onto` it."
+        )
+    if said is None:
+        raise CannotGround(f"Whether '{target.name}' is open is not known: call it a bowl, a cup or a box.")
+    return replace(opening, foot_hidden=_has_hidden_foot(target, beside))
 
 
 def _says_no_place(name: str) -> CannotGround:

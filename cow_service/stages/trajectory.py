@@ -3,7 +3,6 @@
 import base64
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +19,10 @@ from cow_service.physics.world import WorldInput
 from cow_service.records import CLEAR, BBox, CandidateOutcome, Doubt, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
-from cow_service.stages.reconstruction import Situation, reconstruct
+from cow_service.stages.reconstruction import reconstruct
 from cow_service.stages.run import Run
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Floats
+from cow_service.stages.seeing import Situation, see
+from cow_service.vision.types import Floats, Image
 
 SPRITE_SIDE = 256  # px, at most: sprites are seen while somebody drags
 
@@ -32,12 +31,12 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
         scene = run.scene_of(grounding, motion.cue)
-        situation = Situation.of(run, scene, grounding, motion)
-        reconstructed = reconstruct(situation)
-        trajectory = simulate_world(situation, *reconstructed)
-        live = live_worlds(*reconstructed[:2], run.request.ensemble) if run.request.live else None
-        for body, told in zip(reconstructed[0].bodies, [] if live is None else live["bodies"], strict=False):
-            told["sprite"] = _sprite(scene, body)
+        situation = see(run, scene, grounding, motion)
+        world, query, path = reconstruct(situation)
+        trajectory = simulate_world(situation, world, query, path)
+        live = live_worlds(world, query, run.request.ensemble) if run.request.live else None
+        for body, told in zip(world.bodies, [] if live is None else live["bodies"], strict=False):
+            told["sprite"] = cut_out(scene.undrawn, body)
     warnings = warnings_of(run.request, grounding, trajectory)
     if live is None:
         return StageResult(value=trajectory, warnings=warnings)
@@ -47,10 +46,10 @@ def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: 
     return StageResult(value=trajectory, warnings=warnings, artifacts=(kept.sha256,))
 
 
-def _sprite(scene: Scene, body: SeenBody) -> dict[str, Any]:
+def cut_out(image: Image, body: SeenBody) -> dict[str, Any]:
     """A body cut out of the image without what is drawn over it: a PNG as data URL, and its box (px)."""
     mask = body.mask
-    cut = np.dstack([scene.undrawn[mask.rows, mask.columns], mask.patch.astype(np.uint8) * np.uint8(255)])
+    cut = np.dstack([image[mask.rows, mask.columns], mask.patch.astype(np.uint8) * np.uint8(255)])
     png = base64.b64encode(encode_png(fit_within(cut, SPRITE_SIDE))).decode()
     return {"href": f"data:image/png;base64,{png}", "box": list(mask.bbox)}
 
@@ -61,34 +60,22 @@ def simulate_world(situation: Situation, world: WorldInput, query: Query | None,
     Simulates what the mover and everything it meets do, many times, within what the picture leaves open.
     """
     given, known = situation.request.trajectory, situation.is_separated
-    judged = [judge(situation, each) for each in run_ensemble(world, query, situation.request.ensemble)]
-    first, *as_it_is = [record_trajectory(*each, path, given, known) for each in judged]
+    results = run_ensemble(world, query, situation.request.ensemble)
+    first, *as_it_is = [record_trajectory(each, judge(situation, each), path, given, known) for each in results]
     factual = as_it_is[0].model_copy(update={"anchors": ()}) if as_it_is else None
     return first.model_copy(update={"factual": factual})
 
 
-def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult, Outcome | None]:
-    """The result, its bodies as sure as their outlines are; and what the worlds say to what is asked, if anything is.
+def judge(situation: Situation, result: EnsembleResult) -> Outcome | None:
+    """What the worlds say to what is asked, if anything is.
 
     However the worlds agree, nothing is sure of a thing that may be another one than the question means, nor where a
-    thing that matters was not seen clearly: doubtful outlines of those are cut out a second time.
+    thing that matters was not seen clearly.
     """
     asked, world, query = situation.grounding.asked, result.world, result.query
-    touches = None if result.ensemble is None else result.ensemble.events.of[0].times["touches"]
-    candidates = () if result.decided is None or query is None else result.decided.candidates
-    bodies = list(world.bodies)
-    are_named = query is not None and bool(query.asked.among)
-    of_each = [
-        bodies_that_matter(query and query.of(each.body), each.told.touches, len(bodies), each.body if are_named else 0)
-        for each in candidates
-    ]
-    matter = bodies_that_matter(query, touches, len(bodies)).union(*of_each)
-    for body in matter:
-        bodies[body] = replace(bodies[body], confidence=situation.scene.confidence_of(bodies[body].bbox))
-    result = replace(result, world=replace(world, bodies=tuple(bodies)))
     if asked is None:
-        return result, None
-    names = [body.name for body in (*bodies, *world.removed)]
+        return None
+    names = [body.name for body in (*world.bodies, *world.removed)]
     outcome = Outcome(
         asked=asked if query is None else query.asked,
         subject=None if query is None or not query.subject else names[query.subject],
@@ -97,38 +84,51 @@ def judge(situation: Situation, result: EnsembleResult) -> tuple[EnsembleResult,
         robust=False,
     )
     if world.depth is not None and not world.depth.is_of_scene:
-        return result, outcome.model_copy(update={"depends_on": ("depth",)})
-    if result.decided is None:
-        return result, outcome
-    is_misread = situation.motion.other_direction is not None or situation.grounding.question_is_doubtful
-    of_reading: list[Doubt] = ["reading"] if is_misread else []
-    if any(thing.is_doubtful for thing in (situation.grounding, *situation.located)):
-        of_reading.append("identity")
-    path = seen_paths(result.shown.worlds.within_horizon, 0)
+        return outcome.model_copy(update={"depends_on": ("depth",)})
+    return (
+        outcome
+        if result.decided is None or query is None
+        else decided_outcome(situation, result, query, outcome, names)
+    )
+
+
+def decided_outcome(
+    situation: Situation, result: EnsembleResult, query: Query, outcome: Outcome, names: Sequence[str]
+) -> Outcome:
+    """The outcome as worlds decide it, for the whole and for each candidate as sure as what it rests on."""
+    decided, world = result.decided, result.world
+    assert decided is not None
+    assert result.ensemble is not None
+    path, count = seen_paths(result.shown.worlds.within_horizon, 0), len(world.bodies)
     way = path.points[0] - path.seen[0]
+    matter, ways = bodies_that_matter(query, result.ensemble.events.of[0].times["touches"], count), [way]
+    chosen: list[CandidateOutcome] = []
+    for each in decided.candidates:
+        own_way = way if each.told.way is None else each.told.way
+        own = bodies_that_matter(query.of(each.body), each.told.touches, count)
+        own |= {each.body} & set(range(count)) if query.asked.among else set()
+        is_sure = each.sure and not doubts_of(situation, world, own, [own_way])
+        name = names[each.body]
+        chosen.append(CandidateOutcome(object=name, probability=each.probability, sure=is_sure))
+        matter, ways = matter | own, [*ways, own_way]
+    first = None if decided.first is None else names[decided.first]
+    update = vars(decided) | {"first": first, "candidates": tuple(chosen)}
+    if doubts := doubts_of(situation, world, matter, ways):
+        update |= {"sure": False, "robust": False, "depends_on": (*doubts, *decided.depends_on)}
+    return outcome.model_copy(update=update)
 
-    def doubts_of(matter: set[int], ways: Sequence[Floats]) -> list[Doubt]:
-        doubts = list(of_reading)
-        if any(bodies[body].confidence < CLEAR for body in matter):
-            doubts.append("outline")
-        if world.measured is not None and not all(world.measured.footprints[body] for body in matter):
-            doubts.append("depth")
-        if world.placement is None and any(moves_over(bodies[0].bbox, each, world.faint) for each in ways):
-            doubts.append("faint")
-        return doubts
 
-    ways = [way if each.told.way is None else each.told.way for each in candidates]
-    chosen = [
-        CandidateOutcome(
-            object=names[each.body], probability=each.probability, sure=each.sure and not doubts_of(own, [its_way])
-        )
-        for each, own, its_way in zip(candidates, of_each, ways, strict=True)
-    ]
-    first = None if result.decided.first is None else names[result.decided.first]
-    decided = vars(result.decided) | {"first": first, "candidates": tuple(chosen)}
-    if doubts := doubts_of(matter, [way, *ways]):
-        decided |= {"sure": False, "robust": False, "depends_on": (*doubts, *result.decided.depends_on)}
-    return result, outcome.model_copy(update=decided)
+def doubts_of(situation: Situation, world: WorldInput, matter: set[int], ways: Sequence[Floats]) -> tuple[Doubt, ...]:
+    """Why nothing is sure that rests on some of the bodies, and on ways [F, 2] (px) that the mover takes."""
+    grounding, measured, mover = situation.grounding, world.measured, world.bodies[0].bbox
+    holds: dict[Doubt, bool] = {
+        "reading": situation.motion.other_direction is not None or grounding.question_is_doubtful,
+        "identity": any(thing.is_doubtful for thing in (grounding, *situation.located)),
+        "outline": any(world.bodies[body].confidence < CLEAR for body in matter),
+        "depth": measured is not None and not all(measured.footprints[body] for body in matter),
+        "faint": world.placement is None and any(moves_over(mover, way, world.faint) for way in ways),
+    }
+    return tuple(doubt for doubt, is_so in holds.items() if is_so)
 
 
 def moves_over(mover: BBox, way: Floats, boxes: Sequence[BBox]) -> bool:
@@ -138,13 +138,11 @@ def moves_over(mover: BBox, way: Floats, boxes: Sequence[BBox]) -> bool:
     return any(bool(((swept[:, :2] < box[2:]) & (swept[:, 2:] > box[:2])).all(axis=1).any()) for box in lower)
 
 
-def bodies_that_matter(query: Query | None, touches: Floats | None, count: int, candidate: int = 0) -> set[int]:
+def bodies_that_matter(query: Query, touches: Floats, count: int) -> set[int]:
     """Of so many bodies the mover, what is asked about, and what the mover touches [K, B] before that in more than a
     few worlds. What was removed, numbered after the bodies, is never met."""
-    meant = {0, candidate} if query is None else {0, candidate, query.subject, query.target}
-    if touches is None:
-        return {i for i in range(count) if i in meant}
     # Of what is struck by something else in turn, what comes first is not told here.
-    target = None if query is None or query.subject or query.asked.relation != "touches" else query.target
+    target = None if query.subject or query.asked.relation != "touches" else query.target
     before = touches[:, target] if target is not None and target < count else np.full(len(touches), np.inf)
+    meant = {0, query.subject, query.target}
     return {i for i in range(count) if i in meant or float(np.mean(touches[:, i] < before)) > FEW_WORLDS}

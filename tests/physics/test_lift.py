@@ -13,7 +13,7 @@ from floors import TrueCamera, known, outline
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.bodies import NOTHING_SAID, SeenBody, supports_of
 from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.events import find_world_events, seen_paths
@@ -49,7 +49,7 @@ def filled(shape: tuple[int, int], bbox) -> CroppedMask:
     return CroppedMask.of(mask)
 
 
-def body(bbox, shape="box", name="thing", prior=None) -> SeenBody:
+def body(bbox, shape="box", name="thing", prior=NOTHING_SAID) -> SeenBody:
     return SeenBody(name, bbox, filled((400, 640), bbox), shape, prior=prior)
 
 

@@ -7,7 +7,6 @@ from functools import cache
 from typing import Any, get_args
 
 import numpy as np
-import pytest
 from drawn import block, floor
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,9 +16,9 @@ from cow_service.physics.ensemble import EnsembleResult, run_ensemble
 from cow_service.records import Doubt, Grounding, LocatedObject, Motion, Outcome
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import settle_motion
-from cow_service.stages.reconstruction import Situation, reconstruct
+from cow_service.stages.reconstruction import reconstruct
+from cow_service.stages.seeing import Situation, see
 from cow_service.stages.trajectory import judge
-from cow_service.vision.scene import Scene
 
 BALL, CUBE = (100.0, 240.0, 160.0, 300.0), (300.0, 220.0, 380.0, 300.0)
 
@@ -37,28 +36,26 @@ def situation() -> tuple[Situation, EnsembleResult]:
         asked={"relation": "touches", "target": "blue block"},
     )
     grounding = ground(run).value
-    found = Situation.of(run, run.scene_of(grounding), grounding, settle_motion(run, grounding, None).value)
+    found = see(run, run.scene_of(grounding), grounding, settle_motion(run, grounding, None).value)
     world, query, _ = reconstruct(found)
     (result,) = run_ensemble(world, query, 15)
     return found, result
 
 
-def judged(monkeypatch: pytest.MonkeyPatch, doubts: frozenset[str]) -> Outcome:
+def judged(doubts: frozenset[str]) -> Outcome:
     found, result = situation()
     mover: dict[str, Any] = {"is_doubtful": "mover" in doubts, "question_is_doubtful": "question" in doubts}
     others = tuple(each.model_copy(update={"is_doubtful": "target" in doubts}) for each in found.grounding.others)
     rival = (0.0, 1.0) if "direction" in doubts else None
-    doubted = Situation(
-        found.scene,
-        found.grounding.model_copy(update=mover | {"others": others}),
-        found.motion.model_copy(update={"other_direction": rival}),
-        found.request,
-        found.obstacles,
+    doubted = replace(
+        found,
+        grounding=found.grounding.model_copy(update=mover | {"others": others}),
+        motion=found.motion.model_copy(update={"other_direction": rival}),
     )
-    monkeypatch.setattr(Scene, "confidence_of", lambda *_: 0.5 if "outline" in doubts else 1.0)
-    if "unlisted" in doubts:
-        result = replace(result, world=replace(result.world, faint=(CUBE,)))
-    outcome = judge(doubted, result)[1]
+    confidence = 0.5 if "outline" in doubts else 1.0
+    bodies = tuple(replace(body, confidence=confidence) for body in result.world.bodies)
+    world = replace(result.world, bodies=bodies, faint=(CUBE,) if "unlisted" in doubts else ())
+    outcome = judge(doubted, replace(result, world=world))
     assert outcome is not None
     return outcome
 
@@ -71,8 +68,7 @@ DOUBTS = {
 
 @given(doubts=st.frozensets(st.sampled_from(sorted(DOUBTS))))
 def test_nothing_is_sure_that_is_in_doubt(doubts: frozenset[str]) -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        outcome = judged(monkeypatch, doubts)
+    outcome = judged(doubts)
     assert outcome.sure is outcome.robust is (not doubts)
     assert {DOUBTS[each] for each in doubts} == set(outcome.depends_on) & set(DOUBTS.values())
     assert set(outcome.depends_on) <= set(get_args(Doubt))

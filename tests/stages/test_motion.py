@@ -14,8 +14,9 @@ from cow_service.readers.base import ReadResult
 from cow_service.records import Grounding, LocatedObject, Motion, MotionRequest, Reading, Trajectory
 from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import settle_motion
-from cow_service.stages.reconstruction import Situation, reconstruct
+from cow_service.stages.reconstruction import reconstruct
 from cow_service.stages.run import Run
+from cow_service.stages.seeing import see
 from cow_service.stages.trajectory import simulate_world
 
 IMAGE = drawn.block(drawn.ball(drawn.floor(), (150, 250), 25, (200, 40, 40)), (400, 190, 460, 280), (40, 40, 200))
@@ -44,8 +45,7 @@ def read(reading: MotionRequest | None, **given_: Any) -> StageResult[Motion]:
 
 def moved(reading: MotionRequest | None = None, **given_: Any) -> Trajectory:
     run_, found = run_with(reading, given_), read(reading, **given_).value
-    obstacles = run_.scene.obstacles(GROUNDING.bbox, GROUNDING.others)
-    situation = Situation(run_.scene, GROUNDING, found, run_.request, obstacles)
+    situation = see(run_, run_.scene, GROUNDING, found)
     return simulate_world(situation, *reconstruct(situation))
 
 

@@ -17,7 +17,7 @@ from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Asked, Grounding, Intervention, LocatedObject, Placement, Trajectory
 from cow_service.stages.grounding import understood
 from cow_service.stages.motion import settle_motion
-from cow_service.stages.reconstruction import obstacles_of
+from cow_service.stages.seeing import obstacles_of
 from cow_service.stages.trajectory import compute_trajectory
 
 SMALL, BIG = (125.0, 265.0, 175.0, 315.0), (60.0, 180.0, 250.0, 370.0)

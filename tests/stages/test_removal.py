@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,10 @@ from cow_service.physics.ensemble import run_ensemble
 from cow_service.settings import Settings
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import settle_motion
-from cow_service.stages.reconstruction import Situation, reconstruct
+from cow_service.stages.reconstruction import reconstruct
 from cow_service.stages.run import Run
+from cow_service.stages.seeing import see
 from cow_service.stages.trajectory import judge
-from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image
 
 MOVER, GOAL, BETWEEN = (80, 210, 130, 260), (480, 196, 550, 274), (280, 200, 350, 272)
@@ -84,18 +85,16 @@ def test_which_one_to_take_away_is_told_of_each_in_the_scene_with_all() -> None:
     assert (told.factual.outcome.asked.form, told.factual.outcome.probability) == ("whether", 0)
 
 
-def test_what_is_not_seen_clearly_makes_that_candidate_unsure_and_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_seen_clearly_makes_that_candidate_unsure_and_the_whole() -> None:
     asked = {"form": "which", "relation": "touches", "among": ("cube", "green block")}
     wanted = run(interventions=(), asked=asked, camera={"pitch": 28, "focal": 640}, objects_complete=True)
     grounding = ground(wanted).value
-    situation = Situation.of(
-        wanted, wanted.scene_of(grounding), grounding, settle_motion(wanted, grounding, None).value
-    )
+    situation = see(wanted, wanted.scene_of(grounding), grounding, settle_motion(wanted, grounding, None).value)
     world, query, _ = reconstruct(situation)
     (result,) = run_ensemble(world, query, 15)
     for blurred, sure in ((None, [True, True]), (GOAL, [False, True]), (MOVER, [False, False])):
-        monkeypatch.setattr(Scene, "confidence_of", lambda _, box, blurred=blurred: 0.5 if box == blurred else 0.9)
-        _, outcome = judge(situation, result)
+        bodies = tuple(replace(each, confidence=0.5 if each.bbox == blurred else 0.9) for each in result.world.bodies)
+        outcome = judge(situation, replace(result, world=replace(result.world, bodies=bodies)))
         assert [each.sure for each in outcome.candidates] == sure
         assert (outcome.sure, outcome.depends_on[:1]) == (blurred is None, () if blurred is None else ("outline",))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,11 @@ from staged import BLUE, RED, computed
 
 from cow_service.records import Grounding, LocatedObject, ObjectPrior, Trajectory
 from cow_service.stages.motion import settle_motion
-from cow_service.stages.reconstruction import Situation, reconstruct
+from cow_service.stages.reconstruction import reconstruct
+from cow_service.stages.seeing import see
 from cow_service.stages.trajectory import simulate_world
 from cow_service.vision.masks import CroppedMask
-from cow_service.vision.scene import Obstacle, Scene
+from cow_service.vision.scene import Scene
 from cow_service.vision.types import Image
 
 MOVER = {"object": "red ball", "bbox": (80, 210, 130, 260)}
@@ -168,10 +170,18 @@ def seen(mover, others, prior: ObjectPrior | None = None, **request: Any) -> Tra
         LocatedObject(object=f"thing {i}", bbox=bbox, prior=prior) for i, bbox in enumerate(others) if bbox != mover
     ]
     middle = ((mover[0] + mover[2]) / 2, (mover[1] + mover[3]) / 2)
-    grounding = Grounding(object="ball", bbox=mover, point=middle, prior=prior, others=tuple(named), source="request")
-    SEEN.preset_mask(mover, lambda: masked(mover).full())
-    obstacles = [Obstacle(other.object, other.bbox, masked(other.bbox)) for other in named]
-    situation = Situation(SEEN, grounding, settle_motion(run, grounding, None).value, run.request, obstacles)
+    grounding = Grounding(
+        object="ball",
+        bbox=mover,
+        point=middle,
+        prior=prior,
+        others=tuple(named),
+        objects_complete=True,
+        source="request",
+    )
+    for box in (mover, *others):
+        SEEN.preset_mask(box, partial(lambda box: masked(box).full(), box))
+    situation = see(run, SEEN, grounding, settle_motion(run, grounding, None).value)
     return simulate_world(situation, *reconstruct(situation))
 
 

@@ -171,7 +171,7 @@ def fit_drawn(camera: TrueCamera, shapes: tuple[str, ...], tiles: bool, rng: np.
         assert foot is not None
         masks.append(draw(image, camera, shape, foot, rng.uniform(0, 1.5)))
     own, floor = divide(find_segments(image, np.zeros((height, width), bool)), masks)
-    things = [Standing(mask.bbox, segments=segments) for mask, segments in zip(masks, own, strict=True)]
+    things = [Standing(mask.bbox, edges=segments) for mask, segments in zip(masks, own, strict=True)]
     return narrowed(prior(0.0, max(camera.size) / width), things, camera.size, floor)
 
 
@@ -217,6 +217,6 @@ class TestEdges:
                 along = np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.sort(rng.uniform(8, 40, count))[::-1, None]
                 middle = corner + sides * rng.uniform(0, 1, (count, 2))
                 bbox = (*corner.tolist(), *(corner + sides).tolist())
-                things.append(Standing(bbox, segments=np.hstack([middle - along, middle + along])))
+                things.append(Standing(bbox, edges=np.hstack([middle - along, middle + along])))
             measured += narrowed(prior(), things, SIZE).source == "edges"
         assert measured < 11
