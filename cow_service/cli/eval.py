@@ -212,7 +212,7 @@ def report(
     out: Annotated[Path | None, option("Folder for the report.", "--out", "-o", shown="RUN/report")] = None,
     prices: Prices = None,
 ) -> None:
-    """Compare runs in tables, plots and a standalone page."""
+    """Compare runs in tables and plots."""
     _check_installed()
     from cow_service.evals.runs import REPORT, read_run  # noqa: PLC0415
 
@@ -223,9 +223,10 @@ def report(
 def _report(runs: list[Any], out: Path, prices: dict[str, Any]) -> None:
     """Writes a report, and prints its table."""
     from cow_service.evals.report.write import write_report  # noqa: PLC0415
+    from cow_service.evals.runs import LOGS  # noqa: PLC0415
 
     typer.echo(printable(write_report(runs, out, prices)))
-    typer.echo(f"\nThe report, with every item: {out / 'index.html'}")
+    typer.echo(f"\nThe report: {out / 'report.md'}. Every question and reply: inspect view --log-dir {runs[0].folder / LOGS}")
 
 
 def _priced(path: Path | None) -> dict[str, Any]:

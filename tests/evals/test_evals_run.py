@@ -228,7 +228,7 @@ def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None
     kinds = ("primary", "levels", "arms", "gains", "why", "doses", "cost")
     tables = {f"tables/{name}.{form}" for name in kinds for form in ("md", "csv", "tex")}
     tables |= {f"plots/{name}.svg" for name in ("gains", "rates", "calibration", "cost")}
-    assert {"index.html", "report.md", "manifest.json", "tables/replies.csv", *tables} <= names
+    assert {"report.md", "manifest.json", "tables/replies.csv", *tables} <= names
     manifest = json.loads((report / "manifest.json").read_text())
     assert manifest["runs"][0]["versions"]["prompts/eval-question"].startswith("1 (sha256 ")
     assert set(manifest["files"]) == names - {"manifest.json"}

@@ -1,4 +1,4 @@
-"""Writes a report: tables, plots, a page with every item, and a manifest."""
+"""Writes a report: tables, plots and a manifest."""
 
 import hashlib
 import json
@@ -8,7 +8,6 @@ from pathlib import Path
 
 from cow_service.errors import InvalidRequest, StorageUnavailable
 from cow_service.evals.report import tables
-from cow_service.evals.report.page import write_page
 from cow_service.evals.report.summary import Findings, Price, summarize
 from cow_service.evals.runs import EvalRun
 
@@ -44,9 +43,8 @@ def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
         for extension, text in FORMATS.items():
             (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
     (out / "tables" / "replies.csv").write_text(tables.csv_text(tables.replies(runs)), encoding="utf-8")
-    plots = write_plots(out / "plots", findings)
+    write_plots(out / "plots", findings)
     differs = {f"Differences from the paper: {about.lower()}": told for about, told in tables.DIFFERENCES.items()}
-    write_page(out, runs, findings, plots, [(heading, "\n".join(told)) for heading, told in differs.items()])
 
     # What was asked, and what was found in the data.
     asked: list[str] = []
