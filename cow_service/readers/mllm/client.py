@@ -454,8 +454,10 @@ class LearningModel(RetryingModel):
             for part in first.parts
         ]
         messages = [replace(first, parts=parts), *messages[1:]]
-        refused = [name for name in ("temperature", "seed") if not getattr(takes, name)]
-        sent = cast("ModelSettings", {name: value for name, value in (settings or {}).items() if name not in refused})
+        sent = (settings or ModelSettings()).copy()
+        for name in ("temperature", "seed"):
+            if not getattr(takes, name):
+                sent.pop(name, None)
         if self._is_longer and (most := sent.get("max_tokens")):
             sent |= ModelSettings(max_tokens=2 * most)
         if takes.output != "prompt":
