@@ -50,19 +50,8 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
         for name, value in body.items()
         if name not in (*SETTINGS, *READ) and value is not None and value not in NEUTRAL.get(name, ())
     ]
-    settings: dict[str, Any] = {}
-    for name, own in SETTINGS.items():
-        value = body.get(name)
-        if value is None:
-            continue
-        if own in model.unsupported_settings or (name == "tool_choice" and not body.get("tools")):
-            left_out.append(name)
-            continue
-        if name == "stop" and isinstance(value, str):
-            value = [value]
-        elif name == "tool_choice" and isinstance(value, dict):
-            value = [_at(value, "/tool_choice", "function", "name")]
-        settings[own] = value
+    settings, refused = _settings(body, model)
+    left_out += refused
     parameters = ModelRequestParameters(function_tools=_tools(body))
     response_format = body.get("response_format")
     if isinstance(response_format, dict) and response_format.get("type") == "json_schema":
@@ -74,7 +63,25 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
     names = ", ".join(f"`{name}`" for name in left_out)
     warning = f"Not sent: {names}. This MLLM is not asked over OpenAI's protocol, and its own has no such field."
     warnings = (warning,) if left_out else ()
-    return PreparedChat(list(_messages(body)), cast("ModelSettings", settings), parameters, warnings)
+    return PreparedChat(list(_messages(body)), settings, parameters, warnings)
+
+
+def _settings(body: dict[str, Any], model: Model) -> tuple[ModelSettings, list[str]]:
+    """The settings of a chat, and the names of those that the model does not take."""
+    settings: dict[str, Any] = {}
+    refused: list[str] = []
+    for name, own in SETTINGS.items():
+        if (value := body.get(name)) is None:
+            continue
+        if own in model.unsupported_settings or (name == "tool_choice" and not body.get("tools")):
+            refused.append(name)
+            continue
+        if name == "stop" and isinstance(value, str):
+            value = [value]
+        elif name == "tool_choice" and isinstance(value, dict):
+            value = [_at(value, "/tool_choice", "function", "name")]
+        settings[own] = value
+    return cast("ModelSettings", settings), refused
 
 
 def _tools(body: dict[str, Any]) -> list[ToolDefinition]:

@@ -158,21 +158,17 @@ def _of_places(
     def overlaps(coordinates: Coordinates) -> list[float]:
         return [iou(*pair) for reply in written for pair in reply.pairs(coordinates)]
 
-    def found(coordinates: Coordinates) -> int:
-        return sum(each >= FOUND for each in overlaps(coordinates))
-
     forms = product(("thousandths", "fractions", "pixels"), ("xy", "yx"), ("corners", "size"))
     others = [used.model_copy(update=dict(zip(("units", "axes", "box_form"), form, strict=True))) for form in forms]
     count = sum(len(reply.truth.boxes) for reply in written)
     best = max((used, *others), key=lambda coordinates: sum(overlaps(coordinates)))
-    is_found = found(best) * 2 > count
+    is_found = sum(each >= FOUND for each in overlaps(best)) * 2 > count
     best = best if is_found else used
-    result = f"{found(best)} of {count} found"
-    if best != used:
-        result += f", read as {best.words}; asked for were {used.words}"
-    if failed is not None:
-        result += f"; {failed.code}: {failed}"
-    boxes = Finding(question="box", usable=found(best) == count and best == used, result=result)
+    found = sum(each >= FOUND for each in overlaps(best))
+    result = f"{found} of {count} found"
+    result += "" if best == used else f", read as {best.words}; asked for were {used.words}"
+    result += "" if failed is None else f"; {failed.code}: {failed}"
+    boxes = Finding(question="box", usable=found == count and best == used, result=result)
     lines = [(reply.truth, reply.read(best).line or Line()) for reply in written]
     off = [_degrees(truth.way, line.ends) for truth, line in lines if line.ends is not None]
     findings = [boxes, *_of_lines(lines, off)]

@@ -39,12 +39,11 @@ def fit_images(jpegs: Sequence[bytes], takes: ServerCapabilities) -> FittedImage
     first, *frames = map(decode_own, jpegs)
     captions, notes = list[str](), list[str]()
     if takes.reduction:
-        fewer = takes.reduction >= FEWER_FRAMES and len(frames) > FEWER_FRAMES
-        if fewer:
-            kept = (0, len(frames) // 2, len(frames) - 1)
-            captions.append(f"Of the {len(frames)} frames these are numbers {', '.join(str(at + 1) for at in kept)}.")
-            frames = [frames[place] for place in kept]
-        notes.append(f"{SMALLER_NOTE}{' and frames fewer' if fewer else ''}.")
+        if takes.reduction >= FEWER_FRAMES and len(frames) > FEWER_FRAMES:
+            middle, last = len(frames) // 2, len(frames) - 1
+            captions.append(f"Of the {len(frames)} frames these are numbers 1, {middle + 1}, {last + 1}.")
+            frames = [frames[0], frames[middle], frames[last]]
+        notes.append(f"{SMALLER_NOTE}{' and frames fewer' if captions else ''}.")
         scale = 0.5 ** min(takes.reduction, FEWER_FRAMES - 1)
         frames = [_resized(each, round(scale * each.shape[1]), round(scale * each.shape[0])) for each in frames]
     if len(frames) >= most:
@@ -54,7 +53,8 @@ def fit_images(jpegs: Sequence[bytes], takes: ServerCapabilities) -> FittedImage
             frames = [sheet_of(frames, 2)]
         captions.append(AFTER_FIRST if frames else AFTER_FIRST.replace(" after the first", ""))
         notes.insert(0, SHEET_NOTE)
-    encoded = encode_jpeg(first, *([QUALITIES[takes.reduction]] if takes.reduction in QUALITIES else []))
+    quality = QUALITIES.get(takes.reduction)
+    encoded = encode_jpeg(first) if quality is None else encode_jpeg(first, quality)
     return FittedImages((encoded, *map(encode_jpeg, frames)), " ".join(captions), " ".join(notes))
 
 
