@@ -26,6 +26,7 @@ from cow_service.weights.manifests import EXAMPLES
 
 FOUND = 0.5  # intersection over union from which a box counts as that of the thing
 ASIDE = 45.0  # degrees from which a direction counts as another one
+FORMS = tuple(product(("thousandths", "fractions", "pixels"), ("xy", "yx"), ("corners", "size")))  # of coordinates
 WHICH = "These are four pictures of different scenes. Which of them shows a red bottle?"
 PLACES = ("the first", "the second", "the third", "the fourth")  # of the pictures in `QUESTIONS`
 
@@ -155,31 +156,40 @@ def _of_places(
     are found in them. `failed` is what a call came to.
     """
 
-    def overlaps(coordinates: Coordinates) -> list[float]:
-        return [iou(*pair) for reply in written for pair in reply.pairs(coordinates)]
+    def pairs(coordinates: Coordinates) -> list[tuple[BBox, BBox]]:
+        return [pair for reply in written for pair in reply.pairs(coordinates)]
 
-    forms = product(("thousandths", "fractions", "pixels"), ("xy", "yx"), ("corners", "size"))
-    others = [used.model_copy(update=dict(zip(("units", "axes", "box_form"), form, strict=True))) for form in forms]
+    others = [used.model_copy(update=dict(zip(("units", "axes", "box_form"), form, strict=True))) for form in FORMS]
     count = sum(len(reply.truth.boxes) for reply in written)
-    best = max((used, *others), key=lambda coordinates: sum(overlaps(coordinates)))
-    is_found = sum(each >= FOUND for each in overlaps(best)) * 2 > count
-    best = best if is_found else used
-    found = sum(each >= FOUND for each in overlaps(best))
-    result = f"{found} of {count} found"
-    result += "" if best == used else f", read as {best.words}; asked for were {used.words}"
-    result += "" if failed is None else f"; {failed.code}: {failed}"
-    boxes = Finding(question="box", usable=found == count and best == used, result=result)
+    best = max((used, *others), key=lambda coordinates: sum(iou(*pair) for pair in pairs(coordinates)))
+    found = _count_found(pairs(best))
+    if not (is_found := found * 2 > count):
+        best, found = used, _count_found(pairs(used))
+    boxes = _of_boxes(found, count, best, used, failed)
     lines = [(reply.truth, reply.read(best).line or Line()) for reply in written]
     off = [_degrees(truth.way, line.ends) for truth, line in lines if line.ends is not None]
     findings = [boxes, *_of_lines(lines, off)]
     if not is_found or not off:
         return findings, None
-    edges = [_edges_off(*pair) for reply in written for pair in reply.pairs(best)]
+    edges = [_edges_off(*pair) for pair in pairs(best)]
     return findings, MllmMeasurement(
         coordinates=None if best == usual else best,
         bbox_deviation=min(1.0, _spread(USUAL.bbox_deviation, edges)),
         direction_deviation=min(90.0, _spread(USUAL.direction_deviation, off)),
     )
+
+
+def _of_boxes(found: int, count: int, best: Coordinates, used: Coordinates, failed: CowError | None) -> Finding:
+    result = f"{found} of {count} found"
+    if best != used:
+        result += f", read as {best.words}; asked for were {used.words}"
+    if failed is not None:
+        result += f"; {failed.code}: {failed}"
+    return Finding(question="box", usable=found == count and best == used, result=result)
+
+
+def _count_found(pairs: Sequence[tuple[BBox, BBox]]) -> int:
+    return sum(iou(*pair) >= FOUND for pair in pairs)
 
 
 def _of_lines(lines: Sequence[tuple[Truth, Line]], off: Sequence[float]) -> Iterator[Finding]:
