@@ -179,7 +179,7 @@ def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
         f"(variance of scenes {plan.variance:.3f}). There are {plan.scenes:,}: a power of {plan.power:.0%} or more, or "
         f"of {POWER:.0%} for a gain of {shown:.1f} points.",
     ]
-    calls, pictures, simulations = _size_of(plan)
+    calls, pictures, simulations = size_of_run(plan)
     lines.append(
         f"{items:,} questions in {len(plan.arms)} arms, asked {plan.repeats} times: at most {calls:,} calls with "
         f"{pictures:,} pictures, and {simulations:,} simulations."
@@ -199,7 +199,7 @@ def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
     return "\n".join(lines)
 
 
-def _size_of(plan: AnalysisPlan) -> tuple[int, int, int]:
+def size_of_run(plan: AnalysisPlan) -> tuple[int, int, int]:
     """The most calls, pictures sent with them, and simulations that the run takes."""
     replies = sum(plan.counts.values()) * plan.repeats
     simulations: set[Any] = set()

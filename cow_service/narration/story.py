@@ -243,15 +243,17 @@ class Story:
         elif on == "floor" or (on == "air" and asked != "lands"):
             return None
         else:
-            key = "land" if on == "air" else "fall-off"
-            floor = (each.time for each in self._trajectory.contacts if each.a == body and each.b is None)
-            time = next(floor, math.inf)
-            if asked == "lands" and time < math.inf:
-                time = self._time_asked or time
+            key, time = "land" if on == "air" else "fall-off", self._time_landed(body)
+            time = self._time_asked or time if asked == "lands" and time < math.inf else time
         name = self._say.name(on)
         if time == math.inf:
             return (time, self._say(f"{key}-not", object=name)) if asked in OF_ITSELF else None
         return time, self.timed(f"{key}-at", time, object=name)
+
+    def _time_landed(self, body: int) -> float:
+        """When it first meets the floor, s; infinity for never."""
+        floor = (each.time for each in self._trajectory.contacts if each.a == body and each.b is None)
+        return next(floor, math.inf)
 
     def _time_left(self, body: int, outcome: Outcome) -> float:
         """When it leaves the image, s; infinity for never."""

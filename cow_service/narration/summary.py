@@ -61,14 +61,14 @@ def direct(outcome: Outcome, say: Phrases) -> str:
             is_known = outcome.time is not None and outcome.happens
             return say("after", time=say.seconds(outcome.time or 0.0)) if is_known else say("never")
         case "which" | "which-to-remove":
-            return _which(outcome, say)
+            return chosen_names(outcome, say)
         case "how-many":
             return str(outcome.count or 0)
         case "where" | "what-happens":
             return ""
 
 
-def _which(outcome: Outcome, say: Phrases) -> str:
+def chosen_names(outcome: Outcome, say: Phrases) -> str:
     """The candidates of which it is so, in a list."""
     meant = [] if outcome.is_needless else [each.object for each in outcome.candidates if each.is_meant]
     if meant:
@@ -205,7 +205,7 @@ class _Summary:
         """Of which candidates it is so, and of which of those that the question names it is not."""
         outcome, say, asked = self._given, self._say, self._given.asked
         meant = [each.object for each in outcome.candidates if each.is_meant]
-        others = [each.object for each in outcome.candidates if not each.is_meant and (asked.among or not meant)]
+        others = [each.object for each in outcome.candidates if not each.is_meant] if asked.among or not meant else []
         if asked.form == "which-to-remove":
             return self._removals({"prevents": meant, "prevents-not": others})
         if not meant and not asked.among and not asked.negated:
@@ -213,11 +213,20 @@ class _Summary:
         key = "fit" if asked.relation == "inside" else EVENTS[asked.relation]
         told = [(does, names) for does, names in ((not asked.negated, meant), (asked.negated, others)) if names]
         if asked.relation in OF_TARGET:
-            each = [(say.name(name), self._clause(key, does, None, [name])) for does, names in told for name in names]
-            return say.joined([say("statement", subject=name, clause=clause) for name, clause in each], "every-and")
-        subject = say("subject", name=say.name(self._mover)) if outcome.subject is None else say.name(outcome.subject)
+            statements = [
+                say("statement", subject=say.name(name), clause=self._clause(key, does, None, [name]))
+                for does, names in told
+                for name in names
+            ]
+            return say.joined(statements, "every-and")
         clauses = [self._clause(key, does, None, names) for does, names in told]
-        return say("statement", subject=subject, clause=say.joined(clauses, "clauses-and"))
+        return say("statement", subject=self._subject, clause=say.joined(clauses, "clauses-and"))
+
+    @property
+    def _subject(self) -> str:
+        """What does what is asked about, as the subject of a clause."""
+        subject = self._given.subject
+        return self._say("subject", name=self._say.name(self._mover)) if subject is None else self._say.name(subject)
 
     def _removals(self, told: dict[str, list[str]]) -> str:
         """What is so in the world that is shown, and by which removals it would not be."""
@@ -239,11 +248,14 @@ class _Summary:
                 return self._within(say(f"{EVENTS[asked.relation]}-{'any' if does else 'none'}"))
             subjects, parts = [say.name(each) for each in meant], [meant]
         else:
-            subjects = [say.name(outcome.subject) if outcome.subject else say("subject", name=say.name(self._mover))]
             # Not to hit each one is to miss one of them: it misses this one or it misses that one.
-            parts = [[each] for each in meant] if asked.every and not does and meant else [meant]
-        clauses = [self._clause(key, does, time, part) for part in parts]
-        statements = [say("statement", subject=each, clause=clause) for each in subjects for clause in clauses]
+            is_split = asked.every and not does and meant
+            subjects, parts = [self._subject], [[each] for each in meant] if is_split else [meant]
+        statements = [
+            say("statement", subject=subject, clause=self._clause(key, does, time, part))
+            for subject in subjects
+            for part in parts
+        ]
         return say.joined(statements, "every-and" if asked.every == does else "either-or")
 
     def _clause(self, key: str, does: bool, time: float | None, meant: Sequence[str]) -> str:
@@ -254,12 +266,13 @@ class _Summary:
             return self._within(self.story.placed())
         if asked.relation == "lands" and self.story.support():
             key, meant = key.replace("land", "fall-off"), self.story.support()
+        last = "names-and" if asked.every or asked.form == "which" else "names-or"
         if not does:
-            key, last = self._denied(key, meant), "names-nor"
-        else:
-            key = f"{EVENTS[asked.relation]}-part" if asked.partly and asked.relation in OF_COVERING else key
-            last = "names-and" if asked.every or asked.form == "which" else "names-or"
-        name = say.names(meant, "names-or" if key == "fit-not" else last) if meant else say("something")
+            key = self._denied(key, meant)
+            last = {"fit-not": "names-or"}.get(key, "names-nor")
+        elif asked.partly and asked.relation in OF_COVERING:
+            key = f"{EVENTS[asked.relation]}-part"
+        name = say.names(meant, last) if meant else say("something")
         if time is None or not key.endswith("-at"):
             return self._within(say(key.removesuffix("-at"), object=name))
         return self.story.timed(key, time, object=name)  # which says that it is within the time asked

@@ -59,13 +59,13 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
             "The surroundings could not be separated into objects, so encounters were not computed: "
             "an empty list does not mean that nothing is hit."
         )
-    found += _of_path(request, grounding)
+    found += warnings_of_path(request, grounding)
     found += _of_depth(request, grounding, trajectory)
     found += [
         f"Something else may stand at ({(left + right) / 2:.0f}, {bottom:.0f}); it is not simulated."
         for left, _, right, bottom in trajectory.faint
     ]
-    found += _of_outlines(trajectory)
+    found += warnings_of_outlines(trajectory)
     found += [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
     found += [
         f"'{each.object}', put {each.place}, was placed relative to the direction of motion, not as the camera sees it."
@@ -82,7 +82,7 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
     return tuple(found)
 
 
-def _of_path(request: SimulateRequest, grounding: Grounding) -> list[str]:
+def warnings_of_path(request: SimulateRequest, grounding: Grounding) -> list[str]:
     """Where a given path goes beside the motion, the object or the clip that were given with it, in sentences."""
     given, found = request.trajectory, list[str]()
     if given is None:
@@ -107,7 +107,7 @@ def _of_path(request: SimulateRequest, grounding: Grounding) -> list[str]:
     return found
 
 
-def _of_outlines(trajectory: Trajectory) -> list[str]:
+def warnings_of_outlines(trajectory: Trajectory) -> list[str]:
     """What was not seen clearly and matters to the outcome, in sentences."""
     outcome = trajectory.outcome
     if outcome is None or "outline" not in outcome.depends_on:

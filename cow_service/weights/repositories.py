@@ -289,18 +289,18 @@ def download(
     hub = _hub(endpoint)
     with ExitStack() as held:
         for each in downloads:
-            held.enter_context(_held(each.lock.repository, weights_dir))
-        _check_room(downloads, weights_dir)
+            held.enter_context(held_alone(each.lock.repository, weights_dir))
+        check_room(downloads, weights_dir)
         for each in downloads:
             with disk_errors(each.lock.repository):
-                write_lock(weights_dir, _merged(each.lock, read_lock(weights_dir, each.lock.repository)))
+                write_lock(weights_dir, merged_with(each.lock, read_lock(weights_dir, each.lock.repository)))
             for file in each.pending:
                 tell(each.lock.repository, file)
                 _download_file(hub, each.lock, file, weights_dir)
 
 
 @contextmanager
-def _held(repository: str, weights_dir: Path) -> Generator[None]:
+def held_alone(repository: str, weights_dir: Path) -> Generator[None]:
     """Makes a repository's folder, keeps other pulls out of it, and deletes what killed ones have left there."""
     kept = folder_of(weights_dir, repository) / ".cache"
     with ExitStack() as held:
@@ -316,7 +316,7 @@ def _held(repository: str, weights_dir: Path) -> Generator[None]:
         yield
 
 
-def _check_room(downloads: Sequence[Download], weights_dir: Path) -> None:
+def check_room(downloads: Sequence[Download], weights_dir: Path) -> None:
     """Raises `WeightsUnavailable` if a disk is too full for what is to be downloaded to it."""
     needed: Counter[int] = Counter()  # bytes, by disk
     for each in downloads:
@@ -329,7 +329,7 @@ def _check_room(downloads: Sequence[Download], weights_dir: Path) -> None:
             raise _unavailable(each.lock.repository, why, "Free some space, or set COW_MODELS_DIR to a larger disk")
 
 
-def _merged(lock: Lock, old: Lock | None) -> Lock:
+def merged_with(lock: Lock, old: Lock | None) -> Lock:
     """With what the record of the same revision has: another download may have ended meanwhile."""
     if old is None or old.revision != lock.revision:
         return lock
@@ -368,11 +368,11 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
                 pickled = "only pickled files, which can run code when they are read, match"
                 why = f"{pickled if matching else 'no file matches'} '{pattern}'"
                 raise _unavailable(source.repository, why, "Choose a revision that has such files as safetensors")
-        files = tuple(_locked(source.repository, name, siblings[name]) for name in sorted(names))
+        files = tuple(record_of(source.repository, name, siblings[name]) for name in sorted(names))
         return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=files)
 
 
-def _locked(repository: str, name: str, listed: "RepoSibling") -> LockedFile:
+def record_of(repository: str, name: str, listed: "RepoSibling") -> LockedFile:
     """The record of a file that the hub lists."""
     try:
         path = inside(name)

@@ -44,11 +44,11 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
             f"(*/meta.json with image.jpg), a file ({', '.join(formats.READERS)}), or the name of a data set, such as "
             f"{CAUSALSPATIAL}."
         )
-    _check(data, found, skip_faulty)
+    check_faults(data, found, skip_faulty)
     return found
 
 
-def _check(data: str, found: Collected, skip_faulty: bool) -> None:
+def check_faults(data: str, found: Collected, skip_faulty: bool) -> None:
     """Raises `InvalidRequest` for faults that are not skipped, and where no question is left."""
     count = len(found.faults)
     if count and not skip_faulty:

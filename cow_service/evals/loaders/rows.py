@@ -48,7 +48,7 @@ class Row:
 
 def item_of(place: str, row: Row, pictures: Pictures) -> Item:
     """The item of a row; its pictures are kept. Raises `RowFault`."""
-    parts, options = _wording(row)
+    parts, options = wording_of(row)
     image = _picture(row.image, "image", pictures)
     abstain, known = not_sure_option(options), row.truth
     shown = () if known is None else known.pictures
@@ -73,7 +73,8 @@ def item_of(place: str, row: Row, pictures: Pictures) -> Item:
         raise RowFault(f"`{'.'.join(map(str, first['loc']))}` cannot be used: {first['msg']}") from error
 
 
-def _wording(row: Row) -> items.Wording:
+def wording_of(row: Row) -> items.Wording:
+    """The question of a row around its options, and these. Raises `RowFault`."""
     if not row.question.strip():
         raise RowFault("`question` is empty")
     if row.options is None:

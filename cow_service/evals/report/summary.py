@@ -108,7 +108,7 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
                 )
             )
     primaries = filter(None, (_primary(run, several=len(runs) > 1) for run in runs))
-    return Findings(arms=tuple(arms), contrasts=_adjusted(contrasts), primaries=tuple(primaries), splits=tuple(splits))
+    return Findings(arms=tuple(arms), contrasts=with_holm(contrasts), primaries=tuple(primaries), splits=tuple(splits))
 
 
 def _contrasts(name: str, run: EvalRun, arm: Arm, baseline: Sequence[Observation]) -> list[Contrast]:
@@ -135,7 +135,7 @@ def _contrasts(name: str, run: EvalRun, arm: Arm, baseline: Sequence[Observation
     return found
 
 
-def _adjusted(contrasts: Sequence[Contrast]) -> tuple[Contrast, ...]:
+def with_holm(contrasts: Sequence[Contrast]) -> tuple[Contrast, ...]:
     """What a plan has is adjusted for itself: exploration must not cost it anything."""
     adjusted: dict[bool, Iterator[float]] = {}
     for is_exploratory in (False, True):

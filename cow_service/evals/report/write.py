@@ -44,7 +44,7 @@ def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
             (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
     (out / "tables" / "replies.csv").write_text(tables.csv_text(tables.replies(runs)), encoding="utf-8")
     write_plots(out / "plots", findings)
-    parts = ["# Evaluation", "\n".join(line for run in runs for line in _asked(run))]
+    parts = ["# Evaluation", "\n".join(line for run in runs for line in facts_of_run(run))]
     if not findings.primaries:
         parts.append("No placebo was asked: a gain over the image alone may come from more pictures.")
     parts += [f"## {table.title}\n\n{tables.markdown(table)}" for table in known]
@@ -59,7 +59,7 @@ def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
     (out / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _asked(run: EvalRun) -> list[str]:
+def facts_of_run(run: EvalRun) -> list[str]:
     """What was asked in a run, what was found in its data, and what failed."""
     info = run.info
     failures = sorted({each.failure for each in run.observations if each.failure is not None})

@@ -100,14 +100,14 @@ def take_apart(given: GeneratorInput, progress: Callable[[float], None] = lambda
         background[holes] = fit_within(scene.side_view.empty, MAX_SIDE)[holes]
     sprites: list[Sprite] = []
     for body in moving:
-        hidden = _hidden_part(body, moving, still, eye)
+        hidden = hidden_part(body, moving, still, eye)
         shape = None if ground is None else ground.bodies[body.path.body].shape
         sprites.append(Sprite.of(image, body.mask, hidden, factor * body.start, shape))
     containers = () if ground is None else _containers(given, image, moving, still, ground)
     return Layers(image, background, moving, tuple(sprites), unshaded.shadows, still, containers, eye, factor)
 
 
-def _hidden_part(body: MovingBody, moving: Sequence[MovingBody], still: Sequence[StillBody], eye: float) -> Mask | None:
+def hidden_part(body: MovingBody, moving: Sequence[MovingBody], still: Sequence[StillBody], eye: float) -> Mask | None:
     """What nearer bodies hide of one at the first frame: of a sphere's disc; of the hull of what is seen, else."""
     extent, window = body.extent(0), window_of(body.mask, 2) or (slice(0, 0), slice(0, 0))
     others = [(other.mask, other.extent) for other in still]
@@ -207,7 +207,7 @@ def _containers(
         )
         if content not in results or index == content or index not in masks:
             continue
-        it, body, front_mask = ground.bodies[index], paths.get(index), _front_of(image, masks[index])
+        it, body, front_mask = ground.bodies[index], paths.get(index), front_of(image, masks[index])
         front = StillBody(index, front_mask, ground.extent(index, it.bbox))
         sprite = None if body is None else Sprite.of(image, front_mask, None, ground.factor * body.start, it.shape)
         holds = results[content] in ("inside", "sticks-out")
@@ -215,7 +215,7 @@ def _containers(
     return tuple(found)
 
 
-def _front_of(image: Image, mask: Mask) -> Mask:
+def front_of(image: Image, mask: Mask) -> Mask:
     """A container's mask [h, w] below the nearer edge of its opening; without a rim, below its upper third."""
     cropped = CroppedMask.of(mask)
     seen, (x0, y0, x1, y1) = measure_opening(image, cropped), cropped.bbox

@@ -77,7 +77,7 @@ def load_transformer(
             with safe_open(file, framework="pt", device=str(device)) as opened:
                 for name, source in here:
                     entry, tensor = entries[source], opened.get_tensor(entries[source].key)
-                    scale = _read_scale(source, entries, device)
+                    scale = read_scale(source, entries, device)
                     if keep_float8 and entry.dtype in FLOAT8 and len(entry.shape) == 2 and name.startswith("blocks."):
                         state[name] = _keep_in_float8(tensor, scale, dtype, computes=keep_float8 == "stored-dynamic")
                         continue
@@ -91,7 +91,7 @@ def load_transformer(
     return model.eval().requires_grad_(False)
 
 
-def _read_scale(source: str, entries: Mapping[str, Entry], device: torch.device) -> Tensor | None:
+def read_scale(source: str, entries: Mapping[str, Entry], device: torch.device) -> Tensor | None:
     """The scale of a weight, which may lie in another file; None if it has none."""
     entry = entries.get(source.removesuffix(".weight") + SCALE) if source.endswith(".weight") else None
     if entry is None:
@@ -326,12 +326,12 @@ def add_lora(transformer: nn.Module, file: Path) -> None:
     parameters = dict(transformer.named_parameters())
     if any(type(parameter) is not nn.Parameter or parameter.is_meta for parameter in parameters.values()):
         raise GeneratorUnavailable("A LoRA must be added before the weights are made float8 or offloaded.")
-    for name, change in _changes(_read_lora(file), parameters, file.name).items():
+    for name, change in _changes(read_lora(file), parameters, file.name).items():
         parameter = parameters[name]
         parameter.copy_(parameter.float() + change.on(parameter.device))
 
 
-def _read_lora(file: Path) -> dict[str, Tensor]:
+def read_lora(file: Path) -> dict[str, Tensor]:
     """The tensors of a LoRA whose scale is in its weights."""
     if not file.is_file():
         raise WeightsUnavailable(f"There is no LoRA '{file.name}'. Pull it with `cow models pull`.")

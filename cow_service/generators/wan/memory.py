@@ -75,7 +75,7 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
         if profile.acceleration.keeps_float8 and not has_float8:
             fp8 = profile.acceleration.fp8
             return f"fp8: {fp8} needs a checkpoint stored in float8: name one in COW_CHECKPOINTS."
-        return _lacking_room(profile, parameters, int(manifest.architecture["num_layers"]), device)
+        return lacking_room(profile, parameters, int(manifest.architecture["num_layers"]), device)
 
     if problem := lacking(profile_of(manifest, name)):
         able = [other for other in manifest.profiles if not lacking(profile_of(manifest, other))]
@@ -87,7 +87,7 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
         )
 
 
-def _lacking_room(profile: Profile, parameters: Mapping[str, int], blocks: int, device: torch.device) -> str:
+def lacking_room(profile: Profile, parameters: Mapping[str, int], blocks: int, device: torch.device) -> str:
     """Which memory the weights do not fit into, in a sentence; empty if they do, or are not here yet."""
     if not parameters:
         return ""

@@ -54,7 +54,7 @@ def conversation_of(
     special = re.compile("|".join(map(re.escape, tokens)) or r"(?!)")
     turns: list[Turn] = []
     images: list[Image.Image] = []
-    said = _said(messages, instructions)
+    said = said_by_role(messages, instructions)
     for role, items in itertools.groupby(said, key=lambda each: each[0]):
         content: list[dict[str, str]] = []
         for _, item in items:
@@ -75,7 +75,7 @@ def conversation_of(
     return turns, images
 
 
-def _said(messages: Iterable[ai.ModelMessage], instructions: Sequence[str]) -> list[tuple[str, object]]:
+def said_by_role(messages: Iterable[ai.ModelMessage], instructions: Sequence[str]) -> list[tuple[str, object]]:
     """What each role says, one thing after another."""
     said: list[tuple[str, object]] = [("system", text) for text in instructions]
     for message in messages:

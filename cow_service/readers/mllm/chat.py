@@ -50,9 +50,9 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
         for name, value in body.items()
         if name not in (*SETTINGS, *READ) and value is not None and value not in NEUTRAL.get(name, ())
     ]
-    settings, refused = _settings(body, model)
+    settings, refused = settings_of(body, model)
     left_out += refused
-    parameters = ModelRequestParameters(function_tools=_tools(body))
+    parameters = ModelRequestParameters(function_tools=tools_of(body))
     response_format = body.get("response_format")
     if isinstance(response_format, dict) and response_format.get("type") == "json_schema":
         schema = _at(response_format, "/response_format", "json_schema", "schema")
@@ -66,7 +66,7 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
     return PreparedChat(list(_messages(body)), settings, parameters, warnings)
 
 
-def _settings(body: dict[str, Any], model: Model) -> tuple[ModelSettings, list[str]]:
+def settings_of(body: dict[str, Any], model: Model) -> tuple[ModelSettings, list[str]]:
     """The settings of a chat, and the names of those that the model does not take."""
     settings: dict[str, Any] = {}
     refused: list[str] = []
@@ -84,7 +84,8 @@ def _settings(body: dict[str, Any], model: Model) -> tuple[ModelSettings, list[s
     return cast("ModelSettings", settings), refused
 
 
-def _tools(body: dict[str, Any]) -> list[ToolDefinition]:
+def tools_of(body: dict[str, Any]) -> list[ToolDefinition]:
+    """The tools of a chat. Raises `InvalidRequest`."""
     tools: list[ToolDefinition] = []
     for place, tool in enumerate(_list_of(body, "tools")):
         pointer = f"/tools/{place}"

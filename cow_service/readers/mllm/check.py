@@ -165,10 +165,10 @@ def _of_places(
     found = _count_found(pairs(best))
     if not (is_found := found * 2 > count):
         best, found = used, _count_found(pairs(used))
-    boxes = _of_boxes(found, count, best, used, failed)
+    boxes = finding_of_boxes(found, count, best, used, failed)
     lines = [(reply.truth, reply.read(best).line or Line()) for reply in written]
     off = [_degrees(truth.way, line.ends) for truth, line in lines if line.ends is not None]
-    findings = [boxes, *_of_lines(lines, off)]
+    findings = [boxes, *findings_of_lines(lines, off)]
     if not is_found or not off:
         return findings, None
     edges = [_edges_off(*pair) for pair in pairs(best)]
@@ -179,7 +179,8 @@ def _of_places(
     )
 
 
-def _of_boxes(found: int, count: int, best: Coordinates, used: Coordinates, failed: CowError | None) -> Finding:
+def finding_of_boxes(found: int, count: int, best: Coordinates, used: Coordinates, failed: CowError | None) -> Finding:
+    """The finding on boxes: so many were found, of how many, and in which coordinates."""
     result = f"{found} of {count} found"
     if best != used:
         result += f", read as {best.words}; asked for were {used.words}"
@@ -192,7 +193,7 @@ def _count_found(pairs: Sequence[tuple[BBox, BBox]]) -> int:
     return sum(iou(*pair) >= FOUND for pair in pairs)
 
 
-def _of_lines(lines: Sequence[tuple[Truth, Line]], off: Sequence[float]) -> Iterator[Finding]:
+def findings_of_lines(lines: Sequence[tuple[Truth, Line]], off: Sequence[float]) -> Iterator[Finding]:
     """The findings on directions, so many degrees `off`, and on their senses."""
     result = f"{len(off)} of {len(lines)} given"
     if off:

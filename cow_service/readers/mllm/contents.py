@@ -120,12 +120,13 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
         "changed": changed,
         "as_it_is": AS_IT_IS if imagined.factual_frames else "",
         "facts": tuple(facts),
-        "encounters": () if facts else tuple(_meeting(each, trajectory) for each in trajectory.encounters),
+        "encounters": () if facts else tuple(meeting_words(each, trajectory) for each in trajectory.encounters),
         "encounters_known": simulation.encounters_known,
     }
 
 
-def _meeting(each: Encounter, trajectory: Trajectory) -> str:
+def meeting_words(each: Encounter, trajectory: Trajectory) -> str:
+    """An encounter in words, with its time and in how many versions it is so."""
     covered = "" if each.share is None else f", at most {each.share:.0%} covered"
     counted, total = "", trajectory.ensemble
     if each.probability is not None:
