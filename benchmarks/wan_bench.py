@@ -57,7 +57,7 @@ class Bench:
         `off_eager`: its relative distance from what the first form gave for the same inputs, which is the eager one.
         """
         frames = num_frames or self.case.num_frames
-        reset_cache(self._transformer, count)
+        reset_cache(self._transformer)
         self._forget_peak()
         # Other inputs each time: a cache finds no change between two passes that are the same.
         done = [self._pass(self._inputs(frames, batch, seed)) for seed in range(count)]

@@ -54,16 +54,16 @@ def shared_options(
         Texts,
         option(
             "Ways to ask: never, always, auto, placebo-still, placebo-direction, placebo-item, encounters, "
-            "frames-only, gate, oracle, each with suffixes such as :initial or :vote-3; or factors: "
-            "content=simulated,frames=events,votes=1. May be repeated, or several names separated by commas.",
+            "frames-only, gate, oracle, each with suffixes such as :initial or :vote-3. May be repeated, or several "
+            "names separated by commas.",
             shown="the preset's",
         ),
     ] = None,
     preset: Annotated[
-        Literal["default", "paper", "controls", "dose"] | None,
+        Literal["default", "paper", "controls"] | None,
         option(
-            "Set of arms. default: with placebos; paper: the paper's protocol; controls: votes, gate, frames, words; "
-            "dose: degraded frames. Arms of --arm are added.",
+            "Set of arms. default: with placebos; paper: the paper's protocol; controls: votes, gate, frames, words. "
+            "Arms of --arm are added.",
             shown="default, or only the arms of --arm",
         ),
     ] = None,
@@ -200,8 +200,7 @@ def _of_preset(given: dict[str, Any]) -> dict[str, Any]:
         raise InvalidRequest("Give the data to ask about, or a plan with --plan.")
     preset = PRESETS[given["preset"] or "default"]
     ask = given["ask"] or ("answer" if given["mllm"] is None else "prompt")
-    # An arm given by factors contains commas.
-    named = [name for text in given["arm"] or () for name in ([text] if "=" in text else text.split(","))]
+    named = [name for text in given["arm"] or () for name in text.split(",")]
     own = preset.arms if given["preset"] or not named else ()
     if given["preset"] is None and ask == "answer" and not named:
         own = ("never", "always")  # the service's own /answer shows no placebos
@@ -221,7 +220,7 @@ def report(
     out: Annotated[Path | None, option("Folder for the report.", "--out", "-o", shown="RUN/report")] = None,
     prices: Prices = None,
 ) -> None:
-    """Compare runs in tables, plots and a standalone page."""
+    """Compare runs in tables and plots."""
     _check_installed()
     from cow_service.evals.runs import REPORT, read_run  # noqa: PLC0415
 
@@ -232,9 +231,11 @@ def report(
 def _report(runs: list[Any], out: Path, prices: dict[str, Any]) -> None:
     """Writes a report, and prints its table."""
     from cow_service.evals.report.write import write_report  # noqa: PLC0415
+    from cow_service.evals.runs import LOGS  # noqa: PLC0415
 
     typer.echo(printable(write_report(runs, out, prices)))
-    typer.echo(f"\nThe report, with every item: {out / 'index.html'}")
+    logs = runs[0].folder / LOGS
+    typer.echo(f"\nThe report: {out / 'report.md'}. Every question with its reply: inspect view --log-dir {logs}")
 
 
 def _priced(path: Path | None) -> dict[str, Any]:

@@ -200,7 +200,6 @@ class PromptAsker:
     imagination: Imagination
     pictures: Pictures
     key: str  # of the run: replies of other runs are not taken
-    waiting: Counter[str]  # whose number `mllm` is that of calls without a reply
 
     async def __call__(self, case: Case) -> CaseReplies:
         """Imagines where the arm says so, and asks. Raises `MllmUnavailable`, and what a simulation failed with."""
@@ -229,15 +228,12 @@ class PromptAsker:
     async def _ask(self, case: Case, messages: list[inspect_model.ChatMessage], purpose: str) -> Reply:
         # The repeat is part of the key by itself: it is Inspect's epoch.
         scopes = {"run": self.key, "arm": case.arm.name, "item": case.item.id, "purpose": purpose}
-        self.waiting["mllm"] += 1
         try:
             output = await self.model.generate(messages, cache=inspect_model.CachePolicy(expiry=None, scopes=scopes))
         except Exception as error:
             # Providers raise what they like; Inspect has tried again where that may help.
             told = getattr(error, "provider_message", None) or str(error)
             raise MllmUnavailable(f"{self.model} gave no reply: {told}") from error
-        finally:
-            self.waiting["mllm"] -= 1
         usage = Usage(calls=1)
         if (used := output.usage) is not None:
             cached = (used.input_tokens_cache_read or 0) + (used.input_tokens_cache_write or 0)

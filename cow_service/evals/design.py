@@ -32,7 +32,6 @@ class Arm(Record):
     votes: int = Field(default=1, ge=1, le=16, description="Replies, each with a simulation of its own seed.")
     gate: bool = Field(default=False, description="Shown only where answers from the image alone do not agree.")
     image: bool = Field(default=True, description="The image is shown beside the frames.")
-    error: float | None = Field(default=None, ge=0, le=100, description="Of `true`: the path's, by the simulation's.")
 
     @model_validator(mode="after")
     def _shows_what_it_chooses(self) -> Self:
@@ -41,8 +40,6 @@ class Arm(Record):
             raise ValueError(f"{self.content} shows no frames: leave {' and '.join(chosen)} out")
         if not self.image and not self.shows_frames:
             raise ValueError(f"{self.content} shows no frames, so it needs the image")
-        if self.error is not None and self.content != "true":
-            raise ValueError("only frames of content=true are drawn with an error")
         return self
 
     @property
@@ -58,7 +55,6 @@ class Arm(Record):
         parts += [f"vote-{self.votes}"] if self.votes != own.votes else []
         parts += ["gate"] if self.gate != own.gate else []
         parts += ["no-image"] if self.image != own.image else []
-        parts += [f"error-{self.error:g}"] if self.error is not None else []
         return ":".join(parts)
 
     @property
@@ -97,8 +93,11 @@ NAMED: dict[str, Arm] = {
     "oracle": Arm(content="true"),
 }
 BASELINE = "never"
-_SUFFIXES = {"count": "count", "size": "size", "vote": "votes", "error": "error"}  # of a name, and their factors
-_WORDS: dict[str, tuple[str, Any]] = {"gate": ("gate", True), "no-image": ("image", False)}
+# What a suffix sets: a factor and its value, or a factor whose value follows behind a hyphen.
+_WORDS: dict[str, tuple[str, Any]] = {
+    **{moment: ("frames", moment) for moment in MOMENTS}, "gate": ("gate", True), "no-image": ("image", False),
+}  # fmt: skip
+_NUMBERS = {"count": "count", "size": "size", "vote": "votes"}
 
 
 class Preset(Record):
@@ -117,46 +116,28 @@ PRESETS: dict[str, Preset] = {
     # Frames 1, 3 and 5 of 512 px, options as the data has them, five repeats; of COW the paper made three.
     "paper": Preset(arms=("never", "always:initial"), repeats=5, order="data"),
     "controls": Preset(arms=_CONTROLS),
-    # What frames are worth whose path is off by so much: for data with truth.
-    "dose": Preset(arms=(*_MATCHED[:3], *(f"oracle:error-{error:g}" for error in (0, 0.5, 1, 2, 4)))),
 }
 
 
 def arm_of(text: str) -> Arm:
-    """The arm of a name (`always:initial:vote-3`) or of factors (`content=simulated,frames=initial,votes=3`).
-
-    `best-of-K` is `always:vote-K`. Raises `InvalidRequest` for what is neither.
-    """
+    """The arm of a name such as `always:initial:vote-3`. Raises `InvalidRequest` for what is none."""
     base, *suffixes = text.strip().split(":")
-    if base.startswith("best-of-"):
-        base, suffixes = "always", [f"vote-{base.removeprefix('best-of-')}", *suffixes]
-    given: dict[str, Any] = {}
-    if "=" in base:
-        for part in text.split(","):
-            name, _, value = part.strip().partition("=")
-            if name in given:
-                raise InvalidRequest(f"The arm '{text}' sets {name} twice: keep one.")
-            given[name] = value
-    elif base in NAMED:
-        given = NAMED[base].model_dump(exclude_defaults=True)
-    else:
+    if base not in NAMED:
         raise InvalidRequest(
-            f"There is no arm '{text}': arms are {', '.join(NAMED)}, each with suffixes such as :initial or :vote-3, "
-            "or factors, such as content=simulated,frames=events,votes=1."
+            f"There is no arm '{text}': arms are {', '.join(NAMED)}, each with suffixes such as :initial or :vote-3."
         )
-    for suffix in suffixes if "=" not in base else ():
+    factors: dict[str, Any] = NAMED[base].model_dump(exclude_defaults=True)
+    for suffix in suffixes:
         name, _, value = suffix.partition("-")
-        factor = (_WORDS | {each: ("frames", each) for each in MOMENTS}).get(suffix)
-        if factor is None and name in _SUFFIXES:
-            factor = _SUFFIXES[name], value
+        factor, value = _WORDS.get(suffix, (_NUMBERS.get(name), value))
         if factor is None:
-            known = ", ".join(f":{each}" for each in (*MOMENTS, *_WORDS, *(f"{name}-N" for name in _SUFFIXES)))
+            known = ", ".join(f":{each}" for each in (*_WORDS, *(f"{number}-N" for number in _NUMBERS)))
             raise InvalidRequest(f"The arm '{text}' has an unknown suffix ':{suffix}': there are {known}.")
-        if factor[0] in given:
-            raise InvalidRequest(f"The arm '{text}' sets {factor[0]} twice: keep one.")
-        given[factor[0]] = factor[1]
+        if factor in factors:
+            raise InvalidRequest(f"The arm '{text}' sets {factor} twice: keep one.")
+        factors[factor] = value
     try:
-        return Arm.model_validate(given)
+        return Arm.model_validate(factors)
     except ValidationError as error:
         first = error.errors()[0]
         why = ": ".join((*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")))
@@ -174,12 +155,11 @@ def check_arms(names: Sequence[str], ask: Ask, items: Sequence[Item]) -> tuple[A
                 f"The service's own /answer has no arm '{arm.name}', only never, always and auto, each also with "
                 "votes: name a multimodal LLM with --mllm and leave --ask out."
             )
-        without = [item for item in items if item.truth is None or not item.truth.shows(drawn=arm.error is not None)]
+        without = [item for item in items if item.truth is None or not item.truth.is_shown]
         if arm.content == "true" and without:
-            needed = "the true path" if arm.error is not None else "the true path, or pictures of what really happens"
             raise InvalidRequest(
-                f"The arm '{arm.name}' needs {needed}, and {len(without)} of {len(items)} items have none, such as "
-                f"{without[0].row}."
+                f"The arm '{arm.name}' needs the true path, or pictures of what really happens, and {len(without)} of "
+                f"{len(items)} items have none, such as {without[0].row}."
             )
         if arm.content == "other-item" and len({item.scene for item in items}) < 2:
             raise InvalidRequest(f"The arm '{arm.name}' shows frames of another scene, and there is only one.")

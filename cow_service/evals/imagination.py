@@ -104,7 +104,7 @@ class Imagination:
 
     async def _shown(self, arm: Arm, trial: int, item: Item) -> Evidence:
         """Every content begins with the simulation: a placebo has as many pictures as there would be of it, or none."""
-        if arm.content == "true" and arm.error is None:
+        if arm.content == "true":
             return await self._truth(arm, trial, item)
         simulation = await self._simulate(item, arm, trial)
         found = evidence_of(simulation)
@@ -112,7 +112,8 @@ class Imagination:
             track = () if item.truth is None else item.truth.track
             if len(track) < 2:
                 return found
-            return replace(found, path_error=self._share(_offsets(np.array(track), simulation), item))
+            width = decode(self.pictures.read(item.image)).pixels.shape[1]
+            return replace(found, path_error=_distance(np.array(track), simulation) / width)
         if arm.content == "text":
             return replace(found, frames=(), facts=facts_of(simulation), event_shown=None)
         found = replace(found, probability=None, event_shown=None, overlay=None)
@@ -124,8 +125,6 @@ class Imagination:
         moments = {"max_side": arm.size, "indices": [frame.index for frame in simulation.frames]}
         if arm.content == "other-item":
             other = await self._of_another(arm, trial, item, simulation, moments)
-        elif arm.content == "true":
-            other = await self._along(simulation, arm, item)
         else:
             changed = await self._simulate(item, arm, trial, motion=opposite_motion(simulation), frames=moments)
             other = evidence_of(changed)
@@ -172,7 +171,7 @@ class Imagination:
         return replace(found, frames=shown, path_error=0.0)
 
     async def _along(self, simulation: AsyncSimulation | None, arm: Arm, item: Item) -> Evidence:
-        """Frames that the generator draws along the true path, or off it by so much of the simulation's own error.
+        """Frames that the generator draws along the true path.
 
         They show the moments of the simulation's frames; after the end of what is known, that end. Raises
         `CannotGround` where no true path is known.
@@ -180,12 +179,10 @@ class Imagination:
         truth, indices = item.truth or Truth(), None
         if len(truth.track) < 2:
             raise CannotGround("No true path is known.")
-        fps, points, off, frames = truth.fps, np.array(truth.track), np.zeros((1, 2)), arm.frames_request
+        fps, points, frames = truth.fps, np.array(truth.track), arm.frames_request
         if simulation is not None:
             fps = simulation.trajectory.fps
             points = _at_rate(points, truth.fps, fps)
-            off = (arm.error or 0.0) * _offsets(points, simulation)
-            points = points + off
             indices = [min(frame.index, len(points) - 1) for frame in simulation.frames]
             frames = {"max_side": arm.size, "indices": sorted(set(indices))}
         # How it moves is known, so it need not be read.
@@ -201,12 +198,7 @@ class Imagination:
         if indices is not None:
             shown = {frame.index: frame.sha256 for frame in drawn.frames}
             found = replace(found, frames=tuple(shown[index] for index in indices))
-        return replace(found, probability=None, event_shown=None, path_error=self._share(off, item))
-
-    def _share(self, offsets: NDArray[np.float64], item: Item) -> float:
-        """The mean length of offsets (points, 2), px, as a share of the image's width."""
-        width = decode(self.pictures.read(item.image)).pixels.shape[1]
-        return float(np.linalg.norm(offsets, axis=1).mean() / width)
+        return replace(found, probability=None, event_shown=None, path_error=0.0)
 
     async def _simulate(self, item: Item, arm: Arm, trial: int, **changes: Any) -> AsyncSimulation:
         seed = {"seed": trial} if trial else {}
@@ -246,16 +238,15 @@ def _at_rate(values: NDArray[np.float64], fps: float, wanted: float) -> NDArray[
     return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
 
 
-def _offsets(points: NDArray[np.float64], simulation: AsyncSimulation) -> NDArray[np.float64]:
-    """From each of these points (points, 2) to where the simulation's path passes it, px.
+def _distance(points: NDArray[np.float64], simulation: AsyncSimulation) -> float:
+    """The mean distance of points (points, 2) from the simulation's path, px.
 
-    Whenever it does so: no picture tells how fast things are.
+    Wherever it passes them: no picture tells how fast things are.
     """
     path = np.array(simulation.trajectory.path.points)
     stamps = np.linspace(0, len(path) - 1, PATH_SAMPLES)
     fine = np.stack([np.interp(stamps, np.arange(len(path)), path[:, axis]) for axis in (0, 1)], axis=1)
-    nearest = np.linalg.norm(points[:, None] - fine[None], axis=2).argmin(axis=1)
-    return fine[nearest] - points
+    return float(np.linalg.norm(points[:, None] - fine[None], axis=2).min(axis=1).mean())
 
 
 def _sized(pixels: NDArray[np.uint8], simulation: AsyncSimulation) -> bytes:

@@ -34,9 +34,10 @@ class Truth(Record):
     object: str | None = Field(default=None, description="What it is called.")
     boxes: dict[str, BBox] = Field(default_factory=dict, description="Of all known objects at the first moment, px.")
 
-    def shows(self, *, drawn: bool) -> bool:
-        """Whether there are true frames; `drawn`: along the true path."""
-        return len(self.track) > 1 or (not drawn and bool(self.pictures))
+    @property
+    def is_shown(self) -> bool:
+        """Whether there are true frames, or can be drawn."""
+        return len(self.track) > 1 or bool(self.pictures)
 
 
 class Item(Record):

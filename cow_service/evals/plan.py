@@ -179,20 +179,10 @@ def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
         f"(variance of scenes {plan.variance:.3f}). There are {plan.scenes:,}: a power of {plan.power:.0%} or more, or "
         f"of {POWER:.0%} for a gain of {shown:.1f} points.",
     ]
-    simulations: set[Any] = set()
-    calls = pictures = 0
-    for arm in plan.points:
-        asked = arm.votes + (GATE_VOTES if arm.gate else 0)
-        calls += asked * items * plan.repeats
-        pictures += (asked * arm.image + arm.votes * arm.count * arm.shows_frames) * items * plan.repeats
-        for trial in range(arm.votes if arm.content != "none" else 0):
-            frames = tuple(arm.frames_request.values()) if arm.shows_frames else ()
-            simulations |= {(frames, trial)}
-            if arm.content in ("wrong-direction", "true"):
-                simulations |= {(frames, trial, arm.content, arm.error)}
+    calls, pictures, simulations = size_of_run(plan)
     lines.append(
         f"{items:,} questions in {len(plan.arms)} arms, asked {plan.repeats} times: at most {calls:,} calls with "
-        f"{pictures:,} pictures, and {len(simulations) * items:,} simulations."
+        f"{pictures:,} pictures, and {simulations:,} simulations."
     )
     replies = items * plan.repeats
     known = {name: (costs[name], replies / costs[name].replies) for name in plan.arms if name in costs}
@@ -207,3 +197,20 @@ def describe(plan: AnalysisPlan, costs: Mapping[str, Cost]) -> str:
             + (f"; without {', '.join(unknown)}, which the pilot did not ask." if unknown else ".")
         )
     return "\n".join(lines)
+
+
+def size_of_run(plan: AnalysisPlan) -> tuple[int, int, int]:
+    """The most calls, pictures sent with them, and simulations that the run takes."""
+    replies = sum(plan.counts.values()) * plan.repeats
+    simulations: set[Any] = set()
+    calls = pictures = 0
+    for arm in plan.points:
+        asked = arm.votes + (GATE_VOTES if arm.gate else 0)
+        calls += asked * replies
+        pictures += (asked * arm.image + arm.votes * arm.count * arm.shows_frames) * replies
+        for trial in range(arm.votes if arm.content != "none" else 0):
+            frames = tuple(arm.frames_request.values()) if arm.shows_frames else ()
+            simulations |= {(frames, trial)}
+            if arm.content in ("wrong-direction", "true"):
+                simulations |= {(frames, trial, arm.content)}
+    return calls, pictures, len(simulations) * replies // plan.repeats

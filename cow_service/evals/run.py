@@ -6,9 +6,10 @@
 import atexit
 import os
 import secrets
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,6 @@ from inspect_ai.model import GenerateConfig, Model, ModelOutput, get_model
 
 from cow_service.adaptive import FIRST
 from cow_service.client import Client
-from cow_service.client.progress import progress_shown
 from cow_service.errors import CowError, InvalidRequest, StorageUnavailable
 from cow_service.evals import asking, request, runs
 from cow_service.evals.design import Order, arm_of, check_arms
@@ -27,7 +27,7 @@ from cow_service.evals.items import Ask, Item, Observation, Pictures, question_t
 from cow_service.evals.loaders import CAUSALSPATIAL, load
 from cow_service.evals.plan import RunInfo, describe, planned
 from cow_service.evals.report.summary import Price, summarize
-from cow_service.evals.session import EvalProgress, active_session, session
+from cow_service.evals.session import active_session, session
 from cow_service.evals.statistics import upper_variance
 from cow_service.readers.prompts import load_prompt
 
@@ -100,15 +100,9 @@ def look_and_ask(arm: str, ask: Ask, seed: int, order: Order = "shuffled") -> so
         if ask == "answer":
             asker = asking.AnswerAsker(client, imagination.places, shared.pictures, shared.options, shared.key)
         else:
-            asker = asking.PromptAsker(get_model(), imagination, shared.pictures, shared.reply_key, shared.waiting)
-        try:
-            asked = await asker(case)
-        except Exception:
-            shared.on_reply(arm, None)
-            raise
+            asker = asking.PromptAsker(get_model(), imagination, shared.pictures, shared.reply_key)
+        asked = await asker(case)
         seen = asking.observation_of(case, asked)
-        await shared.show_load()
-        shared.on_reply(arm, seen)
         state.store.set(runs.OBSERVATION, seen.model_dump(mode="json"))
         state.messages = asking.conversation(case, asked, shared.pictures)
         state.output = ModelOutput.from_content(str(state.model), asked.replies[-1].text)
@@ -222,32 +216,20 @@ def _ask(
     """Asks what there is no reply to yet. Raises the `CowError` for which that cannot begin: the folder stays free."""
     logs = wanted.out / runs.LOGS
     logs.mkdir(exist_ok=True)
-    progress = EvalProgress(len(items) * info.repeats * len(info.arms))
-    for each in runs.read_observations(logs):
-        if not (wanted.retry_failed and each.failure):
-            progress.add(each.arm, None if each.failure else each, earlier=True)
-    if progress.done == progress.total:
+    replied = [each for each in runs.read_observations(logs) if not (wanted.retry_failed and each.failure)]
+    if len(replied) == len(items) * info.repeats * len(info.arms):
         runs.write_run(wanted.out, info, items)
         return
     keys = f"{info.token} {info.rounds}", info.token
-    console = rich.get_console()
     options = request.request_options(wanted.reader, wanted.generator)
-    with session(wanted.out, wanted.url, options, *keys, **settings) as shared, ExitStack() as stack:
+    with session(wanted.out, wanted.url, options, *keys, **settings) as shared:
         _check_server(shared.url, wanted)
         runs.write_run(wanted.out, info, items)
-        stack.callback(setattr, console, "quiet", console.quiet)
-        console.quiet = True  # Inspect says nothing of its own on standard output
-        with progress_shown(progress, True) as show:
-
-            def on_reply(arm: str, seen: Observation | None) -> None:
-                progress.add(arm, seen)
-                show()
-
-            shared.items, shared.on_reply, shared.concurrency = items, on_reply, wanted.concurrency
-            shared.progress = progress
-            asked: dict[str, Any] = {"data": info.data_digest, "ask": info.ask, "seed": info.seed, "order": info.order}
-            most = wanted.concurrency
-            connections = util.AdaptiveConcurrency(min=1, start=min(FIRST, most), max=most)
+        shared.items, shared.concurrency = items, wanted.concurrency
+        asked: dict[str, Any] = {"data": info.data_digest, "ask": info.ask, "seed": info.seed, "order": info.order}
+        most = wanted.concurrency
+        connections = util.AdaptiveConcurrency(min=1, start=min(FIRST, most), max=most)
+        with redirect_stdout(sys.stderr):  # Inspect shows its progress there: the report alone is output
             _, ended = eval_set(
                 tasks=[causalspatial(arm=arm, **asked) for arm in info.arms],
                 epochs=Epochs(info.repeats, "mean"),
@@ -261,11 +243,10 @@ def _ask(
                 max_tasks=len(info.arms),
                 max_tokens=wanted.max_tokens,
                 max_retries=MAX_RETRIES,
-                display="none",
+                display="rich" if sys.stderr.isatty() else "plain",
                 log_images=wanted.log_images,
                 log_dir_allow_dirty=True,
                 ctl_server=False,
-                score_display=False,
                 temperature=wanted.temperature,
             )
     if len(ended) < len(info.arms):  # Inspect takes an interrupt for an end

@@ -1,9 +1,8 @@
-"""What every task of an evaluation shares: the server that it asks, where its pictures are kept, and its progress."""
+"""What every task of an evaluation shares: the server that it asks, and where its pictures are kept."""
 
 import asyncio
 import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +11,9 @@ from typing import Any
 import httpx
 
 from cow_service.adaptive import AdaptiveLimit, AdaptivePlaces
-from cow_service.client import CONCURRENCY, AsyncClient, progress, protocol
-from cow_service.errors import CowError
+from cow_service.client import CONCURRENCY, AsyncClient, protocol
 from cow_service.evals.imagination import Imagination
-from cow_service.evals.items import Item, Observation, Pictures
+from cow_service.evals.items import Item, Pictures
 from cow_service.evals.runs import PICTURES, SERVER
 from cow_service.observability import logging
 from cow_service.service import Service
@@ -38,10 +36,6 @@ class Session:
     concurrency: int = CONCURRENCY  # most requests at the same time
     items: Sequence[Item] | None = None  # of its tasks; None: each task loads its own
     lenders: Sequence[Item] = ()  # items whose frames others may be shown
-    # Called with the arm of every question that has been asked, and with what came of it; None: it failed.
-    on_reply: Callable[[str, Observation | None], None] = lambda arm, seen: None
-    progress: "EvalProgress | None" = None
-    waiting: Counter[str] = field(default_factory=Counter[str])
     _clients: dict[int, tuple[AsyncClient, Imagination]] = field(default_factory=dict)
 
     def clients(self) -> tuple[AsyncClient, Imagination]:
@@ -53,18 +47,6 @@ class Session:
             imagination = Imagination(client, places, self.pictures, self.options, self.key, self.lenders)
             self._clients[loop] = client, imagination
         return self._clients[loop]
-
-    async def show_load(self) -> None:
-        """Shows what most calls wait for, now and then."""
-        if self.progress is None or not self.progress.is_look_due():
-            return
-        client, imagination = self.clients()
-        of_mllm, places = self.waiting["mllm"], imagination.places
-        if of_mllm > places.limit.in_flight + places.waiting:
-            self.progress.load = f"limited by the MLLM: {of_mllm} calls wait for it"
-        else:
-            with suppress(CowError):
-                self.progress.load = progress.describe_load(await client.workers())
 
 
 def _observed(limit: AdaptiveLimit) -> httpx.AsyncClient:
@@ -132,23 +114,3 @@ def _share_files(pictures: Path, artifacts: Path) -> None:
             if same.is_file() and not same.samefile(path):
                 (linked := same.with_suffix(".linked")).hardlink_to(path)
                 linked.replace(same)
-
-
-@dataclass
-class EvalProgress(progress.BatchProgress):
-    """Rate, time left and accuracy so far. Questions of an earlier process count as done, but not for the rate."""
-
-    arms: defaultdict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter[str]))
-
-    def add(self, arm: str, seen: Observation | None, *, earlier: bool = False) -> None:
-        """Counts a question that has been asked; None: it failed."""
-        self.count(seen is not None, earlier=earlier)
-        self.arms[arm].update(asked=1, failed=int(seen is None), right=int(seen is not None and seen.right))
-
-    def __str__(self) -> str:
-        lines = [super().__str__()]
-        for arm, count in self.arms.items():
-            answered = count["asked"] - count["failed"]
-            right = f", {count['right'] / answered:.1%} right" if answered else ""
-            lines.append(f"{arm}: {count['asked']} asked{right}")
-        return "\n".join(lines)

@@ -112,7 +112,7 @@ class Story:
 
     def _asked_about(self) -> Encounter | None:
         """The first encounter that the question asks for."""
-        outcome, body, bodies = self._outcome, self._subject, self._trajectory.bodies
+        outcome, body = self._outcome, self._subject
         if outcome is None or body is None or outcome.asked.relation not in KINDS:
             return None
         kind = KINDS[outcome.asked.relation]
@@ -122,11 +122,15 @@ class Story:
         ]
         own = [each for each in fitting if each.subject == body and self._is_meant(each.object)]
         if outcome.asked.target is not None:
-            # Of two that both move, either may be the subject of the encounter.
-            pair = {bodies[body].object, outcome.object} if bodies and kind == "touches" else None
-            other = [e for e in fitting if e.subject < len(bodies) and {bodies[e.subject].object, e.object} == pair]
+            other = self._between(body, outcome.object, fitting) if kind == "touches" else []
             own = [each for each in own if each.object == outcome.object] or other
         return min(own, key=lambda each: each.first_frame, default=None)
+
+    def _between(self, body: int, other: str | None, encounters: Sequence[Encounter]) -> list[Encounter]:
+        """Those of a body and another thing: of two that both move, either may be the subject."""
+        bodies = self._trajectory.bodies
+        pair = {bodies[body].object, other} if bodies else set[str]()
+        return [e for e in encounters if e.subject < len(bodies) and {bodies[e.subject].object, e.object} == pair]
 
     def _is_meant(self, name: str) -> bool:
         """Whether a thing is one of those asked about, where the question names several."""
@@ -173,11 +177,7 @@ class Story:
         record = self._trajectory.bodies[body] if self._trajectory.bodies else None
         is_round = record is not None and record.shape == "sphere"
         on, first_touch, way = "rolls" if is_round else "slides", min(touches, default=math.inf), say(_direction(path))
-        bounces = [
-            contact.time
-            for contact in self._trajectory.contacts
-            if contact.a == body and contact.b is None and contact.impulse >= BOUNCE and 0 < contact.time < first_touch
-        ]
+        bounces = self._bounces(body, first_touch)
         if bounces and body == 0:
             times = {1: "one", 2: "two"}.get(len(bounces), "many")
             landed = path.states[min(round(bounces[-1] * self._trajectory.fps), len(path.states) - 1)]
@@ -192,6 +192,11 @@ class Story:
         if not is_round and path.tipped_at is not None:
             on = "topples"
         return [say(on, way=way)]
+
+    def _bounces(self, body: int, until: float) -> list[float]:
+        """When it bounces off the floor before a time, s."""
+        own = [each for each in self._trajectory.contacts if each.a == body and each.b is None]
+        return [each.time for each in own if each.impulse >= BOUNCE and 0 < each.time < until]
 
     def _flight(self, path: Path) -> str:
         """How what nothing carries sets out."""
@@ -231,24 +236,31 @@ class Story:
 
         None where there is nothing to say; infinity for never, which is said where it is asked.
         """
-        outcome, trajectory, on = self._outcome, self._trajectory, self._supports[body]
+        outcome, on = self._outcome, self._supports[body]
         asked = None if outcome is None or body != self._subject else outcome.asked.relation
         if outcome is not None and body == self._leaving:
-            key, seen = "leave", self._paths[body].visible if body in self._paths else ()
-            happens = outcome.happens != outcome.asked.negated
-            time = seen.index(False) / trajectory.fps if False in seen else math.inf
-            time = self._time_asked if happens and self._time_asked is not None else time
+            key, time = "leave", self._time_left(body, outcome)
         elif on == "floor" or (on == "air" and asked != "lands"):
             return None
         else:
-            key = "land" if on == "air" else "fall-off"
-            time = next((each.time for each in trajectory.contacts if each.a == body and each.b is None), math.inf)
-            if asked == "lands" and time < math.inf:
-                time = self._time_asked or time
+            key, time = "land" if on == "air" else "fall-off", self._time_landed(body)
+            time = self._time_asked or time if asked == "lands" and time < math.inf else time
         name = self._say.name(on)
         if time == math.inf:
             return (time, self._say(f"{key}-not", object=name)) if asked in OF_ITSELF else None
         return time, self.timed(f"{key}-at", time, object=name)
+
+    def _time_landed(self, body: int) -> float:
+        """When it first meets the floor, s; infinity for never."""
+        floor = (each.time for each in self._trajectory.contacts if each.a == body and each.b is None)
+        return next(floor, math.inf)
+
+    def _time_left(self, body: int, outcome: Outcome) -> float:
+        """When it leaves the image, s; infinity for never."""
+        if self._time_asked is not None and outcome.happens != outcome.asked.negated:
+            return self._time_asked
+        seen = self._paths[body].visible if body in self._paths else ()
+        return seen.index(False) / self._trajectory.fps if False in seen else math.inf
 
     def _nothing_touched(self, body: int) -> str:
         """That it touches nothing but what it stood on, or what stood on it, all the time."""

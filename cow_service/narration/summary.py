@@ -61,15 +61,20 @@ def direct(outcome: Outcome, say: Phrases) -> str:
             is_known = outcome.time is not None and outcome.happens
             return say("after", time=say.seconds(outcome.time or 0.0)) if is_known else say("never")
         case "which" | "which-to-remove":
-            meant = [] if outcome.is_needless else [each.object for each in outcome.candidates if each.is_meant]
-            is_open = outcome.asked.form == "which" and not outcome.asked.among
-            none = "nothing" if outcome.is_needless or is_open else "none-of-them"
-            last = "names-and" if outcome.asked.form == "which" else "names-or"
-            return say.joined(meant, last) if meant else say(none)
+            return chosen_names(outcome, say)
         case "how-many":
             return str(outcome.count or 0)
         case "where" | "what-happens":
             return ""
+
+
+def chosen_names(outcome: Outcome, say: Phrases) -> str:
+    """The candidates of which it is so, in a list."""
+    meant = [] if outcome.is_needless else [each.object for each in outcome.candidates if each.is_meant]
+    if meant:
+        return say.joined(meant, "names-and" if outcome.asked.form == "which" else "names-or")
+    is_open = outcome.asked.form == "which" and not outcome.asked.among
+    return say("nothing" if outcome.is_needless or is_open else "none-of-them")
 
 
 def why_unsure(outcome: Outcome, in_worlds: bool, say: Phrases) -> str:
@@ -200,43 +205,57 @@ class _Summary:
         """Of which candidates it is so, and of which of those that the question names it is not."""
         outcome, say, asked = self._given, self._say, self._given.asked
         meant = [each.object for each in outcome.candidates if each.is_meant]
-        others = [each.object for each in outcome.candidates if not each.is_meant and (asked.among or not meant)]
+        others = [each.object for each in outcome.candidates if not each.is_meant] if asked.among or not meant else []
         if asked.form == "which-to-remove":
-            shown = self._trajectory.model_copy(update={"outcome": outcome.of_shown})
-            there = _Summary(self._mover, shown, say)._statement(with_time=False)
-            if outcome.is_needless:
-                return say("nothing-to-remove", statement=there)
-            told = (("prevents", meant), ("prevents-not", others))
-            removals = [say(key, object=say.names(names, "names-or")) for key, names in told if names]
-            return say.joined([there, *removals], "every-and")
+            return self._removals({"prevents": meant, "prevents-not": others})
         if not meant and not asked.among and not asked.negated:
             return self._event(False, None)
         key = "fit" if asked.relation == "inside" else EVENTS[asked.relation]
         told = [(does, names) for does, names in ((not asked.negated, meant), (asked.negated, others)) if names]
         if asked.relation in OF_TARGET:
-            each = [(say.name(name), self._clause(key, does, None, [name])) for does, names in told for name in names]
-            return say.joined([say("statement", subject=name, clause=clause) for name, clause in each], "every-and")
-        subject = say("subject", name=say.name(self._mover)) if outcome.subject is None else say.name(outcome.subject)
+            statements = [
+                say("statement", subject=say.name(name), clause=self._clause(key, does, None, [name]))
+                for does, names in told
+                for name in names
+            ]
+            return say.joined(statements, "every-and")
         clauses = [self._clause(key, does, None, names) for does, names in told]
-        return say("statement", subject=subject, clause=say.joined(clauses, "clauses-and"))
+        return say("statement", subject=self._subject, clause=say.joined(clauses, "clauses-and"))
+
+    @property
+    def _subject(self) -> str:
+        """What does what is asked about, as the subject of a clause."""
+        subject = self._given.subject
+        return self._say("subject", name=self._say.name(self._mover)) if subject is None else self._say.name(subject)
+
+    def _removals(self, told: dict[str, list[str]]) -> str:
+        """What is so in the world that is shown, and by which removals it would not be."""
+        outcome, say = self._given, self._say
+        shown = self._trajectory.model_copy(update={"outcome": outcome.of_shown})
+        there = _Summary(self._mover, shown, say)._statement(with_time=False)
+        if outcome.is_needless:
+            return say("nothing-to-remove", statement=there)
+        removals = [say(key, object=say.names(names, "names-or")) for key, names in told.items() if names]
+        return say.joined([there, *removals], "every-and")
 
     def _event(self, does: bool, time: float | None) -> str:
         """That what is asked about happens, or does not, with its time where one is given."""
         outcome, say, asked = self._given, self._say, self._given.asked
         key = EVENTS[asked.relation] if time is None or asked.relation == "inside" else f"{EVENTS[asked.relation]}-at"
         meant = [outcome.object] if outcome.object is not None else list(asked.among)
-        if asked.relation in OF_TARGET and not meant:
-            return self._within(say(f"{EVENTS[asked.relation]}-{'any' if does else 'none'}"))
-        subjects = [say("subject", name=say.name(self._mover))]
         if asked.relation in OF_TARGET:
-            subjects = [say.name(each) for each in meant]
-        elif outcome.subject is not None:
-            subjects = [say.name(outcome.subject)]
-        # Not to hit each one is to miss one of them: it misses this one or it misses that one.
-        is_split = asked.every and not does and meant and asked.relation not in OF_TARGET
-        parts = [[each] for each in meant] if is_split else [meant]
-        clauses = [self._clause(key, does, time, part) for part in parts]
-        statements = [say("statement", subject=each, clause=clause) for each in subjects for clause in clauses]
+            if not meant:
+                return self._within(say(f"{EVENTS[asked.relation]}-{'any' if does else 'none'}"))
+            subjects, parts = [say.name(each) for each in meant], [meant]
+        else:
+            # Not to hit each one is to miss one of them: it misses this one or it misses that one.
+            is_split = asked.every and not does and meant
+            subjects, parts = [self._subject], [[each] for each in meant] if is_split else [meant]
+        statements = [
+            say("statement", subject=subject, clause=self._clause(key, does, time, part))
+            for subject in subjects
+            for part in parts
+        ]
         return say.joined(statements, "every-and" if asked.every == does else "either-or")
 
     def _clause(self, key: str, does: bool, time: float | None, meant: Sequence[str]) -> str:
@@ -247,17 +266,23 @@ class _Summary:
             return self._within(self.story.placed())
         if asked.relation == "lands" and self.story.support():
             key, meant = key.replace("land", "fall-off"), self.story.support()
-        if asked.partly and does and asked.relation in OF_COVERING:
-            key = f"{EVENTS[asked.relation]}-part"
+        last = "names-and" if asked.every or asked.form == "which" else "names-or"
         if not does:
-            key = f"{key}-not" if meant or asked.relation not in KINDS else f"{key}-none"
-            key = "on-from-start" if asked.relation == "touches" and meant and meant == self.story.support() else key
-        last = "names-nor" if not does else "names-and" if asked.every or asked.form == "which" else "names-or"
-        last = "names-or" if key == "fit-not" else last
+            key = self._denied(key, meant)
+            last = {"fit-not": "names-or"}.get(key, "names-nor")
+        elif asked.partly and asked.relation in OF_COVERING:
+            key = f"{EVENTS[asked.relation]}-part"
         name = say.names(meant, last) if meant else say("something")
         if time is None or not key.endswith("-at"):
             return self._within(say(key.removesuffix("-at"), object=name))
         return self.story.timed(key, time, object=name)  # which says that it is within the time asked
+
+    def _denied(self, key: str, meant: Sequence[str]) -> str:
+        """The template of what does not happen."""
+        relation = self._given.asked.relation
+        if relation == "touches" and meant and meant == self.story.support():
+            return "on-from-start"
+        return f"{key}-not" if meant or relation not in KINDS else f"{key}-none"
 
     def _within(self, clause: str) -> str:
         within = self._given.asked.within

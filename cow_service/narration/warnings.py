@@ -53,44 +53,19 @@ OFF_CENTRE = 0.25  # of the object's size: a given path that begins further from
 
 def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Trajectory) -> tuple[str, ...]:
     """What a caller should know of a trajectory beside what it says, in sentences."""
-    given, found = request.trajectory, list[str]()
+    found = list[str]()
     if not trajectory.encounters_known:
         found.append(
             "The surroundings could not be separated into objects, so encounters were not computed: "
             "an empty list does not mean that nothing is hit."
         )
-    # Where a given path goes beside the motion, the object or the clip that were given with it.
-    if given is not None and request.whole_motion is not None:
-        found.append(
-            "Both `motion` and `trajectory` were given: the object follows the trajectory; the motion only words it."
-        )
-    x0, y0, x1, y1 = grounding.bbox
-    gap = 0.0 if given is None else math.dist(given.points[0], grounding.point)
-    if request.grounding is not None and gap > OFF_CENTRE * max(x1 - x0, y1 - y0):
-        found.append(
-            f"The given trajectory starts {gap:.0f} px from the object's centre; the first frame shows it there."
-        )
-    # A path that ends where the clip does, or a frame beside it, is of its length.
-    clip = (request.num_frames - 1) / request.fps
-    path = clip if given is None else (len(given.points) - 1) / given.fps
-    if abs(path - clip) * request.fps > 1.5:
-        happens = (
-            "the end of the path is not shown" if path > clip else "after the path ends, the object stays where it is"
-        )
-        found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
+    found += warnings_of_path(request, grounding)
     found += _of_depth(request, grounding, trajectory)
     found += [
         f"Something else may stand at ({(left + right) / 2:.0f}, {bottom:.0f}); it is not simulated."
         for left, _, right, bottom in trajectory.faint
     ]
-    if trajectory.outcome is not None and "outline" in trajectory.outcome.depends_on:
-        outcome, met = trajectory.outcome, {each.object for each in trajectory.encounters}
-        matter = {trajectory.bodies[0].object, outcome.subject, outcome.object, *outcome.asked.among} | met
-        found += [
-            f"'{body.object}' was not seen clearly: give its box in `objects` to get an answer that may rely on it."
-            for body in trajectory.bodies
-            if not body.is_clear and body.object in matter
-        ]
+    found += warnings_of_outlines(trajectory)
     found += [doubt for placed in trajectory.placed for doubt in doubts_of(placed)]
     found += [
         f"'{each.object}', put {each.place}, was placed relative to the direction of motion, not as the camera sees it."
@@ -105,6 +80,45 @@ def warnings_of(request: SimulateRequest, grounding: Grounding, trajectory: Traj
             if index not in put and body.bbox != seen.bbox
         ]
     return tuple(found)
+
+
+def warnings_of_path(request: SimulateRequest, grounding: Grounding) -> list[str]:
+    """Where a given path goes beside the motion, the object or the clip that were given with it, in sentences."""
+    given, found = request.trajectory, list[str]()
+    if given is None:
+        return []
+    if request.whole_motion is not None:
+        found.append(
+            "Both `motion` and `trajectory` were given: the object follows the trajectory; the motion only words it."
+        )
+    x0, y0, x1, y1 = grounding.bbox
+    gap = math.dist(given.points[0], grounding.point)
+    if request.grounding is not None and gap > OFF_CENTRE * max(x1 - x0, y1 - y0):
+        found.append(
+            f"The given trajectory starts {gap:.0f} px from the object's centre; the first frame shows it there."
+        )
+    # A path that ends where the clip does, or a frame beside it, is of its length.
+    clip, path = (request.num_frames - 1) / request.fps, (len(given.points) - 1) / given.fps
+    if abs(path - clip) * request.fps > 1.5:
+        happens = (
+            "the end of the path is not shown" if path > clip else "after the path ends, the object stays where it is"
+        )
+        found.append(f"The given trajectory lasts {path:.2f} s and the clip {clip:.2f} s: {happens}.")
+    return found
+
+
+def warnings_of_outlines(trajectory: Trajectory) -> list[str]:
+    """What was not seen clearly and matters to the outcome, in sentences."""
+    outcome = trajectory.outcome
+    if outcome is None or "outline" not in outcome.depends_on:
+        return []
+    met = {each.object for each in trajectory.encounters}
+    matter = {trajectory.bodies[0].object, outcome.subject, outcome.object, *outcome.asked.among} | met
+    return [
+        f"'{body.object}' was not seen clearly: give its box in `objects` to get an answer that may rely on it."
+        for body in trajectory.bodies
+        if not body.is_clear and body.object in matter
+    ]
 
 
 def _of_depth(request: SimulateRequest, grounding: Grounding, trajectory: Trajectory) -> list[str]:

@@ -35,6 +35,7 @@ from cow_service.weights.manifests import Manifest, Source
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
+    from huggingface_hub.hf_api import RepoSibling
 
 LOCK_NAME = "cow.lock.json"
 PICKLED = (".bin", ".ckpt", ".pickle", ".pkl", ".pt", ".pth")  # reading one of these can run code that it holds
@@ -288,38 +289,53 @@ def download(
     hub = _hub(endpoint)
     with ExitStack() as held:
         for each in downloads:
-            kept = folder_of(weights_dir, each.lock.repository) / ".cache"
-            with disk_errors(each.lock.repository):
-                kept.mkdir(parents=True, exist_ok=True)
-                try:
-                    held.enter_context(FileLock(kept / "cow.lock").acquire(timeout=0))
-                except Timeout as error:
-                    why = "another pull is downloading it"
-                    raise _unavailable(each.lock.repository, why, "Wait until it has ended") from error
-                # What killed downloads have left. Their names are unique to one: the library never resumes them.
-                for left in kept.rglob("*.*.*.incomplete"):
-                    left.unlink(missing_ok=True)
-        needed: Counter[int] = Counter()  # bytes, by disk
+            held.enter_context(held_alone(each.lock.repository, weights_dir))
+        check_room(downloads, weights_dir)
         for each in downloads:
             with disk_errors(each.lock.repository):
-                folder = folder_of(weights_dir, each.lock.repository)  # which may be a link to another disk
-                disk, free = folder.stat().st_dev, shutil.disk_usage(folder).free
-            needed[disk] += sum(file.size for file in each.pending)
-            if needed[disk] > free:
-                why = f"its disk has {free / 1e9:.1f} GB free, and {needed[disk] / 1e9:.1f} GB are needed"
-                raise _unavailable(each.lock.repository, why, "Free some space, or set COW_MODELS_DIR to a larger disk")
-        for each in downloads:
-            lock, old = each.lock, read_lock(weights_dir, each.lock.repository)
-            if old is not None and old.revision == lock.revision:  # another download may have ended meanwhile
-                patterns = tuple(dict.fromkeys((*old.patterns, *lock.patterns)))
-                files = {file.path: file for file in (*old.files, *lock.files)}
-                both = {"patterns": patterns, "files": tuple(files[path] for path in sorted(files))}
-                lock = lock.model_copy(update=both)
-            with disk_errors(lock.repository):
-                write_lock(weights_dir, lock)
+                write_lock(weights_dir, merged_with(each.lock, read_lock(weights_dir, each.lock.repository)))
             for file in each.pending:
-                tell(lock.repository, file)
+                tell(each.lock.repository, file)
                 _download_file(hub, each.lock, file, weights_dir)
+
+
+@contextmanager
+def held_alone(repository: str, weights_dir: Path) -> Generator[None]:
+    """Makes a repository's folder, keeps other pulls out of it, and deletes what killed ones have left there."""
+    kept = folder_of(weights_dir, repository) / ".cache"
+    with ExitStack() as held:
+        with disk_errors(repository):
+            kept.mkdir(parents=True, exist_ok=True)
+            try:
+                held.enter_context(FileLock(kept / "cow.lock").acquire(timeout=0))
+            except Timeout as error:
+                why = "another pull is downloading it"
+                raise _unavailable(repository, why, "Wait until it has ended") from error
+            for left in kept.rglob("*.*.*.incomplete"):  # unique to one pull: the library never resumes them
+                left.unlink(missing_ok=True)
+        yield
+
+
+def check_room(downloads: Sequence[Download], weights_dir: Path) -> None:
+    """Raises `WeightsUnavailable` if a disk is too full for what is to be downloaded to it."""
+    needed: Counter[int] = Counter()  # bytes, by disk
+    for each in downloads:
+        with disk_errors(each.lock.repository):
+            folder = folder_of(weights_dir, each.lock.repository)  # which may be a link to another disk
+            disk, free = folder.stat().st_dev, shutil.disk_usage(folder).free
+        needed[disk] += sum(file.size for file in each.pending)
+        if needed[disk] > free:
+            why = f"its disk has {free / 1e9:.1f} GB free, and {needed[disk] / 1e9:.1f} GB are needed"
+            raise _unavailable(each.lock.repository, why, "Free some space, or set COW_MODELS_DIR to a larger disk")
+
+
+def merged_with(lock: Lock, old: Lock | None) -> Lock:
+    """With what the record of the same revision has: another download may have ended meanwhile."""
+    if old is None or old.revision != lock.revision:
+        return lock
+    patterns = tuple(dict.fromkeys((*old.patterns, *lock.patterns)))
+    files = {file.path: file for file in (*old.files, *lock.files)}
+    return lock.model_copy(update={"patterns": patterns, "files": tuple(files[path] for path in sorted(files))})
 
 
 def _download_file(hub: "HfApi", lock: Lock, file: LockedFile, weights_dir: Path) -> None:
@@ -352,20 +368,21 @@ def _list(source: Source, revision: str | None, others: tuple[str, ...], endpoin
                 pickled = "only pickled files, which can run code when they are read, match"
                 why = f"{pickled if matching else 'no file matches'} '{pattern}'"
                 raise _unavailable(source.repository, why, "Choose a revision that has such files as safetensors")
-        files: list[LockedFile] = []
-        for name in sorted(names):
-            try:
-                path, listed = inside(name), siblings[name]
-            except ValueError as error:
-                why = f"in its listing, {error}"
-                raise _unavailable(source.repository, why, "Do not use this repository") from error
-            if listed.lfs is not None:  # files in large-file storage, xet included
-                files.append(LockedFile(path=path, size=listed.lfs.size, algorithm="sha256", digest=listed.lfs.sha256))
-            elif listed.size is None or listed.blob_id is None:
-                raise _unavailable(source.repository, f"the hub lists no size or no digest of '{path}'", "Run it again")
-            else:
-                files.append(LockedFile(path=path, size=listed.size, algorithm="git-sha1", digest=listed.blob_id))
-        return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=tuple(files))
+        files = tuple(record_of(source.repository, name, siblings[name]) for name in sorted(names))
+        return Lock(repository=source.repository, revision=info.sha or "", patterns=tuple(patterns), files=files)
+
+
+def record_of(repository: str, name: str, listed: "RepoSibling") -> LockedFile:
+    """The record of a file that the hub lists."""
+    try:
+        path = inside(name)
+    except ValueError as error:
+        raise _unavailable(repository, f"in its listing, {error}", "Do not use this repository") from error
+    if listed.lfs is not None:  # files in large-file storage, xet included
+        return LockedFile(path=path, size=listed.lfs.size, algorithm="sha256", digest=listed.lfs.sha256)
+    if listed.size is None or listed.blob_id is None:
+        raise _unavailable(repository, f"the hub lists no size or no digest of '{path}'", "Run it again")
+    return LockedFile(path=path, size=listed.size, algorithm="git-sha1", digest=listed.blob_id)
 
 
 def _hub(endpoint: str | None) -> "HfApi":

@@ -25,7 +25,7 @@ def test_the_wheel_runs_in_a_clean_environment(wheel: Path, tmp_path: Path) -> N
     assert "cow_service/_shipped/models/cutout.yaml" in names
     assert "cow_service/py.typed" in names
     assert "cow_service/web/docs/start.js" in names
-    assert "cow_service/evals/report/page/template.html" in names
+    assert "cow_service/evals/report/figures.mplstyle" in names
     assert not [name for name in names if name.startswith(("tests", "examples", "benchmarks"))]
     binaries = new_environment(tmp_path / "venv", wheel)
     (tmp_path / "a.png").write_bytes(png_bytes(ball(floor(), (150, 200), 40, (210, 20, 20))))

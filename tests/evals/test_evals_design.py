@@ -28,28 +28,22 @@ def arms(draw: st.DrawFn) -> Arm:
     if content not in ("none", "text"):
         fields |= {"frames": draw(st.sampled_from(MOMENTS)), "count": draw(st.integers(1, 64))}
         fields |= {"size": draw(st.integers(16, 8192)), "image": draw(st.booleans())}
-    if content == "true":
-        fields["error"] = draw(st.none() | st.sampled_from([0.0, 0.5, 2.0, 4.0]))
     return Arm.model_validate(fields)
 
 
 @given(arms())
-def test_an_arm_is_read_from_its_name_and_from_its_factors(arm: Arm) -> None:
+def test_an_arm_is_read_from_its_name(arm: Arm) -> None:
     assert arm_of(arm.name) == arm
-    factors = ",".join(f"{name}={value}" for name, value in arm.model_dump(exclude_none=True).items())
-    if arm.shows_frames:
-        assert arm_of(factors) == arm
 
 
-def test_names_are_short_and_best_of_k_is_k_votes() -> None:
+def test_names_are_short() -> None:
     assert {name: arm.name for name, arm in NAMED.items()} == {name: name for name in NAMED}
-    assert arm_of("best-of-3") == arm_of("always:vote-3") == arm_of("content=simulated,votes=3")
-    assert arm_of("content=simulated,frames=initial,votes=3").name == "always:initial:vote-3"
+    assert arm_of("always:vote-3:initial").name == "always:initial:vote-3"
     assert arm_of("placebo-still:no-image").with_content("simulated").name == "frames-only"
     for wrong in (
         "sometimes",
         "always:initial:events",
-        "content=still,content=true",
+        "content=still",
         "never:no-image",
         "always:vote-17",
     ):
@@ -61,12 +55,9 @@ def test_names_are_short_and_best_of_k_is_k_votes() -> None:
 
 def test_every_preset_can_be_asked_where_there_is_what_it_shows() -> None:
     items = [item(number, DIGEST, "collision", "L1") for number in (0, 3)]
-    errors = [arm_of(name).error for name in PRESETS["dose"].arms if name.startswith("oracle")]
-    assert errors == [0, 0.5, 1, 2, 4]
-    for name in PRESETS.keys() - {"dose"}:
-        arms = PRESETS[name].arms
-        assert [arm.name for arm in check_arms(arms, "prompt", items)] == list(arms)
-    for arms, among in ((PRESETS["dose"].arms, items), (["placebo-item"], items[:1])):
+    for preset in PRESETS.values():
+        assert [arm.name for arm in check_arms(preset.arms, "prompt", items)] == list(preset.arms)
+    for arms, among in ((["oracle"], items), (["placebo-item"], items[:1])):
         with refused("invalid-request"):  # without a true path; without another scene
             check_arms(arms, "prompt", among)
 

@@ -39,10 +39,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(420)]
 SAMPLE = ROOT / "cow-scenes" / "sample"
 ALL_ARMS = (
     *("never", "always", "auto", "gate", "always:vote-2", "never:vote-2", "placebo-still"),
-    *("placebo-direction", "placebo-item", "encounters", "frames-only", "oracle", "oracle:error-2"),
+    *("placebo-direction", "placebo-item", "encounters", "frames-only", "oracle"),
 )
 PICTURES_SHOWN = {"never": 1, "always": 4, "encounters": 1, "frames-only": 3, "oracle": 4}
-PICTURES_SHOWN |= {"placebo-still": 4, "placebo-item": 4, "oracle:error-2": 4}
+PICTURES_SHOWN |= {"placebo-still": 4, "placebo-item": 4}
 LIMIT, REPEATS = (4, 1) if SCALE == 1 else (12, 2)
 MODEL = "openai-api/local/fake"
 # What a run imports, Inspect's own parts among it.
@@ -189,21 +189,13 @@ def test_the_gate_asks_thrice_before_and_imagines_where_answers_differ(done: Don
     assert not any(each.frames for each in done.run.of_arm("gate")), "nothing is shown"
 
 
-def test_true_frames_are_drawn_along_the_true_path_or_off_it(done: Done) -> None:
-    errors = {
-        arm: {each.item: each.path_error for each in done.run.of_arm(arm)}
-        for arm in ("always", "oracle:error-2", "oracle")
-    }
-    assert set(errors["oracle"].values()) == {0.0}
-    for item, simulated in errors["always"].items():
-        off = errors["oracle:error-2"][item]
-        assert simulated is not None or off is None, "where nothing was simulated, no error is known"
-        # The simulation's own is measured at the moments of the truth, the other at those of the clip.
-        assert simulated is None or off is None or off == pytest.approx(2 * simulated, rel=0.2, abs=0.002)
+def test_true_frames_are_drawn_along_the_true_path(done: Done) -> None:
+    assert {each.path_error for each in done.run.of_arm("oracle")} == {0.0}
+    errors = [each.path_error for each in done.run.of_arm("always") if each.refusal is None]
+    assert all(error is not None and 0 < error < 0.2 for error in errors)
     simulations = [each for each in done.run.of_arm("always") if each.probability is not None]
     assert any(each.event_shown for each in simulations)
     assert not any(each.event_shown is False for each in simulations), "the default frames go on to the moment"
-    assert done.findings.doses
     assert {each.by for each in done.findings.splits} > {"simulation", "frames"}
 
 
@@ -225,10 +217,10 @@ def test_the_record_says_what_was_asked_of_whom_and_keeps_a_picture_once(done: D
 def test_the_report_has_tables_plots_pictures_and_a_manifest(done: Done) -> None:
     report = done.out / "report"
     names = {path.relative_to(report).as_posix() for path in report.rglob("*") if path.is_file()}
-    kinds = ("primary", "levels", "arms", "gains", "why", "doses", "cost")
+    kinds = ("primary", "levels", "arms", "gains", "why", "cost")
     tables = {f"tables/{name}.{form}" for name in kinds for form in ("md", "csv", "tex")}
-    tables |= {f"plots/{name}.svg" for name in ("gains", "rates", "calibration", "cost")}
-    assert {"index.html", "report.md", "manifest.json", "tables/replies.csv", *tables} <= names
+    tables |= {f"plots/{name}.svg" for name in ("gains", "rates", "calibration")}
+    assert {"report.md", "manifest.json", "tables/replies.csv", *tables} <= names
     manifest = json.loads((report / "manifest.json").read_text())
     assert manifest["runs"][0]["versions"]["prompts/eval-question"].startswith("1 (sha256 ")
     assert set(manifest["files"]) == names - {"manifest.json"}

@@ -79,4 +79,4 @@ def test_runs_of_two_models_are_compared_each_with_its_own_baseline(tmp_path: Pa
     write_report([large, more, small], tmp_path / "report", {})
     manifest = json.loads((tmp_path / "report" / "manifest.json").read_text())
     assert [each["mllm"] for each in manifest["runs"]] == ["openai/large", "openai/large", "openai/small"]
-    assert (tmp_path / "report" / "index.html").is_file()
+    assert (tmp_path / "report" / "report.md").is_file()

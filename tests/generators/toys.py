@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.profiler import profile
 
 from cow_service.generators.wan import acceleration, generator, loading, memory, ranks
-from cow_service.generators.wan.acceleration import accelerate, cached_pass, pin, reset_cache
+from cow_service.generators.wan.acceleration import accelerate, pin, reset_cache
 from cow_service.generators.wan.capabilities import (
     MINIMUM_VERSIONS,
     Capabilities,

@@ -28,13 +28,14 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
     path = Path(data)
     if not path.exists() and _HUB_NAME.fullmatch(data):
         path = _download(data)
-    wanted = subsets or formats.SUBSETS
-    published = path.is_dir() and bool(formats.subset_shards(path, wanted))
-    if published:
-        found = formats.load_causalspatial(path, wanted, pictures)
+    shards = formats.subset_shards(path, subsets or formats.SUBSETS)
+    if absent := [subset for subset in subsets if shards and subset not in shards]:
+        raise InvalidRequest(f"'{data}' has no subset '{absent[0]}': a folder of that name with Parquet files.")
+    if shards:
+        found, skip_faulty = formats.load_causalspatial(path, tuple(shards), pictures), True
     elif path.is_file() and path.suffix.lower() in formats.READERS:
         found = collect(formats.table_rows(path, ignore_columns=skip_faulty), pictures)
-    elif path.is_dir() and formats.scene_folders(path):
+    elif formats.scene_folders(path):
         found = collect(formats.scene_rows(path), pictures)
     else:
         what = "is not there" if not path.exists() else "holds none of these"
@@ -43,11 +44,14 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
             f"(*/meta.json with image.jpg), a file ({', '.join(formats.READERS)}), or the name of a data set, such as "
             f"{CAUSALSPATIAL}."
         )
-    absent = [subset for subset in subsets if published and not formats.subset_shards(path, [subset])]
-    if absent:
-        raise InvalidRequest(f"'{data}' has no subset '{absent[0]}': a folder of that name with Parquet files.")
+    check_faults(data, found, skip_faulty)
+    return found
+
+
+def check_faults(data: str, found: Collected, skip_faulty: bool) -> None:
+    """Raises `InvalidRequest` for faults that are not skipped, and where no question is left."""
     count = len(found.faults)
-    if count and not skip_faulty and not published:
+    if count and not skip_faulty:
         more = f"\n... and {count - MAX_SHOWN} more" if count > MAX_SHOWN else ""
         raise InvalidRequest(
             f"{count} {'row' if count == 1 else 'rows'} cannot be asked; mend them, or leave them out with "
@@ -56,7 +60,6 @@ def load(data: str, pictures: Pictures, *, subsets: Sequence[str] = (), skip_fau
     if not found.items:
         reasons = "\n".join(found.faults[:5])
         raise InvalidRequest(f"'{data}' holds no question that can be asked.{' ' if reasons else ''}{reasons}")
-    return found
 
 
 def _download(name: str) -> Path:

@@ -25,8 +25,8 @@ SUBSETS: tuple[Subset, ...] = ("collision", "physics", "compatibility", "occlusi
 TRUTH = "truth"  # of sets that are made with it
 _LEVEL = re.compile(r"_Level_(\d+)")
 _AT_ONCE = 64  # rows: a row may hold a picture of a megabyte
-# Where a row stands, and what reads its fields, which raises `RowFault`.
-Numbered = tuple[str, Callable[[], dict[str, Any]]]
+Fields = dict[str, Any]
+Numbered = tuple[str, Fields | bytes]  # where a row stands, and its fields, or the text of a JSON object
 # What a column means, by its names; those of VLMEvalKit are among them.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "id": ("id", "index"),
@@ -39,24 +39,8 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "scene": ("scene",),
 }
 IGNORED = ("split", "l2-category", "source", "meta", "not_sure", "hint")
-REQUIRED = ("image", "question", "answer")
-_URL = ("http://", "https://")
 _NAMES = {name: column for column, names in COLUMNS.items() for name in names}
 _LONGEST_PATH = 1024  # characters; what is longer is base64
-
-
-def parquet_rows(path: Path, name: str) -> Iterator[Numbered]:
-    """The rows of a file that is shown by this name. Raises `InvalidRequest` if it is none, or is not whole."""
-    from pyarrow import ArrowException, parquet  # noqa: PLC0415
-
-    try:
-        with parquet.ParquetFile(path) as file:
-            rows = (row for batch in file.iter_batches(batch_size=_AT_ONCE) for row in batch.to_pylist())
-            for number, row in enumerate(rows):
-                yield f"{name}, row {number}", partial(dict, row)
-    except (ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InvalidRequest(f"{name}: not a complete Parquet file ({reason}); download it again.") from error
 
 
 def scene_folders(folder: Path) -> list[Path]:
@@ -73,19 +57,13 @@ def scene_rows(folder: Path) -> Iterator[Unread]:
 def _scene_row(scene: Path) -> Row:
     meta = _json_object((scene / META).read_bytes())
     _require(meta, ("question", "answer"))
-    texts: dict[str, Any] = {name: str(meta[name]) for name in SCENE_TEXTS if meta.get(name) not in (None, "")}
+    texts: Fields = {name: str(meta[name]) for name in SCENE_TEXTS if meta.get(name) not in (None, "")}
     named, image = str(meta.get("id") or scene.name), scene / IMAGE
-    return Row(
-        id=named,
-        source_id=named,
-        image=image.read_bytes() if image.is_file() else None,
-        scene=scene.name,
-        truth=truth_of(scene, meta),
-        **texts,
-    )
+    picture = image.read_bytes() if image.is_file() else None
+    return Row(id=named, source_id=named, image=picture, scene=scene.name, truth=truth_of(scene, meta), **texts)
 
 
-def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
+def truth_of(scene: Path, meta: Fields) -> Known | None:
     """What a scene's folder knows of what really happens; None if that is nothing.
 
     `future_12.jpg` shows sample 12; `fps` samples pass in a second. Raises `RowFault` for a track that is none.
@@ -97,10 +75,10 @@ def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
         if not pictures and not meta.get("track"):
             return None
         # Of each object a box, or one per sample.
-        boxes: dict[str, Any] = {name: given for name, given in (meta.get("boxes") or {}).items() if given}
+        boxes: Fields = {name: given for name, given in (meta.get("boxes") or {}).items() if given}
         sampled = {name: given for name, given in boxes.items() if isinstance(given[0], list)}
         sides = [math.sqrt(max((x1 - x0) * (y1 - y0), 1.0)) for x0, y0, x1, y1 in sampled.get(str(moved), ())]
-        fields = {"fps": fps, "track": meta.get("track") or (), "scale": [side / sides[0] for side in sides]}
+        fields = {"fps": fps, "track": meta.get("track", ()), "scale": [side / sides[0] for side in sides]}
         fields |= {"object": moved, "boxes": boxes | {name: given[0] for name, given in sampled.items()}}
         truth = Truth.model_validate(fields)
     except (TypeError, ValueError, AttributeError, ZeroDivisionError, IndexError) as error:
@@ -113,12 +91,12 @@ def truth_of(scene: Path, meta: dict[str, Any]) -> Known | None:
 
 def table_rows(path: Path, *, ignore_columns: bool = False) -> Iterator[Unread]:
     """The rows of a file of one's own. Columns that mean nothing are faults, unless they are ignored."""
-    for place, read in READERS[path.suffix.lower()](path):
-        yield place, partial(_table_row, place, read, path.parent, ignore_columns)
+    for place, given in READERS[path.suffix.lower()](path):
+        yield place, partial(_table_row, place, given, path.parent, ignore_columns)
 
 
-def _table_row(place: str, read: Callable[[], dict[str, Any]], folder: Path, ignore_columns: bool) -> Row:
-    fields = read()
+def _table_row(place: str, given: Fields | bytes, folder: Path, ignore_columns: bool) -> Row:
+    fields = _json_object(given) if isinstance(given, bytes) else given
     if isinstance(fields.get("meta"), dict):  # a batch's file has the answer there
         fields = {"answer": fields["meta"].get("answer")} | fields
     unknown = [name for name in fields if name not in (*_NAMES, *IGNORED, *LETTERS)]
@@ -127,31 +105,30 @@ def _table_row(place: str, read: Callable[[], dict[str, Any]], folder: Path, ign
         known = f"known are {', '.join(COLUMNS)}, and A, B, C... for options"
         raise RowFault(f"unknown column `{unknown[0]}`: {f'did you mean `{close[0]}`?' if close else known}")
     values = {_NAMES[name]: value for name, value in fields.items() if name in _NAMES and value not in (None, "")}
-    _require(values, REQUIRED)
+    _require(values, ("image", "question", "answer"))
     image = _image(values.pop("image"), folder)
     options = _options(values.pop("options", None), fields)
-    texts: dict[str, Any] = {name: str(value) for name, value in values.items()}
+    texts: Fields = {name: str(value) for name, value in values.items()}
     named = texts.pop("id", place.rpartition(" ")[2])
     return Row(id=named, source_id=named, image=image, options=options, **texts)
 
 
-def _require(fields: dict[str, Any], names: Sequence[str]) -> None:
+def _require(fields: Fields, names: Sequence[str]) -> None:
     missing = [name for name in names if fields.get(name) in (None, "")]
     if missing:
         raise RowFault(f"has no {' and no '.join(f'`{name}`' for name in missing)}")
 
 
-def _options(given: Any, fields: dict[str, Any]) -> list[str] | None:
+def _options(given: Any, fields: Fields) -> list[str] | None:
     """Those of the row: a list, its JSON, or columns A, B, C...; None if the question lists them."""
-    if isinstance(given, str):
-        try:
-            given = json.loads(given)
-        except ValueError as error:
-            raise RowFault(f'`options` must be a JSON list such as ["Yes", "No"], got {given[:60]!r}') from error
     if given is not None:
-        if not isinstance(given, list):
-            raise RowFault(f"`options` must be a list, got {type(given).__name__}")
-        return [str(text) for text in given]
+        try:
+            listed = json.loads(given) if isinstance(given, str) else given
+        except ValueError:
+            listed = None
+        if not isinstance(listed, list):
+            raise RowFault(f'`options` must be a list such as ["Yes", "No"], or its JSON, got {str(given)[:60]!r}')
+        return [str(text) for text in listed]
     filled = [letter for letter in LETTERS if fields.get(letter) not in (None, "")]
     if "".join(filled) != LETTERS[: len(filled)]:
         raise RowFault(f"the options {', '.join(filled)} leave a letter out")
@@ -166,7 +143,7 @@ def _image(given: Any, folder: Path) -> bytes:
         return given
     if not isinstance(given, str):
         raise RowFault(f"`image` must be a file or base64, got {type(given).__name__}")
-    if given.startswith(_URL):
+    if given.startswith(("http://", "https://")):
         raise RowFault(f"`image` must not be an address ({given[:60]}): download it, and name the file")
     if len(given) <= _LONGEST_PATH and not given.startswith("data:"):
         file = folder / given
@@ -181,13 +158,7 @@ def _image(given: Any, folder: Path) -> bytes:
         raise RowFault(f"`image` is no file and no whole base64: {given[:40]!r}... ({error})") from error
 
 
-def _json_lines(path: Path) -> Iterator[Numbered]:
-    for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        if line.strip():
-            yield f"{path.name}, line {number}", partial(_json_object, line)
-
-
-def _json_object(text: bytes) -> dict[str, Any]:
+def _json_object(text: bytes) -> Fields:
     try:
         found = json.loads(text)
     except ValueError as error:
@@ -197,32 +168,45 @@ def _json_object(text: bytes) -> dict[str, Any]:
     return found
 
 
+def _json_lines(path: Path) -> Iterator[Numbered]:
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        if line.strip():
+            yield f"{path.name}, line {number}", line
+
+
 def _separated(path: Path, delimiter: str) -> Iterator[Numbered]:
     csv.field_size_limit(sys.maxsize)  # a field may hold a picture
-    names: list[str] = []
-    number = 0
+    number = 1
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            for number, cells in enumerate(csv.reader(file, delimiter=delimiter, strict=True), 1):
-                if not names:
-                    names = [name.strip() for name in cells]
-                elif cells:
-                    yield f"{path.name}, row {number}", partial(_named_cells, names, cells)
+            rows = csv.DictReader(file, delimiter=delimiter, strict=True, restkey="", restval=None)
+            for number, row in enumerate(rows, 2):
+                if "" in row or None in row.values():
+                    raise csv.Error("not as many cells as columns")
+                yield f"{path.name}, row {number}", dict(row)
     except (csv.Error, UnicodeDecodeError) as error:
-        raise InvalidRequest(f"{path.name}, row {number + 1}: {error}; was the file written to its end?") from error
+        raise InvalidRequest(f"{path.name}, row {number}: {error}; was the file written to its end?") from error
 
 
-def _named_cells(names: list[str], cells: list[str]) -> dict[str, Any]:
-    if len(cells) != len(names):
-        raise RowFault(f"has {len(cells)} cells for {len(names)} columns; was the file written to its end?")
-    return dict(zip(names, cells, strict=True))
+def _parquet_rows(path: Path, name: str) -> Iterator[tuple[str, Fields]]:
+    """The rows of a file that is shown by this name. Raises `InvalidRequest` if it is none, or is not whole."""
+    from pyarrow import ArrowException, parquet  # noqa: PLC0415
+
+    try:
+        with parquet.ParquetFile(path) as file:
+            rows = (row for batch in file.iter_batches(batch_size=_AT_ONCE) for row in batch.to_pylist())
+            for number, row in enumerate(rows):
+                yield f"{name}, row {number}", row
+    except (ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InvalidRequest(f"{name}: not a complete Parquet file ({reason}); download it again.") from error
 
 
 READERS: dict[str, Callable[[Path], Iterator[Numbered]]] = {
     ".jsonl": _json_lines,
     ".csv": partial(_separated, delimiter=","),
     ".tsv": partial(_separated, delimiter="\t"),
-    ".parquet": lambda path: parquet_rows(path, path.name),
+    ".parquet": lambda path: _parquet_rows(path, path.name),
 }
 
 
@@ -234,47 +218,31 @@ def subset_shards(folder: Path, subsets: Sequence[str]) -> dict[str, list[Path]]
 
 def load_causalspatial(folder: Path, subsets: Sequence[str], pictures: Pictures) -> Collected:
     """The items of a folder in the layout of the published data, or of sets made like it."""
-    abstaining: dict[str, str] = {}  # by id: what the column `not_sure` says
-    found = collect(_published_rows(folder, subsets, abstaining), pictures, repeated_rows=True)
-    ids = Counter((item.id.partition("/")[0], item.source_id) for item in found.items)
-    shared = Counter(subset for (subset, _), count in ids.items() for _ in range(count) if count > 1)
-    told = "rows share their id with others; items are identified by subset, shard and row."
-    notes = [f"{subset}: {count} {told}" for subset, count in shared.items()]
-
-    # Which rows have no option that abstains, though the column `not_sure` names one; and where that is the truth.
-    wrong = [item for item in found.items if item.id in abstaining and abstaining[item.id] != item.abstain]
-    for subset in dict.fromkeys(item.id.partition("/")[0] for item in wrong):
-        of_subset = [item for item in wrong if item.id.startswith(f"{subset}/")]
-        none = [item for item in of_subset if item.abstain is None]
-        right = sum(abstaining[item.id] == item.answer for item in none)
-        if none:
-            notes.append(
-                f"{subset}: {len(none)} rows have no option that abstains, though `not_sure` names one; in {right} of "
-                "them that option is the right answer. It counts as an answer like any other."
-            )
-        if others := len(of_subset) - len(none):
-            notes.append(f"{subset}: in {others} rows another option abstains than `not_sure` says.")
-    found.notes[:0] = notes
+    found = collect(_published_rows(folder, subsets), pictures, repeated_rows=True)
+    made = [(item.id.partition("/")[0], item) for item in found.items if item.level != REAL]
+    ids = Counter((subset, item.source_id) for subset, item in made)
+    shared = Counter(subset for subset, item in made if ids[subset, item.source_id] > 1)
+    without = Counter(subset for subset, item in made if item.abstain is None)
+    found.notes[:0] = [
+        *(
+            f"{subset}: {count} rows share their id with others; items are identified by subset, shard and row."
+            for subset, count in shared.items()
+        ),
+        *(f"{subset}: {count} rows have no option that abstains." for subset, count in without.items()),
+    ]
     return found
 
 
-def _published_rows(folder: Path, subsets: Sequence[str], abstaining: dict[str, str]) -> Iterator[Unread]:
-    """The rows of all files. What the column `not_sure` says of a row goes into `abstaining`."""
+def _published_rows(folder: Path, subsets: Sequence[str]) -> Iterator[Unread]:
     for subset, shards in subset_shards(folder, subsets).items():
         for shard, path in enumerate(shards):
-            rows = parquet_rows(path, path.relative_to(folder).as_posix())
-            for number, (place, read) in enumerate(rows):
-                yield place, partial(_published_row, folder, subset, f"{subset}/{shard}/{number}", read, abstaining)
+            for number, (place, fields) in enumerate(_parquet_rows(path, path.relative_to(folder).as_posix())):
+                yield place, partial(_published_row, folder, subset, f"{subset}/{shard}/{number}", fields)
 
 
-def _published_row(
-    folder: Path, subset: str, unique: str, read: Callable[[], dict[str, Any]], abstaining: dict[str, str]
-) -> Row:
+def _published_row(folder: Path, subset: str, unique: str, fields: Fields) -> Row:
     """A row. One that lacks what the others have is a fault."""
-    fields = read()
     _require(fields, ("id", "question", "answer", "image"))
-    if fields.get("not_sure"):
-        abstaining[unique] = str(fields["not_sure"]).strip("() .").upper()[:1]
     source = str(fields["id"])
     level = _LEVEL.search(source)
     real = subset == "realworld"

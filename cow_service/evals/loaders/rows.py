@@ -48,20 +48,7 @@ class Row:
 
 def item_of(place: str, row: Row, pictures: Pictures) -> Item:
     """The item of a row; its pictures are kept. Raises `RowFault`."""
-    if not row.question.strip():
-        raise RowFault("`question` is empty")
-    if row.options is None:
-        wording = items.listed_wording(row.question)
-        if wording is None:
-            raise RowFault("the question lists no options, such as (A) Yes, (B) No, and the row has none either")
-    else:
-        texts = [str(text).strip() for text in row.options]
-        if len(texts) < 2 or not all(texts) or len({text.lower() for text in texts}) < len(texts):
-            raise RowFault(f"`options` must be two or more different texts, got {texts}")
-        if len(texts) > len(items.LETTERS):
-            raise RowFault(f"`options` are at most {len(items.LETTERS)}, got {len(texts)}")
-        wording = items.appended_wording(row.question.rstrip(), texts)
-    parts, options = wording
+    parts, options = wording_of(row)
     image = _picture(row.image, "image", pictures)
     abstain, known = not_sure_option(options), row.truth
     shown = () if known is None else known.pictures
@@ -84,6 +71,22 @@ def item_of(place: str, row: Row, pictures: Pictures) -> Item:
     except ValidationError as error:
         first = error.errors()[0]
         raise RowFault(f"`{'.'.join(map(str, first['loc']))}` cannot be used: {first['msg']}") from error
+
+
+def wording_of(row: Row) -> items.Wording:
+    """The question of a row around its options, and these. Raises `RowFault`."""
+    if not row.question.strip():
+        raise RowFault("`question` is empty")
+    if row.options is None:
+        wording = items.listed_wording(row.question)
+        if wording is None:
+            raise RowFault("the question lists no options, such as (A) Yes, (B) No, and the row has none either")
+        return wording
+    texts = [str(text).strip() for text in row.options]
+    different = {text.lower() for text in texts if text}
+    if not 2 <= len(texts) == len(different) <= len(items.LETTERS):
+        raise RowFault(f"`options` must be 2 to {len(items.LETTERS)} different texts, got {texts}")
+    return items.appended_wording(row.question.rstrip(), texts)
 
 
 def task_of(name: str | None) -> Task:

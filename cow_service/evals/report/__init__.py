@@ -1,1 +1,1 @@
-"""Tables, plots and a page of runs."""
+"""Tables and plots of runs."""

@@ -1,6 +1,6 @@
 """What a report says of runs, computed once for all its forms: rates, contrasts, and why looking helps or hurts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -8,7 +8,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from cow_service.errors import InvalidRequest
 from cow_service.evals import statistics
-from cow_service.evals.design import BASELINE, primary, references
+from cow_service.evals.design import BASELINE, Arm, primary, references
 from cow_service.evals.items import TASKS, Observation, Task
 from cow_service.evals.plan import departures
 from cow_service.evals.runs import EvalRun
@@ -19,12 +19,10 @@ from cow_service.records import Record
 class ArmSummary(Record):
     """What one arm of one run came to."""
 
-    run: int = Field(description="Place of the run in the report, from 0.")
     arm: str
     name: str = Field(description="Unique in the report: the arm, and the multimodal LLM where there are several.")
     rates: Rates
     cells: dict[tuple[str, str | None], Rates] = Field(description="By task and level; level null: all levels.")
-    baseline: int | None = Field(description="The run whose arm `never` it is compared with; null for that arm.")
     gain: Gain | None = Field(default=None, description="Over the arm `never`; null for itself, or without one.")
     gains: dict[str, Gain] = Field(description="The same per task.")
     calibration: Calibration | None = None
@@ -45,8 +43,6 @@ class Contrast(Record):
 class Primary(Record):
     """The primary question of a run."""
 
-    run: int
-    arm: str
     name: str = Field(description="Of the arm, as in the report.")
     placebos: tuple[str, ...]
     found: PrimaryGain
@@ -63,15 +59,6 @@ class Split(Record):
     gain: Gain
 
 
-class Dose(Record):
-    """The gain of frames with a given error of the path, over the image alone."""
-
-    name: str
-    error: float = Field(description="In units of the simulation's own error.")
-    path_error: float | None = Field(description="Mean of the questions, as a share of the image's width.")
-    gain: Gain
-
-
 class Findings(Record):
     """All that a report says."""
 
@@ -79,7 +66,6 @@ class Findings(Record):
     contrasts: tuple[Contrast, ...]
     primaries: tuple[Primary, ...]
     splits: tuple[Split, ...]
-    doses: tuple[Dose, ...]
 
 
 class Price(Record):
@@ -94,7 +80,6 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
     arms: list[ArmSummary] = []
     contrasts: list[Contrast] = []
     splits: list[Split] = []
-    doses: list[Dose] = []
     for place, run in enumerate(runs):
         for arm in run.info.points:
             observations = run.of_arm(arm.name)
@@ -103,64 +88,62 @@ def summarize(runs: Sequence[EvalRun], prices: Mapping[str, Price] | None = None
                 continue
             name = f"{run.info.mllm}, {arm.name}" if len(runs) > 1 else arm.name
             name = f"{name} ({place + 1})" if any(each.name == name for each in arms) else name
-            compared = None if arm.name == BASELINE else baseline_run(runs, run)
-            baseline = [] if compared is None else compared.of_arm(BASELINE)
-            compared_with = {BASELINE: baseline}
-            compared_with |= {each.name: run.of_arm(each.name) for each in references(arm, run.info.points)}
-            for reference, seen in compared_with.items():
-                explored = run.info.plan is not None and not {arm.name, reference} <= run.info.plan.arms.keys()
-                contrasts += _contrasts(name, reference, observations, seen, explored)
+            baseline = [] if arm.name == BASELINE else baseline_of(runs, run)
+            own = _contrasts(name, run, arm, baseline)
+            gains = {each.task: each.gain for each in own if each.reference == BASELINE}
+            contrasts += own
             if arm.content == "simulated" and not arm.gate:
                 splits += _splits(name, observations, baseline)
-            of_arm = {each.task: each.gain for each in contrasts if (each.name, each.reference) == (name, BASELINE)}
-            if arm.error is not None and None in of_arm:
-                errors = [each.path_error for each in observations if each.path_error is not None]
-                mean = sum(errors) / len(errors) if errors else None
-                doses.append(Dose(name=name, error=arm.error, path_error=mean, gain=of_arm[None]))
             price = (prices or {}).get(run.info.mllm)
             arms.append(
                 ArmSummary(
-                    run=place,
                     arm=arm.name,
                     name=name,
                     rates=of_all,
                     cells=_cells(observations),
-                    baseline=None if compared is None else runs.index(compared),
-                    gain=of_arm.get(None),
-                    gains={task: gain for task, gain in of_arm.items() if task is not None},
+                    gain=gains.pop(None, None),
+                    gains={str(task): gain for task, gain in gains.items()},
                     calibration=statistics.calibration(observations),
                     cost=statistics.cost(observations, *(() if price is None else (price.input, price.output))),
                 )
             )
-    # What a plan has is adjusted for itself: exploration must not cost it anything.
+    primaries = filter(None, (_primary(run, several=len(runs) > 1) for run in runs))
+    return Findings(arms=tuple(arms), contrasts=with_holm(contrasts), primaries=tuple(primaries), splits=tuple(splits))
+
+
+def _contrasts(name: str, run: EvalRun, arm: Arm, baseline: Sequence[Observation]) -> list[Contrast]:
+    """The gain of an arm on all questions; over the image alone also per task, if there are several."""
+    found: list[Contrast] = []
+    asked = {each.name: run.of_arm(each.name) for each in references(arm, run.info.points)}
+    for reference, other in ({BASELINE: baseline} | asked).items():
+        of_task = _by_task(run.of_arm(arm.name)) if reference == BASELINE else {}
+        for task in (None, *(of_task if len(of_task) > 1 else ())):
+            seen = run.of_arm(arm.name) if task is None else of_task[task]
+            gain = statistics.gain(*matched(seen, [each for each in other if task in (None, each.task)]))
+            if gain is not None:
+                explored = run.info.plan is not None and not {arm.name, reference} <= run.info.plan.arms.keys()
+                abstains = all(each.abstained for each in other if each.failure is None)
+                told = Contrast(
+                    name=name,
+                    reference=reference,
+                    task=task,
+                    gain=gain,
+                    is_exploratory=explored,
+                    abstains=abstains,
+                )
+                found.append(told)
+    return found
+
+
+def with_holm(contrasts: Sequence[Contrast]) -> tuple[Contrast, ...]:
+    """What a plan has is adjusted for itself: exploration must not cost it anything."""
+    adjusted: dict[bool, Iterator[float]] = {}
     for is_exploratory in (False, True):
-        places = [place for place, each in enumerate(contrasts) if each.is_exploratory == is_exploratory]
-        adjusted = statistics.holm([contrasts[place].gain.p for place in places])
-        for place, p in zip(places, adjusted, strict=True):
-            gain = contrasts[place].gain.model_copy(update={"p_holm": p})
-            contrasts[place] = contrasts[place].model_copy(update={"gain": gain})
-    primaries = [_primary(place, run, several=len(runs) > 1) for place, run in enumerate(runs)]
-    return Findings(
-        arms=tuple(arms),
-        contrasts=tuple(contrasts),
-        primaries=tuple(each for each in primaries if each is not None),
-        splits=tuple(splits),
-        doses=tuple(doses),
-    )
-
-
-def _contrasts(
-    name: str, reference: str, seen: Sequence[Observation], other: Sequence[Observation], explored: bool
-) -> list[Contrast]:
-    """The gain on all questions; over the image alone also per task, if there are several."""
-    pairs: list[tuple[str | None, Sequence[Observation], Sequence[Observation]]] = [(None, seen, other)]
-    of_task, there = _by_task(seen), _by_task(other)
-    if len(of_task) > 1 and reference == BASELINE:
-        pairs += [(task, each, there.get(task, [])) for task, each in of_task.items()]
-    abstains = bool(other) and all(each.abstained for each in other if each.failure is None)
-    told = {"name": name, "reference": reference, "is_exploratory": explored, "abstains": abstains}
-    found = [(task, statistics.gain(*matched(one, two))) for task, one, two in pairs]
-    return [Contrast.model_validate({**told, "task": task, "gain": gain}) for task, gain in found if gain is not None]
+        adjusted[is_exploratory] = iter(
+            statistics.holm([each.gain.p for each in contrasts if each.is_exploratory == is_exploratory])
+        )
+    gains = [each.gain.model_copy(update={"p_holm": next(adjusted[each.is_exploratory])}) for each in contrasts]
+    return tuple(each.model_copy(update={"gain": gain}) for each, gain in zip(contrasts, gains, strict=True))
 
 
 def matched(seen: Sequence[Observation], other: Sequence[Observation]) -> tuple[list[Observation], list[Observation]]:
@@ -175,7 +158,7 @@ def matched(seen: Sequence[Observation], other: Sequence[Observation]) -> tuple[
     return tuple([each for each in side if (each.item, each.repeat) in kept] for side in (seen, other))  # pyright: ignore[reportReturnType]
 
 
-def _primary(place: int, run: EvalRun, *, several: bool) -> Primary | None:
+def _primary(run: EvalRun, *, several: bool) -> Primary | None:
     """Of a run: the question that its plan states, else that of its arms; None if it has no placebo."""
     plan, question = run.info.plan, primary(run.info.points)
     arm, placebos = ("", ()) if question is None else (question[0].name, tuple(each.name for each in question[1]))
@@ -188,8 +171,6 @@ def _primary(place: int, run: EvalRun, *, several: bool) -> Primary | None:
     failed = sum(each.failure is not None for each in run.observations)
     unasked = len(run.items) * len(run.info.arms) * run.info.repeats - len(run.observations)
     return Primary(
-        run=place,
-        arm=arm,
         name=f"{run.info.mllm}, {arm}" if several else arm,
         placebos=placebos,
         found=found,
@@ -219,10 +200,10 @@ def _splits(name: str, seen: Sequence[Observation], baseline: Sequence[Observati
     return [Split(name=name, by=by, value=value, gain=gain) for by, value, gain in found if gain is not None]
 
 
-def baseline_run(runs: Sequence[EvalRun], run: EvalRun) -> EvalRun | None:
-    """The run with the replies without imagination: itself, else the first that asked the same of the same model."""
+def baseline_of(runs: Sequence[EvalRun], run: EvalRun) -> list[Observation]:
+    """The replies without imagination: of the run itself, else of the first that asked the same of the same model."""
     same = (other for other in runs if other is not run and other.info.baseline_key == run.info.baseline_key)
-    return next((each for each in (run, *same) if each.of_arm(BASELINE)), None)
+    return next((seen for each in (run, *same) if (seen := each.of_arm(BASELINE))), [])
 
 
 def _cells(observations: Sequence[Observation]) -> dict[tuple[str, str | None], Rates]:

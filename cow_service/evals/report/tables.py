@@ -69,8 +69,7 @@ def tables(findings: Findings, *, published: bool = False) -> tuple[Table, ...]:
     arms = findings.arms
     found = (
         *(primary(findings), by_level(arms, published), overview(arms), contrasts(findings, published=published)),
-        *(splits(findings), doses(findings)),
-        *(calibration(arms), costs(arms)),
+        *(splits(findings), calibration(arms), costs(arms)),
     )
     return tuple(table for table in found if table.rows)
 
@@ -99,8 +98,8 @@ def by_level(summaries: Sequence[ArmSummary], published: bool) -> Table:
     rows: list[tuple[str, ...]] = []
     for each in summaries:
         measured = [*(each.cells.get(key) for key in columns), each.rates]
-        rows.append((each.name, "TPR", *(NONE if rates is None else _spread(rates.tpr) for rates in measured)))
-        rows.append((each.name, "NSR", *(NONE if rates is None else _spread(rates.nsr) for rates in measured)))
+        for measure, name in (("TPR", "tpr"), ("NSR", "nsr")):
+            rows.append((each.name, measure, *(_spread(getattr(rates, name, None)) for rates in measured)))
     blank = (NONE,) * len(columns)
     if published:
         rows += [(f"{name} (paper)", "TPR", *blank, f"{value:.2f}") for name, value in PRINTED_TPR.items()]
@@ -126,14 +125,10 @@ def overview(summaries: Sequence[ArmSummary]) -> Table:
     return Table("arms", "Replies by arm", ("arm", *columns), rows)
 
 
-def _gain(gain: Gain) -> tuple[str, ...]:
-    return tuple(cell(gain) for cell in _GAIN.values())
-
-
 def contrasts(findings: Findings, *, by_task: bool = True, published: bool = False) -> Table:
     """The gain of each arm over those it is compared with; for the published data also the paper's figures."""
     rows = [
-        (each.name, each.reference, each.task or ALL, *_gain(each.gain), *_p(each))
+        (each.name, each.reference, each.task or ALL, *(cell(each.gain) for cell in _GAIN.values()), *_p(each))
         for each in findings.contrasts
         if by_task or each.task is None
     ]
@@ -156,18 +151,9 @@ def _p(each: Contrast) -> tuple[str, str]:
 
 def splits(findings: Findings) -> Table:
     """Why simulated frames help or hurt: the gain by known properties of each question's simulation."""
-    rows = tuple((each.name, each.by, each.value, *_gain(each.gain)) for each in findings.splits)
+    rows = tuple((each.name, each.by, each.value, *(c(each.gain) for c in _GAIN.values())) for each in findings.splits)
     title = f"Gains over `{BASELINE}` by properties of the simulation; explored after the fact, so without p"
     return Table("why", title, ("arm", "questions grouped by", "value", *_GAIN), rows)
-
-
-def doses(findings: Findings) -> Table:
-    """The gain of frames by the error of their path."""
-    errors = [NONE if each.path_error is None else f"{100 * each.path_error:.2f}" for each in findings.doses]
-    paired = zip(findings.doses, errors, strict=True)
-    rows = tuple((each.name, f"{each.error:g}", error, *_gain(each.gain)) for each, error in paired)
-    title = f"Gain over `{BASELINE}` of frames off the true path by so many times the simulation's own error"
-    return Table("doses", title, ("arm", "times", "path error, % of width", *_GAIN), rows)
 
 
 def calibration(summaries: Sequence[ArmSummary]) -> Table:
@@ -209,7 +195,9 @@ def replies(runs: Sequence[EvalRun]) -> Table:
     return Table("replies", "Every reply", header, tuple(rows))
 
 
-def _spread(spread: Spread) -> str:
+def _spread(spread: Spread | None) -> str:
+    if spread is None:
+        return NONE
     return f"{100 * spread.mean:.2f}" + ("" if spread.sd is None else f" ± {100 * spread.sd:.2f}")
 
 

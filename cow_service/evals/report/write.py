@@ -1,4 +1,4 @@
-"""Writes a report: tables, plots, a page with every item, and a manifest."""
+"""Writes a report: tables, plots and a manifest."""
 
 import hashlib
 import json
@@ -8,7 +8,6 @@ from pathlib import Path
 
 from cow_service.errors import InvalidRequest, StorageUnavailable
 from cow_service.evals.report import tables
-from cow_service.evals.report.page import write_page
 from cow_service.evals.report.summary import Findings, Price, summarize
 from cow_service.evals.runs import EvalRun
 
@@ -44,28 +43,14 @@ def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
         for extension, text in FORMATS.items():
             (out / "tables" / f"{table.name}.{extension}").write_text(text(table), encoding="utf-8")
     (out / "tables" / "replies.csv").write_text(tables.csv_text(tables.replies(runs)), encoding="utf-8")
-    plots = write_plots(out / "plots", findings)
-    differs = {f"Differences from the paper: {about.lower()}": told for about, told in tables.DIFFERENCES.items()}
-    write_page(out, runs, findings, plots, [(heading, "\n".join(told)) for heading, told in differs.items()])
-
-    # What was asked, and what was found in the data.
-    asked: list[str] = []
-    for run in runs:
-        info = run.info
-        asked.append(
-            f"{info.mllm}, asked by {info.ask}: {len(run.items)} questions of {info.data}, arms "
-            f"{', '.join(info.arms)}, repeats {info.repeats}, seed {info.seed}, design {info.design_digest[:12]}, "
-            f"{info.versions.get('cow-service')} at commit {info.versions.get('commit')}."
-        )
-        failures = sorted({each.failure for each in run.observations if each.failure is not None})
-        asked += [f"- {told}" for told in info.notes]
-        asked += [f"- left out: {fault}" for fault in info.faults]
-        asked += [f"- failed: {' '.join(failure.split())}" for failure in failures]
-    parts = [f"## {table.title}\n\n{tables.markdown(table)}" for table in known]
+    write_plots(out / "plots", findings)
+    parts = ["# Evaluation", "\n".join(line for run in runs for line in facts_of_run(run))]
     if not findings.primaries:
-        parts.insert(0, "No placebo was asked: a gain over the image alone may come from more pictures.")
-    parts += [f"## {heading}\n\n" + "\n".join(f"- {each}" for each in told) for heading, told in differs.items()]
-    (out / "report.md").write_text("\n\n".join(["# Evaluation", "\n".join(asked), *parts]) + "\n", "utf-8")
+        parts.append("No placebo was asked: a gain over the image alone may come from more pictures.")
+    parts += [f"## {table.title}\n\n{tables.markdown(table)}" for table in known]
+    for about, told in tables.DIFFERENCES.items():
+        parts.append(f"## Differences from the paper: {about.lower()}\n\n" + "\n".join(f"- {each}" for each in told))
+    (out / "report.md").write_text("\n\n".join(parts) + "\n", "utf-8")
 
     # What was asked, with which versions, prompts and seeds, and the digest of every file of the report.
     files = sorted(path for path in out.rglob("*") if path.is_file() and path.name != "manifest.json")
@@ -74,10 +59,24 @@ def _write(runs: Sequence[EvalRun], findings: Findings, out: Path) -> None:
     (out / "manifest.json").write_text(json.dumps(manifest, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
+def facts_of_run(run: EvalRun) -> list[str]:
+    """What was asked in a run, what was found in its data, and what failed."""
+    info = run.info
+    failures = sorted({each.failure for each in run.observations if each.failure is not None})
+    return [
+        f"{info.mllm}, asked by {info.ask}: {len(run.items)} questions of {info.data}, arms "
+        f"{', '.join(info.arms)}, repeats {info.repeats}, seed {info.seed}, design {info.design_digest[:12]}, "
+        f"{info.versions.get('cow-service')} at commit {info.versions.get('commit')}.",
+        *(f"- {told}" for told in info.notes),
+        *(f"- left out: {fault}" for fault in info.faults),
+        *(f"- failed: {' '.join(failure.split())}" for failure in failures),
+    ]
+
+
 def write_plots(folder: Path, findings: Findings) -> tuple[Path, ...]:
     """Writes the plots for which there is something to draw, and removes those of an earlier report.
 
-    The files are `gains`, `doses`, `rates`, `calibration` and `cost`, each as `.svg` and `.png`. The same findings make
+    The files are `gains`, `rates` and `calibration`, each as `.svg` and `.png`. The same findings make
     the same bytes of SVG.
     """
     # A second of imports, needed only to write a report.

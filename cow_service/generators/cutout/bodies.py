@@ -256,6 +256,12 @@ class MovingBody:
         cv2.circle(disc, (round(16 * (x - 0.5)), round(16 * (y - 0.5))), round(16 * radius), 1, -1, shift=4)
         return disc > 0
 
+    @property
+    def stays(self) -> bool:
+        """Whether it is where it was, to a pixel, all the time."""
+        points = np.array(self.path.points)
+        return bool(np.abs(points - points[0]).max() <= 1 and np.ptp(self.path.scale) <= 0.01)
+
     def is_unmoved(self, frame: int) -> bool:
         """Whether it is where and as it was at the first frame, to a fraction of a pixel."""
         (x, y), (x0, y0) = self.path.points[frame], self.start

@@ -100,18 +100,22 @@ def take_apart(given: GeneratorInput, progress: Callable[[float], None] = lambda
         background[holes] = fit_within(scene.side_view.empty, MAX_SIDE)[holes]
     sprites: list[Sprite] = []
     for body in moving:
-        # What nearer bodies hide of it at the first frame: of a sphere's disc; of the hull of what is seen, else.
-        extent, window = body.extent(0), window_of(body.mask, 2) or (slice(0, 0), slice(0, 0))
-        others = [(other.mask, other.extent) for other in still]
-        others += [(other.mask, other.extent(0)) for other in moving if other is not body]
-        nearer = [mask for mask, at in others if mask[window].any() and not extent.is_in_front_of(at, eye)]
-        hidden = None
-        if nearer:
-            hidden = (hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
+        hidden = hidden_part(body, moving, still, eye)
         shape = None if ground is None else ground.bodies[body.path.body].shape
         sprites.append(Sprite.of(image, body.mask, hidden, factor * body.start, shape))
     containers = () if ground is None else _containers(given, image, moving, still, ground)
     return Layers(image, background, moving, tuple(sprites), unshaded.shadows, still, containers, eye, factor)
+
+
+def hidden_part(body: MovingBody, moving: Sequence[MovingBody], still: Sequence[StillBody], eye: float) -> Mask | None:
+    """What nearer bodies hide of one at the first frame: of a sphere's disc; of the hull of what is seen, else."""
+    extent, window = body.extent(0), window_of(body.mask, 2) or (slice(0, 0), slice(0, 0))
+    others = [(other.mask, other.extent) for other in still]
+    others += [(other.mask, other.extent(0)) for other in moving if other is not body]
+    nearer = [mask for mask, at in others if mask[window].any() and not extent.is_in_front_of(at, eye)]
+    if not nearer:
+        return None
+    return (hull(body.mask) | body.disc) & np.logical_or.reduce(nearer) & ~body.mask
 
 
 def without_bodies(
@@ -139,11 +143,9 @@ def without_bodies(
             objects |= other.mask
             if other.mask[window].any() and body.extent(0).is_in_front_of(other.extent, eye):
                 behind.append(other)
-        solid = objects & ~body.mask
-        for other in behind:
-            if other.index == body.support:  # its top around the foot was in the shadow
-                solid &= ~other.mask
-        rest = hole & ~solid
+        # The top of what it stands on was in the shadow around its foot.
+        support = [other.mask for other in behind if other.index == body.support]
+        rest = hole & ~(objects & ~np.logical_or.reduce([body.mask, *support]))
         if fill is not None:
             if body.path.body in unshaded.unmeasured:
                 rest |= shadow_beside(image, rest, objects)
@@ -205,18 +207,20 @@ def _containers(
         )
         if content not in results or index == content or index not in masks:
             continue
-        it, body = ground.bodies[index], paths.get(index)
-        mask = masks[index]
-        # Below the nearer edge of its opening; without a rim, below the mask's upper third.
-        cropped = CroppedMask.of(mask)
-        seen, (x0, y0, x1, y1) = measure_opening(cropped), cropped.bbox
-        x, y, half, tall = seen.rim or ((x0 + x1) / 2, y0 + (y1 - y0) / 6, (x1 - x0) / 2, (y1 - y0) / 6)
-        inner = min(1.0, seen.inner * (x1 - x0) / 2 / half)
-        rows, columns = np.ogrid[: mask.shape[0], : mask.shape[1]]
-        off = np.clip((columns + 0.5 - x) / (inner * half), -1, 1)
-        front_mask = mask & (rows + 0.5 > y + inner * tall * np.sqrt(1 - off**2))
+        it, body, front_mask = ground.bodies[index], paths.get(index), front_of(masks[index])
         front = StillBody(index, front_mask, ground.extent(index, it.bbox))
         sprite = None if body is None else Sprite.of(image, front_mask, None, ground.factor * body.start, it.shape)
         holds = results[content] in ("inside", "sticks-out")
         found.append(Container(index, content, holds, front, ground, body, sprite))
     return tuple(found)
+
+
+def front_of(mask: Mask) -> Mask:
+    """A container's mask [h, w] below the nearer edge of its opening; without a rim, below its upper third."""
+    cropped = CroppedMask.of(mask)
+    seen, (x0, y0, x1, y1) = measure_opening(cropped), cropped.bbox
+    x, y, half, tall = seen.rim or ((x0 + x1) / 2, y0 + (y1 - y0) / 6, (x1 - x0) / 2, (y1 - y0) / 6)
+    inner = min(1.0, seen.inner * (x1 - x0) / 2 / half)
+    rows, columns = np.ogrid[: mask.shape[0], : mask.shape[1]]
+    off = np.clip((columns + 0.5 - x) / (inner * half), -1, 1)
+    return mask & (rows + 0.5 > y + inner * tall * np.sqrt(1 - off**2))

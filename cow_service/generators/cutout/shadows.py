@@ -182,23 +182,24 @@ def take_shadows(
     floor, shadows, noisy = eroded(~objects, 2 * RIM + 1), list[MovingShadow](), dict[int, Mask]()
     unmeasured: set[int] = set()
     for body in moving:
-        index, points = body.path.body, np.array(body.path.points)
-        if np.abs(points - points[0]).max() <= 1 and np.ptp(body.path.scale) <= 0.01:  # it stays where it is
+        index = body.path.body
+        if body.stays:
             continue
         if ground is not None and ground.bodies[index].support == "air":
             shadows.append(partial(_sky_shadow, ground, body.path))
             light = _light_through(given, body, ground)
-            shade = None if light is None else _shade_in_light(image, body, ground, light, floor)
-            if light is not None and shade is not None:
+            if light is not None and (shade := _shade_in_light(image, body, ground, light, floor)) is not None:
                 shadows.append(partial(_cast_shadow, ground, body.path, shade, light))
                 image, _ = _without_shade(image, shade, ~objects)
+            continue
+        if body.airborne:
             continue
         # Of a table all that nothing else hides: its shaded part may be missing from its mask.
         masks = [other.mask | (other.outline & ~objects) for other in still if other.index == body.support]
         beside = eroded(masks[0], 2 * RIM + 1) if masks else floor
-        shade = None if body.airborne else contact_shade(image, body.mask, bbox_of(body.mask), beside)
+        shade = contact_shade(image, body.mask, bbox_of(body.mask), beside)
         if shade is None:
-            unmeasured |= set() if body.airborne else {index}
+            unmeasured.add(index)
             continue
         if ground is None:
             shadows.append(partial(_attached_shadow, shade, body.path, factor * body.start, factor))

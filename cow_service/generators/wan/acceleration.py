@@ -16,9 +16,6 @@ from cow_service.errors import CowError, GeneratorUnavailable
 from cow_service.generators.wan.capabilities import detect_capabilities, refusals
 from cow_service.generators.wan.profiles import Acceleration
 
-WARM_UP_SHARE = 5  # magcache never skips in the first fifth of the steps
-MAX_SKIPPED = 3  # steps in a row that magcache skips
-
 
 def check_device(acceleration: Acceleration, device: torch.device) -> None:
     """Raises `GeneratorUnavailable` for all that the device cannot do."""
@@ -93,45 +90,14 @@ def accelerate_transformer(transformer: Any, wanted: Acceleration, device: torch
             for block in transformer.blocks:
                 block.forward = torch.compile(block.forward)
     with naming_option(f"cache: {wanted.cache}"):
-        _enable_cache(transformer, wanted)
+        if wanted.cache == "first-block":
+            from diffusers.hooks.first_block_cache import FirstBlockCacheConfig  # noqa: PLC0415
+
+            transformer.enable_cache(FirstBlockCacheConfig(threshold=wanted.cache_threshold))
 
 
-def _enable_cache(transformer: Any, wanted: Acceleration) -> None:
-    if wanted.cache == "first-block":
-        from diffusers.hooks.first_block_cache import FirstBlockCacheConfig  # noqa: PLC0415
-
-        transformer.enable_cache(FirstBlockCacheConfig(threshold=wanted.cache_threshold))
-    elif wanted.cache == "magcache":
-        from diffusers.hooks.mag_cache import MagCacheConfig  # noqa: PLC0415
-
-        guided, plain = wanted.mag_ratios[::2], wanted.mag_ratios[1::2]
-        config: Any = MagCacheConfig(wanted.cache_threshold, MAX_SKIPPED, 1 / WARM_UP_SHARE, len(guided), list(guided))
-        config.of_passes = {"cond": guided, "uncond": plain}  # diffusers has one list for both
-        transformer.enable_cache(config)
-        transformer.mag_cache = config
-
-
-@contextmanager
-def cached_pass(transformer: Any, branch: str) -> Generator[None]:
-    """Around every pass, "cond" or "uncond", one after the other: each has its own state of the step cache."""
-    if (config := getattr(transformer, "mag_cache", None)) is not None:
-        config.mag_ratios = config.of_clip[branch]
-    with transformer.cache_context(branch):
-        yield
-
-
-def reset_cache(transformer: Any, steps: int | None = None, first: int = 0) -> None:
-    """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next.
-
-    `steps`: denoising steps of the coming clip; those before `first` are skipped. Passes are run in `cached_pass`.
-    """
-    config = getattr(transformer, "mag_cache", None)
-    if steps is not None and config is not None:  # the nearest ratio of each step
-        config.num_inference_steps = steps - first
-        config.of_clip = {
-            branch: [known[round(step * (len(known) - 1) / max(1, steps - 1))] for step in range(first, steps)]
-            for branch, known in config.of_passes.items()
-        }
+def reset_cache(transformer: Any) -> None:
+    """Clears the step cache. Call it before every clip, so that no residual of one clip enters the next."""
     transformer._reset_stateful_cache()  # removing and adding them again would change the order of the hooks
 
 

@@ -5,7 +5,7 @@ import platform
 import re
 import shutil
 import sysconfig
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 
@@ -57,31 +57,35 @@ def detect_capabilities(device: torch.device) -> Capabilities:
     )
 
 
-def refusals(acceleration: Acceleration, available: Capabilities) -> tuple[str, ...]:
+def refusals(wanted: Acceleration, available: Capabilities) -> tuple[str, ...]:
     """One sentence, with reason and remedy, for each option that is not supported; empty if all are."""
-    return tuple(_find_refusals(acceleration, available))
-
-
-def _find_refusals(wanted: Acceleration, available: Capabilities) -> Iterator[str]:
     has, own, here = available.packages, available.compute_capability, available.description
-    on_gpu = available.device == "cuda"
-    if wanted.compile != "none" and on_gpu and "triton" not in has:
-        yield f"compile: regional needs {_package('triton')}; install it, or choose none."
-    if wanted.compile != "none" and not available.compiler:
-        yield "compile: regional needs a C++ compiler and Python's headers; install them, or choose none."
-    if wanted.cache == "first-block" and wanted.context_parallel > 1:
+    on_gpu, compiles = available.device == "cuda", wanted.compile != "none"
+    fp8, parallel = wanted.fp8, wanted.context_parallel
+    found = {
+        f"compile: regional needs {_package('triton')}; install it, or choose none.": (
+            compiles and on_gpu and "triton" not in has
+        ),
+        "compile: regional needs a C++ compiler and Python's headers; install them, or choose none.": (
+            compiles and not available.compiler
+        ),
         # Each GPU measures the change of its own shard; if only some skip, the others wait for their tensors forever.
-        yield "cache: GPUs that share a video would not skip the same steps with first-block; choose none."
-    if wanted.fp8 != "none" and "torchao" not in has:
-        yield f"fp8: {wanted.fp8} needs {_package('torchao')}; install it, or choose none."
-    if wanted.fp8.endswith("dynamic") and (own is None or own < ADA):
-        yield f"fp8: {wanted.fp8} needs a GPU of compute capability {_dotted(ADA)} or more, and {here}; choose none."
-    if wanted.offload != "none" and not on_gpu:
-        yield f"offload: {wanted.offload} needs a GPU to move weights to, and {here}; choose none."
-    if on_gpu and available.gpus < wanted.ranks:
-        yield f"{wanted.ranks} GPUs are to share a clip, from that of COW_DEVICE on, and there are {available.gpus}."
-    if wanted.context_parallel > 1 and not on_gpu:
-        yield f"context_parallel: {wanted.context_parallel} needs GPUs, and {here}; choose 1."
+        "cache: GPUs that share a video would not skip the same steps with first-block; choose none.": (
+            wanted.cache == "first-block" and parallel > 1
+        ),
+        f"fp8: {fp8} needs {_package('torchao')}; install it, or choose none.": fp8 != "none" and "torchao" not in has,
+        f"fp8: {fp8} needs a GPU of compute capability {_dotted(ADA)} or more, and {here}; choose none.": (
+            fp8.endswith("dynamic") and (own is None or own < ADA)
+        ),
+        f"offload: {wanted.offload} needs a GPU to move weights to, and {here}; choose none.": (
+            wanted.offload != "none" and not on_gpu
+        ),
+        f"{wanted.ranks} GPUs are to share a clip, from that of COW_DEVICE on, and there are {available.gpus}.": (
+            on_gpu and available.gpus < wanted.ranks
+        ),
+        f"context_parallel: {parallel} needs GPUs, and {here}; choose 1.": parallel > 1 and not on_gpu,
+    }
+    return tuple(sentence for sentence, applies in found.items() if applies)
 
 
 def _dotted(capability: ComputeCapability) -> str:

@@ -14,6 +14,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -76,11 +77,7 @@ def load_transformer(
             with safe_open(file, framework="pt", device=str(device)) as opened:
                 for name, source in here:
                     entry, tensor = entries[source], opened.get_tensor(entries[source].key)
-                    key = source.removesuffix(".weight") + SCALE
-                    scale = None
-                    if source.endswith(".weight") and key in entries:  # which may lie in another file
-                        with safe_open(entries[key].file, framework="pt", device=str(device)) as scales:
-                            scale = scales.get_tensor(entries[key].key).float()
+                    scale = read_scale(source, entries, device)
                     if keep_float8 and entry.dtype in FLOAT8 and len(entry.shape) == 2 and name.startswith("blocks."):
                         state[name] = _keep_in_float8(tensor, scale, dtype, computes=keep_float8 == "stored-dynamic")
                         continue
@@ -92,6 +89,15 @@ def load_transformer(
     model.load_state_dict(state, strict=True, assign=True)
     cast(Any, model).to(device)  # for the tables of the rotary embedding, which no checkpoint holds
     return model.eval().requires_grad_(False)
+
+
+def read_scale(source: str, entries: Mapping[str, Entry], device: torch.device) -> Tensor | None:
+    """The scale of a weight, which may lie in another file; None if it has none."""
+    entry = entries.get(source.removesuffix(".weight") + SCALE) if source.endswith(".weight") else None
+    if entry is None:
+        return None
+    with safe_open(entry.file, framework="pt", device=str(device)) as scales:
+        return scales.get_tensor(entry.key).float()
 
 
 def diffusers_config(architecture: Architecture) -> dict[str, Any]:
@@ -320,6 +326,13 @@ def add_lora(transformer: nn.Module, file: Path) -> None:
     parameters = dict(transformer.named_parameters())
     if any(type(parameter) is not nn.Parameter or parameter.is_meta for parameter in parameters.values()):
         raise GeneratorUnavailable("A LoRA must be added before the weights are made float8 or offloaded.")
+    for name, change in _changes(read_lora(file), parameters, file.name).items():
+        parameter = parameters[name]
+        parameter.copy_(parameter.float() + change.on(parameter.device))
+
+
+def read_lora(file: Path) -> dict[str, Tensor]:
+    """The tensors of a LoRA whose scale is in its weights."""
     if not file.is_file():
         raise WeightsUnavailable(f"There is no LoRA '{file.name}'. Pull it with `cow models pull`.")
     try:
@@ -340,9 +353,7 @@ def add_lora(transformer: nn.Module, file: Path) -> None:
         raise CheckpointInvalid(
             f"LoRA '{file.name}' holds infinite or undefined values: {listed(sorted(broken), MAX_LISTED)}."
         )
-    for name, change in _changes(tensors, parameters, file.name).items():
-        parameter = parameters[name]
-        parameter.copy_(parameter.float() + change.on(parameter.device))
+    return tensors
 
 
 def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], file: str) -> dict[str, _Change]:
@@ -350,9 +361,7 @@ def _changes(tensors: Mapping[str, Tensor], parameters: Mapping[str, Tensor], fi
     found: dict[str, dict[str, Tensor]] = {}
     unknown: list[str] = []
     for key, tensor in tensors.items():
-        bare = key
-        for prefix in LORA_PREFIXES:
-            bare = bare.removeprefix(prefix)
+        bare = reduce(str.removeprefix, LORA_PREFIXES, key)
         ends = ((bare.removesuffix(end) + parameter, part) for end, part, parameter in ENDS if bare.endswith(end))
         target, part = next(ends, (key, ""))
         layer = found.setdefault(target, {})

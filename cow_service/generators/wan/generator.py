@@ -141,7 +141,7 @@ class WanGenerator(WanLimits):
         """The same model, revision, seed, options and inputs give the same clip on the same kind of device."""
         options = cast(WanOptions, given.options)  # the generator's own `options_model`
         sampling, prompt, negative = self._chosen(options, given)
-        wanted = self.profile.acceleration.model_dump(exclude_defaults=True, mode="json", exclude={"mag_ratios"})
+        wanted = self.profile.acceleration.model_dump(exclude_defaults=True, mode="json")
         return GeneratorInfo(
             name=self.manifest.name,
             model=self._repository,
@@ -156,7 +156,6 @@ class WanGenerator(WanLimits):
                 "guidance_scale": sampling.guidance_scale,
                 "dtype": self.profile.dtype,
                 "vae_dtype": self.profile.vae_dtype,
-                **({} if self.profile.decode_dtype is None else {"decode_dtype": self.profile.decode_dtype}),
                 "device": self.device.type,
                 "prompt": prompt,
                 "negative_prompt": negative or "",
@@ -256,8 +255,7 @@ class WanGenerator(WanLimits):
             latents = self.denoise(
                 noise, conditioning, sampling, lambda done, total: progress(DENOISING_SHARE * done / total)
             )
-            decoded_in = self.profile.decode_dtype
-            return self.pipeline.decode(latents, None if decoded_in is None else getattr(torch, decoded_in))
+            return self.pipeline.decode(latents)
         finally:
             self.pipeline.vae.clear_cache()  # features of a clip that was not decoded to its end
             self.pipeline.maybe_free_model_hooks()  # offloaded parts go back to the CPU, also after a failure

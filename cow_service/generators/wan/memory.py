@@ -75,19 +75,7 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
         if profile.acceleration.keeps_float8 and not has_float8:
             fp8 = profile.acceleration.fp8
             return f"fp8: {fp8} needs a checkpoint stored in float8: name one in COW_CHECKPOINTS."
-        if not parameters:
-            return ""
-        need = need_of(profile, parameters, int(manifest.architecture["num_layers"]))
-        room, host = _room(device), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        limit = CGROUP.read_text().strip() if CGROUP.is_file() else "max"
-        host = min(host, int(limit)) if limit.isdecimal() else host
-        if device.type == "cpu":  # where both are the same memory
-            need = Need(0, max(need.device, need.host))
-        if need.device > room:
-            return f"Its weights take {need.device / 1e9:.0f} GB of the GPU's memory, which has {room / 1e9:.0f} GB."
-        if need.host > host:
-            return f"Its weights take {need.host / 1e9:.0f} GB of this machine's memory, which has {host / 1e9:.0f} GB."
-        return ""
+        return lacking_room(profile, parameters, int(manifest.architecture["num_layers"]), device)
 
     if problem := lacking(profile_of(manifest, name)):
         able = [other for other in manifest.profiles if not lacking(profile_of(manifest, other))]
@@ -97,6 +85,23 @@ def check_machine(manifest: Manifest, name: str, folders: Mapping[str, Path], de
             f"'{manifest.name}', profile '{name}': {problem} This machine {remedy}.{pull}",
             remedy="Or use `generator: cutout`, which needs no GPU and no weights.",
         )
+
+
+def lacking_room(profile: Profile, parameters: Mapping[str, int], blocks: int, device: torch.device) -> str:
+    """Which memory the weights do not fit into, in a sentence; empty if they do, or are not here yet."""
+    if not parameters:
+        return ""
+    need = need_of(profile, parameters, blocks)
+    room, host = _room(device), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    limit = CGROUP.read_text().strip() if CGROUP.is_file() else "max"
+    host = min(host, int(limit)) if limit.isdecimal() else host
+    if device.type == "cpu":  # where both are the same memory
+        need = Need(0, max(need.device, need.host))
+    if need.device > room:
+        return f"Its weights take {need.device / 1e9:.0f} GB of the GPU's memory, which has {room / 1e9:.0f} GB."
+    if need.host > host:
+        return f"Its weights take {need.host / 1e9:.0f} GB of this machine's memory, which has {host / 1e9:.0f} GB."
+    return ""
 
 
 def _read_headers(folders: Mapping[str, Path], parts: Sequence[str]) -> tuple[dict[str, int], bool]:

@@ -145,12 +145,11 @@ class WanTrackPipeline(WanImageToVideoPipeline):
         return (latents - mean) / std
 
     @torch.no_grad()
-    def decode(self, latents: Tensor, dtype: torch.dtype | None = None) -> NDArray[np.uint8]:
-        """Frames RGB [F, height, width, 3] of latents [1, C, T, h, w]; computed in `dtype`, else in the VAE's own."""
+    def decode(self, latents: Tensor) -> NDArray[np.uint8]:
+        """Frames RGB [F, height, width, 3] of latents [1, C, T, h, w]."""
         latents = latents.to(self.compute_device, self.vae.dtype)
         mean, std = self._scale(latents)
-        with torch.autocast(self.compute_device.type, dtype, enabled=dtype is not None):
-            video = self.vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
+        video = self.vae.decode(latents * std + mean, return_dict=False)[0][0]  # [3, F, height, width] in -1..1
         pixels = (video.float() / 2 + 0.5).clamp(0, 1).mul(255).round().to(torch.uint8)
         return pixels.permute(1, 2, 3, 0).cpu().numpy()
 
@@ -244,7 +243,7 @@ def denoise(
 
         def compute() -> Tensor:
             states, times = _with_condition(latents, condition, time)
-            with acceleration.cached_pass(transformer, branch):
+            with transformer.cache_context(branch):  # each pass has its own state of the step cache
                 return transformer(
                     hidden_states=states.to(dtype),
                     timestep=times,
@@ -256,7 +255,7 @@ def denoise(
         return share(branch, compute, latents)
 
     total = sampling.steps - first
-    acceleration.reset_cache(transformer, sampling.steps, first)
+    acceleration.reset_cache(transformer)
     try:
         for step, time in enumerate(schedule.timesteps[first:], first):
             velocity = velocity_of("cond", guided, time, prompt)
@@ -269,7 +268,7 @@ def denoise(
             memory.wait_until_done(device)  # else a solver that never reads a value tells of steps before they are done
             on_step(step + 1 - first, total)
     finally:  # what was kept for the next step would lie in memory while the clip is decoded
-        acceleration.reset_cache(transformer, sampling.steps, first)
+        acceleration.reset_cache(transformer)
     return torch.cat([guided, latents[:, :, 1:]], dim=2) if _is_first_frame(guided, latents) else latents
 
 

@@ -6,7 +6,7 @@ Without the model's libraries: a server that has none checks requests and passes
 import math
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from cow_service.errors import GeneratorUnavailable
 from cow_service.records import Record
@@ -78,24 +78,16 @@ class Acceleration(Record):
         description="regional compiles the transformer's block once for all of its layers; the same to rounding. The "
         "first clips of new shapes wait for the compiler.",
     )
-    cache: Literal["none", "first-block", "magcache"] = Field(
+    cache: Literal["none", "first-block"] = Field(
         default="none",
         description="Skips the transformer in steps that would change little, and so changes the frames. first-block "
         "runs the first layer of every step and skips the others if its output changed by less than `cache_threshold`; "
-        "it keeps one to three copies of the hidden states per guidance branch. magcache knows beforehand how much "
-        "each step changes (`mag_ratios`), never skips in the first fifth of the steps or more than 3 in a row, and "
-        "keeps one copy. Of no use with few, distilled steps.",
-    )
-    mag_ratios: tuple[float, ...] = Field(
-        default=(),
-        description="For magcache: by how much what the blocks add grows from one step to the next, of a clip of any "
-        "number of steps, guided and unconditional pass in turn. They belong to a model.",
+        "it keeps one to three copies of the hidden states per guidance branch. Of no use with few, distilled steps.",
     )
     cache_threshold: float = Field(
         default=0.05,
         ge=0,
-        description="Relative change of the first layer, or of magcache the error that adds up. 0 skips nothing; the "
-        "larger, the faster and the worse.",
+        description="Relative change of the first layer. 0 skips nothing; the larger, the faster and the worse.",
     )
     fp8: Literal["none", "stored", "stored-dynamic", "weights", "dynamic"] = Field(
         default="none",
@@ -129,12 +121,6 @@ class Acceleration(Record):
         "computes the unconditional pass; the same frames in about half the time, where steps are guided.",
     )
 
-    @model_validator(mode="after")
-    def _has_ratios(self) -> "Acceleration":
-        if (self.cache == "magcache") != bool(self.mag_ratios) or len(self.mag_ratios) % 2:
-            raise ValueError("`mag_ratios` go with `cache: magcache`, two for each step")
-        return self
-
     @property
     def keeps_float8(self) -> bool:
         """Whether the float8 of a checkpoint stays as it is."""
@@ -154,11 +140,6 @@ class Profile(Record):
     dtype: Precision = Field(default="bfloat16", description="Of the transformer and the text encoder.")
     vae_dtype: Precision = Field(
         default="float32", description="Of the VAE; bfloat16 decodes in less time, with slightly banded gradients."
-    )
-    decode_dtype: Literal["bfloat16", "float16"] | None = Field(
-        default=None,
-        description="In which the VAE decodes where that is not its own: bfloat16 is faster, with slightly banded "
-        "gradients, and the first frame is still encoded in `vae_dtype`.",
     )
     acceleration: Acceleration = Acceleration()
     lora: str | None = Field(

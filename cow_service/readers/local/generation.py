@@ -49,25 +49,12 @@ def conversation_of(
     that meet are one text. Raises `UserError` for what such a model cannot be given (tools, files other than images),
     and the errors of `images.decode`.
     """
-    said: list[tuple[str, object]] = [("system", text) for text in instructions]
-    for message in messages:
-        role = "assistant" if isinstance(message, ai.ModelResponse) else "user"
-        for part in message.parts:
-            if isinstance(part, ai.SystemPromptPart):
-                # Templates take a system turn at the start only.
-                opening = all(before == "system" for before, _ in said)
-                said.append(("system" if opening else "user", part.content))
-            elif isinstance(part, ai.UserPromptPart):
-                items = [part.content] if isinstance(part.content, str) else part.content
-                said.extend((role, item) for item in items if not isinstance(item, ai.CachePoint))
-            elif not isinstance(part, ai.ThinkingPart):
-                said.append((role, part))
-
     # A space goes into every special token that a text spells, or a question could end its turn or claim an image.
     tokens = sorted((token for token in special_tokens if len(token) > 1), key=len, reverse=True)
     special = re.compile("|".join(map(re.escape, tokens)) or r"(?!)")
     turns: list[Turn] = []
     images: list[Image.Image] = []
+    said = said_by_role(messages, instructions)
     for role, items in itertools.groupby(said, key=lambda each: each[0]):
         content: list[dict[str, str]] = []
         for _, item in items:
@@ -86,6 +73,24 @@ def conversation_of(
             content.append({"type": "text", "text": text})
         turns.append({"role": role, "content": content})
     return turns, images
+
+
+def said_by_role(messages: Iterable[ai.ModelMessage], instructions: Sequence[str]) -> list[tuple[str, object]]:
+    """What each role says, one thing after another."""
+    said: list[tuple[str, object]] = [("system", text) for text in instructions]
+    for message in messages:
+        role = "assistant" if isinstance(message, ai.ModelResponse) else "user"
+        for part in message.parts:
+            if isinstance(part, ai.SystemPromptPart):
+                # Templates take a system turn at the start only.
+                opening = all(before == "system" for before, _ in said)
+                said.append(("system" if opening else "user", part.content))
+            elif isinstance(part, ai.UserPromptPart):
+                items = [part.content] if isinstance(part.content, str) else part.content
+                said.extend((role, item) for item in items if not isinstance(item, ai.CachePoint))
+            elif not isinstance(part, ai.ThinkingPart):
+                said.append((role, part))
+    return said
 
 
 def _closed(schema: Any) -> Any:

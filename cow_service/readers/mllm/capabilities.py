@@ -16,10 +16,10 @@ from cow_service.readers.mllm.known import MllmNotes
 from cow_service.readers.mllm.sheets import FEWER_FRAMES
 from cow_service.records import Delivery, ServerCapabilities
 
-_NEXT_DELIVERY: dict[Delivery, Delivery] = {"whole": "streamed", "streamed": "declared"}
 MAX_STEPS = 8  # that one call may teach
 MAX_REDUCTION = FEWER_FRAMES + 2
 REFUSED = (HTTPStatus.BAD_REQUEST, HTTPStatus.UNPROCESSABLE_ENTITY, HTTPStatus.NOT_IMPLEMENTED)
+_MAY_LEARN = (*REFUSED, HTTPStatus.INTERNAL_SERVER_ERROR)
 _SIZE_STATUS = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
 _IMAGES = re.compile(
     r"(?i)(?:most|maximum(?: of)?|only|up to|limit\D{0,20}|than)\s+(\d+)\s+(?:image|picture)"
@@ -30,10 +30,27 @@ _TOO_LARGE = re.compile(
     r"(?i)too (?:large|big|long)|maximum (?:context|model|size|allowed)|context (?:length|window|size)"
     r"|exceeds? .{0,30}(?:size|limit|length|tokens)"
 )
-_OUTPUT = re.compile(r"(?i)response_?format|json_?(?:schema|object)|\bschema\b|grammar|guided|structured|extra")
-_SYSTEM = re.compile(
-    r"system[ _]?(?:role|message|prompt|instruction)|role\W{0,3}.{0,12}system|roles must", re.IGNORECASE
-)
+# What a refusal may be about, by its words, in the order in which steps are taken.
+_NAMED: dict[str, re.Pattern[str]] = {
+    "token_field": re.compile(r"max_completion_tokens"),
+    "temperature": re.compile(r"temperature"),
+    "seed": re.compile(r"\bseed\b"),
+    "system_role": re.compile(
+        r"(?i)system[ _]?(?:role|message|prompt|instruction)|role\W{0,3}.{0,12}system|roles must"
+    ),
+    "delivery": re.compile(r"(?i)stream"),
+    "output": re.compile(r"(?i)response_?format|json_?(?:schema|object)|\bschema\b|grammar|guided|structured|extra"),
+}
+# The step down from each value that a refusal has named.
+_LOWER: dict[str, dict[object, object]] = {
+    "token_field": {"max_tokens": "max_completion_tokens", "max_completion_tokens": "max_tokens"},
+    "temperature": {True: False},
+    "seed": {True: False},
+    "system_role": {True: False},
+    "delivery": {"whole": "streamed"},
+    "output": {"json_schema": "json_object", "json_object": "prompt"},
+}
+_UNREADABLE: dict[Delivery, Delivery] = {"whole": "streamed", "streamed": "declared"}  # of replies in pieces
 
 
 @dataclass
@@ -89,19 +106,17 @@ def step_down(
 
     `images` were sent, and `shown` is the most that were ever taken.
     """
-    if isinstance(error, errors.ModelHTTPError):
-        update = next(_named_steps(used, error, images), None)
-        may_learn = error.status_code in REFUSED or error.status_code == HTTPStatus.INTERNAL_SERVER_ERROR
-        # Else this call is at fault, not what every call is sent with.
-        if update is None and may_learn and not is_proven and not _is_too_large(error):
-            update = next(_blind_steps(used), None)
-        may_be_many = images > max(1, shown) and used.images is None and error.status_code in REFUSED
-        if update is None and may_be_many and not _is_too_large(error):
-            update = {"images": 1}
-    else:  # no chat completion: it may be one in pieces
+    if not isinstance(error, errors.ModelHTTPError):  # no chat completion: it may be one in pieces
         unreadable = type(error) is errors.ModelAPIError and not is_proven
-        delivery = _NEXT_DELIVERY.get(used.delivery) if unreadable else None
-        update = None if delivery is None else {"delivery": delivery}
+        delivery = _UNREADABLE.get(used.delivery) if unreadable else None
+        return None if delivery is None else used.model_copy(update={"delivery": delivery})
+    update = next(_named_steps(used, error, images), None)
+    # Else this call is at fault, not what every call is sent with.
+    if update is None and not is_proven and error.status_code in _MAY_LEARN and not _is_too_large(error):
+        update = next(_blind_steps(used), None)
+    may_be_many = images > max(1, shown) and used.images is None and error.status_code in REFUSED
+    if update is None and may_be_many and not _is_too_large(error):
+        update = {"images": 1}
     return None if update is None else used.model_copy(update=update)
 
 
@@ -118,35 +133,21 @@ def _named_steps(used: ServerCapabilities, error: errors.ModelHTTPError, images:
     most = int(counted[counted.lastindex or 1]) if counted else 1 if _ONE_IMAGE.search(said) else images
     if status in REFUSED and 0 < most < images:
         yield {"images": most}
-    if _is_too_large(error) and used.reduction < MAX_REDUCTION:
-        only_first = images == 1  # what is done to frames does not help
-        yield {"reduction": max(used.reduction, FEWER_FRAMES if only_first else 0) + 1}
-    if _is_too_large(error) or status not in (*REFUSED, HTTPStatus.INTERNAL_SERVER_ERROR):
-        return
-    if "max_completion_tokens" in said:
-        had_new = used.token_field == "max_completion_tokens"
-        yield {"token_field": "max_tokens" if had_new else "max_completion_tokens"}
-    if used.temperature and "temperature" in said:
-        yield {"temperature": False}
-    if used.seed and re.search(r"\bseed\b", said):
-        yield {"seed": False}
-    if used.system_role and _SYSTEM.search(said):
-        yield {"system_role": False}
-    if used.delivery == "whole" and "stream" in said.lower():
-        yield {"delivery": "streamed"}
-    if used.output != "prompt" and _OUTPUT.search(said):
-        yield _lower_output(used)
+    if _is_too_large(error):
+        if used.reduction < MAX_REDUCTION:
+            only_first = images == 1  # what is done to frames does not help
+            yield {"reduction": max(used.reduction, FEWER_FRAMES if only_first else 0) + 1}
+    elif status in _MAY_LEARN:
+        for field, words in _NAMED.items():
+            if (value := getattr(used, field)) in _LOWER[field] and words.search(said):
+                yield {field: _LOWER[field][value]}
 
 
 def _blind_steps(used: ServerCapabilities) -> Iterator[dict[str, object]]:
     """Steps after a refusal that names nothing, what is refused most often first."""
     if used.output != "prompt":
-        yield _lower_output(used)
+        yield {"output": _LOWER["output"][used.output]}
     if used.temperature or used.seed:
         yield {"temperature": False, "seed": False}
     if used.system_role:
         yield {"system_role": False}
-
-
-def _lower_output(used: ServerCapabilities) -> dict[str, object]:
-    return {"output": "json_object" if used.output == "json_schema" else "prompt"}

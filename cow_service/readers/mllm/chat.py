@@ -9,7 +9,7 @@ import binascii
 import time
 import uuid
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 from pydantic_ai import messages as ai
@@ -50,27 +50,42 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
         for name, value in body.items()
         if name not in (*SETTINGS, *READ) and value is not None and value not in NEUTRAL.get(name, ())
     ]
+    settings, refused = settings_of(body, model)
+    left_out += refused
+    parameters = ModelRequestParameters(function_tools=tools_of(body))
+    response_format = body.get("response_format")
+    if isinstance(response_format, dict) and response_format.get("type") == "json_schema":
+        schema = _at(response_format, "/response_format", "json_schema", "schema")
+        output = OutputObjectDefinition(schema, response_format["json_schema"].get("name", "reply"))
+        parameters = replace(parameters, output_mode="native", output_object=output)
+    elif response_format not in (None, *NEUTRAL["response_format"]):
+        left_out.append("response_format")
+    names = ", ".join(f"`{name}`" for name in left_out)
+    warning = f"Not sent: {names}. This MLLM is not asked over OpenAI's protocol, and its own has no such field."
+    warnings = (warning,) if left_out else ()
+    return PreparedChat(list(_messages(body)), settings, parameters, warnings)
+
+
+def settings_of(body: dict[str, Any], model: Model) -> tuple[ModelSettings, list[str]]:
+    """The settings of a chat, and the names of those that the model does not take."""
     settings: dict[str, Any] = {}
+    refused: list[str] = []
     for name, own in SETTINGS.items():
-        value = body.get(name)
-        if value is None:
+        if (value := body.get(name)) is None:
             continue
         if own in model.unsupported_settings or (name == "tool_choice" and not body.get("tools")):
-            left_out.append(name)
+            refused.append(name)
             continue
         if name == "stop" and isinstance(value, str):
             value = [value]
         elif name == "tool_choice" and isinstance(value, dict):
             value = [_at(value, "/tool_choice", "function", "name")]
         settings[own] = value
+    return cast("ModelSettings", settings), refused
 
-    output, response_format = None, body.get("response_format")
-    if isinstance(response_format, dict) and response_format.get("type") == "json_schema":
-        schema = _at(response_format, "/response_format", "json_schema", "schema")
-        output = OutputObjectDefinition(schema, response_format["json_schema"].get("name", "reply"))
-    elif response_format not in (None, *NEUTRAL["response_format"]):
-        left_out.append("response_format")
 
+def tools_of(body: dict[str, Any]) -> list[ToolDefinition]:
+    """The tools of a chat. Raises `InvalidRequest`."""
     tools: list[ToolDefinition] = []
     for place, tool in enumerate(_list_of(body, "tools")):
         pointer = f"/tools/{place}"
@@ -80,13 +95,7 @@ def prepare_chat(body: dict[str, Any], model: Model) -> PreparedChat:
         name = _at(function, pointer + "/function", "name")
         schema = function.get("parameters") or {"type": "object", "properties": {}}
         tools.append(ToolDefinition(name=name, description=function.get("description"), parameters_json_schema=schema))
-    mode = "text" if output is None else "native"
-    parameters = ModelRequestParameters(function_tools=tools, output_mode=mode, output_object=output)
-
-    names = ", ".join(f"`{name}`" for name in left_out)
-    warning = f"Not sent: {names}. This MLLM is not asked over OpenAI's protocol, and its own has no such field."
-    warnings = (warning,) if left_out else ()
-    return PreparedChat(list(_messages(body)), cast("ModelSettings", settings), parameters, warnings)
+    return tools
 
 
 def completion_of(response: ai.ModelResponse, model: str) -> dict[str, Any]:

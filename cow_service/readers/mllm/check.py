@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal, TypeVar, cast
 
 from cow_service.errors import CowError, MllmUnavailable
@@ -25,6 +26,7 @@ from cow_service.weights.manifests import EXAMPLES
 
 FOUND = 0.5  # intersection over union from which a box counts as that of the thing
 ASIDE = 45.0  # degrees from which a direction counts as another one
+FORMS = tuple(product(("thousandths", "fractions", "pixels"), ("xy", "yx"), ("corners", "size")))  # of coordinates
 WHICH = "These are four pictures of different scenes. Which of them shows a red bottle?"
 PLACES = ("the first", "the second", "the third", "the fourth")  # of the pictures in `QUESTIONS`
 
@@ -153,46 +155,53 @@ def _of_places(
     `usual` are the coordinates of the family, and `used` those that were asked for; others are taken where most boxes
     are found in them. `failed` is what a call came to.
     """
-    others = [
-        used.model_copy(update={"units": units, "axes": axes, "box_form": form})
-        for units in ("thousandths", "fractions", "pixels")
-        for axes in ("xy", "yx")
-        for form in ("corners", "size")
-    ]
 
-    def fit(coordinates: Coordinates) -> float:
-        return sum(iou(*pair) for reply in written for pair in reply.pairs(coordinates))
+    def pairs(coordinates: Coordinates) -> list[tuple[BBox, BBox]]:
+        return [pair for reply in written for pair in reply.pairs(coordinates)]
 
-    def found(coordinates: Coordinates) -> int:
-        return sum(iou(*pair) >= FOUND for reply in written for pair in reply.pairs(coordinates))
+    others = [used.model_copy(update=dict(zip(("units", "axes", "box_form"), form, strict=True))) for form in FORMS]
+    count = sum(len(reply.truth.boxes) for reply in written)
+    best = max((used, *others), key=lambda coordinates: sum(iou(*pair) for pair in pairs(coordinates)))
+    found = _count_found(pairs(best))
+    if not (is_found := found * 2 > count):
+        best, found = used, _count_found(pairs(used))
+    boxes = finding_of_boxes(found, count, best, used, failed)
+    lines = [(reply.truth, reply.read(best).line or Line()) for reply in written]
+    off = [_degrees(truth.way, line.ends) for truth, line in lines if line.ends is not None]
+    findings = [boxes, *findings_of_lines(lines, off)]
+    if not is_found or not off:
+        return findings, None
+    edges = [_edges_off(*pair) for pair in pairs(best)]
+    return findings, MllmMeasurement(
+        coordinates=None if best == usual else best,
+        bbox_deviation=min(1.0, _spread(USUAL.bbox_deviation, edges)),
+        direction_deviation=min(90.0, _spread(USUAL.direction_deviation, off)),
+    )
 
-    count, best = sum(len(reply.truth.boxes) for reply in written), max((used, *others), key=fit)
-    if found(best) * 2 <= count:
-        best = used
-    pairs = [pair for reply in written for pair in reply.pairs(best)]
-    result = f"{found(best)} of {count} found"
+
+def finding_of_boxes(found: int, count: int, best: Coordinates, used: Coordinates, failed: CowError | None) -> Finding:
+    """The finding on boxes: so many were found, of how many, and in which coordinates."""
+    result = f"{found} of {count} found"
     if best != used:
         result += f", read as {best.words}; asked for were {used.words}"
     if failed is not None:
         result += f"; {failed.code}: {failed}"
-    findings = [Finding(question="box", usable=found(best) == count and best == used, result=result)]
-    lines = [(reply.truth, reply.read(best).line or Line()) for reply in written]
-    off = [_degrees(truth.way, line.ends) for truth, line in lines if line.ends is not None]
+    return Finding(question="box", usable=found == count and best == used, result=result)
+
+
+def _count_found(pairs: Sequence[tuple[BBox, BBox]]) -> int:
+    return sum(iou(*pair) >= FOUND for pair in pairs)
+
+
+def findings_of_lines(lines: Sequence[tuple[Truth, Line]], off: Sequence[float]) -> Iterator[Finding]:
+    """The findings on directions, so many degrees `off`, and on their senses."""
     result = f"{len(off)} of {len(lines)} given"
     if off:
         result += f", {', '.join(f'{each:.0f}' for each in off)} degrees off"
-    is_usable = len(off) == len(lines) and max(off) < ASIDE
-    findings.append(Finding(question="direction", usable=is_usable, result=result))
+    yield Finding(question="direction", usable=len(off) == len(lines) and max(off) < ASIDE, result=result)
     senses = sum(line.along_arrow == truth.along_arrow for truth, line in lines)
     result = f"{senses} of {len(lines)} right, along or against an arrow"
-    findings.append(Finding(question="sense", usable=senses == len(lines), result=result))
-    if found(best) * 2 <= count or not off:
-        return findings, None
-    return findings, MllmMeasurement(
-        coordinates=None if best == usual else best,
-        bbox_deviation=min(1.0, _spread(USUAL.bbox_deviation, [_edges_off(*pair) for pair in pairs])),
-        direction_deviation=min(90.0, _spread(USUAL.direction_deviation, off)),
-    )
+    yield Finding(question="sense", usable=senses == len(lines), result=result)
 
 
 def _spread(usual: float, off: Sequence[float]) -> float:

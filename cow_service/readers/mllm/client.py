@@ -447,15 +447,11 @@ class LearningModel(RetryingModel):
         fitted = await anyio.to_thread.run_sync(fit_images, self._call.images, takes)
         self._note = fitted.note
         shown = [BinaryContent(each, media_type=MEDIA_TYPE) for each in fitted.jpegs]
-        shown += [fitted.caption] if fitted.caption else []
-        first = cast("ai.ModelRequest", messages[0])
-        parts = [
-            replace(part, content=[*shown, cast("str", part.content)]) if isinstance(part, ai.UserPromptPart) else part
-            for part in first.parts
-        ]
-        messages = [replace(first, parts=parts), *messages[1:]]
-        refused = [name for name in ("temperature", "seed") if not getattr(takes, name)]
-        sent = cast("ModelSettings", {name: value for name, value in (settings or {}).items() if name not in refused})
+        messages = with_shown(messages, [*shown, *([fitted.caption] if fitted.caption else [])])
+        sent = (settings or ModelSettings()).copy()
+        for name in ("temperature", "seed"):
+            if not getattr(takes, name):
+                sent.pop(name, None)
         if self._is_longer and (most := sent.get("max_tokens")):
             sent |= ModelSettings(max_tokens=2 * most)
         if takes.output != "prompt":
@@ -475,6 +471,16 @@ class LearningModel(RetryingModel):
             async for _ in stream:
                 pass
             return stream.get()
+
+
+def with_shown(messages: list[ai.ModelMessage], shown: list[ai.UserContent]) -> list[ai.ModelMessage]:
+    """Messages with images and their caption before the first prompt."""
+    first = cast("ai.ModelRequest", messages[0])
+    parts = [
+        replace(part, content=[*shown, cast("str", part.content)]) if isinstance(part, ai.UserPromptPart) else part
+        for part in first.parts
+    ]
+    return [replace(first, parts=parts), *messages[1:]]
 
 
 def with_text(response: ai.ModelResponse) -> ai.ModelResponse:

@@ -18,7 +18,7 @@ from cow_service.narration.summary import found_in, label_of_changes, narrate
 from cow_service.narration.words import bare_name, phrases_of
 from cow_service.readers.base import Imagined
 from cow_service.readers.mllm.replies import text_of
-from cow_service.records import DIRECTED_KINDS, MEETINGS, Simulation
+from cow_service.records import DIRECTED_KINDS, MEETINGS, Encounter, Simulation, Trajectory
 from cow_service.weights.manifests import EXAMPLES
 
 # `true`: frames drawn along the path that is known to be true. `text`: what the simulation found, in words.
@@ -113,15 +113,6 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
         doubts = [ENGLISH(f"doubt-{doubt}") for doubt in trajectory.outcome.depends_on]
         facts += [f"It depends most on {', '.join(doubts)}."] if doubts else []
 
-    encounters: list[str] = []
-    for each in () if facts else trajectory.encounters:
-        covered = "" if each.share is None else f", at most {each.share:.0%} covered"
-        counted, total = "", trajectory.ensemble
-        if each.probability is not None:
-            counted = f"; in {round(each.probability * total)} of {total} simulated versions"
-        meets = f"{MEETINGS[each.kind]} the {bare_name(each.object)}"
-        time = each.first_frame / trajectory.fps if each.time is None else each.time
-        encounters.append(f"{meets}, {time:.1f} s in{covered}{counted}")
     return {
         "sentence": simulation.motion.sentence,
         "times": ", ".join(f"{frame.time:.2f} s" for frame in simulation.frames),
@@ -129,9 +120,19 @@ def hypothesis(imagined: Imagined) -> dict[str, object]:
         "changed": changed,
         "as_it_is": AS_IT_IS if imagined.factual_frames else "",
         "facts": tuple(facts),
-        "encounters": tuple(encounters),
+        "encounters": () if facts else tuple(meeting_words(each, trajectory) for each in trajectory.encounters),
         "encounters_known": simulation.encounters_known,
     }
+
+
+def meeting_words(each: Encounter, trajectory: Trajectory) -> str:
+    """An encounter in words, with its time and in how many versions it is so."""
+    covered = "" if each.share is None else f", at most {each.share:.0%} covered"
+    counted, total = "", trajectory.ensemble
+    if each.probability is not None:
+        counted = f"; in {round(each.probability * total)} of {total} simulated versions"
+    time = each.first_frame / trajectory.fps if each.time is None else each.time
+    return f"{MEETINGS[each.kind]} the {bare_name(each.object)}, {time:.1f} s in{covered}{counted}"
 
 
 def _changed(simulation: Simulation) -> str:

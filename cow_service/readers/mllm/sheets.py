@@ -17,6 +17,7 @@ from cow_service.records import ServerCapabilities
 
 FEWER_FRAMES = 3  # reductions from which only the first, middle and last frame are sent
 AFTER_FIRST = "All images after the first are on one sheet, from left to right and row by row."
+SMALLER_NOTE = "The multimodal LLM's server takes no larger requests, so images were made smaller"
 SHEET_NOTE = "The multimodal LLM's server takes fewer images a call: frames were sent on one sheet."
 QUALITIES = {FEWER_FRAMES + 1: 80, FEWER_FRAMES + 2: 60}  # JPEG, percent, of the first image by reduction
 
@@ -36,25 +37,25 @@ def fit_images(jpegs: Sequence[bytes], takes: ServerCapabilities) -> FittedImage
     if len(jpegs) <= most and (not takes.reduction or (len(jpegs) == 1 and takes.reduction <= FEWER_FRAMES)):
         return FittedImages(tuple(jpegs))
     first, *frames = map(decode_own, jpegs)
-    caption = note = ""
-    if takes.reduction >= FEWER_FRAMES and len(frames) > FEWER_FRAMES:
-        kept = (0, len(frames) // 2, len(frames) - 1)
-        caption = f"Of the {len(frames)} frames these are numbers {', '.join(str(place + 1) for place in kept)}. "
-        frames = [frames[place] for place in kept]
+    captions, notes = list[str](), list[str]()
     if takes.reduction:
-        note = "The multimodal LLM's server takes no larger requests, so images were made smaller"
-        note += " and frames fewer." if caption else "."
+        if takes.reduction >= FEWER_FRAMES and len(frames) > FEWER_FRAMES:
+            middle, last = len(frames) // 2, len(frames) - 1
+            captions.append(f"Of the {len(frames)} frames these are numbers 1, {middle + 1}, {last + 1}.")
+            frames = [frames[0], frames[middle], frames[last]]
+        notes.append(f"{SMALLER_NOTE}{' and frames fewer' if captions else ''}.")
         scale = 0.5 ** min(takes.reduction, FEWER_FRAMES - 1)
         frames = [_resized(each, round(scale * each.shape[1]), round(scale * each.shape[0])) for each in frames]
     if len(frames) >= most:
-        shared = [first, *frames] if most == 1 else frames
-        sheet = sheet_of(shared, 1 + len(frames) + 1 - len(shared))
-        first, frames = (sheet, []) if most == 1 else (first, [sheet])
-        caption += AFTER_FIRST.replace(" after the first", "") if most == 1 else AFTER_FIRST
-        note = f"{SHEET_NOTE} {note}".strip()
+        if most == 1:
+            first, frames = sheet_of([first, *frames], 1), []
+        else:
+            frames = [sheet_of(frames, 2)]
+        captions.append(AFTER_FIRST if frames else AFTER_FIRST.replace(" after the first", ""))
+        notes.insert(0, SHEET_NOTE)
     quality = QUALITIES.get(takes.reduction)
     encoded = encode_jpeg(first) if quality is None else encode_jpeg(first, quality)
-    return FittedImages((encoded, *map(encode_jpeg, frames)), caption.strip(), note)
+    return FittedImages((encoded, *map(encode_jpeg, frames)), " ".join(captions), " ".join(notes))
 
 
 def sheet_of(images: Sequence[NDArray[np.uint8]], begin: int) -> NDArray[np.uint8]:
