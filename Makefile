@@ -84,7 +84,7 @@ $(BIN)/python:
 
 # What an installation makes modules of the SDK from.
 TWINS := hatch_build.py $(addprefix cow_service/,client/async_client.py client/async_results.py client/batches.py \
-	requests/simulation.py requests/values.py)
+	requests/simulation.py records/reading.py records/values.py)
 
 $(VENV)/.base: pyproject.toml $(TWINS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable .

@@ -20,8 +20,7 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from cow_service.api.problems import invalid
 from cow_service.errors import BodyTypeUnsupported, FieldError, InvalidRequest, MalformedBody, pointer_part, shortened
-from cow_service.requests import LookRequest, SimulateRequest
-from cow_service.requests.checks import SHOWN_CHARACTERS
+from cow_service.requests import SHOWN_CHARACTERS, LookRequest, SimulateRequest
 
 FORM_FIELDS = ("image", "question", "request")
 MAX_VALUES = 2_000_000  # of a JSON text: the longest tracks that a request may hold, twice; each takes up to 100 bytes

@@ -18,7 +18,7 @@ from starlette.types import Scope
 
 from cow_service import errors
 from cow_service.records import Problem, Record
-from cow_service.requests.checks import field_errors
+from cow_service.requests import field_errors
 
 MEDIA_TYPE = "application/problem+json"
 OPENAI_ROOT = "/v1/"  # of the paths of operations that OpenAI's clients call

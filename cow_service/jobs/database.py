@@ -18,8 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from cow_service.errors import Canceled, StorageUnavailable
 from cow_service.jobs import schema
-from cow_service.jobs.packing import packed, unpacked
-from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES
+from cow_service.jobs.schema import JOBS, MAINTENANCE, REFERENCES, SCHEMA, STAGES, STORES, packed, unpacked
 from cow_service.records import Stage
 from cow_service.settings import SettingsError
 

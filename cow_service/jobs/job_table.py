@@ -24,9 +24,8 @@ from pydantic_core import to_json
 
 from cow_service.errors import CowError, FieldError, InternalError, InvalidRequest, kinds, unforeseen
 from cow_service.jobs.database import OPEN, Database, Notification
-from cow_service.jobs.packing import packed, unpacked
 from cow_service.jobs.queues import moves, next_turn
-from cow_service.jobs.schema import CALLS, JOBS, REFERENCES, STAGES, TRAJECTORIES
+from cow_service.jobs.schema import CALLS, JOBS, REFERENCES, STAGES, TRAJECTORIES, packed, unpacked
 from cow_service.observability.logging import rfc3339
 from cow_service.records import AcceptedRequest, Answer, Job, JobKind, JobPage, JobStatus, Problem, Record, Simulation
 from cow_service.records.stages import At, Stage, share_done

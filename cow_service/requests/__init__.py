@@ -2,5 +2,4 @@
 
 from cow_service.records.reading import *  # noqa: F403
 from cow_service.records.values import *  # noqa: F403
-from cow_service.requests.checks import *  # noqa: F403
 from cow_service.requests.simulation import *  # noqa: F403

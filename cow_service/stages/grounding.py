@@ -13,18 +13,9 @@ from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_o
 from cow_service.media.images import encode_png
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
-from cow_service.readers.base import ReadResult, WordReader, WordsReading
+from cow_service.readers.base import GIVE_OBJECT, ReadResult, WordReader, WordsReading
 from cow_service.readers.options import plain
-from cow_service.readers.remedies import GIVE_OBJECT
-from cow_service.records import (
-    Grounding,
-    Intervention,
-    LocatedObject,
-    MotionRequest,
-    ObjectPrior,
-    ObjectRequest,
-    Reading,
-)
+from cow_service.records import Grounding, Intervention, LocatedObject, MotionRequest, ObjectRequest, Reading
 from cow_service.requests import SimulateRequest
 from cow_service.stages.keys import StageResult
 from cow_service.stages.places import Located, bare, find_things, locate_given, outlined
@@ -116,7 +107,7 @@ def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[Object
     """The reading without what the request says, with its boxes, what is asked and what is changed settled."""
     words, said, request = run.backends.words(), run.words, run.request
     with run.cpu():
-        reading = _located(run.scene, read.reading, run.reader.source)
+        reading = located(run.scene, read.reading, run.reader.source)
     if not run.reader.heeds_objections:
         return Settled(reading, read.warnings)
     if request.interventions:
@@ -139,7 +130,7 @@ def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[Object
     return Settled(reading, (*read.warnings, *unproved), (*objections, *misnamed, *misread), bool(misnamed or misread))
 
 
-def _located(scene: Scene, reading: Reading, source: records.Source) -> Reading:
+def located(scene: Scene, reading: Reading, source: records.Source) -> Reading:
     """The reading with its source, and the box of what is at the point of a mover that was only pointed at."""
     mover = mover_of(reading)
     boxed = {} if mover.bbox is not None or mover.point is None else {"bbox": scene.bbox_at(mover.point)}
@@ -167,7 +158,7 @@ def settle_grounding(
     """The grounding, with its interventions made, its names understood, and where its mover goes, if it is put."""
     request, said = run.request, mover.said
     own = LocatedObject(object=mover.name, bbox=mover.bbox, prior=said.prior, source=said.source)
-    interventions = _find_interventions(request, reading, (*others, own))
+    interventions = find_interventions(request, reading, (*others, own))
     removed = [each.object.bbox for each in interventions if each.kind == "remove"]
     x0, y0, x1, y1 = mover.bbox
     pointed = None if said.source == "request" else said.point
@@ -226,7 +217,7 @@ def unanswerable(grounding: Grounding, run: Run[SimulateRequest]) -> list[str]:
 # --- interventions
 
 
-def _find_interventions(
+def find_interventions(
     request: SimulateRequest, reading: Reading, things: Sequence[LocatedObject]
 ) -> tuple[Intervention, ...]:
     """Those of the request, else those of the question; the last of `things` is the mover.
@@ -239,7 +230,7 @@ def _find_interventions(
     read = [(None, change) for change in reading.interventions]
     for pointer, change in given or read:
         gone = [other.object for other in found if other.kind == "remove"]  # of two with one name, each goes once
-        each = _with_things(change, (*(thing for thing in things if thing not in gone), *gone), pointer)
+        each = with_things(change, (*(thing for thing in things if thing not in gone), *gone), pointer)
         name, box, targets = each.object.object, each.object.bbox, [thing.bbox for thing in each.targets]
         taken = [other.object.bbox for other in found if other.kind == "remove"]
         put = [other for other in found if other.kind == "place"]
@@ -268,7 +259,7 @@ def _find_interventions(
     return tuple(found)
 
 
-def _with_things(
+def with_things(
     change: records.InterventionRequest, things: Sequence[LocatedObject], pointer: str | None = None
 ) -> Intervention:
     """A change with its objects in the place of their names, of the request at a JSON Pointer or of the question.
@@ -343,11 +334,11 @@ def removed_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
 def understood(grounding: Grounding, words: WordReader) -> Grounding:
     """The grounding with what the names of its things say of their shapes, and with the things that a kind means."""
 
-    def prior_of(thing: LocatedObject | Grounding) -> ObjectPrior | None:
+    def prior_of(thing: LocatedObject | Grounding) -> records.ObjectPrior | None:
         """Its prior, completed by what its name says; None where neither says anything."""
         said = {field: value for field, value in thing.prior or () if value}
         completed = words.read_name(thing.object).model_copy(update=said)
-        return None if completed == ObjectPrior() else completed
+        return None if completed == records.ObjectPrior() else completed
 
     def described(thing: LocatedObject) -> LocatedObject:
         return thing.model_copy(update={"prior": prior_of(thing)})

@@ -16,19 +16,7 @@ from pydantic import BaseModel
 from cow_service import __version__, records
 from cow_service.perception.base import PerceptionKind
 from cow_service.readers.prompts import load_prompt
-from cow_service.records import (
-    Clip,
-    Grounding,
-    Motion,
-    MotionRequest,
-    ReaderInfo,
-    Record,
-    Simulation,
-    Stage,
-    Trajectory,
-    Usage,
-    Verdict,
-)
+from cow_service.records import MotionRequest, Record, Simulation, Stage, Usage, Verdict
 from cow_service.requests import DepthRequest, SimulateRequest
 
 Value = TypeVar("Value")
@@ -39,7 +27,7 @@ class StageResult(Record, Generic[Value]):
 
     value: Value
     warnings: tuple[str, ...] = ()
-    reader: ReaderInfo | None = None  # null where the stage asked none
+    reader: records.ReaderInfo | None = None  # null where the stage asked none
     usage: Usage = Usage()
     artifacts: tuple[records.Sha256, ...] = ()  # those that the value names
     motion: MotionRequest | None = None  # of stage 1 for stage 2: what the reader said of it
@@ -61,11 +49,11 @@ class FirstAnswers(Record):
 RESULT_TYPES: dict[Stage, type[StageResult[Any]]] = {
     "gating": StageResult[FirstAnswers],
     "baseline": StageResult[FirstAnswers],
-    "grounding": StageResult[Grounding],
+    "grounding": StageResult[records.Grounding],
     "depth": StageResult[EstimatedDepth],
-    "motion": StageResult[Motion],
-    "trajectory": StageResult[Trajectory],
-    "generation": StageResult[Clip],
+    "motion": StageResult[records.Motion],
+    "trajectory": StageResult[records.Trajectory],
+    "generation": StageResult[records.Clip],
     "answering": StageResult[Verdict],
 }
 

@@ -16,18 +16,9 @@ from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GR
 from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
+from cow_service.readers.base import GIVE_DIRECTION
 from cow_service.readers.prompts import load_prompt
-from cow_service.readers.remedies import GIVE_DIRECTION
-from cow_service.records import (
-    DIRECTED_KINDS,
-    BBox,
-    Grounding,
-    LocatedObject,
-    Motion,
-    MotionKind,
-    MotionRequest,
-    Vector,
-)
+from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, Motion, MotionRequest, Vector
 from cow_service.requests import SimulateRequest
 from cow_service.stages.grounding import others_of, placed_mover
 from cow_service.stages.keys import StageResult
@@ -39,7 +30,10 @@ from cow_service.vision.trails import trail_of
 
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
 THROW_DEPTH_DEVIATION = 20.0  # degrees: words and arrows tell a throw's heading in the image alone
-SPEED_DEVIATIONS: dict[MotionKind, float] = {"linear": 0.25, "projectile": 0.28}  # of the logarithm of a default speed
+SPEED_DEVIATIONS: dict[records.MotionKind, float] = {
+    "linear": 0.25,
+    "projectile": 0.28,
+}  # of the logarithm of a default speed
 SPEED_FACTORS: dict[records.SpeedWord, float] = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
 SCALE_DEVIATION = 0.25  # of the logarithm of metres per pixel, where nobody gave them
 ELSEWHERE_SIGMA = 0.3  # of the logarithm of a scale that is told by the size of what stands elsewhere
@@ -68,7 +62,7 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
         warnings.append(f"The {' and '.join(unused)} of the motion was not used: {ends}.")
     scale, doubts = scale_of(run, grounding, said)
     warnings += doubts
-    if _is_up_the_floor(said, grounding, request.law):
+    if is_up_the_floor(said, grounding, request.law):
         warnings.append(
             f"'Up' was read as along the floor, away from the camera. If the {bare_name(grounding.object)} leaves "
             "the floor, say that it is lifted or thrown, or give `motion.rises`."
@@ -145,19 +139,16 @@ def settled_way(
 
     Raises `CannotReadDirection` where the arrow, the goal or the front by which it is told cannot be seen.
     """
-    if read.stated_kind not in (*DIRECTED_KINDS, "static", None) or _is_exact(read):
+    is_exact = read.direction is not None and read.direction_deviation is None
+    if read.stated_kind not in (*DIRECTED_KINDS, "static", None) or is_exact:
         return read, ()
     with run.cpu():
         scene = scene or run.scene_of(grounding, read.cue)
         seen = seen_way(run, scene, grounding, read, said)
         way, objections = settle_way(read, said, seen, grounding.bbox)
         if way.direction is None and way.stated_kind in DIRECTED_KINDS:
-            raise CannotReadDirection(_fault_of(scene, grounding, said, seen), remedy=GIVE_DIRECTION)
+            raise CannotReadDirection(fault_of(scene, grounding, said, seen), remedy=GIVE_DIRECTION)
     return way, objections
-
-
-def _is_exact(read: MotionRequest) -> bool:
-    return read.direction is not None and read.direction_deviation is None
 
 
 def seen_way(
@@ -182,7 +173,7 @@ def seen_way(
     )
 
 
-def _fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: SeenWay) -> str:
+def fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: SeenWay) -> str:
     """Why nothing tells which way the mover goes."""
     name = grounding.object
     if said.along_arrow is not None:
@@ -304,7 +295,7 @@ def scale_of(
     return records.MetresPerPixel(value=value, source=source, note="by the sizes of objects"), doubts
 
 
-def _is_up_the_floor(reading: MotionRequest, grounding: Grounding, law: records.Law) -> bool:
+def is_up_the_floor(reading: MotionRequest, grounding: Grounding, law: records.Law) -> bool:
     """Whether words alone say that something moves up that may stand on the floor."""
     said = reading.stated_kind == "linear" and reading.cue == "text" and reading.depth == 0 and reading.towards is None
     in_air = reading.rises or (grounding.prior is not None and grounding.prior.stands_on == "air")
@@ -346,7 +337,7 @@ def _pixels(said: float | records.Quantity, scale: records.MetresPerPixel, image
             return value * image_width
 
 
-def _speed_of(
+def speed_of(
     said: MotionRequest | records.OtherMotionRequest,
     bbox: BBox,
     scale: records.MetresPerPixel,
@@ -367,7 +358,7 @@ def _speed_of(
     return usual * SPEED_FACTORS[said.speed or "normal"], SPEED_DEVIATIONS[kind]
 
 
-def _other(
+def other_motion(
     said: records.OtherMotionRequest,
     thing: LocatedObject,
     goal: LocatedObject | None,
@@ -377,7 +368,7 @@ def _other(
     usual_deviation: float,
 ) -> records.AlsoMoving:
     """What another thing does."""
-    speed, deviation = _speed_of(said, thing.bbox, scale, law, image_width)
+    speed, deviation = speed_of(said, thing.bbox, scale, law, image_width)
     direction = None if goal is None else way_to(goal.bbox, thing.bbox, is_on_floor=False)
     direction = said.direction or direction
     return records.AlsoMoving(
@@ -408,7 +399,7 @@ def completed(
     )
     moves, falls = kind in DIRECTED_KINDS, kind in records.FALLING_KINDS
     cue = said.cue or ("request" if source == "request" else CUES.get(kind, "text"))
-    speed, speed_deviation = _speed_of(said, grounding.bbox, scale, law, image_width)
+    speed, speed_deviation = speed_of(said, grounding.bbox, scale, law, image_width)
     usual = DIRECTION_DEVIATIONS[cue]
     things = (LocatedObject(object=grounding.object, bbox=grounding.bbox), *others_of(grounding))
 
@@ -428,7 +419,7 @@ def completed(
         for step in said.steps
     )
     others = tuple(
-        _other(each, thing, goal_of(each.towards), scale, law, image_width, said.direction_deviation or usual)
+        other_motion(each, thing, goal_of(each.towards), scale, law, image_width, said.direction_deviation or usual)
         for each, thing in others_given(said, grounding)
     )
     gravity, towards, down = GRAVITY / scale.value, goal_of(said.towards), _unit(said.down)  # px/s^2
@@ -460,7 +451,7 @@ def completed(
     )
 
 
-CUES: dict[MotionKind, records.Cue] = {
+CUES: dict[records.MotionKind, records.Cue] = {
     "fall": "gravity",
     "projectile": "gravity",
 }  # of a motion whose direction none tells
@@ -468,7 +459,7 @@ CUES: dict[MotionKind, records.Cue] = {
 
 def sentence_of(
     grounding: Grounding,
-    kind: MotionKind,
+    kind: records.MotionKind,
     law: records.Law,
     direction: Vector | None,
     said: MotionRequest,
@@ -528,7 +519,7 @@ def along_trail(
 
 def motion_sentence(
     object: str,
-    kind: MotionKind,
+    kind: records.MotionKind,
     law: records.Law,
     direction: Vector | None,
     depth: float,

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
 from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import SeenThing
-from cow_service.readers.remedies import GIVE_PLACE
+from cow_service.readers.base import GIVE_PLACE, SeenThing
 from cow_service.records import BBox, GroundingRequest, LocatedObject, MaskRef, ObjectRequest, Reading, kept_mask
 from cow_service.requests import SimulateRequest
 from cow_service.stages.run import UNREADABLE, Run
@@ -104,7 +103,7 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
     scene, field = run.scene, field_of(pointer)
     outside = f"lies outside the upright image of {scene.width} x {scene.height} px"
     if given.mask is not None:
-        mask = _read_mask(run, given.mask, f"{pointer}/mask")
+        mask = read_mask(run, given.mask, f"{pointer}/mask")
         bbox = mask.bbox if given.bbox is None else given.bbox
         scene.preset_mask(bbox, mask.full)
         return Located.at(given, bbox, mask)
@@ -119,7 +118,7 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
         beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
         warnings = () if clipped == given.bbox else (beyond,)
         if run.can_segment:
-            return _outlined_box(run, given, clipped, field, warnings)
+            return outlined_box(run, given, clipped, field, warnings)
         return Located.at(given, clipped, warnings=warnings)
     x, y = given.point or (0.0, 0.0)
     if not (0 <= x < scene.width and 0 <= y < scene.height):
@@ -157,7 +156,7 @@ def _not_cut_out(detail: str, pointer: str) -> CannotGround:
     )
 
 
-def _outlined_box(
+def outlined_box(
     run: Run[SimulateRequest],
     given: GroundingRequest | ObjectRequest,
     bbox: BBox,
@@ -233,7 +232,7 @@ def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidReque
     return InvalidRequest(message, errors=(FieldError(pointer, detail),))
 
 
-def _read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> CroppedMask:
+def read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> CroppedMask:
     """The mask of the image that a request names. Raises `InvalidRequest`."""
     kept, image = kept_mask(given), run.image.info
 

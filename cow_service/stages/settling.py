@@ -55,25 +55,25 @@ def settle_way(
     if kind not in DIRECTED_KINDS or (read.direction is not None and read.direction_deviation is None):
         return read, ()
     taken = (
-        _by_trail(read, said, seen)
-        or _by_arrow(read, said, seen.arrow)
-        or _by_words(read, said, seen.goal, mover)
-        or _by_front(read, said, seen.front)
+        by_trail(read, said, seen)
+        or by_arrow(read, said, seen.arrow)
+        or by_words(read, said, seen.goal, mover)
+        or by_front(read, said, seen.front)
     )
     if taken is None:
         if read.direction is None:
-            return _by_drawing(read, said, seen), ()
+            return by_drawing(read, said, seen), ()
         if {said.along_arrow, read.along_arrow} != {True, False}:
             return read, ()
         told = "The question and the reading have it move to opposite ends of an arrow that is not seen."
         return read.model_copy(update={"other_direction": _turned(read.direction)}), (told,)
-    rival, objections = _rival_of(taken, read, said, seen, mover)
+    rival, objections = rival_of(taken, read, said, seen, mover)
     # A direction beside another one is no goal.
     update = {} if rival is None else {"other_direction": rival, "towards": None}
     return taken.model_copy(update=update), objections
 
 
-def _rival_of(
+def rival_of(
     taken: MotionRequest, read: MotionRequest, said: MotionRequest, seen: SeenWay, mover: BBox
 ) -> tuple[Vector | None, Objections]:
     """The direction that speaks against the one that was taken, and in which words it does."""
@@ -98,7 +98,7 @@ def _rival_of(
     return rival, tuple(objections)
 
 
-def _by_trail(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest | None:
+def by_trail(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest | None:
     """Measured, where the reading or the words go by the trail, and the words say nothing else."""
     told = said.has_way and said.cue != "trail"
     if told or seen.trail is None or "trail" not in (read.cue, said.cue):
@@ -110,7 +110,8 @@ def _by_trail(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> Motion
     return read.model_copy(update=update)
 
 
-def _by_arrow(read: MotionRequest, said: MotionRequest, arrow: Vector | None) -> MotionRequest | None:
+def by_arrow(read: MotionRequest, said: MotionRequest, arrow: Vector | None) -> MotionRequest | None:
+    """Along the arrow or against it, where one is meant."""
     is_open = read.direction is None and read.direction_deviation is not None and not said.has_way
     if arrow is None or not (said.along_arrow is not None or read.cue == "arrow" or is_open):
         return None
@@ -121,7 +122,8 @@ def _by_arrow(read: MotionRequest, said: MotionRequest, arrow: Vector | None) ->
     return _taken(read, arrow if along else _turned(arrow), "arrow", along=along)
 
 
-def _by_words(read: MotionRequest, said: MotionRequest, goal: BBox | None, mover: BBox) -> MotionRequest | None:
+def by_words(read: MotionRequest, said: MotionRequest, goal: BBox | None, mover: BBox) -> MotionRequest | None:
+    """As words say it, or towards the goal that they name."""
     is_beside_arrow = said.along_arrow is not None and read.direction_deviation is None  # which then must be seen
     if said.direction is not None and not is_beside_arrow:
         return _taken(read, said.direction, "text", depth=said.depth)
@@ -131,13 +133,14 @@ def _by_words(read: MotionRequest, said: MotionRequest, goal: BBox | None, mover
     return _taken(read, way, "text").model_copy(update={"towards": said.towards})
 
 
-def _by_front(read: MotionRequest, said: MotionRequest, front: Vector | None) -> MotionRequest | None:
+def by_front(read: MotionRequest, said: MotionRequest, front: Vector | None) -> MotionRequest | None:
+    """As it faces, where the words say forward or backward."""
     if front is None or said.forward is None:
         return None
     return _taken(read, front if said.forward else _turned(front), "orientation")
 
 
-def _by_drawing(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest:
+def by_drawing(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest:
     """Along the only arrow at the thing, where nothing at all is said; else as it was."""
     if said.has_way:
         return read
@@ -185,10 +188,10 @@ def settle_places(read: Reading, seen: SeenThings) -> tuple[Reading, Objections,
     last value says whether the mover's box was moved onto a thing.
     """
     mover = mover_of(read)
-    moved = _onto_regions(list(dict.fromkeys(box_of(each) for each in (mover, *read.objects))), seen.regions)
+    moved = onto_regions(list(dict.fromkeys(box_of(each) for each in (mover, *read.objects))), seen.regions)
     objections, doubtful = list[str](), set[BBox]()
     for thing in dict.fromkeys((mover, *read.objects)):
-        fault = _fault_of(thing, moved[box_of(thing)], seen)
+        fault = fault_of(thing, moved[box_of(thing)], seen)
         if fault is not None and thing.bbox not in doubtful:
             objections.append(fault)
             doubtful.add(box_of(thing))
@@ -218,7 +221,7 @@ def box_of(thing: GroundingRequest | ObjectRequest) -> BBox:
     return thing.bbox
 
 
-def _onto_regions(boxes: Sequence[BBox], regions: Sequence[Region]) -> dict[BBox, Region | None]:
+def onto_regions(boxes: Sequence[BBox], regions: Sequence[Region]) -> dict[BBox, Region | None]:
     """For each box the region that it is about: none of its edges is far off, and no other box fits it better."""
     pairs = [
         (iou(box, region.bbox), at, box, region)
@@ -240,7 +243,8 @@ def _is_about(box: BBox, region: BBox) -> bool:
     return all(abs(a - b) <= EDGE_OFF * side for a, b, side in zip(box, region, sides, strict=True))
 
 
-def _fault_of(thing: GroundingRequest | ObjectRequest, region: Region | None, seen: SeenThings) -> str | None:
+def fault_of(thing: GroundingRequest | ObjectRequest, region: Region | None, seen: SeenThings) -> str | None:
+    """What speaks against the place of a thing."""
     name, box = thing.object or "", box_of(thing)
     if region is None and box in seen.bare:
         return f"In the box of '{name}' nothing stands."

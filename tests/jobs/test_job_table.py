@@ -30,8 +30,7 @@ from cow_service.jobs.computing import Computer, EngineParts, JobOutcome, Work
 from cow_service.jobs.database import Database, StoredResult
 from cow_service.jobs.job_table import MAX_DEATHS, MAX_LISTED, VERSION, JobFilters, JobSpec, JobTable
 from cow_service.jobs.loop import JobLoop
-from cow_service.jobs.packing import packed
-from cow_service.jobs.schema import CALLS, JOBS
+from cow_service.jobs.schema import CALLS, JOBS, packed
 from cow_service.observability.metrics import Metrics
 from cow_service.settings import Settings
 

@@ -31,8 +31,7 @@ from cow_service.client import Client
 from cow_service.jobs import opening, schema
 from cow_service.jobs.database import Database
 from cow_service.jobs.job_table import JobSpec, JobTable
-from cow_service.jobs.packing import packed
-from cow_service.jobs.schema import METADATA, PROCESSES, SCHEMAS
+from cow_service.jobs.schema import METADATA, PROCESSES, SCHEMAS, packed
 from cow_service.media.artifacts import DiskArtifacts
 from cow_service.records import Answer, Simulation
 from cow_service.settings import Settings, SettingsError

@@ -16,8 +16,7 @@ from job_rows import add_job, open_database
 from servers import data_url
 
 from cow_service.jobs.database import Database, StoredResult
-from cow_service.jobs.packing import unpacked
-from cow_service.jobs.schema import JOBS, RESULTS, TRAJECTORIES
+from cow_service.jobs.schema import JOBS, RESULTS, TRAJECTORIES, unpacked
 from cow_service.records import Simulation
 from cow_service.service import Service
 from cow_service.settings import Settings

@@ -11,11 +11,10 @@ import numpy as np
 
 from cow_service.errors import CannotGround, listed
 from cow_service.physics.bodies import SeenBody, supports_of
-from cow_service.readers.base import SeenThing
+from cow_service.readers.base import GIVE_OBJECT, GIVE_PLACE, SeenThing
 from cow_service.readers.embedded.english.lexicon import COLOURS, GENERIC, PLACES, SETS, TABLES, ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import Kind, kind_of, may_name, parse_noun_phrase, prior_of
 from cow_service.readers.embedded.english.questions import Question
-from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import BBox, ObjectRequest
 from cow_service.vision import forms
 from cow_service.vision.masks import is_same_object, mask_iou

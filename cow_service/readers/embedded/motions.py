@@ -6,28 +6,15 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from cow_service import records
 from cow_service.errors import CannotGround, CannotReadDirection
 from cow_service.physics.camera import depth_motion, way_to
+from cow_service.readers.base import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
 from cow_service.readers.embedded.english.noun_phrases import kind_of, prior_of
 from cow_service.readers.embedded.english.questions import MotionWords, Question
 from cow_service.readers.embedded.matching import best_matches, match_one, unclear
-from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_PLACE
-from cow_service.records import (
-    DIRECTED_KINDS,
-    BBox,
-    Distance,
-    GroundingRequest,
-    MotionKind,
-    MotionRequest,
-    MotionStepRequest,
-    ObjectRequest,
-    OtherMotionRequest,
-    Speed,
-    SpeedWord,
-    Until,
-    Vector,
-)
+from cow_service.records import DIRECTED_KINDS, BBox, MotionKind, MotionRequest, ObjectRequest, Vector
 from cow_service.vision.masks import is_same_object
 from cow_service.vision.scene import Scene
 from cow_service.vision.trails import trail_of
@@ -64,7 +51,7 @@ def settled_kind(question: Question) -> MotionKind | None:
 
 def quantities(
     words: Sequence[QuantityWords], way: float | None, bbox: BBox
-) -> tuple[SpeedWord | Speed | None, Distance | None, float | None, Until | None]:
+) -> tuple[records.SpeedWord | records.Speed | None, records.Distance | None, float | None, records.Until | None]:
     """Speed, distance, duration (s) and end of one leg; `way`, px, is the distance to the goal; `bbox` is the mover's.
 
     Raises `CannotReadDirection`.
@@ -75,15 +62,15 @@ def quantities(
         if found.setdefault(what, each) != each:
             raise _refused(f"The question names more than one {what} of the motion.")
     speed, length, duration = (found.get(what) for what in ("speed", "distance", "duration"))
-    distance = None if length is None else Distance(value=length.value, unit="m" if length.is_metric else "px")
+    distance = None if length is None else records.Distance(value=length.value, unit="m" if length.is_metric else "px")
     if length is not None and length.what == "share" and way is None:
         raise _refused("The question says that it moves part of the way, but not where to.")
     if length is not None and length.what != "distance":
         whole = (way or 0.0) if length.what == "share" else bbox[2] - bbox[0]
-        distance = Distance(value=length.value * whole, unit="px")
+        distance = records.Distance(value=length.value * whole, unit="px")
     pace = None if speed is None else speed.pace
     if speed is not None and pace is None:
-        pace = Speed(value=speed.value, unit="m/s" if speed.is_metric else "px/s")
+        pace = records.Speed(value=speed.value, unit="m/s" if speed.is_metric else "px/s")
     return pace, distance, None if duration is None else duration.value, "contact" if "until" in found else None
 
 
@@ -94,21 +81,21 @@ def _way(motion: MotionWords, direction: Vector | None = None) -> tuple[Vector, 
     return depth_motion(motion.depth) if direction is None else (direction, motion.depth)
 
 
-def steps_of(steps: Sequence[MotionWords], bbox: BBox) -> tuple[MotionStepRequest, ...]:
+def steps_of(steps: Sequence[MotionWords], bbox: BBox) -> tuple[records.MotionStepRequest, ...]:
     """The legs behind the first of what has this box."""
-    found = list[MotionStepRequest]()
+    found = list[records.MotionStepRequest]()
     for step in steps:
         direction, depth = _way(step)
         _, distance, duration, _ = quantities(step.quantities, None, bbox)
-        found.append(MotionStepRequest(direction=direction, depth=depth, distance=distance, duration=duration))
+        found.append(records.MotionStepRequest(direction=direction, depth=depth, distance=distance, duration=duration))
     return tuple(found)
 
 
 def others_of(
     others: Sequence[tuple[ObjectPhrase, MotionWords]], scene: Scene, things: Sequence[ObjectRequest]
-) -> tuple[OtherMotionRequest, ...]:
+) -> tuple[records.OtherMotionRequest, ...]:
     """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
-    readings: list[OtherMotionRequest] = []
+    readings: list[records.OtherMotionRequest] = []
     for phrase, motion in others:
         found = next((each for each in things if each.object == phrase.text), None)
         if found is None or motion.steps or any(each.what != "speed" for each in motion.quantities):
@@ -119,11 +106,11 @@ def others_of(
             goal = None if motion.direction or motion.towards is None else motion.towards.text
             said |= {"towards": goal} if goal else dict(zip(("direction", "depth"), _way(motion), strict=True))
             said["speed"] = quantities(motion.quantities, None, found.bbox or (0.0, 0.0, 0.0, 0.0))[0]
-        readings.append(OtherMotionRequest.model_validate({"object": phrase.text, "kind": kind, **said}))
+        readings.append(records.OtherMotionRequest.model_validate({"object": phrase.text, "kind": kind, **said}))
     return tuple(readings)
 
 
-def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: GroundingRequest | ObjectRequest) -> None:
+def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: records.GroundingRequest | ObjectRequest) -> None:
     """Raises `CannotReadDirection` for what falls over where it stands, and for a fall of what may stand."""
     name = thing.object or ""
     region = None if thing.bbox is None else scene.region_of(thing.bbox)
@@ -197,7 +184,7 @@ def said_way(words: MotionWords, kind: MotionKind) -> dict[str, object]:
 
 
 def read_motion(
-    question: Question, scene: Scene, mover: GroundingRequest, things: Sequence[ObjectRequest]
+    question: Question, scene: Scene, mover: records.GroundingRequest, things: Sequence[ObjectRequest]
 ) -> MotionRequest:
     """How the mover moves by the words, without the image's say in which way. Raises `CannotReadDirection`."""
     words, name, bbox = question.motion, mover.object, mover.bbox or (0.0, 0.0, 0.0, 0.0)
@@ -233,7 +220,9 @@ def read_motion(
         raise _refused(f"How far, how fast or how long the {name} moves cannot be used: {fault['msg']}.") from error
 
 
-def goal_of(scene: Scene, phrase: ObjectPhrase, mover: GroundingRequest, things: Sequence[ObjectRequest]) -> BBox:
+def goal_of(
+    scene: Scene, phrase: ObjectPhrase, mover: records.GroundingRequest, things: Sequence[ObjectRequest]
+) -> BBox:
     """The box of the thing that the mover moves towards. Raises `CannotReadDirection`."""
     goal = next((each.bbox for each in things if each.object == phrase.text), None)
     besides = [each for each in scene.regions if not is_same_object(each.bbox, mover.bbox or each.bbox)]

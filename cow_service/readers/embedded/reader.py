@@ -7,13 +7,13 @@ from cow_service import __version__, records
 from cow_service.errors import CannotGround
 from cow_service.narration.words import phrases_of, same_name
 from cow_service.readers import base
+from cow_service.readers.base import GIVE_OBJECT, GIVE_PLACE
 from cow_service.readers.embedded import matching, motions
 from cow_service.readers.embedded.answers import MAX_UNREAD, answer_from
 from cow_service.readers.embedded.english import noun_phrases
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.questions import ChangeWords, Question, parse, rewordings
 from cow_service.readers.options import plain
-from cow_service.readers.remedies import GIVE_OBJECT, GIVE_PLACE
 from cow_service.settings import Settings
 from cow_service.vision.masks import is_among, is_same_object
 from cow_service.vision.regions import Region

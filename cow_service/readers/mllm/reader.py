@@ -10,7 +10,7 @@ from cow_service import __version__, records
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
 from cow_service.physics.camera import depth_motion
 from cow_service.readers import base
-from cow_service.readers.base import ReaderInput, ReadResult
+from cow_service.readers.base import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE, ReaderInput, ReadResult
 from cow_service.readers.chat import ChatTurn
 from cow_service.readers.mllm.answer import VOTING_TEMPERATURE, answer_calls
 from cow_service.readers.mllm.check import MllmCheck, check_model
@@ -22,7 +22,6 @@ from cow_service.readers.mllm.known import UNKNOWN, USUAL
 from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
-from cow_service.readers.remedies import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
