@@ -186,7 +186,7 @@ def fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: Seen
     if said.forward is not None:
         told = f"The question says that the {name} moves {'forward' if said.forward else 'backward'}."
         if grounding.prior is None or not grounding.prior.elongated:
-            return f"{told} The service sees only of vehicles with wheels which way they face."
+            return f"{told} Which way they face is seen of vehicles with wheels alone."
         return f"{told} Which way it faces could not be seen for certain."
     near = len(scene.arrows_near(grounding.bbox))
     return (

@@ -154,7 +154,7 @@ def test_options_become_fields_of_a_request(tmp_path: Path) -> None:
     path.write_text('{"points": [[1, 2], [3, 4]]}')
     depth = tmp_path / "depth.png"
     depth.write_bytes(b"png")
-    moving = {"box": "105, 155,195,245", "object": "it", "direction": "0,-1", "kind": "projectile", "speed": 50.0}
+    moving = {"box": "105, 155,195,245", "object": "it", "direction": "0,-1", "kind": "projectile", "speed": "50"}
     scene = {"other": ["blue cube=1,2,3,4", "a=b=5,6"], "remove": ["mug"], "depth": depth, "depth_scale": 0.001}
     place = ["apple in front of the bowl", "cube BETWEEN mug and vase"]
     own = {"option": ["steps=4", "mode=fast"], "request": '{"camera": {"pitch": 25}, "depth": {"focal": 240}}'}

@@ -37,7 +37,7 @@ PLAIN = {"image": "x", "question": "?"}
 
 def test_arguments_of_the_tools_are_flat() -> None:
     given = {"image", "question", "object", "bbox", "point", "direction", "motion_kind", "speed", "num_frames", "seed"}
-    given |= {"distance", "duration", "until", "remove", "place"}
+    given |= {"towards", "distance", "duration", "until", "remove", "place"}
     given |= {"asked", "law", "objects", "objects_complete", "frames_policy", "frames_count", "generator", "reader"}
     answer = {"options", "votes", "baseline", "imagine", "imagine_votes", "imagine_threshold"}
     for tool, names in (("simulate", given | {"video"}), ("answer", given | answer)):
