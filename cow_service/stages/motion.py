@@ -1,10 +1,10 @@
 """Stage 2: how the object moves."""
 
 import math
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,10 +30,8 @@ from cow_service.vision.trails import trail_of
 
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
 THROW_DEPTH_DEVIATION = 20.0  # degrees: words and arrows tell a throw's heading in the image alone
-SPEED_DEVIATIONS: dict[records.MotionKind, float] = {
-    "linear": 0.25,
-    "projectile": 0.28,
-}  # of the logarithm of a default speed
+# Of the logarithm of a default speed.
+SPEED_DEVIATIONS: dict[records.MotionKind, float] = {"linear": 0.25, "projectile": 0.28}
 SPEED_FACTORS: dict[records.SpeedWord, float] = {"slow": 0.5, "normal": 1.0, "fast": 2.0}  # of the default speed
 SCALE_DEVIATION = 0.25  # of the logarithm of metres per pixel, where nobody gave them
 ELSEWHERE_SIGMA = 0.3  # of the logarithm of a scale that is told by the size of what stands elsewhere
@@ -222,77 +220,77 @@ def given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReques
     return records.merged(given, told)
 
 
-def others_given(motion: MotionRequest, grounding: Grounding) -> list[tuple[records.OtherMotionRequest, LocatedObject]]:
-    """What else moves, each with the thing of its name. Raises `InvalidRequest` for one that was not located."""
-    found = list[tuple[records.OtherMotionRequest, LocatedObject]]()
-    for index, each in enumerate(motion.others):
-        things = [other for other in grounding.others if same_name(other.object, each.object)]
-        if len(things) != 1:
-            seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
-            pointer = f"/motion/others/{index}/object"
-            detail = f"'{each.object}' matches {len(things)} of the located objects ({seen})"
-            raise InvalidRequest(
-                f"`{field_of(pointer)}`: {detail}: give it in `objects` under this name.",
-                errors=(FieldError(pointer, detail),),
-            )
-        found.append((each, things[0]))
-    return found
+class SizeScale(NamedTuple):
+    """Metres per pixel at the mover, by the size of one thing."""
+
+    name: str
+    value: float
+    deviation: float  # of its logarithm
+    is_exact: bool
+
+
+def scales_by_size(grounding: Grounding, camera: FloorCamera, mover_in_air: bool) -> list[SizeScale]:
+    """By each thing of a known size. What stands elsewhere on the floor is nearer or farther than the mover."""
+    things = [LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior), *grounding.others]
+    feet = np.array([((x0 + x1) / 2, y1) for x0, _, x1, y1 in (each.bbox for each in things)])
+    depths = camera.floor_points(feet)[:, 2]
+    scales = list[SizeScale]()
+    for each, depth in zip(things, depths / depths[0], strict=True):
+        prior = each.prior
+        if prior is None or prior.size is None or not prior.size.value > 0:
+            continue
+        is_as_near = mover_in_air or prior.stands_on == "air" or not math.isfinite(depth)
+        value = prior.size.value / _longest_side(each.bbox) / (1.0 if is_as_near else float(depth))
+        deviation = prior.size.deviation / prior.size.value + ELSEWHERE_SIGMA * (each is not things[0])
+        scales.append(SizeScale(each.object, value, deviation, prior.size.deviation == 0))
+    return scales
 
 
 def scale_of(
     run: Run[SimulateRequest], grounding: Grounding, said: MotionRequest
-) -> tuple[records.MetresPerPixel | None, list[str]]:
+) -> tuple[records.MetresPerPixel, list[str]]:
     """Metres per pixel at the mover, and doubts: by a depth map in metres, else as given, else by sizes that are given,
-    else as read of it or others.
-
-    What stands elsewhere on the floor is nearer or farther, by the camera as far as it is known. None where nobody
-    says anything of it.
+    else as read of it or others, else of an image of the usual width.
     """
-    given = said.metres_per_pixel
-    told = {} if given is None else {"metres_per_pixel": given}
-    things = [LocatedObject(object=grounding.object, bbox=grounding.bbox, prior=grounding.prior), *grounding.others]
-    width, height = run.image.info.width, run.image.info.height
-    fit, depth_map = given_camera((width, height), said.down, run.request.camera, run.focal), run.depth
-    mapped = None
-    if depth_map is not None and run.request.law == "contact" and run.request.trajectory is None:
-        mapped = depth_map.metres_per_pixel(grounding.bbox, math.exp(fit.mean[1]) * width)
-    if mapped is not None:
-        told["the depth map, which is taken"] = mapped
+    request, given, width, height = run.request, said.metres_per_pixel, run.image.info.width, run.image.info.height
+    fit, depth_map, mapped = given_camera((width, height), said.down, request.camera, run.focal), run.depth, None
     camera = FloorCamera(width, height, math.exp(fit.mean[1]) * width, float(fit.mean[0]), fit.roll, 1.0)
-    depths = camera.floor_points(np.array([((x0 + x1) / 2, y1) for x0, _, x1, y1 in (each.bbox for each in things)]))
-    sizes: list[tuple[float, float, bool]] = []  # log of the metres per pixel at the mover, deviation, taken as exact
-    for each, depth in zip(things, depths[:, 2] / depths[0, 2], strict=True):
-        size = None if each.prior is None else each.prior.size
-        if size is None or not size.value > 0:
-            continue
-        in_air = said.kind in records.FALLING_KINDS or (each.prior is not None and each.prior.stands_on == "air")
-        nearer = 1.0 if in_air or not math.isfinite(depth) else float(depth)
-        x0, y0, x1, y1 = each.bbox
-        value = size.value / max(x1 - x0, y1 - y0) / nearer
-        elsewhere = 0.0 if each is things[0] else ELSEWHERE_SIGMA
-        sizes.append((math.log(value), size.deviation / size.value + elsewhere, size.deviation == 0))
-        told[f"the size of '{each.object}'"] = value
-    doubts: list[str] = []
-    if told and max(told.values()) > MOST_APART * min(told.values()):
-        listed = ", ".join(f"{value:.4g} by {name}" for name, value in told.items())
-        doubts = [f"The given sizes disagree by more than a factor of two, in metres per pixel: {listed}."]
+    if depth_map is not None and request.law == "contact" and request.trajectory is None:
+        mapped = depth_map.metres_per_pixel(grounding.bbox, camera.focal)
+    sizes = scales_by_size(grounding, camera, said.kind in records.FALLING_KINDS)
+    told = {"metres_per_pixel": given, "the depth map, which is taken": mapped}
+    told |= {f"the size of '{each.name}'": each.value for each in sizes}
+    doubts = scale_doubts({name: value for name, value in told.items() if value is not None})
+    is_given = request.motion is not None and request.motion.metres_per_pixel is not None
     if mapped is not None:
         return records.MetresPerPixel(value=mapped, source="depth"), doubts
-    exact = [each for each in sizes if each[2]]
-    is_read = run.request.motion is None or run.request.motion.metres_per_pixel is None
-    if given is not None and not (is_read and exact):
-        x0, y0, x1, y1 = grounding.bbox
-        span = max(x1 - x0, y1 - y0)
-        if not is_read:
-            return records.MetresPerPixel(value=given, source="request"), doubts
+    if given is not None and is_given:
+        return records.MetresPerPixel(value=given, source="request"), doubts
+    if given is not None and not any(each.is_exact for each in sizes):
+        span = _longest_side(grounding.bbox)
         note = f"{grounding.object}: {given * span:.3g} m over {span:.0f} px"
         return records.MetresPerPixel(value=given, source="reference", note=note), doubts
-    if not sizes:
-        return None, doubts
-    weights = np.array([1 / (deviation + LEAST_SIZE_SIGMA) ** 2 for _, deviation, _ in exact or sizes])
-    value = math.exp(float(weights @ [each[0] for each in exact or sizes] / weights.sum()))
+    if sizes:
+        return mean_scale(sizes), doubts
+    note = f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object"
+    return records.MetresPerPixel(value=DEFAULT_SCENE_WIDTH / width, source="default", note=note), doubts
+
+
+def scale_doubts(told: dict[str, float]) -> list[str]:
+    """What speaks against scales, metres per pixel by what tells them: that they contradict each other."""
+    if not told or max(told.values()) <= MOST_APART * min(told.values()):
+        return []
+    listed = ", ".join(f"{value:.4g} by {name}" for name, value in told.items())
+    return [f"The given sizes disagree by more than a factor of two, in metres per pixel: {listed}."]
+
+
+def mean_scale(sizes: list[SizeScale]) -> records.MetresPerPixel:
+    """The weighted mean of the scales that are exact, else of all."""
+    exact = [each for each in sizes if each.is_exact]
+    weights = np.array([1 / (each.deviation + LEAST_SIZE_SIGMA) ** 2 for each in exact or sizes])
+    value = math.exp(float(weights @ [math.log(each.value) for each in exact or sizes] / weights.sum()))
     source = "request" if exact else "reference"
-    return records.MetresPerPixel(value=value, source=source, note="by the sizes of objects"), doubts
+    return records.MetresPerPixel(value=value, source=source, note="by the sizes of objects")
 
 
 def is_up_the_floor(reading: MotionRequest, grounding: Grounding, law: records.Law) -> bool:
@@ -307,17 +305,14 @@ def is_up_the_floor(reading: MotionRequest, grounding: Grounding, law: records.L
 # --- in pixels and seconds
 
 
-def throw_speed(bbox: BBox, scale: records.MetresPerPixel) -> float:
-    """px/s of a throw whose speed nobody gave: v^2 / (g R) as of a toy of radius 0.15 m thrown at 1.8 m/s.
-
-    How far it gets in the image, in its own radii, does then not depend on the scale, which is uncertain.
-    """
-    return math.sqrt(THROW_SPEED**2 / (GRAVITY * THROW_RADIUS) * (GRAVITY / scale.value) * _radius(bbox))
-
-
 def _radius(bbox: BBox) -> float:
     x0, y0, x1, y1 = bbox
     return (x1 - x0 + y1 - y0) / 4  # px
+
+
+def _longest_side(bbox: BBox) -> float:
+    x0, y0, x1, y1 = bbox
+    return max(x1 - x0, y1 - y0)  # px
 
 
 def _unit(vector: Vector) -> Vector:
@@ -325,168 +320,170 @@ def _unit(vector: Vector) -> Vector:
     return vector[0] / length, vector[1] / length
 
 
-def _pixels(said: float | records.Quantity, scale: records.MetresPerPixel, image_width: int) -> float:
-    """px, or px/s."""
-    value, unit = (said.value, said.unit) if isinstance(said, records.Quantity) else (said, "px")
-    match unit:
-        case "px" | "px/s":
-            return value
-        case "m" | "m/s":
-            return value / scale.value
-        case "widths" | "widths/s":
-            return value * image_width
+@dataclass(frozen=True)
+class Units:
+    """Turns what is said of lengths and speeds into pixels and seconds."""
+
+    scale: records.MetresPerPixel
+    image_width: int
+    law: records.Law
+
+    def pixels(self, said: float | records.Quantity) -> float:
+        """px, or px/s."""
+        value, unit = (said.value, said.unit) if isinstance(said, records.Quantity) else (said, "px")
+        match unit:
+            case "px" | "px/s":
+                return value
+            case "m" | "m/s":
+                return value / self.scale.value
+            case "widths" | "widths/s":
+                return value * self.image_width
+
+    def length(self, said: records.AnyDistance | None) -> float | None:
+        """px; none where none is said."""
+        return None if said is None else self.pixels(said)
+
+    def way_of(
+        self, said: MotionRequest | records.OtherMotionRequest, bbox: BBox, usual_deviation: float
+    ) -> dict[str, Any]:
+        """The fields of a motion that tell which way and how fast what is in a box sets out."""
+        speed, deviation = self.speed_of(said, bbox)
+        return {
+            "kind": said.stated_kind or "linear",
+            "direction": None if said.direction is None else _unit(said.direction),
+            "direction_deviation": usual_deviation if said.direction_deviation is None else said.direction_deviation,
+            "depth": said.depth,
+            "speed": speed,
+            "speed_deviation": deviation if said.speed_deviation is None else said.speed_deviation,
+        }
+
+    def speed_of(self, said: MotionRequest | records.OtherMotionRequest, bbox: BBox) -> tuple[float, float]:
+        """Speed (px/s) of what is in a box, and the deviation of its logarithm; kinds without a direction have none.
+
+        A throw whose speed nobody gave has v^2 / (g R) as of a toy of radius 0.15 m thrown at 1.8 m/s: how far it gets
+        in the image, in its own radii, does then not depend on the scale, which is uncertain.
+        """
+        kind, speed = said.stated_kind or "linear", said.speed
+        if kind not in DIRECTED_KINDS:
+            return 0.0, 0.0
+        if speed is not None and not isinstance(speed, str):
+            is_assumed = isinstance(speed, records.Quantity) and speed.unit == "m/s" and self.scale.source == "default"
+            return self.pixels(speed), SCALE_DEVIATION if is_assumed else 0.0
+        usual = DEFAULT_SPEED * self.image_width
+        if kind == "projectile" and self.law == "contact":
+            gravity = GRAVITY / self.scale.value  # px/s^2
+            usual = math.sqrt(THROW_SPEED**2 / (GRAVITY * THROW_RADIUS) * gravity * _radius(bbox))
+        return usual * SPEED_FACTORS[speed or "normal"], SPEED_DEVIATIONS[kind]
 
 
-def speed_of(
-    said: MotionRequest | records.OtherMotionRequest,
-    bbox: BBox,
-    scale: records.MetresPerPixel,
-    law: records.Law,
-    image_width: int,
-) -> tuple[float, float]:
-    """Speed (px/s) of what is in a box, and the deviation of its logarithm; kinds without a direction have none."""
-    kind = said.stated_kind or "linear"
-    if kind not in DIRECTED_KINDS:
-        return 0.0, 0.0
-    if said.speed is not None and not isinstance(said.speed, str):
-        is_metric = isinstance(said.speed, records.Quantity) and said.speed.unit == "m/s"
-        deviation = SCALE_DEVIATION if is_metric and scale.source == "default" else 0.0
-        return _pixels(said.speed, scale, image_width), deviation
-    usual = DEFAULT_SPEED * image_width
-    if kind == "projectile" and law == "contact":
-        usual = throw_speed(bbox, scale)
-    return usual * SPEED_FACTORS[said.speed or "normal"], SPEED_DEVIATIONS[kind]
+def goal_of(grounding: Grounding, name: str | None) -> LocatedObject | None:
+    """The thing of that name which something moves towards."""
+    things = (LocatedObject(object=grounding.object, bbox=grounding.bbox), *others_of(grounding))
+    return next((each for each in things if name is not None and same_name(each.object, name)), None)
 
 
-def other_motion(
-    said: records.OtherMotionRequest,
-    thing: LocatedObject,
-    goal: LocatedObject | None,
-    scale: records.MetresPerPixel,
-    law: records.Law,
-    image_width: int,
-    usual_deviation: float,
-) -> records.AlsoMoving:
-    """What another thing does."""
-    speed, deviation = speed_of(said, thing.bbox, scale, law, image_width)
-    direction = None if goal is None else way_to(goal.bbox, thing.bbox, is_on_floor=False)
-    direction = said.direction or direction
-    return records.AlsoMoving(
-        object=thing,
-        kind=said.stated_kind,
-        direction=None if direction is None else _unit(direction),
-        direction_deviation=usual_deviation if said.direction_deviation is None else said.direction_deviation,
-        depth=said.depth,
-        towards=goal,
-        speed=speed,
-        speed_deviation=deviation if said.speed_deviation is None else said.speed_deviation,
-    )
+def others_moving(
+    grounding: Grounding, said: MotionRequest, units: Units, usual_deviation: float
+) -> tuple[records.AlsoMoving, ...]:
+    """What else moves, and how. Raises `InvalidRequest` for what was not located."""
+    moving = list[records.AlsoMoving]()
+    for index, each in enumerate(said.others):
+        things = [other for other in grounding.others if same_name(other.object, each.object)]
+        if len(things) != 1:
+            seen = ", ".join(f"'{other.object}'" for other in grounding.others) or "none"
+            pointer = f"/motion/others/{index}/object"
+            detail = f"'{each.object}' matches {len(things)} of the located objects ({seen})"
+            raise InvalidRequest(
+                f"`{field_of(pointer)}`: {detail}: give it in `objects` under this name.",
+                errors=(FieldError(pointer, detail),),
+            )
+        goal, way = goal_of(grounding, each.towards), units.way_of(each, things[0].bbox, usual_deviation)
+        if goal is not None and each.direction is None:
+            way["direction"] = _unit(way_to(goal.bbox, things[0].bbox, is_on_floor=False))
+        moving.append(records.AlsoMoving(object=things[0], towards=goal, **way))
+    return tuple(moving)
 
 
 def completed(
     run: Run[SimulateRequest],
     grounding: Grounding,
     said: MotionRequest,
-    scale: records.MetresPerPixel | None,
+    scale: records.MetresPerPixel,
     source: records.Source,
 ) -> Motion:
     """The motion with what nobody said of it: scale, speed, deviations, gravity and the sentence."""
-    image_width, law, kind = run.image.info.width, run.request.law, said.stated_kind or "linear"
-    scale = scale or records.MetresPerPixel(
-        value=DEFAULT_SCENE_WIDTH / image_width,
-        source="default",
-        note=f"the image is taken to be {DEFAULT_SCENE_WIDTH:g} m wide at the object",
-    )
-    moves, falls = kind in DIRECTED_KINDS, kind in records.FALLING_KINDS
+    kind, units = said.stated_kind or "linear", Units(scale, run.image.info.width, run.request.law)
     cue = said.cue or ("request" if source == "request" else CUES.get(kind, "text"))
-    speed, speed_deviation = speed_of(said, grounding.bbox, scale, law, image_width)
     usual = DIRECTION_DEVIATIONS[cue]
-    things = (LocatedObject(object=grounding.object, bbox=grounding.bbox), *others_of(grounding))
-
-    def goal_of(name: str | None) -> LocatedObject | None:
-        return next((each for each in things if name is not None and same_name(each.object, name)), None)
-
-    # A direction in the image leaves open how far a throw leads into its depth.
-    is_open = kind == "projectile" and not (source == "request" and "depth" in said.model_fields_set)
-    depth_deviation = said.depth_deviation if said.depth_deviation is not None else THROW_DEPTH_DEVIATION * is_open
     steps = tuple(
         records.MotionStep(
             direction=_unit(step.direction),
             depth=step.depth,
-            distance=None if step.distance is None else _pixels(step.distance, scale, image_width),
+            distance=units.length(step.distance),
             duration=step.duration,
         )
         for step in said.steps
     )
-    others = tuple(
-        other_motion(each, thing, goal_of(each.towards), scale, law, image_width, said.direction_deviation or usual)
-        for each, thing in others_given(said, grounding)
-    )
-    gravity, towards, down = GRAVITY / scale.value, goal_of(said.towards), _unit(said.down)  # px/s^2
-    direction = None if said.direction is None or not moves else _unit(said.direction)
-    return Motion(
-        kind=kind,
-        law=law,
-        direction=direction,
-        direction_deviation=usual if said.direction_deviation is None else said.direction_deviation,
+    way = units.way_of(said, grounding.bbox, usual)
+    if kind in DIRECTED_KINDS:
+        # A direction in the image leaves open how far a throw leads into its depth.
+        is_open = kind == "projectile" and not (source == "request" and "depth" in said.model_fields_set)
+        usual_depth = THROW_DEPTH_DEVIATION if is_open else 0.0
+        way["depth_deviation"] = usual_depth if said.depth_deviation is None else said.depth_deviation
+        way["towards"] = goal_of(grounding, said.towards)
+    else:
+        way |= {"direction": None, "depth": 0.0, "speed_deviation": 0.0}
+    down, gravity = _unit(said.down), GRAVITY / scale.value if kind in records.FALLING_KINDS else 0.0  # px/s^2
+    motion = Motion(
+        **way,
+        law=run.request.law,
         other_direction=None if said.other_direction is None else _unit(said.other_direction),
-        depth=said.depth if moves else 0.0,
-        depth_deviation=depth_deviation if moves else 0.0,
-        towards=towards if moves else None,
         rises=said.rises and kind == "linear",
         cue=cue,
         along_arrow=said.along_arrow,
-        speed=speed,
-        speed_deviation=speed_deviation if said.speed_deviation is None or not moves else said.speed_deviation,
-        distance=None if said.distance is None else _pixels(said.distance, scale, image_width),
+        distance=units.length(said.distance),
         duration=said.duration,
         until=said.until,
         steps=steps,
-        others=others,
-        gravity=(down[0] * gravity, down[1] * gravity) if falls else (0.0, 0.0),
+        others=others_moving(grounding, said, units, said.direction_deviation or usual),
+        gravity=(down[0] * gravity, down[1] * gravity),
         down=down,
         metres_per_pixel=scale,
-        sentence=sentence_of(grounding, kind, law, direction, said, steps, others),
+        sentence="",
         source=source,
     )
+    return motion.model_copy(update={"sentence": motion_sentence(motion, grounding, said.towards)})
 
 
-CUES: dict[records.MotionKind, records.Cue] = {
-    "fall": "gravity",
-    "projectile": "gravity",
-}  # of a motion whose direction none tells
+# The cue of a motion whose direction nothing tells.
+CUES: dict[records.MotionKind, records.Cue] = {"fall": "gravity", "projectile": "gravity"}
 
 
-def sentence_of(
-    grounding: Grounding,
-    kind: records.MotionKind,
-    law: records.Law,
-    direction: Vector | None,
-    said: MotionRequest,
-    steps: Sequence[records.MotionStep],
-    others: Sequence[records.AlsoMoving],
-) -> str:
-    """The motion in one line."""
-    placed, told = placed_mover(grounding), None
-    if placed is not None and kind == "place":
-        told = f"The {bare_name(grounding.object)} is lifted, carried over and put {place_words(placed)}"
-    also: list[str] = []
-    for other in others:
+def motion_sentence(motion: Motion, grounding: Grounding, towards: str | None = None) -> str:
+    """The motion in one declarative line, and that the camera stays; `towards` names its goal.
+
+    What obeys contacts only sets off that way: it may be stopped, turned or pushed later.
+    """
+    name, placed, sentence = bare_name(grounding.object), placed_mover(grounding), ""
+    if placed is not None and motion.kind == "place":
+        sentence = f"The {name} is lifted, carried over and put {place_words(placed)}."
+    also = list[str]()
+    for other in motion.others:
         verb = {"projectile": "is thrown", "fall": "falls", "static": "stays where it is"}.get(other.kind, "moves")
         way = "" if other.kind in ("fall", "static") else direction_words(other.direction, other.depth)
         also.append(f"{bare_name(other.object.object)} {verb} {way}".rstrip())
-    return motion_sentence(
-        grounding.object,
-        kind,
-        law,
-        direction,
-        said.depth,
-        told,
-        towards=said.towards,
-        further=[direction_words(step.direction, step.depth) for step in steps],
-        stops=any(value is not None for value in (said.distance, said.duration, said.until)),
+    words = direction_words(motion.direction, motion.depth) if towards is None else f"towards the {bare_name(towards)}"
+    text = load_prompt("motion-sentence").render(
+        object=name,
+        kind=motion.kind,
+        law=motion.law,
+        words=words,
+        sentence=sentence,
+        further=[direction_words(step.direction, step.depth) for step in motion.steps],
+        stops=any(value is not None for value in (motion.distance, motion.duration, motion.until)),
         also=also,
     )
+    return " ".join(text.split())
 
 
 def along_trail(
@@ -515,33 +512,3 @@ def along_trail(
         square = throw.froude * GRAVITY * _radius(grounding.bbox) / motion.metres_per_pixel.value
         measured |= {"speed": math.sqrt(square), "speed_deviation": min(throw.speed_deviation, 3.0)}
     return motion.model_copy(update=measured)
-
-
-def motion_sentence(
-    object: str,
-    kind: records.MotionKind,
-    law: records.Law,
-    direction: Vector | None,
-    depth: float,
-    sentence: str | None = None,
-    towards: str | None = None,
-    further: Sequence[str] = (),
-    stops: bool = False,
-    also: Sequence[str] = (),
-) -> str:
-    """The motion in one line: a declarative `sentence` of a reader, or one made here; and that the camera stays.
-
-    What obeys contacts only sets off that way: it may be stopped, turned or pushed later. `towards` names its goal,
-    `further` are the directions of more legs in words, `also` what else moves, such as "car moves to the left".
-    """
-    text = load_prompt("motion-sentence").render(
-        object=bare_name(object),
-        kind=kind,
-        law=law,
-        words=direction_words(direction, depth) if towards is None else f"towards the {bare_name(towards)}",
-        sentence="" if sentence is None else sentence.strip().rstrip(".") + ".",
-        further=further,
-        stops=stops,
-        also=also,
-    )
-    return " ".join(text.split())

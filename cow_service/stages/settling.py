@@ -24,6 +24,7 @@ Objections = tuple[str, ...]
 
 APART = 2.0  # spreads between two sources from which they contradict each other
 FORWARD: Vector = (0.0, 1.0)  # which way, where something moves and nothing tells which
+SOURCES: dict[records.Cue, str] = {"arrow": "the arrow drawn at the object", "orientation": "its front"}  # in words
 WORDS_APART = 60.0  # degrees between a drawn arrow and a direction in words, which is a rough one: "to the right"
 
 
@@ -61,12 +62,7 @@ def settle_way(
         or by_front(read, said, seen.front)
     )
     if taken is None:
-        if read.direction is None:
-            return by_drawing(read, said, seen), ()
-        if {said.along_arrow, read.along_arrow} != {True, False}:
-            return read, ()
-        told = "The question and the reading have it move to opposite ends of an arrow that is not seen."
-        return read.model_copy(update={"other_direction": _turned(read.direction)}), (told,)
+        return as_drawn(read, said, seen)
     rival, objections = rival_of(taken, read, said, seen, mover)
     # A direction beside another one is no goal.
     update = {} if rival is None else {"other_direction": rival, "towards": None}
@@ -78,24 +74,31 @@ def rival_of(
 ) -> tuple[Vector | None, Objections]:
     """The direction that speaks against the one that was taken, and in which words it does."""
     rival, objections, way = None, list[str](), taken.direction or FORWARD
+    is_arrow, is_estimate = taken.cue == "arrow", read.direction_deviation is not None
     goal = None if seen.goal is None else way_to(seen.goal, mover, is_on_floor=read.kind == "linear")
     words = said.direction or goal
-    if taken.cue == "arrow" and words is not None and angle(words, way) > WORDS_APART:
+    if is_arrow and words is not None and angle(words, way) > WORDS_APART:
         objections.append("The question's words for the direction contradict the arrow drawn at the object.")
         rival = words
-    is_estimate = read.direction_deviation is not None
-    if is_estimate and taken.cue == "arrow" and not said.has_way and read.along_arrow is None and not read.direction:
+    if is_arrow and is_estimate and not said.has_way and read.along_arrow is None and read.direction is None:
         objections.append("Nothing tells whether it moves along the arrow drawn at it or against it.")
         rival = _turned(way)
-    off = 0.0 if read.direction is None or taken.cue == "trail" else angle(read.direction, way)
-    if off > APART * math.hypot(read.direction_deviation or 0.0, DIRECTION_DEVIATIONS[taken.cue or "text"]):
-        source = {"arrow": "the arrow drawn at the object", "orientation": "its front"}.get(taken.cue or "", "")
-        source = source or "the question"
-        if taken.cue == "arrow" and said.along_arrow is not None:
-            source += f", which the question has it move {'along' if said.along_arrow else 'against'},"
-        objections.append(f"The direction that was read is {off:.0f} degrees off what {source} says.")
+    if fault := reading_fault(taken, read, said):
+        objections.append(fault)
         rival = read.direction
     return rival, tuple(objections)
+
+
+def reading_fault(taken: MotionRequest, read: MotionRequest, said: MotionRequest) -> str:
+    """That the direction that was read is far from the one that was taken; empty where it is not."""
+    cue = taken.cue or "text"
+    off = 0.0 if read.direction is None or cue == "trail" else angle(read.direction, taken.direction or FORWARD)
+    if off <= APART * math.hypot(read.direction_deviation or 0.0, DIRECTION_DEVIATIONS[cue]):
+        return ""
+    source = SOURCES.get(cue, "the question")
+    if cue == "arrow" and said.along_arrow is not None:
+        source += f", which the question has it move {'along' if said.along_arrow else 'against'},"
+    return f"The direction that was read is {off:.0f} degrees off what {source} says."
 
 
 def by_trail(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest | None:
@@ -140,11 +143,15 @@ def by_front(read: MotionRequest, said: MotionRequest, front: Vector | None) -> 
     return _taken(read, front if said.forward else _turned(front), "orientation")
 
 
-def by_drawing(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> MotionRequest:
-    """Along the only arrow at the thing, where nothing at all is said; else as it was."""
-    if said.has_way:
-        return read
-    return read if seen.arrow is None or not seen.is_only_arrow else _taken(read, seen.arrow, "arrow", along=True)
+def as_drawn(read: MotionRequest, said: MotionRequest, seen: SeenWay) -> tuple[MotionRequest, Objections]:
+    """As it was read; along the only arrow at the thing, where nothing at all is said."""
+    if read.direction is None:
+        is_led = seen.is_only_arrow and not said.has_way
+        return _taken(read, seen.arrow, "arrow", along=True) if seen.arrow and is_led else read, ()
+    if {said.along_arrow, read.along_arrow} != {True, False}:
+        return read, ()
+    told = "The question and the reading have it move to opposite ends of an arrow that is not seen."
+    return read.model_copy(update={"other_direction": _turned(read.direction)}), (told,)
 
 
 def _turned(way: Vector) -> Vector:
@@ -292,32 +299,40 @@ def settle_question(
         return read, ()
     objections, names = list[str](), [mover_of(read).object or "", *(each.object for each in read.objects)]
     if asked is not None and not is_given:
+        differ = differences(asked, plain, names, words)
+        told = (f"`{name}` {_shown(getattr(plain, name))}, not {_shown(getattr(asked, name))}" for name in differ)
+        objections += [f"By its words the question asks with {', '.join(told)}."] if differ else []
         # What is left at its default was not said: the words complete it.
-        usual = records.Asked(relation=asked.relation)
-        differ = [name for name in PLAIN if getattr(asked, name) != getattr(plain, name)]
-        differ += [name for name in DETAILS if getattr(asked, name) not in (getattr(usual, name), getattr(plain, name))]
-        followed = asked.model_copy(update={name: getattr(plain, name) for name in (*PLAIN, *DETAILS)})
-        for name in ("subject", "target"):
-            wanted, taken = getattr(plain, name), getattr(asked, name)
-            if wanted is None or taken is None:
-                # The place that something is put into tells what it is to be inside of.
-                differs = wanted is not taken and not (wanted is None and asked.relation == "inside")
-            else:
-                differs = not _is_meant(wanted, taken, names, words)
-            differ += [name] if differs else []
-        if len(plain.among) > 1 and not _are_meant(plain.among, asked.among, names, words):
-            differ.append("among")
-        if differ:
-            told = (f"`{name}` {_shown(getattr(plain, name))}, not {_shown(getattr(asked, name))}" for name in differ)
-            objections.append(f"By its words the question asks with {', '.join(told)}.")
-        asked = followed
-    removed = tuple(each.object for each in said.reading.interventions if each.kind == "remove")
-    taken = tuple(each.object for each in read.interventions if each.kind == "remove")
-    if not _are_meant(removed, taken, names, words):
-        told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in (removed, taken)]
-        objections.append(f"By its words the question takes {told[0]} away beforehand, and {told[1]} was read.")
+        asked = asked.model_copy(update={name: getattr(plain, name) for name in (*PLAIN, *DETAILS)})
+    objections += removal_faults(read, said.reading, names, words)
     update = {"asked": asked or plain, "question_is_doubtful": read.question_is_doubtful or bool(objections)}
     return read.model_copy(update=update), tuple(objections)
+
+
+def differences(asked: records.Asked, plain: records.Asked, names: Sequence[str], words: WordReader) -> list[str]:
+    """The fields in which what was read to be asked is not what the words `plain`ly ask."""
+    usual = records.Asked(relation=asked.relation)
+    differ = [name for name in PLAIN if getattr(asked, name) != getattr(plain, name)]
+    differ += [name for name in DETAILS if getattr(asked, name) not in (getattr(usual, name), getattr(plain, name))]
+    for name in ("subject", "target"):
+        wanted, taken = getattr(plain, name), getattr(asked, name)
+        if wanted is not None and taken is not None:
+            is_same = _is_meant(wanted, taken, names, words)
+        else:  # the place that something is put into tells what it is to be inside of
+            is_same = wanted is taken or (wanted is None and asked.relation == "inside")
+        differ += [] if is_same else [name]
+    if len(plain.among) > 1 and not _are_meant(plain.among, asked.among, names, words):
+        differ.append("among")
+    return differ
+
+
+def removal_faults(read: Reading, said: Reading, names: Sequence[str], words: WordReader) -> list[str]:
+    """That the words take away other things than was read."""
+    removed, taken = ([each.object for each in of.interventions if each.kind == "remove"] for of in (said, read))
+    if _are_meant(removed, taken, names, words):
+        return []
+    told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in (removed, taken)]
+    return [f"By its words the question takes {told[0]} away beforehand, and {told[1]} was read."]
 
 
 def _is_meant(wanted: str, taken: str, names: Sequence[str], words: WordReader) -> bool:

@@ -14,7 +14,7 @@ from jinja2.exceptions import SecurityError
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import Prompt, load_prompt, parse_prompt
-from cow_service.records import Asked, Speed
+from cow_service.records import Asked, Grounding, MetresPerPixel, Motion, Speed
 from cow_service.stages.motion import motion_sentence
 from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import PROMPTS, load_families
@@ -152,9 +152,16 @@ def test_a_file_without_a_whole_number_as_its_version_is_no_prompt(head: str | N
 
 
 def test_the_sentence_of_a_motion_is_one_line_that_names_the_object_and_says_what_stops_it() -> None:
+    ball = Grounding(object="the orange\n ball", point=(5, 5), bbox=(0, 0, 10, 10), source="request")
+    scale = MetresPerPixel(value=0.01, source="default")
+    motion = Motion(
+        kind="linear", law="contact", direction=(1.0, 0.0), cue="text", speed=9, metres_per_pixel=scale, sentence="",
+        source="request",
+    )  # fmt: skip
     for kind in ("linear", "projectile", "fall", "static"):
-        sentence = motion_sentence("the orange\n ball", kind, "contact", (1.0, 0.0), 0.0)
+        sentence = motion_sentence(motion.model_copy(update={"kind": kind}), ball)
         assert sentence.startswith("The orange ball ")
         assert len(sentence.splitlines()) == 1
         assert "constant speed" not in sentence
-    assert "constant speed" in motion_sentence("ball", "linear", "ballistic", (1.0, 0.0), 0.0), "nothing stops it"
+    ballistic = motion_sentence(motion.model_copy(update={"law": "ballistic"}), ball)
+    assert "constant speed" in ballistic, "nothing stops it"
