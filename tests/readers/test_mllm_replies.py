@@ -277,7 +277,7 @@ def test_a_size_is_a_number_in_metres(written: object, metres: float | None) -> 
     from cow_service.readers.mllm.locate import read_scale
 
     assert read_scale(json.dumps({"metres": written, "down": "Left"})).metres == metres
-    assert read_scale(json.dumps({"metres": written, "down": "Left"})).down == "left"
+    assert read_scale(json.dumps({"metres": written, "down": "Left"})).down == (-1, 0)
 
 
 @pytest.mark.parametrize("written", [3000, 0, -1, 10**400, True, "3 km", [0.1, 0.2], "large"])

@@ -99,7 +99,7 @@ def test_a_prompt_asks_for_the_fields_of_its_schema_and_shows_a_reply_that_is_re
         ("vase", pytest.approx((448, 144, 512, 288), abs=0.7))
     ]
     assert [*itertools.chain(*found.line.ends)] == pytest.approx([160, 264, 576, 264], abs=0.7)
-    assert (found.line.along_arrow, scale.metres, scale.down) == (True, 0.067, "bottom")
+    assert (found.line.along_arrow, scale.metres, scale.down) == (True, 0.067, (0, 1))
 
 
 def test_only_a_question_with_a_number_is_searched_for_speeds_and_lengths() -> None:

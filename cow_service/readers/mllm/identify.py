@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, Self, get_args
 
@@ -140,6 +140,12 @@ class Change(replies.Reply):
     relation: Annotated[records.PlaceRelation | None, _PLACE_RELATION] = None
     targets: Annotated[tuple[str, ...], *_names(2)] = ()
 
+    @property
+    def as_said(self) -> records.InterventionRequest:
+        """As a request says it."""
+        place = {"relation": self.relation, "targets": self.targets} if self.kind == "place" else {}
+        return records.InterventionRequest.model_validate({"kind": self.kind, "object": self.object, **place})
+
     @pydantic.model_validator(mode="after")
     def _check_place(self) -> Self:
         count = 2 if self.relation == "between" else 1
@@ -156,6 +162,14 @@ class Leg(replies.Reply):
     way: Annotated[tuple[records.Vector, float], *_WAY]
     distance: Distance = None
     duration: Seconds = None
+
+    @property
+    def as_said(self) -> records.MotionStepRequest:
+        """As a request says it."""
+        direction, depth = self.way
+        return records.MotionStepRequest(
+            direction=direction, depth=depth, distance=self.distance, duration=self.duration
+        )
 
 
 class AlsoMoving(replies.Reply):
@@ -260,23 +274,24 @@ class Identified(replies.Reply):
     @property
     def motion(self) -> dict[str, Any]:
         """Fields of a motion, as far as the reply says them."""
-        steps = (
-            {"direction": each.way[0], "depth": each.way[1], "distance": each.distance, "duration": each.duration}
-            for each in self.then
-        )
+        if not self.object:
+            return {}
         kind = self.kind or "linear"
-        said = (name for name in SAID_ALIKE if name != "speed" or kind in records.DIRECTED_KINDS)
+        said = [name for name in SAID_ALIKE if name != "speed" or kind in records.DIRECTED_KINDS]
         return {
             "kind": kind,
             **{name: value for name in said if (value := getattr(self, name)) is not None},
-            "steps": tuple(records.MotionStepRequest.model_validate(each) for each in steps),
+            "steps": tuple(each.as_said for each in self.then),
             "others": tuple(each.as_said for each in self.also_moving),
         }
 
 
+NOTHING_IDENTIFIED = Identified.model_construct(object="", others=(), asked=None, kind=None)
+
+
 def identified_by_words(given: ReaderInput) -> Identified | None:
     """What the words of a question say of all that is asked here; None where they leave something open."""
-    words = given.words
+    words, is_changed = given.words, bool(given.given.interventions)
     if words is None or not words.is_whole or words.reading.grounding is None or words.reading.motion is None:
         return None
     read = words.reading
@@ -285,24 +300,25 @@ def identified_by_words(given: ReaderInput) -> Identified | None:
         others=tuple(each.object for each in read.objects),
         asked=read.asked if given.given.asked is None else None,
         kind=words.reading.motion.kind,
-        changes=() if given.given.interventions else read.interventions,
+        changes=tuple(Change.model_construct(**dict(each)) for each in read.interventions if not is_changed),
     )
 
 
 def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int) -> PromptCall[Identified | None]:
     """The call that asks which object moves, in words, and of the rest what neither the caller nor the words say."""
-    has_numbers = any(map(str.isdigit, given.question))
     asked = None if given.words is None or given.given.asked is not None else given.words.reading.asked
     if asked is not None and (asked.among or asked.form.startswith("which")):
         asked = None  # the words do not say which things these are
-    place = given.given.grounding
+    place, said = given.given.grounding, set[str]()
     is_placed = place is not None and place.bbox is not None  # then all but the motion is known
-    said = frozenset((
-        *(("asked",) if is_placed or asked is not None or given.given.asked is not None else ()),
-        *(("changes",) if is_placed or given.given.interventions else ()),
-        *(() if given.motion_wanted else _MOTION),
-        *(() if has_numbers else _NUMBERS),
-    ))  # fmt: skip
+    if is_placed or asked is not None or given.given.asked is not None:
+        said.add("asked")
+    if is_placed or given.given.interventions:
+        said.add("changes")
+    if not given.motion_wanted:
+        said.update(_MOTION)
+    if not any(map(str.isdigit, given.question)):
+        said.update(_NUMBERS)
     fields = {name: each for name, each in replies.fields_schema(Identified).items() if name not in said}
     example = {"reasoning": "...", **{name: _EXAMPLE[name] for name in fields if name in _EXAMPLE}}
     inputs: dict[str, object] = {
@@ -332,42 +348,52 @@ def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked
     if not written and not any(isinstance(value, dict | list) or value is None for value in values):
         written = [{"object": name} for name in _names_in_prose(text)]
     names = [replies.text_of(fields["object"]) for fields in written]
-    if names:
-        if all(map(_ABSENT.fullmatch, names)):
-            return None
-    # A value that has the field says so there, any other as a whole.
-    elif _ABSENT.fullmatch(text) or any(
-        replies.is_none(replies.first_of({"": value} | replies.fields_of(value), *_NAMES, "")) for value in values
-    ):
+    if _says_nothing_moves(names, text, values):
         return None
-    else:
+    if not names:
         raise replies.ReplyError("`object` is missing; name the one object that moves, and do not answer the question")
     if len(set(map(replies.name_words, names))) > 1:
         raise replies.ReplyError(f"several objects are named ({', '.join(names)}); name the one that moves")
-
-    # What contradicts the rest of the same reply is left out, and things have one name each.
     context = ReadingContext(faults=[] if objects else ["it is no JSON object, so that fields are missing"])
     fields = {name: held for name, held in written[-1].items() if name not in said}
-    found = Identified.model_validate(fields, context=context)
-    mover, asked = replies.name_words(found.object), asked or found.asked
-    others = tuple(name for name in found.others if replies.name_words(name) != mover)
-    if asked is not None:
-        one = partial(replies.named_among, known=(found.object, *others))
-        names = {name: one(name) or name for name in (asked.subject, asked.target, *asked.among) if name is not None}
-        subject = names.get(asked.subject or "")
-        update: dict[str, Any] = {
-            "subject": None if subject == found.object else subject,  # null is the mover
-            "target": names.get(asked.target or ""),
-            "among": tuple(names[name] for name in asked.among),
-        }
-        asked = asked.model_copy(update=update)
-    placed = any(each.kind == "place" and replies.name_words(each.object) == mover for each in found.changes)
-    kind = None if found.kind == "place" and not placed else found.kind
-    update = {"others": others, "asked": asked, "kind": kind, "warnings": context.left_out}
-    found = found.model_copy(update=update)
+    found = _consistent(Identified.model_validate(fields, context=context), asked)
+    found = found.model_copy(update={"warnings": context.left_out})
     if context.faults:
         raise replies.ReplyError("; ".join(context.faults), found)
     return found
+
+
+def _says_nothing_moves(names: Sequence[str], text: str, values: Sequence[object]) -> bool:
+    """Whether a reply says, instead of the name of what moves, that there is nothing of the kind."""
+    if names or _ABSENT.fullmatch(text):
+        return all(map(_ABSENT.fullmatch, names))
+    # A value that has the field says so there, any other as a whole.
+    said = (replies.first_of({"": value} | replies.fields_of(value), *_NAMES, "") for value in values)
+    return any(map(replies.is_none, said))
+
+
+def _consistent(found: Identified, asked: records.Asked | None) -> Identified:
+    """A reply whose things have one name each, without what contradicts the rest of it.
+
+    `asked` is what the question's words ask, which goes before what the reply says of it.
+    """
+    mover, asked = replies.name_words(found.object), asked or found.asked
+    others = tuple(name for name in found.others if replies.name_words(name) != mover)
+
+    def one(name: str | None) -> str | None:
+        return name and (replies.named_among(name, (found.object, *others)) or name)
+
+    if asked is not None:
+        subject = one(asked.subject)
+        update: dict[str, Any] = {
+            "subject": None if subject == found.object else subject,  # null is the mover
+            "target": one(asked.target),
+            "among": tuple(map(one, asked.among)),
+        }
+        asked = asked.model_copy(update=update)
+    is_put = any(each.kind == "place" and replies.name_words(each.object) == mover for each in found.changes)
+    kind = None if found.kind == "place" and not is_put else found.kind
+    return found.model_copy(update={"others": others, "asked": asked, "kind": kind})
 
 
 def _replies(value: object) -> Iterator[dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from cow_service import records
 from cow_service.narration.words import same_name
+from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.mllm import coordinates, replies
 from cow_service.readers.mllm.client import PromptCall
@@ -27,7 +28,7 @@ MAX_LABEL = 80  # characters
 STRAIGHT = 60.0  # degrees from the image's vertical, within which a line can also lead towards or away
 LEAST_SIZE, LARGEST_SIZE = 0.001, 1000.0  # m: what is smaller or larger is not seen in a picture as one thing
 DOWN: dict[str, records.Vector] = {"bottom": (0.0, 1.0), "top": (0.0, -1.0), "left": (-1.0, 0.0), "right": (1.0, 0.0)}
-_SIDES = {side: side for side in DOWN} | {"down": "bottom", "below": "bottom", "up": "top", "above": "top"}
+_SIDES = DOWN | {"down": DOWN["bottom"], "below": DOWN["bottom"], "up": DOWN["top"], "above": DOWN["top"]}
 _LISTS = ("objects", "others")  # `others`: without what moves
 _LABEL_KEYS = ("label", "object", "name", "class")
 _DIRECTION_KEYS = ("direction", "motion_direction", "line", "vector")
@@ -64,6 +65,7 @@ SENSES = {  # what `sense` may be, and words for it
     "away": {"away"},
 }
 CameraSense = Literal["towards", "away"]
+CAMERA_SENSE: dict[CameraSense, float] = {"towards": -1.0, "away": 1.0}
 Ends = tuple[records.Point, records.Point]  # of a line, px of the upright image
 
 
@@ -75,6 +77,17 @@ class Line:
     along_arrow: bool | None = None
     camera: CameraSense | None = None
     cue: records.Cue | None = None
+
+    def motion(self, deviation: float) -> dict[str, Any]:
+        """Fields of a motion: which way it goes. `deviation` is that of its depth, degrees."""
+        said: dict[str, Any] = {"cue": self.cue or "orientation", "along_arrow": self.along_arrow}
+        if self.camera is not None:
+            direction, depth = depth_motion(CAMERA_SENSE[self.camera])
+            said |= {"direction": direction, "depth": depth, "depth_deviation": deviation}
+        elif self.ends is not None:
+            (x0, y0), (x1, y1) = self.ends
+            said["direction"] = x1 - x0, y1 - y0
+        return said
 
 
 @dataclass(frozen=True)
@@ -451,11 +464,17 @@ class Scale:
     """How large an object that falls is, and which way things fall."""
 
     metres: float | None = None  # its longest side
-    down: str = "bottom"
+    down: records.Vector | None = None
 
-    def metres_per_pixel(self, bbox: records.BBox) -> float | None:
-        """At the object in a box; null if its size is not known."""
-        return None if self.metres is None else self.metres / max(bbox[2] - bbox[0], bbox[3] - bbox[1])
+    def motion_at(self, bbox: records.BBox | None) -> dict[str, Any]:
+        """Fields of a motion, for the object in a box."""
+        said: dict[str, Any] = {} if self.down is None else {"down": self.down}
+        if self.metres is not None and bbox is not None:
+            said["metres_per_pixel"] = self.metres / max(bbox[2] - bbox[0], bbox[3] - bbox[1])
+        return said
+
+
+UNKNOWN_SCALE = Scale()
 
 
 def scale_call(image: EncodedImage, name: str, reasoning_length: int) -> PromptCall[Scale]:
@@ -477,4 +496,4 @@ def read_scale(reply: str) -> Scale:
         raise ReplyError(
             f"`metres` is {replies.shown(written)}; give a length from {LEAST_SIZE:g} to {LARGEST_SIZE:g}, or null"
         )
-    return Scale(metres, _SIDES.get(down, "bottom"))
+    return Scale(metres, _SIDES.get(down, DOWN["bottom"]))

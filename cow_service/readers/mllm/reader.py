@@ -8,7 +8,6 @@ from typing import Any
 
 from cow_service import __version__, records
 from cow_service.errors import CannotReadDirection, CowError, ObjectNotFound
-from cow_service.physics.camera import depth_motion
 from cow_service.readers import base
 from cow_service.readers.base import GIVE_DIRECTION, GIVE_OBJECT, GIVE_PLACE, ReaderInput, ReadResult
 from cow_service.readers.chat import ChatTurn
@@ -17,16 +16,15 @@ from cow_service.readers.mllm.check import MllmCheck, check_model
 from cow_service.readers.mllm.client import MllmClient, PromptCall
 from cow_service.readers.mllm.contents import pictures
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
-from cow_service.readers.mllm.identify import Identified, identified_by_words, identify_call
+from cow_service.readers.mllm.identify import NOTHING_IDENTIFIED, Identified, identified_by_words, identify_call
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
-from cow_service.readers.mllm.locate import DOWN, Line, Located, Scale, locate_call, scale_call, separate_objects
+from cow_service.readers.mllm.locate import UNKNOWN_SCALE, Located, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS
 from cow_service.settings import Settings
 from cow_service.weights.manifests import PROMPTS
 
-CAMERA_SENSE = {"towards": -1.0, "away": 1.0}
 DEFAULT_KIND: records.MotionKind = "linear"
 DEFAULT_REASONING_LENGTH = 2000  # characters, where the manifest says nothing else
 
@@ -102,127 +100,74 @@ class MllmReader:
         with given.cpu():
             image = encode(given.scene.image, self._client.family)
         place, motion = given.given.grounding, given.given.motion
-        is_placed = place is not None and place.bbox is not None
-        is_known = is_placed and motion is not None and motion.kind is not None
-        identified = None if is_known else self._identify(given, image)
-        name = (place.object if place is not None else None) or (None if identified is None else identified.object)
-        if name is None:
-            raise ObjectNotFound(
-                f"{self._subject} sees nothing in the image that the question could move.", remedy=GIVE_PLACE
-            )
-        kind = (motion.kind if is_known and motion else identified and identified.kind) or DEFAULT_KIND
-        bbox = place.bbox if is_placed and place is not None else None
-        located, scale = self._locate(given, image, identified, name, kind, bbox)
-        warnings = () if identified is None else identified.warnings
-        if bbox is not None:
-            reading = records.Reading()
-        elif located is None:
-            raise ObjectNotFound(f"{self._subject} does not see '{name}' in the image.", remedy=GIVE_PLACE)
-        else:
-            reading, told = self._placed(given, name, identified, located)
-            warnings += told
+        bbox = None if place is None else place.bbox
+        known_kind = None if bbox is None or motion is None else motion.kind
+        said = NOTHING_IDENTIFIED if known_kind is not None else self._identify(given, image)
+        name = (place.object if place is not None else None) or said.object
+        if not name:
+            fault = f"{self._subject} sees nothing in the image that the question could move."
+            raise ObjectNotFound(fault, remedy=GIVE_PLACE)
+        kind = known_kind or said.kind or DEFAULT_KIND
+        located, scale = self._locate(given, image, said, name, kind, bbox)
+        reading, warnings, place_doubts = records.Reading(), said.warnings, ()
+        if bbox is None:
+            reading, told = self._placed(given, name, said, located)
+            bbox = None if reading.grounding is None else reading.grounding.bbox
+            warnings, place_doubts = (*warnings, *told), self._family_warnings
         if given.motion_wanted:
-            said = {} if identified is None else identified.motion
-            said |= self._way(located.line) if located is not None and located.line and kind in DIRECTED_KINDS else {}
-            said |= {"direction_deviation": self._measured.direction_deviation} if kind in DIRECTED_KINDS else {}
-            placed = reading.grounding or place
-            said |= self._scaled(scale, placed.bbox if placed is not None else None)
-            if isinstance(scale, CowError):
-                default = "the default one was taken"
-                warnings += (f"The scale of the scene could not be read ({scale.code}): {default}.",)
-            reading, left_out = self._with_motion(given, reading, said)
+            deviation, fields = self._measured.direction_deviation, said.motion | scale.motion_at(bbox)
+            if kind in DIRECTED_KINDS:
+                way = {} if located.line is None else located.line.motion(deviation)
+                fields |= way | {"direction_deviation": deviation}
+            reading, left_out = self._with_motion(given, reading, fields)
             warnings += left_out
-        warnings += () if located is None else located.warnings
-        label = "" if located is None else located.label
-        return ReadResult(reading, warnings, label, self._family_warnings if bbox is None else ())
+        return ReadResult(reading, (*warnings, *located.warnings), located.label, place_doubts)
 
     def _placed(
-        self, given: ReaderInput, name: str, identified: Identified | None, located: Located
+        self, given: ReaderInput, name: str, said: Identified, located: Located
     ) -> tuple[records.Reading, tuple[str, ...]]:
         """Where the things are, and what is changed and asked; and warnings. Raises `ObjectNotFound`."""
         deviation, label = self._measured.bbox_deviation, located.label
         is_other = bool(label) and set(name_words(label)).isdisjoint(name_words(name))
         mover = records.GroundingRequest(
-            object=name,
-            bbox=located.bbox,
-            point=None if located.bbox is not None else located.point,
-            bbox_deviation=deviation,
-            is_doubtful=is_other,
+            object=name, bbox=located.bbox, point=located.point, bbox_deviation=deviation, is_doubtful=is_other
         )
         others, doubles = separate_objects(mover, located.others)
-        changes = () if identified is None else identified.changes
-        changed = {each: "target" for change in changes for each in (change.object, *change.targets)}
-        seen = {" ".join(name_words(each.object)) for each in (*others, *given.known)} | {" ".join(name_words(name))}
-        for each in changed:
-            if " ".join(name_words(each)) not in seen:
-                raise ObjectNotFound(
-                    f"{self._subject} does not see '{each}' in the image, which the question changes.",
-                    remedy=GIVE_PLACE,
-                )
-        meant = [name_words(each) for each in changed]
+        changed = {name_words(each): each for change in said.changes for each in (change.object, *change.targets)}
+        seen = {name_words(name), *(name_words(each.object) for each in (*others, *given.known))}
+        for lost in (each for words, each in changed.items() if words not in seen):
+            fault = f"{self._subject} does not see '{lost}' in the image, which the question changes."
+            raise ObjectNotFound(fault, remedy=GIVE_PLACE)
+        objects = (
+            each.model_copy(update={"role": "target"}) if name_words(each.object) in changed else each
+            for each in others
+        )
         reading = records.Reading(
             grounding=mover,
-            objects=tuple(
-                each.model_copy(
-                    update={
-                        "bbox_deviation": deviation,
-                        "role": "target" if name_words(each.object) in meant else each.role,
-                    }
-                )
-                for each in others
-            ),
+            objects=tuple(each.model_copy(update={"bbox_deviation": deviation}) for each in objects),
             objects_complete=located.objects_complete and not doubles,
-            interventions=tuple(
-                records.InterventionRequest(kind="remove", object=each.object)
-                if each.kind == "remove"
-                else records.InterventionRequest(
-                    kind="place", object=each.object, relation=each.relation, targets=each.targets
-                )
-                for each in changes
-            ),
-            asked=None if identified is None else identified.asked,
-            question_is_doubtful=bool(identified and identified.warnings),
-            language=None if identified is None else identified.language,
+            interventions=tuple(change.as_said for change in said.changes),
+            asked=said.asked,
+            question_is_doubtful=bool(said.warnings),
+            language=said.language,
         )
-        mismatch = f"Asked for '{name}', the reader gave a place that it calls '{located.label}'."
+        mismatch = f"Asked for '{name}', the reader gave a place that it calls '{label}'."
         return reading, (*((mismatch,) if is_other else ()), *doubles)
 
-    def _way(self, line: Line) -> dict[str, Any]:
-        """The fields of a motion that tell which way it goes."""
-        said: dict[str, Any] = {"cue": line.cue or "orientation", "along_arrow": line.along_arrow}
-        if line.camera is not None:
-            said["direction"], said["depth"] = depth_motion(CAMERA_SENSE[line.camera])
-            said["depth_deviation"] = self._measured.direction_deviation
-        elif line.ends is not None:
-            (x0, y0), (x1, y1) = line.ends
-            said["direction"] = (x1 - x0, y1 - y0)
-        return {name: value for name, value in said.items() if value is not None}
-
-    def _scaled(self, scale: Scale | CowError | None, bbox: records.BBox | None) -> dict[str, Any]:
-        """The fields of a motion that tell the scale, and which way things fall."""
-        if not isinstance(scale, Scale):
-            return {}
-        metres = None if bbox is None else scale.metres_per_pixel(bbox)
-        return {"down": DOWN[scale.down], **({} if metres is None else {"metres_per_pixel": metres})}
-
     def _with_motion(
-        self, given: ReaderInput, reading: records.Reading, said: dict[str, Any]
+        self, given: ReaderInput, reading: records.Reading, fields: dict[str, Any]
     ) -> tuple[records.Reading, tuple[str, ...]]:
         """The reading with its motion; what else moves must have a place. Raises `CannotReadDirection`."""
-        places = {" ".join(name_words(each.object)) for each in (*given.known, *reading.objects)}
-        moving: tuple[records.OtherMotionRequest, ...] = said.pop("others", ())
-        lost = [each.object for each in moving if " ".join(name_words(each.object)) not in places]
+        places = {name_words(each.object) for each in (*given.known, *reading.objects)}
+        moving: tuple[records.OtherMotionRequest, ...] = fields.pop("others", ())
+        lost = [each.object for each in moving if name_words(each.object) not in places]
         if lost and reading.grounding is not None:  # they were looked for with the mover
             raise CannotReadDirection(f"'{lost[0]}' moves, too, and was not found.", remedy=GIVE_DIRECTION)
-        deviation = self._measured.direction_deviation
-        kept = (each for each in moving if each.object not in lost)
-        said |= (
-            {"others": tuple(each.model_copy(update={"direction_deviation": deviation}) for each in kept)}
-            if moving
-            else {}
-        )
+        if moving:
+            update = {"direction_deviation": self._measured.direction_deviation}
+            fields["others"] = tuple(each.model_copy(update=update) for each in moving if each.object not in lost)
         left_out = (f"'{name}' moves, too, and was left out: it has no place. {GIVE_OBJECT}" for name in lost)
-        motion = records.MotionRequest.model_validate(said)
+        motion = records.MotionRequest.model_validate(fields)
         return reading.model_copy(update={"motion": motion}), tuple(left_out)
 
     def answer(
@@ -244,28 +189,29 @@ class MllmReader:
             raise next(each for each in results if isinstance(each, CowError))
         return tuple(replace(each, notes=(*each.notes, *given.calls.notes)) for each in readings)
 
-    def _identify(self, given: ReaderInput, image: EncodedImage) -> Identified | None:
+    def _identify(self, given: ReaderInput, image: EncodedImage) -> Identified:
         """The question in words; of several arrows the MLLM says which one is meant."""
         with given.cpu():
             said = identified_by_words(given) if given.words and len(given.scene.arrows) <= 1 else None
-        return said or self._client.complete(identify_call(given, image, self._reasoning), given)
+        said = said or self._client.complete(identify_call(given, image, self._reasoning), given)
+        return said or NOTHING_IDENTIFIED
 
     def _locate(
         self,
         given: ReaderInput,
         image: EncodedImage,
-        identified: Identified | None,
+        said: Identified,
         name: str,
         kind: records.MotionKind,
         bbox: records.BBox | None,
-    ) -> tuple[Located | None, Scale | CowError | None]:
+    ) -> tuple[Located, Scale]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
-        None for what was not asked for, or not seen. Raises `MllmBadReply`, `MllmUnavailable`.
+        Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
         """
         others: tuple[str, ...] = ()
-        if identified is not None and bbox is None:
-            named = (*identified.must_be_found, *given.sought, *identified.others)
+        if bbox is None and said.object:
+            named = (*said.must_be_found, *given.sought, *said.others)
             others = tuple(dict.fromkeys(each for each in named if name_words(each) != name_words(name)))
         wants_direction = given.motion_wanted and kind in DIRECTED_KINDS
         is_asked_again = bbox is not None and bool(given.objections)  # the direction alone
@@ -275,10 +221,16 @@ class MllmReader:
         if given.motion_wanted and kind in FALLING_KINDS and not is_asked_again:
             calls["scale"] = scale_call(image, name, self._reasoning)
         results = dict(zip(calls, self._client.complete_all(list(calls.values()), given), strict=True))
-        located: Located | CowError | None = results.get("place")
+        located: Located | CowError | None = results.get("place", Located())
+        scale: Scale | CowError = results.get("scale", UNKNOWN_SCALE)
         if isinstance(located, CowError):
             raise located
-        return located, results.get("scale")
+        if located is None:
+            raise ObjectNotFound(f"{self._subject} does not see '{name}' in the image.", remedy=GIVE_PLACE)
+        if isinstance(scale, CowError):
+            told = f"The scale of the scene could not be read ({scale.code}): the default one was taken."
+            return replace(located, warnings=(told, *located.warnings)), UNKNOWN_SCALE
+        return located, scale
 
 
 def create(settings: Settings) -> MllmReader:
