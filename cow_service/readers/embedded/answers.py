@@ -170,26 +170,37 @@ def _unsure(options: Sequence[AnswerOption], say: Phrases, why: str) -> AnswerRe
 
 def _fitting(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
     """The options that say what the world says."""
-    form, first = outcome.asked.form, outcome.first
-    if form in ("whether", "changes"):
-        is_yes = outcome.happens
-        return [option for option in options if says_it_happens(option.text, outcome.asked) is is_yes]
-    if form == "how-many":
-        counts = [(option, (0, 0) if names_none(option.text) else span_of(option.text, 1)) for option in options]
-        return [option for option, span in counts if span and span[0] <= (outcome.count or 0) <= span[1]]
-    if (form == "which-first" and first is None) or (form == "when" and not outcome.happens):
-        return [option for option in options if names_none(option.text)]
-    if form == "which-first" and first is not None:
-        things = [(each, parse_noun_phrase(each.text)) for each in options if not names_none(each.text)]
-        several = any(_SEVERAL.search(option.text) for option, _ in things)
-        return [each for each, phrase in things if phrase is not None and may_name(phrase, first) and not several]
-    if form == "when" and outcome.time is not None:
-        # The only option whose span meets the band of times, where all of the band lies in it.
-        low, high = outcome.time_band or (outcome.time, outcome.time)
-        met = [(option, start <= low and high <= end) for option, (start, end) in _times(options)
-               if start <= high and end >= low]  # fmt: skip
-        return [option for option, is_inside in met if is_inside and len(met) == 1]
-    return []
+    match outcome.asked.form:
+        case "whether" | "changes":
+            return [each for each in options if says_it_happens(each.text, outcome.asked) is outcome.happens]
+        case "how-many":
+            counts = [(each, (0, 0) if names_none(each.text) else span_of(each.text, 1)) for each in options]
+            return [each for each, span in counts if span and span[0] <= (outcome.count or 0) <= span[1]]
+        case "which-first" if outcome.first is not None:
+            return _naming(options, outcome.first)
+        case "when" if outcome.happens:
+            return _around(options, outcome)
+        case "which-first" | "when":
+            return [each for each in options if names_none(each.text)]
+        case _:
+            return []
+
+
+def _naming(options: Sequence[AnswerOption], name: str) -> list[AnswerOption]:
+    """The options that name a thing; none where any names several at once."""
+    things = [(each, parse_noun_phrase(each.text)) for each in options if not names_none(each.text)]
+    if any(_SEVERAL.search(each.text) for each, _ in things):
+        return []
+    return [each for each, phrase in things if phrase is not None and may_name(phrase, name)]
+
+
+def _around(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:
+    """The only option whose span of time meets the band of the outcome, where all of the band lies in it."""
+    if outcome.time is None:
+        return []
+    low, high = outcome.time_band or (outcome.time, outcome.time)
+    met = [(each, span) for each, span in _times(options) if span[0] <= high and span[1] >= low]
+    return [each for each, (start, end) in met if len(met) == 1 and start <= low and high <= end]
 
 
 def _fitting_set(options: Sequence[AnswerOption], outcome: Outcome) -> list[AnswerOption]:

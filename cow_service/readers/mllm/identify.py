@@ -166,10 +166,8 @@ class Leg(replies.Reply):
     @property
     def as_said(self) -> records.MotionStepRequest:
         """As a request says it."""
-        direction, depth = self.way
-        return records.MotionStepRequest(
-            direction=direction, depth=depth, distance=self.distance, duration=self.duration
-        )
+        (direction, depth), ends = self.way, {"distance": self.distance, "duration": self.duration}
+        return records.MotionStepRequest.model_validate({"direction": direction, "depth": depth, **ends})
 
 
 class AlsoMoving(replies.Reply):
@@ -341,12 +339,8 @@ def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked
     """
     text = replies.without_thinking(reply)
     values = replies.values_in(text)
-    # Words in brackets may be part of the prose around the object.
     objects = [value for value in values if any(replies.objects_in(value))]
-    written = [fields for value in objects for fields in _replies(value)]
-    written = written or [fields for value in values for fields in _replies(value)]
-    if not written and not any(isinstance(value, dict | list) or value is None for value in values):
-        written = [{"object": name} for name in _names_in_prose(text)]
+    written = _written(text, values, objects)
     names = [replies.text_of(fields["object"]) for fields in written]
     if _says_nothing_moves(names, text, values):
         return None
@@ -363,13 +357,22 @@ def read_identified(reply: str, said: Collection[str] = (), asked: records.Asked
     return found
 
 
+def _written(text: str, values: Sequence[object], objects: Sequence[object]) -> list[dict[str, Any]]:
+    """The fields of each reply in a text, with `object`: of its JSON objects, else of its lists, else of its prose."""
+    for among in (objects, values):  # words in brackets may be part of the prose around the object
+        if found := [fields for value in among for fields in _replies(value)]:
+            return found
+    is_prose = not any(isinstance(value, dict | list) or value is None for value in values)
+    return [{"object": name} for name in _names_in_prose(text)] if is_prose else []
+
+
 def _says_nothing_moves(names: Sequence[str], text: str, values: Sequence[object]) -> bool:
     """Whether a reply says, instead of the name of what moves, that there is nothing of the kind."""
-    if names or _ABSENT.fullmatch(text):
+    if names:
         return all(map(_ABSENT.fullmatch, names))
     # A value that has the field says so there, any other as a whole.
     said = (replies.first_of({"": value} | replies.fields_of(value), *_NAMES, "") for value in values)
-    return any(map(replies.is_none, said))
+    return _ABSENT.fullmatch(text) is not None or any(map(replies.is_none, said))
 
 
 def _consistent(found: Identified, asked: records.Asked | None) -> Identified:

@@ -228,43 +228,60 @@ def _read_objects(
     What cannot be read of the rest is a fault, and the list is not complete then.
     """
     fields = list(replies.objects_in(list(values), *_LISTS))
-    entries = [each for held in fields for key in _LISTS for each in replies.listed(held.get(key))]
-    is_whole = True
-    for entry in entries:
-        found = list(_places(entry, frame))
-        is_usable = any(each == place or (each.label and not replies.is_none(each.box)) for each in found)
-        is_whole = is_whole and is_usable
-        if not is_usable and not replies.is_none(entry) and not any(each.is_unseen for each in found):
-            context.faults.append(f"`objects` has {replies.shown(entry)}, without a label and a box")
     rest = [each for each in places if each != place and not replies.is_none(each.box)]
+    is_whole = _check_entries(fields, place, frame, context)
     if others and not rest and not any("others" in held for held in fields):
         context.faults.append(f"`objects` lacks the boxes of {', '.join(others)}")
     bbox = None if replies.is_none(place.box) else frame.bbox(place.box)
     if bbox is not None and coordinates.covers_image(frame.width, frame.height, bbox):
         raise ReplyError(f"the box of '{wanted}' covers nearly the whole image; give that of the object alone")
-    objects: list[records.ObjectRequest] = []
     named = list(_named(rest, others, context))
-    for name, role, other in named:
-        try:
-            box = frame.bbox(other.box)
-        except ReplyError as error:
-            context.faults.append(f"the box of '{name}': {error}")
-            continue
-        if role == "obstacle" and coordinates.covers_image(frame.width, frame.height, box):
-            context.faults.append(f"the box of '{name}' covers nearly the whole image")
-        elif role == "target" and bbox is not None and is_same_object(box, bbox):
-            context.faults.append(f"'{wanted}' and '{name}' have the same box")
-        else:
-            objects.append(records.ObjectRequest(object=name, bbox=box, role=role))
+    objects = tuple(_boxed(named, records.GroundingRequest(object=wanted, bbox=bbox), frame, context))
     told = [replies.truth_of(held["complete"]) for held in fields if "complete" in held]
     is_complete = told[-1] is True if told else len(objects) >= MIN_COMPLETE_LIST
     return Located(
         bbox=bbox,
         point=frame.point(place.point) if bbox is None else None,
         label=place.label,
-        others=tuple(objects),
+        others=objects,
         objects_complete=is_complete and is_whole and len(objects) == len(named),
     )
+
+
+def _check_entries(
+    fields: Sequence[Mapping[str, Any]], place: WrittenPlace, frame: CoordinateFrame, context: ReadingContext
+) -> bool:
+    """Whether each entry of the lists has a label and a box; a fault for each that has none of them."""
+    is_whole = True
+    for entry in (each for held in fields for key in _LISTS for each in replies.listed(held.get(key))):
+        found = list(_places(entry, frame))
+        if any(each == place or (each.label and not replies.is_none(each.box)) for each in found):
+            continue
+        is_whole = False
+        if not replies.is_none(entry) and not any(each.is_unseen for each in found):
+            context.faults.append(f"`objects` has {replies.shown(entry)}, without a label and a box")
+    return is_whole
+
+
+def _boxed(
+    named: Sequence[tuple[str, records.ObjectRole, WrittenPlace]],
+    mover: records.GroundingRequest,
+    frame: CoordinateFrame,
+    context: ReadingContext,
+) -> Iterator[records.ObjectRequest]:
+    """The other things whose boxes can be used; a fault for each of the rest."""
+    for name, role, place in named:
+        try:
+            box = frame.bbox(place.box)
+        except ReplyError as error:
+            context.faults.append(f"the box of '{name}': {error}")
+            continue
+        if role == "obstacle" and coordinates.covers_image(frame.width, frame.height, box):
+            context.faults.append(f"the box of '{name}' covers nearly the whole image")
+        elif role == "target" and mover.bbox is not None and is_same_object(box, mover.bbox):
+            context.faults.append(f"'{mover.object}' and '{name}' have the same box")
+        else:
+            yield records.ObjectRequest(object=name, bbox=box, role=role)
 
 
 def separate_objects(
