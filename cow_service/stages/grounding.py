@@ -225,38 +225,42 @@ def find_interventions(
     Raises `InvalidRequest` for an object that is not there, for what is done twice, for a thing that is put to itself,
     and for the mover taken away; `CannotGround` where the question says so.
     """
-    mover, found = things[-1], list[Intervention]()
+    found = list[Intervention]()
     given = [(f"/interventions/{index}", change) for index, change in enumerate(request.interventions)]
-    read = [(None, change) for change in reading.interventions]
-    for pointer, change in given or read:
+    for pointer, change in given or [(None, change) for change in reading.interventions]:
         gone = [other.object for other in found if other.kind == "remove"]  # of two with one name, each goes once
         each = with_things(change, (*(thing for thing in things if thing not in gone), *gone), pointer)
-        name, box, targets = each.object.object, each.object.bbox, [thing.bbox for thing in each.targets]
-        taken = [other.object.bbox for other in found if other.kind == "remove"]
-        put = [other for other in found if other.kind == "place"]
-        if each.kind == "remove":
-            used = [thing.bbox for other in put for thing in (other.object, *other.targets)]
-            faults = {
-                f"'{name}' is what moves: it cannot be taken away.": is_same_object(box, mover.bbox),
-                f"'{name}' is taken away twice: name each object once.": is_among(box, taken),
-                f"'{name}' takes part in another change: it cannot be taken away.": is_among(box, used),
-            }
-        else:
-            relation = (each.relation or "to").replace("-", " ")
-            gone = [thing.object for thing in (each.object, *each.targets) if is_among(thing.bbox, taken)]
-            twice = is_among(box, [other.object.bbox for other in put])
-            faults = {
-                f"'{name}' cannot be put {relation} itself.": is_among(box, targets),
-                f"'{name}' is put somewhere twice: name each object once.": twice,
-                f"'{gone[0] if gone else ''}' is taken away: nothing can be put there, nor it elsewhere.": bool(gone),
-            }
-        fault = next((fault for fault, holds in faults.items() if holds), None)
+        fault = fault_of_removal(each, found, things[-1]) if each.kind == "remove" else fault_of_placing(each, found)
         if fault is not None and pointer is None:
             raise CannotGround(f"{fault} Ask about another object, or state the change in `interventions`.")
         if fault is not None and pointer is not None:
             raise InvalidRequest(f"`{field_of(pointer)}`: {fault}", errors=(FieldError(pointer, fault),))
         found.append(each)
     return tuple(found)
+
+
+def fault_of_removal(each: Intervention, before: Sequence[Intervention], mover: LocatedObject) -> str | None:
+    """Why a thing cannot be taken away, after some changes `before`."""
+    name, box = each.object.object, each.object.bbox
+    if is_same_object(box, mover.bbox):
+        return f"'{name}' is what moves: it cannot be taken away."
+    if is_among(box, [other.object.bbox for other in before if other.kind == "remove"]):
+        return f"'{name}' is taken away twice: name each object once."
+    placed = (thing for other in before if other.kind == "place" for thing in (other.object, *other.targets))
+    is_used = is_among(box, [thing.bbox for thing in placed])
+    return f"'{name}' takes part in another change: it cannot be taken away." if is_used else None
+
+
+def fault_of_placing(each: Intervention, before: Sequence[Intervention]) -> str | None:
+    """Why a thing cannot be put somewhere, after some changes `before`."""
+    name, box = each.object.object, each.object.bbox
+    if is_among(box, [thing.bbox for thing in each.targets]):
+        return f"'{name}' cannot be put {(each.relation or 'to').replace('-', ' ')} itself."
+    if is_among(box, [other.object.bbox for other in before if other.kind == "place"]):
+        return f"'{name}' is put somewhere twice: name each object once."
+    removed = [other.object.bbox for other in before if other.kind == "remove"]
+    gone = [thing.object for thing in (each.object, *each.targets) if is_among(thing.bbox, removed)]
+    return f"'{gone[0]}' is taken away: nothing can be put there, nor it elsewhere." if gone else None
 
 
 def with_things(
@@ -266,21 +270,19 @@ def with_things(
 
     Raises `InvalidRequest` for a name that none of the things has.
     """
-    found: list[LocatedObject] = []
-    for field, name in (
-        *((f"targets/{at}", name) for at, name in enumerate(change.targets)),
-        ("object", change.object),
-    ):
-        thing = next((thing for thing in things if same_name(thing.object, name)), None)
-        if thing is None:
-            at, detail = "/objects", f"the question changes '{name}', which is not looked for when `grounding` is given"
-            if pointer is not None:
-                known = ", ".join(f"'{each.object}'" for each in things)
-                detail = f"there is no '{name}' among the objects of the scene, which are {known}"
-                at = f"{pointer}/{field}"
-            raise InvalidRequest(f"`{field_of(at)}`: {detail}.", remedy=GIVE_OBJECT, errors=(FieldError(at, detail),))
-        found.append(thing)
-    return Intervention(kind=change.kind, object=found[-1], relation=change.relation, targets=tuple(found[:-1]))
+
+    def thing_at(field: str, name: str) -> LocatedObject:
+        if thing := next((thing for thing in things if same_name(thing.object, name)), None):
+            return thing
+        at, detail = "/objects", f"the question changes '{name}', which is not looked for when `grounding` is given"
+        if pointer is not None:
+            known = ", ".join(f"'{each.object}'" for each in things)
+            at, detail = f"{pointer}/{field}", f"there is no '{name}' among the objects of the scene, which are {known}"
+        raise InvalidRequest(f"`{field_of(at)}`: {detail}.", remedy=GIVE_OBJECT, errors=(FieldError(at, detail),))
+
+    targets = tuple(thing_at(f"targets/{at}", name) for at, name in enumerate(change.targets))
+    thing = thing_at("object", change.object)
+    return Intervention(kind=change.kind, object=thing, relation=change.relation, targets=targets)
 
 
 # --- what a grounding says of its things

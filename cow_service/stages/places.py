@@ -29,7 +29,6 @@ class Located:
     """A thing that was located: what is said of it, its box with it, and its mask."""
 
     said: GroundingRequest | ObjectRequest
-    bbox: BBox  # px, inside the image
     mask: CroppedMask | None = None  # where it does not follow from the box
     warnings: tuple[str, ...] = ()
 
@@ -41,12 +40,12 @@ class Located:
         warnings: tuple[str, ...] = (),
     ) -> Located:
         """What is said of a thing, in the box where it was found."""
-        return Located(said.model_copy(update={"bbox": bbox}), bbox, mask, warnings)
+        return Located(said.model_copy(update={"bbox": bbox}), mask, warnings)
 
-    @staticmethod
-    def of(said: GroundingRequest | ObjectRequest) -> Located:
-        """A thing in its box."""
-        return Located(said, box_of(said))
+    @property
+    def bbox(self) -> BBox:
+        """px, inside the image."""
+        return box_of(self.said)
 
     @property
     def name(self) -> str:
@@ -189,7 +188,7 @@ def find_things(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenTh
 
 def bare(reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
     """The things of a reading by their boxes alone."""
-    return Located.of(mover_of(reading)), tuple(map(Located.of, reading.objects)), ()
+    return Located(mover_of(reading)), tuple(map(Located, reading.objects)), ()
 
 
 def outlined(run: Run[SimulateRequest], reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
@@ -214,7 +213,7 @@ def outlined(run: Run[SimulateRequest], reading: Reading) -> tuple[Located, tupl
             others.append(Located.at(thing, own.bbox))
         elif outline is None or not outline.is_sure:
             doubted.append(thing.object)
-            others.append(Located.of(thing.model_copy(update={"is_doubtful": True})))
+            others.append(Located(thing.model_copy(update={"is_doubtful": True})))
         else:
             exact = thing.model_copy(update={"bbox_deviation": None})
             others.append(Located.at(exact, outline.bbox, CroppedMask.of(outline.mask)))

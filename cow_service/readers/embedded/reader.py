@@ -114,7 +114,7 @@ class EmbeddedReader:
         is_told = given.given.asked is None or not given.given.interventions
         doubts, doubtful = matching.noun_doubts(scene, [*named, *([] if mover.is_given else [(mover, bbox)])])
         left = question.unread if is_told else ()
-        own = finder.known.get(mover.text) or records.ObjectRequest(object=mover.text)
+        own = finder.known.get(mover.text) or records.GroundingRequest()
         # A thing has one name: that under which it is asked about goes before that of a change.
         beside = {each.bbox: each for each in reversed([*things, *(thing for _, all in changed for thing in all)])}
         beside.pop(bbox, None)
@@ -122,11 +122,9 @@ class EmbeddedReader:
         known = {each.object for each in given.known}
         reading = records.Reading(
             grounding=records.GroundingRequest(
+                **own.model_dump(include={"shape", "size", "stands_on"}),
                 object=mover.text,
                 bbox=bbox,
-                shape=own.shape,
-                size=own.size,
-                stands_on=own.stands_on,
                 is_doubtful=bbox in doubtful or own.is_doubtful or bool(left and given.given.asked is not None),
             ),
             objects=tuple(
