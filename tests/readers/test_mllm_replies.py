@@ -17,8 +17,8 @@ from cow_service.records import Asked, Coordinates
 from cow_service.weights.manifests import load_families
 
 if TYPE_CHECKING:
+    from cow_service.readers.base import ReadResult
     from cow_service.readers.mllm.coordinates import CoordinateFrame
-    from cow_service.readers.mllm.locate import Located
 
 SHARED = ROOT.parent / "shared" / "mllm_replies" / "replies.json"
 OWN = DATA / "mllm_replies.json"
@@ -97,13 +97,21 @@ def told(case: dict[str, Any]) -> dict[str, Any]:
         return {"error": "mllm-bad-reply"}
     if found is None:
         return {"error": "object-not-found"}
-    if found.line is None:
-        return {"bbox": found.bbox, "point": found.point}
-    if found.line.ends is None:
-        return {"error": "cannot-read-direction"} if found.line.camera is None else {"camera": found.line.camera}
-    (x0, y0), (x1, y1) = found.line.ends
-    length = math.hypot(x1 - x0, y1 - y0)
-    return {"direction": ((x1 - x0) / length, (y1 - y0) / length), "cue": found.line.cue}
+    place, way = found.reading.grounding, found.reading.motion
+    if way is None:
+        assert place is not None
+        return {"bbox": place.bbox, "point": place.point}
+    if way.direction is None:
+        return {"error": "cannot-read-direction"}
+    if way.depth:
+        return {"camera": "towards" if way.depth < 0 else "away"}
+    length = math.hypot(*way.direction)
+    return {"direction": (way.direction[0] / length, way.direction[1] / length), "cue": way.cue}
+
+
+def box_of(found: ReadResult) -> Any:
+    assert found.reading.grounding is not None
+    return found.reading.grounding.bbox
 
 
 @pytest.mark.parametrize(("reply", "reasoning"), [("B", ""), ("It rolls on.\nB", "It rolls on.\nB")])
@@ -226,7 +234,7 @@ def test_what_the_caller_has_said_is_not_read() -> None:
 # Where things are, and which way
 
 
-def read(mover: dict[str, Any], others: object = (), targets: tuple[str, ...] = ("vase",), **motion: Any) -> Located:
+def read(mover: dict[str, Any], others: object = (), targets: tuple[str, ...] = ("vase",), **motion: Any) -> ReadResult:
     """What is read of a reply that gives a mover, others and a motion."""
     from cow_service.readers.mllm.locate import read_located
 
@@ -246,9 +254,9 @@ VALUES = st.recursive(
 @given(fields=st.dictionaries(st.sampled_from(["size", "shape", "depth_degrees", "speed", "cue", "complete"]), VALUES))
 def test_nothing_that_is_not_asked_moves_the_box_or_the_line(fields: dict[str, Any]) -> None:
     found = read(BALL | fields, [VASE | fields])
-    assert (found.bbox, len(found.others)) == (read(BALL).bbox, 1)
-    assert found.line is not None
-    assert found.line.ends == (pytest.approx((147.2, 200)), (384, 200))
+    assert (box_of(found), len(found.reading.objects)) == (box_of(read(BALL)), 1)
+    assert found.reading.motion is not None
+    assert found.reading.motion.direction == pytest.approx((236.8, 0))
 
 
 @pytest.mark.parametrize(
@@ -265,9 +273,10 @@ def test_nothing_that_is_not_asked_moves_the_box_or_the_line(fields: dict[str, A
     ],
 )
 def test_the_sense_is_a_word(said: dict[str, Any], along: bool | None, camera: str | None, cue: str | None) -> None:
-    line = read(BALL, **({"cue": None} if "sense" in said else {}), **said).line
+    line = read(BALL, **({"cue": None} if "sense" in said else {}), **said).reading.motion
     assert line is not None
-    assert (line.along_arrow, line.camera, line.cue) == (along, camera, cue)
+    assert (line.along_arrow, line.cue) == (along, cue)
+    assert (line.depth < 0, line.depth > 0) == (camera == "towards", camera == "away")
 
 
 @pytest.mark.parametrize(
@@ -305,8 +314,11 @@ def test_boxes_of_targets_and_obstacles_in_every_convention(family: str) -> None
     )
     found = read_located(reply, frame, "red ball", ("blue mug",), True, False)
     assert found is not None
-    assert [(other.object, other.role) for other in found.others] == [("blue mug", "target"), ("box", "obstacle")]
-    places = (found.bbox, *(other.bbox for other in found.others))
+    assert [(other.object, other.role) for other in found.reading.objects] == [
+        ("blue mug", "target"),
+        ("box", "obstacle"),
+    ]
+    places = (box_of(found), *(other.bbox for other in found.reading.objects))
     for place, wanted in zip(places, ("red ball", "the blue mug", "box"), strict=True):
         assert place == pytest.approx(boxes[wanted], abs=2)
 
@@ -314,10 +326,10 @@ def test_boxes_of_targets_and_obstacles_in_every_convention(family: str) -> None
 def test_targets_are_known_by_their_words() -> None:
     mug, other_mug = {"label": "mug", "bbox_2d": [1, 1, 90, 90]}, {"label": "red mug", "bbox_2d": [300, 1, 390, 90]}
     found = read(BALL, [other_mug, mug, VASE], targets=("the blue mug", "vase"))
-    roles = [(other.object, other.role) for other in found.others]
+    roles = [(other.object, other.role) for other in found.reading.objects]
     assert roles == [("the blue mug", "target"), ("vase", "target"), ("red mug", "obstacle")]
     unsure = read(BALL, [other_mug, {"label": "green mug", "bbox_2d": [1, 1, 90, 90]}], targets=("mug",))
-    assert {other.role for other in unsure.others} == {"obstacle"}
+    assert {other.role for other in unsure.reading.objects} == {"obstacle"}
 
 
 def test_what_is_no_object_is_left_out() -> None:
@@ -325,7 +337,7 @@ def test_what_is_no_object_is_left_out() -> None:
     wall = {"label": "wall", "bbox_2d": [0, 0, 1000, 1000]}
     ground = {"label": "the floor", "bbox_2d": [0, 500, 1000, 1000]}
     found = read(BALL, [bad, wall, ground, VASE, {"label": "cat", "bbox_2d": None}, 3, "cup"])
-    assert [other.object for other in found.others] == ["vase"]
+    assert [other.object for other in found.reading.objects] == ["vase"]
     assert all(sum(name in warning for warning in found.warnings) == 1 for name in ("'3'", "'cup'", "'lamp'", "'wall'"))
     assert len(found.warnings) == 4
 
@@ -351,9 +363,9 @@ def test_others_are_found_in_whatever_the_reply_is_wrapped(wrap: str) -> None:
         reply = {"name": "reply", wrap: reply}
     found = read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", ("vase",), True, True)
     assert found is not None
-    assert [(other.object, other.role) for other in found.others] == IN_THE_WAY
-    assert found.objects_complete
-    assert found.line is not None
+    assert [(other.object, other.role) for other in found.reading.objects] == IN_THE_WAY
+    assert found.reading.objects_complete
+    assert found.reading.motion is not None
 
 
 @pytest.mark.parametrize(
@@ -374,7 +386,7 @@ def test_others_are_found_in_whatever_the_reply_is_wrapped(wrap: str) -> None:
 def test_a_list_is_complete_if_it_says_so_or_is_one_and_nothing_of_it_is_left_out(
     others: dict[str, Any], complete: bool
 ) -> None:
-    assert read(BALL, **others).objects_complete is complete
+    assert read(BALL, **others).reading.objects_complete is complete
 
 
 @pytest.mark.parametrize(
@@ -415,10 +427,8 @@ def test_a_direction_is_two_named_points(family: str) -> None:
     line = {"start": frame.write((100, 300)), "end": frame.write((400, 100)), "sense": None}
     found = read_located(json.dumps(line), frame, "red ball", (), False, True)
     assert found is not None
-    assert found.line is not None
-    assert found.line.ends is not None
-    for point, wanted in zip(found.line.ends, ((100, 300), (400, 100)), strict=True):
-        assert point == pytest.approx(wanted, abs=2)
+    assert found.reading.motion is not None
+    assert found.reading.motion.direction == pytest.approx((300, -200), abs=4)
 
 
 @pytest.mark.parametrize(
@@ -438,8 +448,8 @@ def test_what_moves_is_known_by_its_words_else_it_comes_first(labels: tuple[str,
     reply = {"objects": [{"bbox_2d": box, "label": label} for box, label in zip(boxes, labels, strict=True)]}
     found = read_located(json.dumps(reply), frame_of("qwen3-vl"), "red ball", (), True, False)
     assert found is not None
-    assert found.bbox == frame_of("qwen3-vl").bbox(boxes[first])
-    assert [each.object for each in found.others] == [labels[1 - first]]
+    assert box_of(found) == frame_of("qwen3-vl").bbox(boxes[first])
+    assert [each.object for each in found.reading.objects] == [labels[1 - first]]
 
 
 def test_of_two_lists_neither_comes_first() -> None:

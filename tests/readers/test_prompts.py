@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 from typing import TYPE_CHECKING, Any
@@ -94,12 +93,12 @@ def test_a_prompt_asks_for_the_fields_of_its_schema_and_shows_a_reply_that_is_re
     assert named.asked == Asked(relation="touches", target="mug", negated=True)
     assert named.speed == Speed(value=20, unit="px/s")
     assert [(each.kind, each.object) for each in named.changes] == [("remove", "vase")]
-    assert found.bbox == pytest.approx((128, 240, 192, 288), abs=0.7)
-    assert [(each.object, each.bbox) for each in found.others] == [
+    assert found.reading.grounding.bbox == pytest.approx((128, 240, 192, 288), abs=0.7)
+    assert [(each.object, each.bbox) for each in found.reading.objects] == [
         ("vase", pytest.approx((448, 144, 512, 288), abs=0.7))
     ]
-    assert [*itertools.chain(*found.line.ends)] == pytest.approx([160, 264, 576, 264], abs=0.7)
-    assert (found.line.along_arrow, scale.metres, scale.down) == (True, 0.067, (0, 1))
+    assert found.reading.motion.direction == pytest.approx((416, 0), abs=1.4)
+    assert (found.reading.motion.along_arrow, scale.metres, scale.down) == (True, 0.067, (0, 1))
 
 
 def test_only_a_question_with_a_number_is_searched_for_speeds_and_lengths() -> None:

@@ -10,16 +10,16 @@ from typing import Literal, TypeVar, cast
 from cow_service.errors import CowError, MllmUnavailable
 from cow_service.media.images import decode
 from cow_service.narration.words import same_name
-from cow_service.readers.base import CallLog, ReaderInput
+from cow_service.readers.base import CallLog, ReaderInput, ReadResult
 from cow_service.readers.mllm.answer import answer_calls
 from cow_service.readers.mllm.client import PARSER_BUGS, MllmClient, PromptCall
 from cow_service.readers.mllm.contents import QUESTIONS
 from cow_service.readers.mllm.coordinates import CoordinateFrame, encode
 from cow_service.readers.mllm.identify import identify_call
 from cow_service.readers.mllm.known import USUAL
-from cow_service.readers.mllm.locate import Line, Located, locate_call, read_located
+from cow_service.readers.mllm.locate import locate_call, read_located
 from cow_service.readers.mllm.replies import ReplyError
-from cow_service.records import AnswerOption, BBox, Coordinates, MllmMeasurement, Record, Usage, Vector
+from cow_service.records import AnswerOption, BBox, Coordinates, MllmMeasurement, MotionRequest, Record, Usage, Vector
 from cow_service.vision.masks import iou
 from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import EXAMPLES
@@ -80,22 +80,22 @@ class WrittenPlaces:
     frame: CoordinateFrame
     text: str
 
-    def read(self, coordinates: Coordinates) -> Located:
+    def read(self, coordinates: Coordinates) -> ReadResult:
         """What it says if places are written in that way; nothing where it cannot be read."""
         frame, (mover, *others) = replace(self.frame, coordinates=coordinates), self.truth.boxes
         try:
             located = read_located(self.text, frame, mover, others, wants_box=True, wants_direction=True)
         except ReplyError as error:
-            located = cast("Located | None", error.usable)
+            located = cast("ReadResult | None", error.usable)
         except PARSER_BUGS:
             located = None
-        return located or Located()
+        return located or ReadResult()
 
     def pairs(self, coordinates: Coordinates) -> list[tuple[BBox, BBox]]:
         """The true box and the one that was written, of each thing that was found."""
-        located, (mover, target) = self.read(coordinates), self.truth.boxes
-        named = (each.bbox for each in located.others if same_name(each.object, target))
-        written = {mover: located.bbox, target: next(named, None)}
+        read, (mover, target) = self.read(coordinates).reading, self.truth.boxes
+        named = (each.bbox for each in read.objects if same_name(each.object, target))
+        written = {mover: read.grounding and read.grounding.bbox, target: next(named, None)}
         return [(self.truth.boxes[name], box) for name, box in written.items() if box is not None]
 
 
@@ -166,8 +166,8 @@ def _of_places(
     if not (is_found := found * 2 > count):
         best, found = used, _count_found(pairs(used))
     boxes = finding_of_boxes(found, count, best, used, failed)
-    lines = [(reply.truth, reply.read(best).line or Line()) for reply in written]
-    off = [_degrees(truth.way, line.ends) for truth, line in lines if line.ends is not None]
+    lines = [(reply.truth, reply.read(best).reading.motion or MotionRequest()) for reply in written]
+    off = [_degrees(truth.way, line.direction) for truth, line in lines if line.direction is not None]
     findings = [boxes, *findings_of_lines(lines, off)]
     if not is_found or not off:
         return findings, None
@@ -193,7 +193,7 @@ def _count_found(pairs: Sequence[tuple[BBox, BBox]]) -> int:
     return sum(iou(*pair) >= FOUND for pair in pairs)
 
 
-def findings_of_lines(lines: Sequence[tuple[Truth, Line]], off: Sequence[float]) -> Iterator[Finding]:
+def findings_of_lines(lines: Sequence[tuple[Truth, MotionRequest]], off: Sequence[float]) -> Iterator[Finding]:
     """The findings on directions, so many degrees `off`, and on their senses."""
     result = f"{len(off)} of {len(lines)} given"
     if off:
@@ -215,8 +215,7 @@ def _edges_off(true: BBox, box: BBox) -> float:
     return math.sqrt(sum(((a - b) / side) ** 2 for a, b, side in zip(true, box, sides, strict=True)) / 4)
 
 
-def _degrees(way: Vector, ends: tuple[Vector, Vector]) -> float:
-    """Between a direction and that of a line."""
-    (x0, y0), (x1, y1) = ends
-    off = math.degrees(math.atan2(y1 - y0, x1 - x0) - math.atan2(way[1], way[0]))
+def _degrees(true: Vector, way: Vector) -> float:
+    """Between two directions."""
+    off = math.degrees(math.atan2(way[1], way[0]) - math.atan2(true[1], true[0]))
     return abs((off + 180) % 360 - 180)

@@ -5,14 +5,14 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
 from cow_service import records
 from cow_service.narration.words import same_name
 from cow_service.physics.camera import depth_motion
-from cow_service.readers.base import ReaderInput
+from cow_service.readers.base import ReaderInput, ReadResult
 from cow_service.readers.mllm import coordinates, replies
 from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, EncodedImage
@@ -78,32 +78,16 @@ class Line:
     camera: CameraSense | None = None
     cue: records.Cue | None = None
 
-    def motion(self, deviation: float) -> dict[str, Any]:
-        """Fields of a motion: which way it goes. `deviation` is that of its depth, degrees."""
-        said: dict[str, Any] = {"cue": self.cue or "orientation", "along_arrow": self.along_arrow}
+    @property
+    def motion(self) -> records.MotionRequest:
+        """As a request says it."""
+        direction, depth = None, 0.0
         if self.camera is not None:
             direction, depth = depth_motion(CAMERA_SENSE[self.camera])
-            said |= {"direction": direction, "depth": depth, "depth_deviation": deviation}
         elif self.ends is not None:
             (x0, y0), (x1, y1) = self.ends
-            said["direction"] = x1 - x0, y1 - y0
-        return said
-
-
-@dataclass(frozen=True)
-class Located:
-    """Where the object is (px of the upright image) and which way it moves; parts that were not asked for are None.
-
-    A reply may give a point instead of a box. `label` is what the reply calls it.
-    """
-
-    bbox: records.BBox | None = None
-    point: records.Point | None = None
-    label: str = ""
-    others: tuple[records.ObjectRequest, ...] = ()
-    objects_complete: bool = False  # the others are all that could be hit or hide something
-    line: Line | None = None
-    warnings: tuple[str, ...] = ()  # of what was left out
+            direction = x1 - x0, y1 - y0
+        return records.MotionRequest(direction=direction, depth=depth, cue=self.cue, along_arrow=self.along_arrow)
 
 
 @dataclass(frozen=True)
@@ -128,7 +112,7 @@ def locate_call(
     others: Sequence[str],
     wants_direction: bool,
     reasoning_length: int,
-) -> PromptCall[Located | None]:
+) -> PromptCall[ReadResult | None]:
     """The call that asks where the object `name` is, unless its box is known, and which way it moves."""
     frame, wants_box = image.coordinate_frame, bbox is None
     inputs: dict[str, object] = {
@@ -188,7 +172,7 @@ def locate_schema(
 
 def read_located(
     reply: str, frame: CoordinateFrame, wanted: str, others: Sequence[str], wants_box: bool, wants_direction: bool
-) -> Located | None:
+) -> ReadResult | None:
     """What a reply says of the object `wanted`; None if it says that it does not see it. Raises `ReplyError`.
 
     `others` are the things that the question names besides.
@@ -199,19 +183,19 @@ def read_located(
     place = _choose_place(places, values, frame, wanted, others) if wants_box else None
     if wants_box and place is None:
         return None
-    context, line = ReadingContext(), None
+    context, motion, reading = ReadingContext(), None, records.Reading()
     if wants_direction:
         try:
-            line = _read_line(values, said, frame, context)
+            motion = _read_line(values, said, frame, context).motion
         except ReplyError as error:  # what is drawn or said may tell the direction as well
             context.faults.append(str(error))
-    located = Located(line=line)
     if place is not None:
-        located = replace(_read_objects(values, place, places, frame, wanted, others, context), line=line)
-    located = replace(located, warnings=context.left_out)
+        reading = _read_objects(values, place, places, frame, wanted, others, context)
+    reading = reading.model_copy(update={"motion": motion})
+    read = ReadResult(reading, context.left_out, "" if place is None else place.label)
     if context.faults:
-        raise ReplyError("; ".join(context.faults), located)
-    return located
+        raise ReplyError("; ".join(context.faults), read)
+    return read
 
 
 def _read_objects(
@@ -222,7 +206,7 @@ def _read_objects(
     wanted: str,
     others: Sequence[str],
     context: ReadingContext,
-) -> Located:
+) -> records.Reading:
     """The object at its `place`, and the rest of the `places`.
 
     What cannot be read of the rest is a fault, and the list is not complete then.
@@ -235,17 +219,14 @@ def _read_objects(
     bbox = None if replies.is_none(place.box) else frame.bbox(place.box)
     if bbox is not None and coordinates.covers_image(frame.width, frame.height, bbox):
         raise ReplyError(f"the box of '{wanted}' covers nearly the whole image; give that of the object alone")
+    point = frame.point(place.point) if bbox is None else None
+    mover = records.GroundingRequest(object=wanted, bbox=bbox, point=point)
     named = list(_named(rest, others, context))
-    objects = tuple(_boxed(named, records.GroundingRequest(object=wanted, bbox=bbox), frame, context))
+    objects = tuple(_boxed(named, mover, frame, context))
     told = [replies.truth_of(held["complete"]) for held in fields if "complete" in held]
     is_complete = told[-1] is True if told else len(objects) >= MIN_COMPLETE_LIST
-    return Located(
-        bbox=bbox,
-        point=frame.point(place.point) if bbox is None else None,
-        label=place.label,
-        others=objects,
-        objects_complete=is_complete and is_whole and len(objects) == len(named),
-    )
+    is_complete = is_complete and is_whole and len(objects) == len(named)
+    return records.Reading(grounding=mover, objects=objects, objects_complete=is_complete)
 
 
 def _check_entries(

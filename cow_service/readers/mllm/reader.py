@@ -18,7 +18,7 @@ from cow_service.readers.mllm.contents import pictures
 from cow_service.readers.mllm.coordinates import EncodedImage, encode
 from cow_service.readers.mllm.identify import NOTHING_IDENTIFIED, Identified, identified_by_words, identify_call
 from cow_service.readers.mllm.known import UNKNOWN, USUAL
-from cow_service.readers.mllm.locate import UNKNOWN_SCALE, Located, Scale, locate_call, scale_call, separate_objects
+from cow_service.readers.mllm.locate import UNKNOWN_SCALE, Scale, locate_call, scale_call, separate_objects
 from cow_service.readers.mllm.models import configure
 from cow_service.readers.mllm.replies import name_words
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS
@@ -115,24 +115,23 @@ class MllmReader:
             bbox = None if reading.grounding is None else reading.grounding.bbox
             warnings, place_doubts = (*warnings, *told), self._family_warnings
         if given.motion_wanted:
-            deviation, fields = self._measured.direction_deviation, said.motion | scale.motion_at(bbox)
+            fields = said.motion | scale.motion_at(bbox)
             if kind in DIRECTED_KINDS:
-                way = {} if located.line is None else located.line.motion(deviation)
-                fields |= way | {"direction_deviation": deviation}
+                fields |= self._way(located.reading.motion)
             reading, left_out = self._with_motion(given, reading, fields)
             warnings += left_out
         return ReadResult(reading, (*warnings, *located.warnings), located.label, place_doubts)
 
     def _placed(
-        self, given: ReaderInput, name: str, said: Identified, located: Located
+        self, given: ReaderInput, name: str, said: Identified, located: ReadResult
     ) -> tuple[records.Reading, tuple[str, ...]]:
         """Where the things are, and what is changed and asked; and warnings. Raises `ObjectNotFound`."""
+        assert located.reading.grounding is not None, "what was asked for and not seen is an error"
         deviation, label = self._measured.bbox_deviation, located.label
         is_other = bool(label) and set(name_words(label)).isdisjoint(name_words(name))
-        mover = records.GroundingRequest(
-            object=name, bbox=located.bbox, point=located.point, bbox_deviation=deviation, is_doubtful=is_other
-        )
-        others, doubles = separate_objects(mover, located.others)
+        update = {"bbox_deviation": deviation, "is_doubtful": is_other}
+        mover = located.reading.grounding.model_copy(update=update)
+        others, doubles = separate_objects(mover, located.reading.objects)
         changed = {name_words(each): each for change in said.changes for each in (change.object, *change.targets)}
         seen = {name_words(name), *(name_words(each.object) for each in (*others, *given.known))}
         for lost in (each for words, each in changed.items() if words not in seen):
@@ -145,7 +144,7 @@ class MllmReader:
         reading = records.Reading(
             grounding=mover,
             objects=tuple(each.model_copy(update={"bbox_deviation": deviation}) for each in objects),
-            objects_complete=located.objects_complete and not doubles,
+            objects_complete=located.reading.objects_complete and not doubles,
             interventions=tuple(change.as_said for change in said.changes),
             asked=said.asked,
             question_is_doubtful=bool(said.warnings),
@@ -153,6 +152,15 @@ class MllmReader:
         )
         mismatch = f"Asked for '{name}', the reader gave a place that it calls '{label}'."
         return reading, (*((mismatch,) if is_other else ()), *doubles)
+
+    def _way(self, read: records.MotionRequest | None) -> dict[str, Any]:
+        """Fields of a motion: which way it goes as it was read, and how far off that may be."""
+        deviation = self._measured.direction_deviation
+        if read is None:
+            return {"direction_deviation": deviation}
+        way = read.model_dump(include={"direction", "depth", "along_arrow"}, exclude_defaults=True)
+        way |= {"cue": read.cue or "orientation", "direction_deviation": deviation}
+        return way | ({"depth_deviation": deviation} if read.depth else {})
 
     def _with_motion(
         self, given: ReaderInput, reading: records.Reading, fields: dict[str, Any]
@@ -204,7 +212,7 @@ class MllmReader:
         name: str,
         kind: records.MotionKind,
         bbox: records.BBox | None,
-    ) -> tuple[Located, Scale]:
+    ) -> tuple[ReadResult, Scale]:
         """Asks for the place, the direction and, of what falls, the scale, as far as they are needed; all at once.
 
         Raises `ObjectNotFound`, `MllmBadReply`, `MllmUnavailable`.
@@ -221,7 +229,7 @@ class MllmReader:
         if given.motion_wanted and kind in FALLING_KINDS and not is_asked_again:
             calls["scale"] = scale_call(image, name, self._reasoning)
         results = dict(zip(calls, self._client.complete_all(list(calls.values()), given), strict=True))
-        located: Located | CowError | None = results.get("place", Located())
+        located: ReadResult | CowError | None = results.get("place", ReadResult())
         scale: Scale | CowError = results.get("scale", UNKNOWN_SCALE)
         if isinstance(located, CowError):
             raise located
