@@ -202,7 +202,7 @@ class Edges:
             on, across, down = _on_circle(points, normals, x, y, radius, max(2.0, share * radius))
             if np.count_nonzero(on) < CIRCLE.least_on:
                 return None
-            a, b, fitted = _least_squares(across[on], down[on])
+            a, b, fitted = fit_circle(across[on], down[on])
             if not 0.7 * radius < fitted < 1.4 * radius or math.hypot(a, b) > 0.4 * radius:
                 return None
             x, y, radius = x + a, y + b, fitted
@@ -215,7 +215,7 @@ class Edges:
         return Circle(float((x + 0.5) * fx), float((y + 0.5) * fy), radius * (fx + fy) / 2, bins)
 
 
-def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:
+def fit_circle(across: Floats, down: Floats) -> tuple[float, float, float]:
     """Centre and radius of the circle x^2 + y^2 = 2ax + 2by + c through points [N], by its normal equations."""
     count = len(across)
     squares = across * across + down * down

@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.records import BBox
+from cow_service.vision.circles import fit_circle
 from cow_service.vision.contrast import VIEW, View
-from cow_service.vision.masks import dilated, outline_of
+from cow_service.vision.masks import dilated, outer_contour, outline_of
 from cow_service.vision.types import Floats, Floats32, Mask
 
 
@@ -53,11 +55,7 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
 
     A part that ends before the edges, by up to `grow` px, gives the disc that reaches to the strongest.
     """
-    contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = np.asarray(max(contours, key=len)[:, 0], np.float64)
-    if len(outline) < 20:
-        return None
-    circle = _best_circle(outline)
+    circle = _best_circle(outer_contour(part)[:, 0].astype(np.float64))
     if circle is None:
         return None
     x, y, radius, on_circle = circle
@@ -101,16 +99,17 @@ def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
 
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None if too few do."""
+    if len(outline) < 20:
+        return None
     rng = np.random.default_rng(0)  # the same outline must give the same circle
-    a, b, c = np.moveaxis(
-        outline[rng.integers(0, len(outline), (DISC.tries, 3))], 1, 0
-    )  # [T, 2] each: not finite on a line
+    a, b, c = np.moveaxis(outline[rng.integers(0, len(outline), (DISC.tries, 3))], 1, 0)  # [T, 2] each
     ab, ac = b - a, c - a
     doubled = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
     ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         x = (ac[:, 1] * ab2 - ab[:, 1] * ac2) / doubled
         y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / doubled
+    # Not finite for three points on a line.
     circles = np.column_stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)])
     reach = float(np.ptp(outline, axis=0).max())
     circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] >= DISC.radius) & (circles[:, 2] <= reach)]
@@ -121,10 +120,7 @@ def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     best = int(close.sum(axis=1).argmax())
     if close[best].mean() < DISC.on_circle:
         return None
-    chosen = outline[close[best]]
-    terms = np.column_stack([2 * chosen, np.ones(len(chosen))])  # x^2 + y^2 = 2ax + 2by + c, least squares
-    u, v, w = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0].tolist()
-    return u, v, math.sqrt(max(w + u * u + v * v, 0.0)), float(close[best].mean())
+    return *fit_circle(*outline[close[best]].T), float(close[best].mean())
 
 
 def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
@@ -216,39 +212,37 @@ def white_sides(view: View, core: Mask) -> Mask:
     sides, surely_white = np.zeros(white.shape, bool), set[int]()
     for top, (x, y, w, h, area) in enumerate(tops.tolist()):
         around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        if top == 0 or area < FACE.top:
-            continue
-        if float(np.mean(near_edges[around][outline_of(labels[around] == top)])) <= FACE.sharp_top:
+        own = labels[around] == top
+        if top == 0 or area < FACE.top or float(np.mean(near_edges[around][outline_of(own)])) <= FACE.sharp_top:
             continue
         if 0.2 * w < h < 0.8 * w:  # slightly lit pixels joined to it, right below and no further down than it is wide
             window = slice(y, y + h + w), slice(x, x + w)
             sides[window] |= _joined(lit_too[window], labels[window] == top, 4)
-        own = labels[y : y + h, x : x + w] == top
-        if area >= FACE.white and float(np.median(view.chroma[y : y + h, x : x + w][own])) < VIEW.chroma_step:
+        if area >= FACE.white and float(np.median(view.chroma[around][own])) < VIEW.chroma_step:
             surely_white.add(top)
-
-    def has_side(top: int, side: _Box, area: int, lit: bool) -> bool:
-        """Whether a side belongs to a top: small compared with it, and lit or right below it."""
-        x, y, w, _ = side
-        tx, ty, tw, _, top_area = tops[top].tolist()
-        hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > FACE.hangs * w and y >= ty
-        return top_area >= FACE.top and area < FACE.ratio * top_area and (lit or hangs)
-
     for thresholds in (*VIEW.edges, *([FACE.weak_edges] if surely_white else [])):
         weak = thresholds == FACE.weak_edges
         for near, patch, box in enclosed(view, *thresholds):
-            is_shade = (
-                np.median(view.light[near][patch]) < FACE.shade
-                and np.median(view.chroma_gap[near][patch]) < FACE.same_chroma
+            light, gap, chroma, bright = (
+                float(np.median(values[near][patch]))
+                for values in (view.light, view.chroma_gap, view.chroma, view.bright)
             )
-            if is_shade or (weak and float(np.median(view.chroma[near][patch])) > VIEW.chroma_step):
+            is_shade = light < FACE.shade and gap < FACE.same_chroma
+            if is_shade or (weak and chroma > VIEW.chroma_step):
                 continue
             touched = set(np.unique(labels[near][dilated(patch, times=4)]).tolist()) - {0}
-            lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > FACE.bright_reach
-            area = int(np.count_nonzero(patch))
-            if any(has_side(top, box, area, lit) for top in (touched & surely_white if weak else touched)):
+            area, is_lit = int(np.count_nonzero(patch)), bright > FACE.bright_reach
+            if any(_has_side(tops[top], box, area, is_lit) for top in (touched & surely_white if weak else touched)):
                 sides[near] |= dilated(patch, times=2)
     return sides
+
+
+def _has_side(top: NDArray[np.int32], side: _Box, area: int, is_lit: bool) -> bool:
+    """Whether a side belongs to a top, by its statistics: small compared with it, and lit or right below it."""
+    x, y, w, _ = side
+    tx, ty, tw, _, top_area = top.tolist()
+    hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > FACE.hangs * w and y >= ty
+    return top_area >= FACE.top and area < FACE.ratio * top_area and (is_lit or hangs)
 
 
 def black_faces(view: View, black: Mask) -> Mask:

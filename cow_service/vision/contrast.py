@@ -50,9 +50,7 @@ class View:
     bright: Floats32  # lightness above the surroundings
     around: Floats32  # lightness of the surroundings
     spread: Floats32  # how far the lightness of the surroundings varies: the texture of a floor is no thing
-    across: Floats32  # [h, w, 3] Lab gradients per px to the right
-    down: Floats32  # [h, w, 3] and down
-    edges: Floats32  # length of all of them
+    edges: Floats32  # length of all Lab gradients, per px
     median_edge: float  # of the whole image
     edge_threshold: float  # gradient from which the outline of an object may lie on it
 
@@ -63,7 +61,7 @@ class View:
 
     def crop(self, window: tuple[slice, slice]) -> View:
         """The same measurements for a part of the image."""
-        names = ("lab", "chroma", "chroma_gap", "bright", "around", "spread", "across", "down", "edges")
+        names = ("lab", "chroma", "chroma_gap", "bright", "around", "spread", "edges")
         return replace(self, **{name: getattr(self, name)[window] for name in names})
 
 
@@ -99,7 +97,7 @@ def view_of(small: Image) -> View:
     deviation = scaled(np.asarray(off_light * (255 / VIEW.spread_limit), np.uint8), 0.25)
     typical = np.maximum(_median(deviation, VIEW.wide, VIEW.wide), _median(deviation, *VIEW.strip)).astype(np.float32)
     spread = cv2.resize(typical * np.float32(1.48 * VIEW.spread_limit / 255), small.shape[1::-1])
-    across, down, edges = lab_gradients(lab)
+    edges = lab_gradients(lab)[2]
     median_edge = float(np.median(edges))
     return View(
         lab=lab,
@@ -108,8 +106,6 @@ def view_of(small: Image) -> View:
         bright=bright,
         around=np.asarray(around, np.float32),
         spread=np.asarray(spread, np.float32),
-        across=across,
-        down=down,
         edges=edges,
         median_edge=median_edge,
         edge_threshold=max(VIEW.edges[1][0], VIEW.edges[1][1] * median_edge),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
@@ -17,14 +17,7 @@ from cow_service.vision.contrast import VIEW
 from cow_service.vision.edges import find_segments
 from cow_service.vision.inpainting import erase_drawing
 from cow_service.vision.masks import CroppedMask, bbox_of, dilated, iou, is_among, is_same_object, without_holes
-from cow_service.vision.regions import (
-    Region,
-    disc_region,
-    drawn_region,
-    find_regions,
-    found_region,
-    region_of,
-)
+from cow_service.vision.regions import Region, find_regions, known_region, region_of
 from cow_service.vision.segmentation import fault_of, is_bare, mask_from_bbox, mask_from_point
 from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
@@ -161,13 +154,13 @@ class Scene:
     def regions(self) -> tuple[Region, ...]:
         """Objects of the image, largest first; empty if it is too cluttered to tell."""
         if self.side_view is not None:
-            drawn = (drawn_region(self.clean, shape) for shape in self.side_view.shapes)
-            return tuple(sorted(drawn, key=lambda region: -region.mask.area))
+            return _largest_first(known_region(self.clean, shape) for shape in self.side_view.shapes)
         found = find_regions(self.clean)
         for trail in self.trails:
             if region_of(found, trail.present.bbox) is None:
-                found = (*found, disc_region(self.clean, trail.present.disc((self.height, self.width))))
-        return tuple(sorted(found, key=lambda region: -region.mask.area))
+                ball = CroppedMask.of(trail.present.disc((self.height, self.width)))
+                found = (*found, replace(known_region(self.clean, ball), roundness=1.0, is_disc=True))
+        return _largest_first(found)
 
     def with_mover(self, bbox: BBox) -> Scene:
         """This scene where its trails end as they are, else the scene in which the one in a box ends there."""
@@ -306,13 +299,16 @@ class Scene:
         What lies in one of them for the most part is no region of its own.
         """
         other = self.changed(self.image, self.clean)
-        found = [found_region(self.clean, *thing) for thing in things]
+        found = [
+            replace(known_region(self.clean, CroppedMask.of(mask)), is_disc=False, called=called)
+            for mask, called in things
+        ]
         own = [
             region
             for region in self.regions
             if all(region.mask.shared_with(mask) <= PART_OF * region.mask.area for mask, _ in things)
         ]
-        other.__dict__["regions"] = tuple(sorted((*found, *own), key=lambda region: -region.mask.area))
+        other.__dict__["regions"] = _largest_first((*found, *own))
         return other
 
     def changed(self, image: Image, clean: Image) -> Scene:
@@ -377,6 +373,10 @@ class Scene:
         bbox = bbox_of(mask)
         self._found["mask", bbox] = CroppedMask.of(mask)
         return bbox
+
+
+def _largest_first(regions: Iterable[Region]) -> tuple[Region, ...]:
+    return tuple(sorted(regions, key=lambda region: -region.mask.area))
 
 
 def _is_part(region: Region, outlined: Sequence[CroppedMask], obstacles: Sequence[Obstacle]) -> bool:
