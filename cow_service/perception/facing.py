@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cow_service.physics.camera import FOCAL_WIDTHS, FloorCamera
 from cow_service.records import BBox, Vector
-from cow_service.vision.masks import bbox_of, eroded, lab_of, resized_mask, scaled, without_holes
+from cow_service.vision.masks import bbox_of, eroded, lab_of, mask_iou, resized_mask, scaled, without_holes
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 PAINT, DARK, OTHER = 1, 2, 3  # labels of pixels, 0 beside it: the body's colour, tyres, and glass and lamps
@@ -193,7 +193,7 @@ def _fits(image: Image, seen: _Seen, pitches: Iterable[float], turns: Floats) ->
             if model is not None:
                 # Intersection over union of the outlines, and the weighted agreement of the parts.
                 drawn = model.drawn(seen.corner, seen.scale, seen.labels.shape[:2])
-                whole = float((inside & (drawn > 0)).sum()) / max(1, int((inside | (drawn > 0)).sum()))
+                whole = mask_iou(inside, drawn > 0)
                 pairs = ((seen.labels == label, drawn == label) for label in (DARK, OTHER))
                 # Sørensen-Dice coefficients, smoothed: 1 where both are empty.
                 tyres, glass = ((2 * (a & b).sum() + least) / (a.sum() + b.sum() + least) for a, b in pairs)

@@ -34,19 +34,14 @@ OUTLINE = OutlineRules()
 class Outline:
     """What a segmenter takes for a thing."""
 
-    cropped: CroppedMask
+    mask: CroppedMask
     score: float
     is_sure: bool  # two prompts agree on it
 
     @property
-    def mask(self) -> Mask:
-        """[H, W]."""
-        return self.cropped.full()
-
-    @property
     def bbox(self) -> BBox:
         """Tight, px."""
-        return self.cropped.bbox
+        return self.mask.bbox
 
 
 def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
@@ -90,7 +85,7 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
             chosen.append(each)
     close = [each for each in chosen if each.score >= chosen[0].score - OUTLINE.rival]
     outlines = [Outline(each.enlarged(*image.size), each.score, True) for each in close]
-    return [each for each in outlines if each.cropped.area]
+    return [each for each in outlines if each.mask.area]
 
 
 def _first(candidates: Sequence[Segment]) -> Segment | None:

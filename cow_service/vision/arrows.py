@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox, Point
+from cow_service.vision.masks import mask_iou
 from cow_service.vision.strokes import STROKE, Stroke, WorkingImage, drawing_mask
 from cow_service.vision.types import Floats, Mask
 
@@ -193,8 +194,7 @@ class _Profile:
             for barb in barbs:
                 start, end = fixed(barb, point).tolist()
                 cv2.line(ideal, start, end, 1, max(1, round(thickness)), cv2.LINE_8, 4)
-        real, drawn = np.pad(patch, pad), ideal.astype(bool)
-        return float((real & drawn).sum() / max(1, (real | drawn).sum()))
+        return mask_iou(np.pad(patch, pad), ideal > 0)
 
 
 def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) -> _Profile | None:

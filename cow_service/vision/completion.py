@@ -48,6 +48,8 @@ class DiscRules(NamedTuple):
 
 
 DISC = DiscRules()
+_ANGLES = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)
+_RAYS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # unit vectors
 
 
 def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.0) -> Mask | None:
@@ -63,8 +65,7 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     radii = radius + np.arange(-DISC.bled, max(0.5, grow) + 0.01, 0.5)
     radius = float(radii[int(np.median(_along_rays(edges, x, y, radii), axis=0).argmax())])
     height, width = part.shape
-    angles = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)
-    columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
+    columns, rows = np.round(np.array([[x], [y]]) + radius * _RAYS).astype(int)
     seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     strong = dilated(edges > edge_threshold)
     if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < DISC.on_edges:
@@ -91,8 +92,7 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
 
 def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
     """Values [DISC.samples, R] on rays from a place, at distances [R]."""
-    angles = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)[:, None]
-    columns, rows = x + np.cos(angles) * radii[None], y + np.sin(angles) * radii[None]
+    columns, rows = x + np.outer(_RAYS[0], radii), y + np.outer(_RAYS[1], radii)
     values = cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
     return np.asarray(values, np.float32)
 
@@ -121,13 +121,6 @@ def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     if close[best].mean() < DISC.on_circle:
         return None
     return *fit_circle(*outline[close[best]].T), float(close[best].mean())
-
-
-def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
-    """The connected patches of a mask [h, w] in which seeds [h, w] lie."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
-    touched = np.unique(labels[seeds])
-    return np.isin(labels, touched[touched > 0])
 
 
 class DarkRules(NamedTuple):
@@ -217,7 +210,8 @@ def white_sides(view: View, core: Mask) -> Mask:
             continue
         if 0.2 * w < h < 0.8 * w:  # slightly lit pixels joined to it, right below and no further down than it is wide
             window = slice(y, y + h + w), slice(x, x + w)
-            sides[window] |= _joined(lit_too[window], labels[window] == top, 4)
+            _, patches = cv2.connectedComponents(lit_too[window].astype(np.uint8), connectivity=4)
+            sides[window] |= np.isin(patches, np.unique(patches[labels[window] == top]))
         if area >= FACE.white and float(np.median(view.chroma[around][own])) < VIEW.chroma_step:
             surely_white.add(top)
     for thresholds in (*VIEW.edges, *([FACE.weak_edges] if surely_white else [])):

@@ -155,9 +155,7 @@ def _measures(region: Region) -> list[float]:
     """What `OUTLINES` has ranges of, the first as a natural logarithm."""
     mask = region.mask.patch
     height, width = mask.shape
-    sides = mask & ~(np.roll(mask, 1, axis=1) & np.roll(mask, -1, axis=1))  # their hull is that of the mask
-    sides[:, [0, -1]] = mask[:, [0, -1]]
-    filled = np.count_nonzero(mask) / np.count_nonzero(hull(sides))
+    filled = np.count_nonzero(mask) / np.count_nonzero(hull(mask))
     # The median width in each of the bands, over the largest of them.
     rows = mask.sum(axis=1)
     cuts = [(int(low * height), math.ceil(high * height)) for low, high in BANDS]

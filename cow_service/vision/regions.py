@@ -208,7 +208,7 @@ def _is_black(view: View, blob: Mask, is_darkest: bool, beside: Sequence[BBox]) 
         return None
     if not is_darkest or np.percentile(view.lab[blob, 0], 30) >= REGION.blackest:
         return False
-    return np.count_nonzero(blob) > REGION.own_area or any(is_underside(box, thing) for thing in beside)
+    return bool(np.count_nonzero(blob) > REGION.own_area) or any(is_underside(box, thing) for thing in beside)
 
 
 def _stands_out(view: View, part: Mask) -> bool:
@@ -270,13 +270,13 @@ def _parts(view: View, component: Mask) -> list[Mask]:
                 balls.append(disc)
     rest = _blobs(component & ~taken, REGION.min_rest * component.sum())
     if balls:  # what is left along the edge of a ball is blur
-        rest = [blob for blob in rest if _half_width(blob) > REGION.edge_band]
+        rest = [blob for blob in rest if masks.half_width(blob) > REGION.edge_band]
     parts = balls + [part for blob in rest for part in _coloured_parts(view, blob)]
-    whole = masks.hull(component) if len(parts) > 1 else component
-    is_one = (
-        len(parts) > 1 and np.count_nonzero(component) > REGION.filled * np.count_nonzero(whole) and _is_ellipse(whole)
-    )
-    return [whole] if is_one else parts  # a ball or an egg, and a shadow across it
+    if len(parts) > 1:
+        whole = masks.hull(component)
+        if np.count_nonzero(component) > REGION.filled * np.count_nonzero(whole) and _is_ellipse(whole):
+            return [whole]  # a ball or an egg, and a shadow across it
+    return parts
 
 
 def _is_ellipse(mask: Mask) -> bool:
@@ -284,7 +284,7 @@ def _is_ellipse(mask: Mask) -> bool:
     outline = np.argwhere(masks.outline_of(mask))[:, ::-1].astype(np.int32)
     ellipse = np.zeros(mask.shape, np.uint8)
     cv2.ellipse(ellipse, cv2.fitEllipse(outline), (1,), -1)
-    return float(np.count_nonzero(mask & (ellipse > 0)) / np.count_nonzero(mask | (ellipse > 0))) > REGION.ellipse
+    return masks.mask_iou(mask, ellipse > 0) > REGION.ellipse
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
@@ -307,9 +307,9 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
     black = neutral & (lab[..., 0] < REGION.black_share * view.around)
     dark = _blobs(black, min(0.35 * area, REGION.own_area))
-    broad = min((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
+    broad = min((masks.half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
     seeds.extend(_blobs(bright, min(0.3 * area, REGION.own_area)))
-    seeds += [seed for seed in dark if _half_width(seed) > REGION.own_width * broad or seed.sum() > 0.35 * area]
+    seeds += [seed for seed in dark if masks.half_width(seed) > REGION.own_width * broad or seed.sum() > 0.35 * area]
     if len(seeds) <= 1:
         return [component]
     distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
@@ -341,11 +341,6 @@ def _hidden(found: Sequence[_Found]) -> list[bool]:
         )
         for outline, own in zip((masks.outline_of(one.mask) for one in found), things, strict=True)
     ]
-
-
-def _half_width(mask: Mask) -> float:
-    """Radius (px) of the largest circle inside a mask [h, w]."""
-    return float(cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
 
 
 def _blobs(mask: Mask, least: float) -> list[Mask]:

@@ -16,7 +16,16 @@ from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.contrast import VIEW
 from cow_service.vision.edges import find_segments
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import CroppedMask, bbox_of, dilated, iou, is_among, is_same_object, without_holes
+from cow_service.vision.masks import (
+    CroppedMask,
+    bbox_of,
+    dilated,
+    iou,
+    is_among,
+    is_same_object,
+    mask_iou,
+    without_holes,
+)
 from cow_service.vision.regions import Region, find_regions, known_region, region_of
 from cow_service.vision.segmentation import fault_of, is_bare, mask_from_bbox, mask_from_point
 from cow_service.vision.side_view import SideView, find_side_view
@@ -167,13 +176,15 @@ class Scene:
         trail = trail_ending_at(self.trails, bbox)
         if trail is None or any(trail.positions == other.positions for other in self.trails):
             return self
-        return self.once(("mover", trail.positions), lambda: self._with_trails(mover=bbox))
+        return self.once(
+            ("mover", trail.positions), lambda: self._with(self._measured(OF_THE_IMAGE), mover=bbox, _preset={})
+        )
 
     def with_trail_named(self) -> Scene:
         """The scene in which balls that look alike, one after another, are one; masks that were given stay."""
         if self.trail_named:
             return self
-        return self.once("trail named", lambda: self._with_trails(trail_named=True, _preset=dict(self._preset)))
+        return self.once("trail named", lambda: self._with(self._measured(OF_THE_IMAGE), trail_named=True))
 
     def keeping(self, things: Sequence[BBox]) -> Scene:
         """The scene in which none of some things, by their boxes, is taken for an annotation that is drawn over it."""
@@ -188,23 +199,21 @@ class Scene:
         if len(arrows) + len(boxes) == len(self.arrows) + len(self.boxes):
             return self
 
-        def without() -> Scene:
-            other = replace(self, _found={}, _preset=dict(self._preset))
-            other.__dict__.update(arrows=arrows, boxes=boxes)
-            return other
+        key = ("keeping", *(each.tail for each in arrows), *(each.bbox for each in boxes))
+        return self.once(key, lambda: self._with({"arrows": arrows, "boxes": boxes}))
 
-        return self.once(("keeping", *(each.tail for each in arrows), *(each.bbox for each in boxes)), without)
-
-    def _with_trails(self, **changes: Any) -> Scene:
-        """The same image with other trails in it."""
-        other = replace(self, **{"_found": {}, "_preset": {}, **changes})
-        other.__dict__.update({key: self.__dict__[key] for key in OF_THE_IMAGE if key in self.__dict__})
+    def _with(self, measured: Measured, **changes: Any) -> Scene:
+        """Another scene of which only this is measured yet, and with the masks that were given."""
+        other = replace(self, **{"_found": {}, "_preset": dict(self._preset), **changes})
+        other.__dict__.update(measured)  # where cached properties are kept
         return other
+
+    def _measured(self, names: Sequence[str]) -> Measured:
+        return {name: self.__dict__[name] for name in names if name in self.__dict__}
 
     def measured(self) -> Measured:
         """The measurements so far that depend only on the image; read-only."""
-        alone = OF_THE_IMAGE if self.trail_named else (*OF_THE_IMAGE, *WITHOUT_TRAILS)
-        return {key: self.__dict__[key] for key in alone if key in self.__dict__}
+        return self._measured(OF_THE_IMAGE if self.trail_named else (*OF_THE_IMAGE, *WITHOUT_TRAILS))
 
     def take(self, measured: Measured) -> None:
         """Takes over what another scene of the same image has measured."""
@@ -246,11 +255,8 @@ class Scene:
         has colours that its surroundings lack."""
         if self.region_of(bbox) is not None:
             return True
-
-        def shown() -> bool:
-            return fault_of(self.clean, self.silhouette(bbox)) is None or not is_bare(self.clean, bbox)
-
-        return self.once(("thing", bbox), shown)
+        fault = self.once(("fault", bbox), lambda: fault_of(self.clean, self.silhouette(bbox)))
+        return fault is None or not self.once(("bare", bbox), lambda: is_bare(self.clean, bbox))
 
     def confidence_of(self, bbox: BBox) -> float:
         """How sure it is (0..1) that what is in a box is one separate thing with its outline; 1 for what is given.
@@ -264,12 +270,7 @@ class Scene:
         if region.is_disc or region.confidence >= CLEAR_CUT:
             return region.confidence
         mask = region.mask.full()
-
-        def agreement() -> float:
-            again = mask_from_bbox(self.clean, bbox)
-            return float(np.count_nonzero(mask & again) / np.count_nonzero(mask | again))
-
-        return self.once(("confidence", bbox), agreement)
+        return self.once(("confidence", bbox), lambda: mask_iou(mask, mask_from_bbox(self.clean, bbox)))
 
     def silhouette(self, bbox: BBox) -> Mask:
         """As `cropped`, of the whole image [H, W]: a new array."""
@@ -313,11 +314,8 @@ class Scene:
 
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
-        other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
-        names = ("cues", "arrows", "boxes", "side_view", "regions")
-        # Where cached properties are kept.
-        other.__dict__.update({name: getattr(self, name) for name in names}, clean=clean)
-        return other
+        stays = {name: getattr(self, name) for name in ("cues", "arrows", "boxes", "side_view", "regions")}
+        return self._with({**stays, "clean": clean}, image=image, _found=dict(self._found))
 
     def with_mask(self, bbox: BBox, mask: Mask) -> Scene:
         """The same with another mask [H, W] of the object in a box."""
