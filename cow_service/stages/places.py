@@ -137,14 +137,15 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
         )
         if not may_guess:
             raise _not_cut_out(f"The object at the point [{x:.0f}, {y:.0f}] is not clear: {fault}", pointer)
-    cutout = scene.locate((x, y))
-    if cutout.mask is None:
-        return Located.at(given, cutout.bbox)
-    if cutout.fault is not None and not may_guess:
-        raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {cutout.fault}.", pointer)
-    box = ", ".join(f"{value:.0f}" for value in cutout.bbox)
+    bbox = scene.bbox_at((x, y))
+    if scene.region_of(bbox) is not None:
+        return Located.at(given, bbox)
+    fault = scene.fault_of(bbox)
+    if fault is not None and not may_guess:
+        raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {fault}.", pointer)
+    box = ", ".join(f"{value:.0f}" for value in bbox)
     warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
-    return Located.at(given, cutout.bbox, CroppedMask.of(cutout.mask), (warning,))
+    return Located.at(given, bbox, scene.cropped(bbox), (warning,))
 
 
 def _not_cut_out(detail: str, pointer: str) -> CannotGround:

@@ -7,13 +7,13 @@ what has most votes is fitted to the edges by least squares.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from cow_service.records import BBox, Point
+from cow_service.records import Point
 from cow_service.vision.contrast import VIEW, lab_gradients
 from cow_service.vision.masks import lab_of, scaled
 from cow_service.vision.types import Floats, Image, Mask
@@ -153,12 +153,6 @@ class Edges:
             scores[max(0, i - 3) : i + 4, *near] = 0
             best[near] = scores[:, *near].max(axis=0)
         return tuple(sorted(found, key=lambda circle: -circle.support))
-
-    def within(self, box: BBox) -> Edges:
-        """Those in a box [x0, y0, x1, y1] of the image (px)."""
-        stretch = np.array(self.stretch)
-        inside = ((self.points > np.array(box[:2]) / stretch) & (self.points < np.array(box[2:]) / stretch)).all(axis=1)
-        return replace(self, points=self.points[inside], normals=self.normals[inside])
 
     def fit(self, x: float, y: float, radius: float) -> Circle | None:
         """The circle near one of the image (px), if edges lie on it."""

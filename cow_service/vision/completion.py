@@ -198,22 +198,7 @@ def white_sides(view: View, core: Mask) -> Mask:
     _, labels, tops, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
     if not (tops[1:, 4] >= FACE.top).any():
         return np.zeros(white.shape, bool)
-    near_edges = dilated(view.edges > view.edge_threshold, 5)
-    lit_too = (
-        (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > FACE.bright_reach) & (view.chroma < 2 * VIEW.chroma_step)
-    ) | white
-    sides, surely_white = np.zeros(white.shape, bool), set[int]()
-    for top, (x, y, w, h, area) in enumerate(tops.tolist()):
-        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        own = labels[around] == top
-        if top == 0 or area < FACE.top or float(np.mean(near_edges[around][outline_of(own)])) <= FACE.sharp_top:
-            continue
-        if 0.2 * w < h < 0.8 * w:  # slightly lit pixels joined to it, right below and no further down than it is wide
-            window = slice(y, y + h + w), slice(x, x + w)
-            _, patches = cv2.connectedComponents(lit_too[window].astype(np.uint8), connectivity=4)
-            sides[window] |= np.isin(patches, np.unique(patches[labels[window] == top]))
-        if area >= FACE.white and float(np.median(view.chroma[around][own])) < VIEW.chroma_step:
-            surely_white.add(top)
+    sides, surely_white = _lit_below(view, white, labels, tops)
     for thresholds in (*VIEW.edges, *([FACE.weak_edges] if surely_white else [])):
         weak = thresholds == FACE.weak_edges
         for near, patch, box in enclosed(view, *thresholds):
@@ -229,6 +214,28 @@ def white_sides(view: View, core: Mask) -> Mask:
             if any(_has_side(tops[top], box, area, is_lit) for top in (touched & surely_white if weak else touched)):
                 sides[near] |= dilated(patch, times=2)
     return sides
+
+
+def _lit_below(view: View, white: Mask, labels: NDArray[np.int32], tops: NDArray[np.int32]) -> tuple[Mask, set[int]]:
+    """What is slightly lit right below bright tops, and which of those are surely of something white.
+
+    Tops are the patches of `white` [h, w], by their labels [h, w] and statistics [N, 5].
+    """
+    near_edges = dilated(view.edges > view.edge_threshold, 5)
+    is_lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > FACE.bright_reach) & (view.chroma < 2 * VIEW.chroma_step)
+    sides, surely_white = np.zeros(white.shape, bool), set[int]()
+    for top, (x, y, w, h, area) in enumerate(tops.tolist()):
+        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
+        own = labels[around] == top
+        if top == 0 or area < FACE.top or float(np.mean(near_edges[around][outline_of(own)])) <= FACE.sharp_top:
+            continue
+        if 0.2 * w < h < 0.8 * w:  # pixels joined to it, no further down than it is wide
+            window = slice(y, y + h + w), slice(x, x + w)
+            _, patches = cv2.connectedComponents((is_lit | white)[window].astype(np.uint8), connectivity=4)
+            sides[window] |= np.isin(patches, np.unique(patches[labels[window] == top]))
+        if area >= FACE.white and float(np.median(view.chroma[around][own])) < VIEW.chroma_step:
+            surely_white.add(top)
+    return sides, surely_white
 
 
 def _has_side(top: NDArray[np.int32], side: _Box, area: int, is_lit: bool) -> bool:

@@ -52,15 +52,6 @@ class Obstacle:
     confidence: float = 1.0  # 0..1: how sure it is that it is there as one thing with this mask; 1 for what is given
 
 
-@dataclass(frozen=True)
-class Cutout:
-    """The object at a point of the image."""
-
-    bbox: BBox
-    mask: Mask | None = None  # [H, W], where it is no region of the image: it was cut out around the point
-    fault: str | None = None  # why what was cut out can be no object, in words
-
-
 Found = TypeVar("Found")
 Measured = dict[str, Any]
 """Cached properties of a `Scene` by their names."""
@@ -253,10 +244,13 @@ class Scene:
     def shows_thing(self, bbox: BBox) -> bool:
         """Whether something stands in a box: what was found there, what can be cut out with a visible outline, or what
         has colours that its surroundings lack."""
+        return self.fault_of(bbox) is None or not self.once(("bare", bbox), lambda: is_bare(self.clean, bbox))
+
+    def fault_of(self, bbox: BBox) -> str | None:
+        """Why what can be cut out in a box can be no whole object, in words; None for a region, too."""
         if self.region_of(bbox) is not None:
-            return True
-        fault = self.once(("fault", bbox), lambda: fault_of(self.clean, self.silhouette(bbox)))
-        return fault is None or not self.once(("bare", bbox), lambda: is_bare(self.clean, bbox))
+            return None
+        return self.once(("fault", bbox), lambda: fault_of(self.clean, self.silhouette(bbox)))
 
     def confidence_of(self, bbox: BBox) -> float:
         """How sure it is (0..1) that what is in a box is one separate thing with its outline; 1 for what is given.
@@ -351,14 +345,6 @@ class Scene:
             return Obstacle(named.object, named.bbox, self.cropped(named.bbox))
         is_found = region.bbox == named.bbox  # here, not by the request or a reader
         return Obstacle(named.object, named.bbox, region.mask, region.confidence if is_found else 1.0)
-
-    def locate(self, point: tuple[float, float]) -> Cutout:
-        """The object at a point [x, y]: the region there, else what can be cut out around it."""
-        bbox = self.bbox_at(point)
-        if self.region_of(bbox) is not None:
-            return Cutout(bbox)
-        mask = self.silhouette(bbox)
-        return Cutout(bbox, mask, fault_of(self.clean, mask))
 
     def bbox_at(self, point: tuple[float, float]) -> BBox:
         """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or else segmented."""

@@ -190,11 +190,8 @@ class _Search:
         Its more opaque end is the last; if both are alike, the end that is less hidden.
         """
         best: Chain = ()
-        reach = 0.5 * math.dist(a.centre, b.centre) + 1.6 * max(a.radius, b.radius)
-        low, high = (min(a.x, b.x) - reach, min(a.y, b.y) - reach), (max(a.x, b.x) + reach, max(a.y, b.y) + reach)
-        near = self.edges.within((*low, *high))
         for inner in range(3 * TRAIL.positions // 4):
-            chain = self.between(near, a, b, inner)
+            chain = self.between(a, b, inner)
             if chain is None:
                 continue
             chain = self.extended(self.extended(chain)[::-1])
@@ -213,7 +210,7 @@ class _Search:
         ordered = positions if rank[1] >= rank[0] else positions[::-1]
         return Trail(ordered, known)
 
-    def between(self, edges: Edges, a: Circle, b: Circle, inner: int) -> Chain | None:
+    def between(self, a: Circle, b: Circle, inner: int) -> Chain | None:
         """Two circles with others between them, evenly along an arc that bulges to one side or the other."""
         apart = math.dist(a.centre, b.centre)
         gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
@@ -225,7 +222,7 @@ class _Search:
             chain = [a]
             for t in np.arange(1, inner + 1) / (inner + 1):
                 x, y = (start * (1 - t) + end * t + 4 * t * (1 - t) * bulge * across).tolist()
-                found = _fit_near(edges, x, y, a.radius ** (1 - t) * b.radius**t)
+                found = _fit_near(self.edges, x, y, a.radius ** (1 - t) * b.radius**t)
                 if found is None or any(found.is_same(other) for other in (*chain, b)):
                     break
                 chain.append(found)
