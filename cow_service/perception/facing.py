@@ -119,8 +119,7 @@ class FacingRules(NamedTuple):
     """
 
     working_side: int = 80  # px: the vehicle is compared at this size
-    # of the angle between two headings from which they are different ones
-    elsewhere: float = math.cos(math.radians(72))
+    elsewhere: float = math.cos(math.radians(72))  # of the angle from which two headings differ
     min_score: float = 1.2  # of 2.2: what fits worse is no such vehicle, or is hidden in part
     min_parts: float = 0.03  # of the outline's area that are tyres, glass or lamps: paint alone tells no front
     min_lead: float = 0.03  # of the best score before that of another heading

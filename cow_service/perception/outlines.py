@@ -59,9 +59,8 @@ def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
         agrees = any(mask_iou(segment.mask, other.mask) >= OUTLINE.agree for other in next(again))
         mask = segment.enlarged(*size)
         fills = iou(mask.bbox, box) if mask.area else 0.0
-        outlines.append(
-            Outline(mask, segment.score, agrees and fills >= OUTLINE.is_whole) if fills >= OUTLINE.fills else None
-        )
+        outline = Outline(mask, segment.score, agrees and fills >= OUTLINE.is_whole)
+        outlines.append(outline if fills >= OUTLINE.fills else None)
     return outlines
 
 
@@ -90,10 +89,8 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
 
 def _first(candidates: Sequence[Segment]) -> Segment | None:
     """The best of some candidates that is good enough to be a thing."""
-    good = (
-        each for each in candidates if each.score >= OUTLINE.least_score and 0 < each.mask.mean() <= OUTLINE.most_share
-    )
-    return next(good, None)
+    good = (each for each in candidates if each.score >= OUTLINE.least_score)
+    return next((each for each in good if 0 < each.mask.mean() <= OUTLINE.most_share), None)
 
 
 def _inmost(mask: Mask, size: tuple[int, int]) -> Point:

@@ -35,8 +35,7 @@ class ArrowRules(NamedTuple):
     hollow_fit: float = 0.88  # the same for a hollow drawing, whose head may be small
     head: float = 1.8  # of the shaft's width: the least width of a head
     hollow_head: float = 1.3  # the same of a hollow drawing
-    # of the shaft's width: an arrow without a rim is longer; the side of a can behind a ball is not
-    slender: float = 5.0
+    slender: float = 5.0  # of the shaft's width: the least length without a rim; the side of a can is shorter
 
 
 ARROW = ArrowRules()

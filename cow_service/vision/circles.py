@@ -41,8 +41,7 @@ class CircleRules(NamedTuple):
     max_circles: int = 32  # that are tried
     near: tuple[float, float] = (0.035, 1.0)  # of the radius, px: edges this close to a circle lie on it
     facing: float = 0.93  # cosine of the angle between an edge's gradient and the radius
-    # cosine of the angle between an edge's gradient and the line of two centres, at most, in a notch
-    notch_facing: float = 0.7
+    notch_facing: float = 0.7  # of a notch, at most: cosine between an edge's gradient and the line of both centres
     notch_reach: float = 1.5  # px beyond the notch's depth in which edges are of it
     least_notch: int = 4  # edges
     same: float = 0.15  # of the radius, by which centres and radii of one circle may differ

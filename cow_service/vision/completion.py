@@ -35,8 +35,7 @@ class DiscRules(NamedTuple):
     arc: float = 0.25  # so much of the circle must lie on edges in one run
     beyond_image: float = 0.85  # share of those rays for a circle that the image's border cuts
     ray: tuple[float, float] = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray is searched
-    # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
-    ray_error: tuple[float, float] = (1.0, 0.03)
+    ray_error: tuple[float, float] = (1.0, 0.03)  # px, and of the radius: how far off its strongest edge may lie
     on_edges: float = 0.8  # share of the circle
     filled: float = 0.72  # share of the disc that the region fills
     spilled: float = 0.25  # share of the region outside it
@@ -178,8 +177,7 @@ class FaceRules(NamedTuple):
     lit_black: float = 0.85  # of the surroundings' light: the lit face of something black
     touched: float = 1.0  # of the side of a patch: so much of something black lies next to it
     texture_edge: float = 0.4  # of the surroundings' spread in lightness: weaker edges are texture
-    # as `ViewRules.edges`: the sides of something surely white stand out by as little
-    weak_edges: tuple[float, float] = (0.45, 1.8)
+    weak_edges: tuple[float, float] = (0.45, 1.8)  # as `ViewRules.edges`, for the sides of something surely white
 
 
 FACE = FaceRules()
@@ -253,10 +251,8 @@ def black_faces(view: View, black: Mask) -> Mask:
         return faces
     for near, patch, _ in enclosed(view, FACE.strong_edge, 0.0):
         touched = np.count_nonzero(dilated(patch, times=4) & black[near])
-        if (
-            touched > FACE.touched * math.sqrt(np.count_nonzero(patch))
-            and np.median(view.light[near][patch]) < FACE.lit_black
-        ):
+        is_beside = touched > FACE.touched * math.sqrt(np.count_nonzero(patch))
+        if is_beside and np.median(view.light[near][patch]) < FACE.lit_black:
             faces[near] |= dilated(patch, times=2)
     return faces
 

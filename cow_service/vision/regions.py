@@ -44,8 +44,7 @@ class RegionRules(NamedTuple):
     halfway: float = 0.35  # of the largest step nearby
     min_area: float = 0.0003  # of the image
     max_area: float = 0.25  # the same, at most
-    # of the height or width of something bright and pale that runs along the image's border: a wall
-    along_border: float = 0.5
+    along_border: float = 0.5  # of the length of something bright and pale along the image's border: a wall
     most: int = 40  # the largest are kept: the work that follows grows with their number
     clutter: float = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
     split_hue: float = 36.0  # degrees: another colour, hence another object
@@ -60,8 +59,7 @@ class RegionRules(NamedTuple):
     disc: float = 0.93  # roundness from which a drawn shape is a disc
     rim: int = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
     dark: float = 28.0  # lightness below which a part may be the underside of another
-    # Lab units from the surroundings, from which contrast takes nothing from the confidence
-    sure_contrast: float = 20.0
+    sure_contrast: float = 20.0  # Lab units: from here on contrast takes nothing from the confidence
     sure_area: float = 300.0  # px at the working size, from which the size takes nothing
 
 
@@ -333,13 +331,16 @@ def _without_rim(one: _Found, balls: Mask) -> _Found:
 
 def _hidden(found: Sequence[_Found]) -> list[bool]:
     """Which of them have much of their outline along one thing of another colour that ends lower in the image."""
-    things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
+    things = [
+        (masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.outline_of(one.mask), masks.dilated(one.mask, 5))
+        for one in found
+    ]
     return [
         any(
-            low > own[0] and not colours & own[1] and near[outline].mean() > REGION.hidden
-            for low, colours, near in things
+            low > own_low and not colours & own and near[outline].mean() > REGION.hidden
+            for low, colours, _, near in things
         )
-        for outline, own in zip((masks.outline_of(one.mask) for one in found), things, strict=True)
+        for own_low, own, outline, _ in things
     ]
 
 
@@ -362,13 +363,12 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     inner = outline & ~border
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
-    contrast = (
-        1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / REGION.sure_contrast
-    )
-    size = float(np.count_nonzero(part)) / (REGION.sure_area / 2 if is_disc else REGION.sure_area)
+    contrast = float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / REGION.sure_contrast
+    size = float(np.count_nonzero(part)) / REGION.sure_area
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
-    edges = max(sharp, 0.9) if is_disc else sharp
-    return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
+    if is_disc:
+        sharp, contrast, size = max(sharp, 0.9), 1.0, 2 * size
+    return sharp * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
 
 
 def _with_undersides(found: Sequence[_Found]) -> list[_Found]:

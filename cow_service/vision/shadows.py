@@ -49,8 +49,7 @@ class ShadowRules(NamedTuple):
     iterations: int = 8  # of the fit
     least_shade: float = 0.025  # of the floor's lightness that shadows take away, at least
     most_shade: float = 0.6  # the same: more is an object
-    # of the ball's width, from its foot down to the shadow's middle: nearer, the ball may touch the floor
-    nearest: float = 0.25
+    nearest: float = 0.25  # of the ball's width, from its foot to the shadow's middle: nearer, it may touch the floor
     slant: float = 1.1  # px sideways per px down: light indoors falls steeper
 
 
@@ -189,12 +188,13 @@ class _Floor:
         wide, high, soft = float(np.exp(log_a)), float(np.exp(log_b)), float(np.exp(log_soft))
         shade = -dark / max(float(level), 1.0)
         width = self.box[2] - self.box[0]
+        least_soft, most_soft = SHADOW.softness
+        if shade > SHADOW.dark and explained > SHADOW.well_explained:
+            most_soft = SHADOW.most_soft
         fits = (
             SHADOW.least_shade < shade < SHADOW.most_shade
             and explained > SHADOW.explained
-            and SHADOW.softness[0]
-            < soft
-            < (SHADOW.most_soft if shade > SHADOW.dark and explained > SHADOW.well_explained else SHADOW.softness[1])
+            and least_soft < soft < most_soft
             and float(np.hypot(*tint)) < SHADOW.same_hue
             and 0.6 * width < 2 * wide < 1.6 * width
             and 0.15 < high / wide < 0.95

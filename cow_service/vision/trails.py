@@ -33,14 +33,12 @@ class TrailRules(NamedTuple):
     contrast: float = 12.0  # grey levels of that contrast, at least
     opacity: float = 0.08  # at least
     unrest: float = 12.0  # grey levels of a background's variation that are allowed for
-    # of the circumference of a position at an end, on edges: what hides the rest is the next position
-    end_support: float = 0.5
+    end_support: float = 0.5  # of the circumference of an end, on edges: the next position hides the rest
     pale_support: float = 0.4  # of the circumference of a pale one that a path leads to
     predicted: float = 0.2  # radii: how near to where a path leads a pale position must lie
     sure_support: float = 0.3  # of the circumference: with more, no better circle is sought nearby
     seen_support: float = 0.75  # of what the other positions leave to be seen of a circumference, on edges
-    # of the depth that the outline of two overlapping circles has between them: less is a straight side
-    notched: float = 0.35
+    notched: float = 0.35  # of the depth of the notch between two circles: less is a straight side
     sizes: float = 1.35  # between the radii of neighbours, at most
     faded: float = 0.85  # of the opacity of the most opaque: with less, a position was faded
     spacing: tuple[float, float] = (0.5, 2.0)  # between neighbouring gaps
