@@ -138,12 +138,12 @@ class Edges:
             gathered[gathered < CIRCLE.least_votes * 2 * np.pi * radius] = 0
             scores[i] = gathered / np.sqrt(2 * np.pi * radius)
         found: list[Circle] = []
-        best, tried = scores.max(axis=0), 0
-        while tried < CIRCLE.max_circles:
+        best = scores.max(axis=0)
+        for _ in range(CIRCLE.max_circles):
             row, column = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
             if best[row, column] <= 0:
                 break
-            i, tried = int(scores[:, row, column].argmax()), tried + 1
+            i = int(scores[:, row, column].argmax())
             circle = self._fitted(float(column * CIRCLE.cell), float(row * CIRCLE.cell), float(radii[i]))
             if circle is not None and not any(circle.is_same(other) for other in found):
                 found.append(circle)

@@ -136,14 +136,14 @@ def _median(coarse: Image, across: float, down: float) -> Image:
     """The median of an 8-bit image [h, w, ...] over a window around every pixel, in shares of the shorter side."""
     height, width = coarse.shape[:2]
     shorter = min(height, width)
-    squeezed = (
-        max(1, round(width * VIEW.median_side / (across * shorter))),
-        max(1, round(height * VIEW.median_side / (down * shorter))),
+    w, h = (
+        min(side, max(1, round(side * VIEW.median_side / (share * shorter))))
+        for side, share in ((width, across), (height, down))
     )
-    small = cv2.resize(coarse, (min(width, squeezed[0]), min(height, squeezed[1])), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(coarse, (w, h), interpolation=cv2.INTER_AREA)
     pad = VIEW.median_side // 2
     padded = cv2.copyMakeBorder(small, pad, pad, pad, pad, cv2.BORDER_REFLECT)
-    median = cv2.medianBlur(padded, VIEW.median_side)[pad : pad + small.shape[0], pad : pad + small.shape[1]]
+    median = cv2.medianBlur(padded, VIEW.median_side)[pad : pad + h, pad : pad + w]
     return np.asarray(cv2.resize(median, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 

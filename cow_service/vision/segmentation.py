@@ -236,14 +236,14 @@ def _labels_from_box(height: int, width: int, box: Floats, core: float) -> NDArr
 
 def _grabcut(image: Image, labels: NDArray[np.uint8]) -> Mask:
     """GrabCut from labels; the labels' own guess where it has nothing to learn from."""
-    sure = {int(value) for value in np.unique(labels)}
-    foreground, background = {int(cv2.GC_FGD), int(cv2.GC_PR_FGD)}, {int(cv2.GC_BGD), int(cv2.GC_PR_BGD)}
-    if sure & foreground and sure & background:
+    foreground = cv2.GC_FGD, cv2.GC_PR_FGD
+    guess = np.isin(labels, foreground)
+    if guess.any() and not guess.all():
         light = np.clip(255 * (image / 255.0) ** CUT.gamma, 0, 255).astype(np.uint8)
         cv2.setRNGSeed(0)  # its clustering draws random numbers: the same image must give the same mask
         no_box, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))  # labels say it all
         cv2.grabCut(light, labels, no_box, *models, CUT.iterations, cv2.GC_INIT_WITH_MASK)
-    return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    return np.isin(labels, foreground)
 
 
 def _tidy(cut: Mask, box: Floats) -> Mask:

@@ -156,12 +156,10 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     search = _Search(edges, image)
     ends = [c for c in edges.circles() if c.support >= TRAIL.end_support and search.contrast(c) >= TRAIL.contrast]
     trails: list[Trail] = []
-    tried = 0
-    for a, b in _pairs(ends):
-        if tried < TRAIL.pairs and _are_apart((a, b), trails) and search.are_alike((a, b)):
-            tried += 1
-            trail = search.trail_through(a, b)
-            trails += [] if trail is None else [trail]
+    alike = (pair for pair in _pairs(ends) if _are_apart(pair, trails) and search.are_alike(pair))
+    for a, b in itertools.islice(alike, TRAIL.pairs):
+        trail = search.trail_through(a, b)
+        trails += [] if trail is None else [trail]
     whole: list[Trail] = []
     for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
         if _are_apart(trail.positions, whole):
