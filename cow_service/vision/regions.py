@@ -104,8 +104,11 @@ class _Found:
 
     def region(self, size: tuple[int, int], is_hidden: bool) -> Region:
         """It as a region of the image (height and width)."""
-        soft = cv2.GaussianBlur(self.mask.astype(np.float32), (0, 0), REGION.mask_sigma)
-        mask = masks.enlarged(np.asarray(soft, np.float32), size)
+        soft = self.mask.astype(np.float32)
+        near = masks.window_of(self.mask, round(6 * REGION.mask_sigma))
+        if near is not None:
+            soft[near] = cv2.GaussianBlur(soft[near], (0, 0), REGION.mask_sigma)
+        mask = masks.enlarged(soft, size)
         roundness = masks.roundness_of(mask.patch)
         return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
 
