@@ -95,12 +95,12 @@ VARIANTS: dict[str, tuple[Patch, ...]] = {
     "drawn boxes": (("vision.scene:find_boxes", none),),
     "arrows": (("vision.scene:find_arrows", none),),
     "hollow arrows": (("vision.strokes:_hollow", none),),
-    "shapes seen": (("stages.reconstruction:shape_seen", nothing),),
+    "shapes seen": (("stages.seeing:shape_seen", nothing),),
     "likeness": (("vision.forms:log_ratio", lambda *_: 0.0),),
     "unlike": (("vision.forms:is_unlike", never), ("vision.forms:is_other_kind", never)),
-    "shadows": (("stages.reconstruction:find_shadow", nothing), ("stages.motion:find_shadow", nothing)),
+    "shadows": (("stages.seeing:find_shadow", nothing), ("stages.motion:find_shadow", nothing)),
     "openings": (("vision.openings:_outer_rim", nothing),),
-    "facing": (("readers.embedded.motions:facing", nothing), ("stages.motion:facing", nothing)),
+    "facing": (("stages.motion:facing", nothing),),
 }
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cow_service.physics.camera import FOCAL_WIDTHS, FloorCamera
 from cow_service.records import BBox, Vector
-from cow_service.vision.masks import bbox_of, eroded, lab_of, resized_mask, scaled, without_holes
+from cow_service.vision.masks import bbox_of, eroded, lab_of, mask_iou, resized_mask, scaled, without_holes
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 PAINT, DARK, OTHER = 1, 2, 3  # labels of pixels, 0 beside it: the body's colour, tyres, and glass and lamps
@@ -119,8 +119,7 @@ class FacingRules(NamedTuple):
     """
 
     working_side: int = 80  # px: the vehicle is compared at this size
-    # of the angle between two headings from which they are different ones
-    elsewhere: float = math.cos(math.radians(72))
+    elsewhere: float = math.cos(math.radians(72))  # of the angle from which two headings differ
     min_score: float = 1.2  # of 2.2: what fits worse is no such vehicle, or is hidden in part
     min_parts: float = 0.03  # of the outline's area that are tyres, glass or lamps: paint alone tells no front
     min_lead: float = 0.03  # of the best score before that of another heading
@@ -193,7 +192,7 @@ def _fits(image: Image, seen: _Seen, pitches: Iterable[float], turns: Floats) ->
             if model is not None:
                 # Intersection over union of the outlines, and the weighted agreement of the parts.
                 drawn = model.drawn(seen.corner, seen.scale, seen.labels.shape[:2])
-                whole = float((inside & (drawn > 0)).sum()) / max(1, int((inside | (drawn > 0)).sum()))
+                whole = mask_iou(inside, drawn > 0)
                 pairs = ((seen.labels == label, drawn == label) for label in (DARK, OTHER))
                 # Sørensen-Dice coefficients, smoothed: 1 where both are empty.
                 tyres, glass = ((2 * (a & b).sum() + least) / (a.sum() + b.sum() + least) for a, b in pairs)

@@ -34,19 +34,14 @@ OUTLINE = OutlineRules()
 class Outline:
     """What a segmenter takes for a thing."""
 
-    cropped: CroppedMask
+    mask: CroppedMask
     score: float
     is_sure: bool  # two prompts agree on it
 
     @property
-    def mask(self) -> Mask:
-        """[H, W]."""
-        return self.cropped.full()
-
-    @property
     def bbox(self) -> BBox:
         """Tight, px."""
-        return self.cropped.bbox
+        return self.mask.bbox
 
 
 def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
@@ -64,9 +59,8 @@ def outlines_in(image: Embedded, boxes: Sequence[BBox]) -> list[Outline | None]:
         agrees = any(mask_iou(segment.mask, other.mask) >= OUTLINE.agree for other in next(again))
         mask = segment.enlarged(*size)
         fills = iou(mask.bbox, box) if mask.area else 0.0
-        outlines.append(
-            Outline(mask, segment.score, agrees and fills >= OUTLINE.is_whole) if fills >= OUTLINE.fills else None
-        )
+        outline = Outline(mask, segment.score, agrees and fills >= OUTLINE.is_whole)
+        outlines.append(outline if fills >= OUTLINE.fills else None)
     return outlines
 
 
@@ -90,15 +84,13 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
             chosen.append(each)
     close = [each for each in chosen if each.score >= chosen[0].score - OUTLINE.rival]
     outlines = [Outline(each.enlarged(*image.size), each.score, True) for each in close]
-    return [each for each in outlines if each.cropped.area]
+    return [each for each in outlines if each.mask.area]
 
 
 def _first(candidates: Sequence[Segment]) -> Segment | None:
     """The best of some candidates that is good enough to be a thing."""
-    good = (
-        each for each in candidates if each.score >= OUTLINE.least_score and 0 < each.mask.mean() <= OUTLINE.most_share
-    )
-    return next(good, None)
+    good = (each for each in candidates if each.score >= OUTLINE.least_score)
+    return next((each for each in good if 0 < each.mask.mean() <= OUTLINE.most_share), None)
 
 
 def _inmost(mask: Mask, size: tuple[int, int]) -> Point:

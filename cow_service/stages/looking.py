@@ -59,7 +59,7 @@ MOST_FOUND = 24  # things that are outlined, best first
 def _seen(bbox: BBox, outline: Outline | None) -> SeenObject:
     mask = None
     if outline is not None and outline.is_sure:
-        mask = f"data:image/png;base64,{base64.b64encode(encode_png(outline.mask)).decode()}"
+        mask = f"data:image/png;base64,{base64.b64encode(encode_png(outline.mask.full())).decode()}"
     return SeenObject(bbox=bbox, mask=mask, score=0.0 if outline is None else outline.score)
 
 

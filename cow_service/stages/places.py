@@ -127,9 +127,8 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
     if run.can_segment:
         found = outlines_at(run.embedded(), (x, y))
         if len(found) == 1 or (found and may_guess):
-            mask = CroppedMask.of(found[0].mask)
-            scene.preset_mask(found[0].bbox, mask.full)
-            return Located.at(given, found[0].bbox, mask)
+            scene.preset_mask(found[0].bbox, found[0].mask.full)
+            return Located.at(given, found[0].bbox, found[0].mask)
         fault = (
             f"{len(found)} objects lie there, one inside the other."
             if found
@@ -137,14 +136,15 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
         )
         if not may_guess:
             raise _not_cut_out(f"The object at the point [{x:.0f}, {y:.0f}] is not clear: {fault}", pointer)
-    cutout = scene.locate((x, y))
-    if cutout.mask is None:
-        return Located.at(given, cutout.bbox)
-    if cutout.fault is not None and not may_guess:
-        raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {cutout.fault}.", pointer)
-    box = ", ".join(f"{value:.0f}" for value in cutout.bbox)
+    bbox = scene.bbox_at((x, y))
+    if scene.region_of(bbox) is not None:
+        return Located.at(given, bbox)
+    fault = scene.fault_of(bbox)
+    if fault is not None and not may_guess:
+        raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {fault}.", pointer)
+    box = ", ".join(f"{value:.0f}" for value in bbox)
     warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
-    return Located.at(given, cutout.bbox, CroppedMask.of(cutout.mask), (warning,))
+    return Located.at(given, bbox, scene.cropped(bbox), (warning,))
 
 
 def _not_cut_out(detail: str, pointer: str) -> CannotGround:
@@ -166,12 +166,10 @@ def outlined_box(
     (outline,) = outlines_in(run.embedded(), [bbox])
     if outline is None or not outline.is_sure:
         doubt = f"Two attempts to outline what is in `{field}.bbox` disagree: give its outline as `{field}.mask`."
-        mask = None if outline is None else CroppedMask.of(outline.mask)
         doubted = given.model_copy(update={"is_doubtful": True})
-        return Located.at(doubted, bbox, mask, (*warnings, doubt))
-    mask = CroppedMask.of(outline.mask)
-    run.scene.preset_mask(outline.bbox, mask.full)
-    return Located.at(given, outline.bbox, mask, warnings)
+        return Located.at(doubted, bbox, None if outline is None else outline.mask, (*warnings, doubt))
+    run.scene.preset_mask(outline.bbox, outline.mask.full)
+    return Located.at(given, outline.bbox, outline.mask, warnings)
 
 
 def find_things(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, ...]:
@@ -183,7 +181,7 @@ def find_things(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenTh
         masks = [(each, mask_from_bbox(scene.clean, each.bbox)) for each in found]
         return tuple(SeenThing(each.phrase, mask, each.score) for each, mask in masks if mask.any())
     outlines = zip(found, outlines_in(run.embedded(), [each.bbox for each in found]), strict=True)
-    return tuple(SeenThing(each.phrase, one.mask, each.score) for each, one in outlines if one and one.is_sure)
+    return tuple(SeenThing(each.phrase, one.mask.full(), each.score) for each, one in outlines if one and one.is_sure)
 
 
 def bare(reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
@@ -209,20 +207,22 @@ def outlined(run: Run[SimulateRequest], reading: Reading) -> tuple[Located, tupl
     others = list[Located]()
     for thing in reading.objects:
         outline = outlines[box_of(thing)]
-        if outline is not None and mask_iou(outline.mask, own.mask) > SAME_MASK:  # the mover, under another name
+        if (
+            outline is not None and mask_iou(outline.mask.full(), own.mask.full()) > SAME_MASK
+        ):  # the mover, under another name
             others.append(Located.at(thing, own.bbox))
         elif outline is None or not outline.is_sure:
             doubted.append(thing.object)
             others.append(Located(thing.model_copy(update={"is_doubtful": True})))
         else:
             exact = thing.model_copy(update={"bbox_deviation": None})
-            others.append(Located.at(exact, outline.bbox, CroppedMask.of(outline.mask)))
+            others.append(Located.at(exact, outline.bbox, outline.mask))
     doubts = tuple(
         f"Two attempts to outline '{name}' disagree: give it in `objects`, with its `mask`."
         for name in dict.fromkeys(doubted)
     )
     exact = mover.model_copy(update={"bbox_deviation": None})
-    return Located.at(exact, own.bbox, CroppedMask.of(own.mask)), tuple(others), doubts
+    return Located.at(exact, own.bbox, own.mask), tuple(others), doubts
 
 
 def _misplaced(pointer: str, value: Sequence[float], fault: str) -> InvalidRequest:

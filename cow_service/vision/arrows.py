@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox, Point
+from cow_service.vision.masks import mask_iou
 from cow_service.vision.strokes import STROKE, Stroke, WorkingImage, drawing_mask
 from cow_service.vision.types import Floats, Mask
 
@@ -34,8 +35,7 @@ class ArrowRules(NamedTuple):
     hollow_fit: float = 0.88  # the same for a hollow drawing, whose head may be small
     head: float = 1.8  # of the shaft's width: the least width of a head
     hollow_head: float = 1.3  # the same of a hollow drawing
-    # of the shaft's width: an arrow without a rim is longer; the side of a can behind a ball is not
-    slender: float = 5.0
+    slender: float = 5.0  # of the shaft's width: the least length without a rim; the side of a can is shorter
 
 
 ARROW = ArrowRules()
@@ -193,8 +193,7 @@ class _Profile:
             for barb in barbs:
                 start, end = fixed(barb, point).tolist()
                 cv2.line(ideal, start, end, 1, max(1, round(thickness)), cv2.LINE_8, 4)
-        real, drawn = np.pad(patch, pad), ideal.astype(bool)
-        return float((real & drawn).sum() / max(1, (real | drawn).sum()))
+        return mask_iou(np.pad(patch, pad), ideal > 0)
 
 
 def _profile(points: Floats, centre: Floats, axis: Floats, least_head: float) -> _Profile | None:

@@ -7,13 +7,13 @@ what has most votes is fitted to the edges by least squares.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from cow_service.records import BBox, Point
+from cow_service.records import Point
 from cow_service.vision.contrast import VIEW, lab_gradients
 from cow_service.vision.masks import lab_of, scaled
 from cow_service.vision.types import Floats, Image, Mask
@@ -41,8 +41,7 @@ class CircleRules(NamedTuple):
     max_circles: int = 32  # that are tried
     near: tuple[float, float] = (0.035, 1.0)  # of the radius, px: edges this close to a circle lie on it
     facing: float = 0.93  # cosine of the angle between an edge's gradient and the radius
-    # cosine of the angle between an edge's gradient and the line of two centres, at most, in a notch
-    notch_facing: float = 0.7
+    notch_facing: float = 0.7  # of a notch, at most: cosine between an edge's gradient and the line of both centres
     notch_reach: float = 1.5  # px beyond the notch's depth in which edges are of it
     least_notch: int = 4  # edges
     same: float = 0.15  # of the radius, by which centres and radii of one circle may differ
@@ -139,12 +138,12 @@ class Edges:
             gathered[gathered < CIRCLE.least_votes * 2 * np.pi * radius] = 0
             scores[i] = gathered / np.sqrt(2 * np.pi * radius)
         found: list[Circle] = []
-        best, tried = scores.max(axis=0), 0
-        while tried < CIRCLE.max_circles:
+        best = scores.max(axis=0)
+        for _ in range(CIRCLE.max_circles):
             row, column = (int(v) for v in np.unravel_index(int(best.argmax()), best.shape))
             if best[row, column] <= 0:
                 break
-            i, tried = int(scores[:, row, column].argmax()), tried + 1
+            i = int(scores[:, row, column].argmax())
             circle = self._fitted(float(column * CIRCLE.cell), float(row * CIRCLE.cell), float(radii[i]))
             if circle is not None and not any(circle.is_same(other) for other in found):
                 found.append(circle)
@@ -153,12 +152,6 @@ class Edges:
             scores[max(0, i - 3) : i + 4, *near] = 0
             best[near] = scores[:, *near].max(axis=0)
         return tuple(sorted(found, key=lambda circle: -circle.support))
-
-    def within(self, box: BBox) -> Edges:
-        """Those in a box [x0, y0, x1, y1] of the image (px)."""
-        stretch = np.array(self.stretch)
-        inside = ((self.points > np.array(box[:2]) / stretch) & (self.points < np.array(box[2:]) / stretch)).all(axis=1)
-        return replace(self, points=self.points[inside], normals=self.normals[inside])
 
     def fit(self, x: float, y: float, radius: float) -> Circle | None:
         """The circle near one of the image (px), if edges lie on it."""
@@ -202,7 +195,7 @@ class Edges:
             on, across, down = _on_circle(points, normals, x, y, radius, max(2.0, share * radius))
             if np.count_nonzero(on) < CIRCLE.least_on:
                 return None
-            a, b, fitted = _least_squares(across[on], down[on])
+            a, b, fitted = fit_circle(across[on], down[on])
             if not 0.7 * radius < fitted < 1.4 * radius or math.hypot(a, b) > 0.4 * radius:
                 return None
             x, y, radius = x + a, y + b, fitted
@@ -215,7 +208,7 @@ class Edges:
         return Circle(float((x + 0.5) * fx), float((y + 0.5) * fy), radius * (fx + fy) / 2, bins)
 
 
-def _least_squares(across: Floats, down: Floats) -> tuple[float, float, float]:
+def fit_circle(across: Floats, down: Floats) -> tuple[float, float, float]:
     """Centre and radius of the circle x^2 + y^2 = 2ax + 2by + c through points [N], by its normal equations."""
     count = len(across)
     squares = across * across + down * down

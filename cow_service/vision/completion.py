@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cow_service.records import BBox
+from cow_service.vision.circles import fit_circle
 from cow_service.vision.contrast import VIEW, View
-from cow_service.vision.masks import dilated, outline_of
+from cow_service.vision.masks import dilated, outer_contour, outline_of
 from cow_service.vision.types import Floats, Floats32, Mask
 
 
@@ -33,8 +35,7 @@ class DiscRules(NamedTuple):
     arc: float = 0.25  # so much of the circle must lie on edges in one run
     beyond_image: float = 0.85  # share of those rays for a circle that the image's border cuts
     ray: tuple[float, float] = (-0.3, 0.2)  # of the radius: how far inside and outside the circle a ray is searched
-    # px, and of the radius: how near the circle its strongest edge must lie; the larger counts
-    ray_error: tuple[float, float] = (1.0, 0.03)
+    ray_error: tuple[float, float] = (1.0, 0.03)  # px, and of the radius: how far off its strongest edge may lie
     on_edges: float = 0.8  # share of the circle
     filled: float = 0.72  # share of the disc that the region fills
     spilled: float = 0.25  # share of the region outside it
@@ -46,6 +47,8 @@ class DiscRules(NamedTuple):
 
 
 DISC = DiscRules()
+_ANGLES = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)
+_RAYS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # unit vectors
 
 
 def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.0) -> Mask | None:
@@ -53,11 +56,7 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
 
     A part that ends before the edges, by up to `grow` px, gives the disc that reaches to the strongest.
     """
-    contours, _ = cv2.findContours(part.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outline = np.asarray(max(contours, key=len)[:, 0], np.float64)
-    if len(outline) < 20:
-        return None
-    circle = _best_circle(outline)
+    circle = _best_circle(outer_contour(part)[:, 0].astype(np.float64))
     if circle is None:
         return None
     x, y, radius, on_circle = circle
@@ -65,8 +64,7 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
     radii = radius + np.arange(-DISC.bled, max(0.5, grow) + 0.01, 0.5)
     radius = float(radii[int(np.median(_along_rays(edges, x, y, radii), axis=0).argmax())])
     height, width = part.shape
-    angles = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)
-    columns, rows = np.round(x + radius * np.cos(angles)).astype(int), np.round(y + radius * np.sin(angles)).astype(int)
+    columns, rows = np.round(np.array([[x], [y]]) + radius * _RAYS).astype(int)
     seen = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     strong = dilated(edges > edge_threshold)
     if seen.mean() < 0.5 or strong[rows[seen], columns[seen]].mean() < DISC.on_edges:
@@ -93,24 +91,24 @@ def as_disc(part: Mask, edges: Floats32, edge_threshold: float, grow: float = 0.
 
 def _along_rays(edges: Floats32, x: float, y: float, radii: Floats) -> Floats32:
     """Values [DISC.samples, R] on rays from a place, at distances [R]."""
-    angles = np.linspace(0, 2 * np.pi, DISC.samples, endpoint=False)[:, None]
-    columns, rows = x + np.cos(angles) * radii[None], y + np.sin(angles) * radii[None]
+    columns, rows = x + np.outer(_RAYS[0], radii), y + np.outer(_RAYS[1], radii)
     values = cv2.remap(edges, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
     return np.asarray(values, np.float32)
 
 
 def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     """Centre and radius (px) of the circle on which most points [N, 2] lie, and their share; None if too few do."""
+    if len(outline) < 20:
+        return None
     rng = np.random.default_rng(0)  # the same outline must give the same circle
-    a, b, c = np.moveaxis(
-        outline[rng.integers(0, len(outline), (DISC.tries, 3))], 1, 0
-    )  # [T, 2] each: not finite on a line
+    a, b, c = np.moveaxis(outline[rng.integers(0, len(outline), (DISC.tries, 3))], 1, 0)  # [T, 2] each
     ab, ac = b - a, c - a
     doubled = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
     ab2, ac2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         x = (ac[:, 1] * ab2 - ab[:, 1] * ac2) / doubled
         y = (ab[:, 0] * ac2 - ac[:, 0] * ab2) / doubled
+    # Not finite for three points on a line.
     circles = np.column_stack([a[:, 0] + x, a[:, 1] + y, np.hypot(x, y)])
     reach = float(np.ptp(outline, axis=0).max())
     circles = circles[np.isfinite(circles).all(axis=1) & (circles[:, 2] >= DISC.radius) & (circles[:, 2] <= reach)]
@@ -121,17 +119,7 @@ def _best_circle(outline: Floats) -> tuple[float, float, float, float] | None:
     best = int(close.sum(axis=1).argmax())
     if close[best].mean() < DISC.on_circle:
         return None
-    chosen = outline[close[best]]
-    terms = np.column_stack([2 * chosen, np.ones(len(chosen))])  # x^2 + y^2 = 2ax + 2by + c, least squares
-    u, v, w = np.linalg.lstsq(terms, (chosen**2).sum(axis=1), rcond=None)[0].tolist()
-    return u, v, math.sqrt(max(w + u * u + v * v, 0.0)), float(close[best].mean())
-
-
-def _joined(mask: Mask, seeds: Mask, connectivity: int) -> Mask:
-    """The connected patches of a mask [h, w] in which seeds [h, w] lie."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
-    touched = np.unique(labels[seeds])
-    return np.isin(labels, touched[touched > 0])
+    return *fit_circle(*outline[close[best]].T), float(close[best].mean())
 
 
 class DarkRules(NamedTuple):
@@ -189,8 +177,7 @@ class FaceRules(NamedTuple):
     lit_black: float = 0.85  # of the surroundings' light: the lit face of something black
     touched: float = 1.0  # of the side of a patch: so much of something black lies next to it
     texture_edge: float = 0.4  # of the surroundings' spread in lightness: weaker edges are texture
-    # as `ViewRules.edges`: the sides of something surely white stand out by as little
-    weak_edges: tuple[float, float] = (0.45, 1.8)
+    weak_edges: tuple[float, float] = (0.45, 1.8)  # as `ViewRules.edges`, for the sides of something surely white
 
 
 FACE = FaceRules()
@@ -209,46 +196,52 @@ def white_sides(view: View, core: Mask) -> Mask:
     _, labels, tops, _ = cv2.connectedComponentsWithStats(white.astype(np.uint8), connectivity=8)
     if not (tops[1:, 4] >= FACE.top).any():
         return np.zeros(white.shape, bool)
-    near_edges = dilated(view.edges > view.edge_threshold, 5)
-    lit_too = (
-        (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > FACE.bright_reach) & (view.chroma < 2 * VIEW.chroma_step)
-    ) | white
-    sides, surely_white = np.zeros(white.shape, bool), set[int]()
-    for top, (x, y, w, h, area) in enumerate(tops.tolist()):
-        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        if top == 0 or area < FACE.top:
-            continue
-        if float(np.mean(near_edges[around][outline_of(labels[around] == top)])) <= FACE.sharp_top:
-            continue
-        if 0.2 * w < h < 0.8 * w:  # slightly lit pixels joined to it, right below and no further down than it is wide
-            window = slice(y, y + h + w), slice(x, x + w)
-            sides[window] |= _joined(lit_too[window], labels[window] == top, 4)
-        own = labels[y : y + h, x : x + w] == top
-        if area >= FACE.white and float(np.median(view.chroma[y : y + h, x : x + w][own])) < VIEW.chroma_step:
-            surely_white.add(top)
-
-    def has_side(top: int, side: _Box, area: int, lit: bool) -> bool:
-        """Whether a side belongs to a top: small compared with it, and lit or right below it."""
-        x, y, w, _ = side
-        tx, ty, tw, _, top_area = tops[top].tolist()
-        hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > FACE.hangs * w and y >= ty
-        return top_area >= FACE.top and area < FACE.ratio * top_area and (lit or hangs)
-
+    sides, surely_white = _lit_below(view, white, labels, tops)
     for thresholds in (*VIEW.edges, *([FACE.weak_edges] if surely_white else [])):
         weak = thresholds == FACE.weak_edges
         for near, patch, box in enclosed(view, *thresholds):
-            is_shade = (
-                np.median(view.light[near][patch]) < FACE.shade
-                and np.median(view.chroma_gap[near][patch]) < FACE.same_chroma
+            light, gap, chroma, bright = (
+                float(np.median(values[near][patch]))
+                for values in (view.light, view.chroma_gap, view.chroma, view.bright)
             )
-            if is_shade or (weak and float(np.median(view.chroma[near][patch])) > VIEW.chroma_step):
+            is_shade = light < FACE.shade and gap < FACE.same_chroma
+            if is_shade or (weak and chroma > VIEW.chroma_step):
                 continue
             touched = set(np.unique(labels[near][dilated(patch, times=4)]).tolist()) - {0}
-            lit = len(touched) > 0 and float(np.median(view.bright[near][patch])) > FACE.bright_reach
-            area = int(np.count_nonzero(patch))
-            if any(has_side(top, box, area, lit) for top in (touched & surely_white if weak else touched)):
+            area, is_lit = int(np.count_nonzero(patch)), bright > FACE.bright_reach
+            if any(_has_side(tops[top], box, area, is_lit) for top in (touched & surely_white if weak else touched)):
                 sides[near] |= dilated(patch, times=2)
     return sides
+
+
+def _lit_below(view: View, white: Mask, labels: NDArray[np.int32], tops: NDArray[np.int32]) -> tuple[Mask, set[int]]:
+    """What is slightly lit right below bright tops, and which of those are surely of something white.
+
+    Tops are the patches of `white` [h, w], by their labels [h, w] and statistics [N, 5].
+    """
+    near_edges = dilated(view.edges > view.edge_threshold, 5)
+    is_lit = (cv2.GaussianBlur(view.bright, (0, 0), 1.5) > FACE.bright_reach) & (view.chroma < 2 * VIEW.chroma_step)
+    sides, surely_white = np.zeros(white.shape, bool), set[int]()
+    for top, (x, y, w, h, area) in enumerate(tops.tolist()):
+        around = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
+        own = labels[around] == top
+        if top == 0 or area < FACE.top or float(np.mean(near_edges[around][outline_of(own)])) <= FACE.sharp_top:
+            continue
+        if 0.2 * w < h < 0.8 * w:  # pixels joined to it, no further down than it is wide
+            window = slice(y, y + h + w), slice(x, x + w)
+            _, patches = cv2.connectedComponents((is_lit | white)[window].astype(np.uint8), connectivity=4)
+            sides[window] |= np.isin(patches, np.unique(patches[labels[window] == top]))
+        if area >= FACE.white and float(np.median(view.chroma[around][own])) < VIEW.chroma_step:
+            surely_white.add(top)
+    return sides, surely_white
+
+
+def _has_side(top: NDArray[np.int32], side: _Box, area: int, is_lit: bool) -> bool:
+    """Whether a side belongs to a top, by its statistics: small compared with it, and lit or right below it."""
+    x, y, w, _ = side
+    tx, ty, tw, _, top_area = top.tolist()
+    hangs = min(x + w, tx + tw + 3) - max(x, tx - 3) > FACE.hangs * w and y >= ty
+    return top_area >= FACE.top and area < FACE.ratio * top_area and (is_lit or hangs)
 
 
 def black_faces(view: View, black: Mask) -> Mask:
@@ -258,10 +251,8 @@ def black_faces(view: View, black: Mask) -> Mask:
         return faces
     for near, patch, _ in enclosed(view, FACE.strong_edge, 0.0):
         touched = np.count_nonzero(dilated(patch, times=4) & black[near])
-        if (
-            touched > FACE.touched * math.sqrt(np.count_nonzero(patch))
-            and np.median(view.light[near][patch]) < FACE.lit_black
-        ):
+        is_beside = touched > FACE.touched * math.sqrt(np.count_nonzero(patch))
+        if is_beside and np.median(view.light[near][patch]) < FACE.lit_black:
             faces[near] |= dilated(patch, times=2)
     return faces
 

@@ -50,9 +50,7 @@ class View:
     bright: Floats32  # lightness above the surroundings
     around: Floats32  # lightness of the surroundings
     spread: Floats32  # how far the lightness of the surroundings varies: the texture of a floor is no thing
-    across: Floats32  # [h, w, 3] Lab gradients per px to the right
-    down: Floats32  # [h, w, 3] and down
-    edges: Floats32  # length of all of them
+    edges: Floats32  # length of all Lab gradients, per px
     median_edge: float  # of the whole image
     edge_threshold: float  # gradient from which the outline of an object may lie on it
 
@@ -63,7 +61,7 @@ class View:
 
     def crop(self, window: tuple[slice, slice]) -> View:
         """The same measurements for a part of the image."""
-        names = ("lab", "chroma", "chroma_gap", "bright", "around", "spread", "across", "down", "edges")
+        names = ("lab", "chroma", "chroma_gap", "bright", "around", "spread", "edges")
         return replace(self, **{name: getattr(self, name)[window] for name in names})
 
 
@@ -99,7 +97,7 @@ def view_of(small: Image) -> View:
     deviation = scaled(np.asarray(off_light * (255 / VIEW.spread_limit), np.uint8), 0.25)
     typical = np.maximum(_median(deviation, VIEW.wide, VIEW.wide), _median(deviation, *VIEW.strip)).astype(np.float32)
     spread = cv2.resize(typical * np.float32(1.48 * VIEW.spread_limit / 255), small.shape[1::-1])
-    across, down, edges = lab_gradients(lab)
+    edges = lab_gradients(lab)[2]
     median_edge = float(np.median(edges))
     return View(
         lab=lab,
@@ -108,8 +106,6 @@ def view_of(small: Image) -> View:
         bright=bright,
         around=np.asarray(around, np.float32),
         spread=np.asarray(spread, np.float32),
-        across=across,
-        down=down,
         edges=edges,
         median_edge=median_edge,
         edge_threshold=max(VIEW.edges[1][0], VIEW.edges[1][1] * median_edge),
@@ -140,14 +136,14 @@ def _median(coarse: Image, across: float, down: float) -> Image:
     """The median of an 8-bit image [h, w, ...] over a window around every pixel, in shares of the shorter side."""
     height, width = coarse.shape[:2]
     shorter = min(height, width)
-    squeezed = (
-        max(1, round(width * VIEW.median_side / (across * shorter))),
-        max(1, round(height * VIEW.median_side / (down * shorter))),
+    w, h = (
+        min(side, max(1, round(side * VIEW.median_side / (share * shorter))))
+        for side, share in ((width, across), (height, down))
     )
-    small = cv2.resize(coarse, (min(width, squeezed[0]), min(height, squeezed[1])), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(coarse, (w, h), interpolation=cv2.INTER_AREA)
     pad = VIEW.median_side // 2
     padded = cv2.copyMakeBorder(small, pad, pad, pad, pad, cv2.BORDER_REFLECT)
-    median = cv2.medianBlur(padded, VIEW.median_side)[pad : pad + small.shape[0], pad : pad + small.shape[1]]
+    median = cv2.medianBlur(padded, VIEW.median_side)[pad : pad + h, pad : pad + w]
     return np.asarray(cv2.resize(median, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 

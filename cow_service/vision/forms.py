@@ -28,11 +28,9 @@ class FormRules(NamedTuple):
     aspect_step: float = 0.1  # natural logarithm: so far off counts as 1
     filled_step: float = 0.02  # share of the hull: the same
     width_step: float = 0.05  # share of the width: the same
-    # misfit above which a ball shows less than two thirds of its height; whole ones have none
-    less_than_round: float = 3.0
+    less_than_round: float = 3.0  # misfit of a ball of which less than two thirds of the height show; whole ones have 0
     contradicts: float = 6.0  # misfit above which an object is not the named one
-    # log ratio of an outline: with less it is some other thing that is called so, whatever its colour
-    unlike: float = -2.5
+    unlike: float = -2.5  # log ratio of an outline: with less it is some other thing that is called so
     fits: float = 2.0  # misfit below which an outline is well described
     circle: float = 0.95  # share of balls whose outline a circle fits, and of other things whose outline none fits
     odd: float = 0.05  # share of outlines that fit no shape: half hidden, or with a shadow
@@ -155,9 +153,7 @@ def _measures(region: Region) -> list[float]:
     """What `OUTLINES` has ranges of, the first as a natural logarithm."""
     mask = region.mask.patch
     height, width = mask.shape
-    sides = mask & ~(np.roll(mask, 1, axis=1) & np.roll(mask, -1, axis=1))  # their hull is that of the mask
-    sides[:, [0, -1]] = mask[:, [0, -1]]
-    filled = np.count_nonzero(mask) / np.count_nonzero(hull(sides))
+    filled = np.count_nonzero(mask) / np.count_nonzero(hull(mask))
     # The median width in each of the bands, over the largest of them.
     rows = mask.sum(axis=1)
     cuts = [(int(low * height), math.ceil(high * height)) for low, high in BANDS]
@@ -187,9 +183,8 @@ NAMING = NamingRules()
 
 
 IMPOSSIBLE = -math.inf
-SOLID = frozenset(
-    ["glass", "chair", "book", "lamp", "robot", "pencil", "pen"]
-)  # no balls; of their outlines nothing is known
+# No balls; of their outlines nothing is known.
+SOLID = frozenset(["glass", "chair", "book", "lamp", "robot", "pencil", "pen"])
 
 
 def likeness(regions: Sequence[Region], noun: str | None, head: str | None, colour: str | None) -> list[float]:
@@ -197,10 +192,9 @@ def likeness(regions: Sequence[Region], noun: str | None, head: str | None, colo
     ratios, is_found = list[float](), any(noun in region.called for region in regions)
     for region in regions:
         tint, shape = 0.0, shape_ratio(region, head, colour is not None)
-        if colour is not None and region.colour != colour:
-            tint = NAMING.near if colour in region.colours else IMPOSSIBLE
-        elif colour is not None:
-            tint = NAMING.exact
+        if colour is not None:
+            near = NAMING.near if colour in region.colours else IMPOSSIBLE
+            tint = NAMING.exact if region.colour == colour else near
         if noun in region.called:  # outlines of real things are of many forms
             ratios.append(max(shape, NAMING.least) + tint + NAMING.called)
         else:
@@ -218,6 +212,5 @@ def shape_ratio(region: Region, head: str | None, has_colour: bool) -> float:
         can_be = round_enough or (region.is_hidden and has_colour)
     if form is None or not can_be:
         return 0.0 if can_be else IMPOSSIBLE
-    return (NAMING.cut if is_cut(region, form) else 1.0) * min(
-        NAMING.clearly_worse, max(NAMING.least, log_ratio(region, form))
-    )
+    ratio = min(NAMING.clearly_worse, max(NAMING.least, log_ratio(region, form)))
+    return NAMING.cut * ratio if is_cut(region, form) else ratio

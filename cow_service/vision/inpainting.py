@@ -70,13 +70,10 @@ def fill_hole(image: Image, hole: Mask, avoid: Mask | None = None) -> Image:
     size = float(np.sqrt(np.count_nonzero(hole)))
     reach = FILL.rim * size + FILL.rim_least + max(FILL.beside_least, FILL.beside * size)
     around = _surroundings(image, hole, avoid, max(round(reach), round(FILL.fade * size)) + 2)
-    if around is None or not around.trusted.any():
-        around = _surroundings(image, hole, avoid, max(24, int(FILL.wide * size)))
-        reach = np.inf
     if around is None:
         return image
     varied = _is_varied(around.source, around.inside, around.trusted)
-    if varied and np.isfinite(reach):
+    if varied:
         around = _surroundings(image, hole, avoid, max(24, int(FILL.wide * size))) or around
     beside = around.trusted & (around.away < reach)
     if not beside.any():
@@ -114,10 +111,8 @@ def blend_fill(image: Image, filled: Image, hole: Mask, avoid: Mask) -> Image:
     beyond, within = (
         cv2.distanceTransform((~there).astype(np.uint8), cv2.DIST_L2, 5) for there in (inside, known)
     )  # px from the hole, and from what is known around it
-    (around, most), (own, least) = (
-        (_mean_along(values, band), cv2.boxFilter(band.astype(np.float32), -1, (FILL.seam_width,) * 2, normalize=False))
-        for values, band in ((source, known & (beyond <= FILL.seam)), (new, inside & (within <= FILL.seam)))
-    )
+    around, most = _mean_along(source, known & (beyond <= FILL.seam))
+    own, least = _mean_along(new, inside & (within <= FILL.seam))
     seen = inside & (within <= FILL.seam) & (most > FILL.seam_width) & (least > FILL.seam_width)
     if seen.any():
         off = push_pull(np.asarray(around - own, np.float32), seen)
@@ -129,12 +124,12 @@ def blend_fill(image: Image, filled: Image, hole: Mask, avoid: Mask) -> Image:
     return result
 
 
-def _mean_along(values: Floats32, band: Mask) -> Floats32:
-    """Per pixel, the mean colour [h, w, 3] of what lies next to it in a band [h, w]."""
+def _mean_along(values: Floats32, band: Mask) -> tuple[Floats32, Floats32]:
+    """Per pixel, the mean colour [h, w, 3] of what lies next to it in a band [h, w], and how many pixels that are."""
     weight = band.astype(np.float32)
     total = cv2.boxFilter(values * weight[..., None], -1, (FILL.seam_width,) * 2, normalize=False)
     count = cv2.boxFilter(weight, -1, (FILL.seam_width,) * 2, normalize=False)
-    return np.asarray(total / np.maximum(count, 1)[..., None], np.float32)
+    return np.asarray(total / np.maximum(count, 1)[..., None], np.float32), np.asarray(count, np.float32)
 
 
 def shadow_beside(image: Image, hole: Mask, avoid: Mask) -> Mask:

@@ -115,6 +115,11 @@ def roundness_of(mask: Mask) -> float:
     return float(cv2.contourArea(outline) / max(1.0, np.pi * radius * radius))
 
 
+def half_width(mask: Mask) -> float:
+    """Radius (px) of the largest circle inside a mask [h, w]."""
+    return float(cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
+
+
 def hull(mask: Mask) -> Mask:
     """The convex hull [H, W] of a mask."""
     filled = np.zeros(mask.shape, np.uint8)

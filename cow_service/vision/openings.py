@@ -62,10 +62,11 @@ def _outer_rim(mask: CroppedMask) -> Rim | None:
     height, width = patch.shape
     tops = np.where(patch.any(axis=0), patch.argmax(axis=0), height).astype(np.float64)
     found: list[tuple[float, Rim]] = []
-    for tall in np.arange(
-        max(1.0, RIM.flattest * width / 2), min(RIM.roundest * width / 2, 0.9 * height), 0.5
-    ).tolist():
+    least, most = max(1.0, RIM.flattest * width / 2), min(RIM.roundest * width / 2, 0.9 * height)
+    for tall in np.arange(least, most, 0.5).tolist():
         across = np.nonzero(patch[min(height - 1, round(tall))])[0]
+        if not len(across):  # between two pieces of the mask
+            continue
         half, middle = float(across[-1] - across[0] + 1) / 2, float(across[-1] + across[0] + 1) / 2
         if half < max(3.0, RIM.least_rim * width / 2):
             continue

@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 
 from cow_service.records import BBox
 from cow_service.vision import masks
-from cow_service.vision.completion import (
-    as_disc,
-    black_faces,
-    is_top,
-    is_underside,
-    white_sides,
-)
+from cow_service.vision.completion import as_disc, black_faces, is_top, is_underside, white_sides
 from cow_service.vision.contrast import VIEW, View, colour_name, colour_names, view_of
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.types import Floats32, Image, Mask
@@ -50,8 +44,7 @@ class RegionRules(NamedTuple):
     halfway: float = 0.35  # of the largest step nearby
     min_area: float = 0.0003  # of the image
     max_area: float = 0.25  # the same, at most
-    # of the height or width of something bright and pale that runs along the image's border: a wall
-    along_border: float = 0.5
+    along_border: float = 0.5  # of the length of something bright and pale along the image's border: a wall
     most: int = 40  # the largest are kept: the work that follows grows with their number
     clutter: float = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
     split_hue: float = 36.0  # degrees: another colour, hence another object
@@ -66,8 +59,7 @@ class RegionRules(NamedTuple):
     disc: float = 0.93  # roundness from which a drawn shape is a disc
     rim: int = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
     dark: float = 28.0  # lightness below which a part may be the underside of another
-    # Lab units from the surroundings, from which contrast takes nothing from the confidence
-    sure_contrast: float = 20.0
+    sure_contrast: float = 20.0  # Lab units: from here on contrast takes nothing from the confidence
     sure_area: float = 300.0  # px at the working size, from which the size takes nothing
 
 
@@ -125,6 +117,40 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
     height, width = image.shape[:2]
     view = view_of(masks.scaled(image, min(1.0, VIEW.working_side / max(height, width))))
+    solid = _solid(view)
+    border = np.ones(solid.shape, bool)
+    border[1:-1, 1:-1] = False
+    walls = border.copy()
+    walls[-1, 1:-1] = False  # what the lower border cuts stands in front
+    found: list[_Found] = []
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
+    for i, (x, y, w, h, _) in enumerate(stats.tolist()):
+        if i == 0 or _is_background(stats[i], solid.shape):
+            continue
+        pad = 6 + max(w, h) // 3  # a ball may have lost as much to a highlight
+        window = slice(max(0, y - pad), y + h + pad), slice(max(0, x - pad), x + w + pad)
+        near = view.crop(window)
+        for part in _parts(near, labels[window] == i):
+            if _is_wall(near, part, walls[window]):
+                continue
+            disc = as_disc(part, near.edges, near.edge_threshold)
+            if disc is None and not _stands_out(near, part):
+                continue
+            shape = part if disc is None else disc
+            whole = np.zeros(solid.shape, bool)
+            whole[window] = shape
+            confidence = _confidence(near, shape, border[window], disc is not None)
+            found.append(_Found(whole, near.lab[part], confidence, disc is not None))
+    found = _with_undersides(found)
+    balls = np.logical_or.reduce([border & False, *(one.mask for one in found if one.is_disc)])
+    found = [_without_rim(one, balls) for one in found]
+    pairs = zip(found, _hidden(found), strict=True)
+    regions = [one.region((height, width), is_hidden) for one, is_hidden in pairs]
+    return tuple(sorted(regions, key=lambda region: -region.mask.area)[: REGION.most])
+
+
+def _solid(view: View) -> NDArray[np.uint8]:
+    """Where [h, w] things are, 1 or 0; nowhere in a cluttered image."""
     # What is surely of an object: of another hue, clearly brighter, or nearly black.
     coloured = view.chroma_gap > VIEW.chroma_step
     body = coloured | (view.bright > np.maximum(VIEW.bright_step, REGION.bright_spreads * view.spread))
@@ -134,41 +160,9 @@ def find_regions(image: Image) -> tuple[Region, ...]:
     low = step < REGION.halfway * cv2.dilate(step, np.ones((7, 7), np.uint8))
     core &= ~(low & masks.dilated(~core, 5))
     if core.mean() > REGION.clutter:
-        return ()
+        return np.zeros(core.shape, np.uint8)
     solid = (core | white_sides(view, core)).astype(np.uint8)
-    solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    border = np.ones(solid.shape, bool)
-    border[1:-1, 1:-1] = False
-    walls = border.copy()
-    walls[-1, 1:-1] = False  # what the lower border cuts stands in front
-    found: list[_Found] = []
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
-    for i in range(1, count):
-        if not REGION.min_area * solid.size <= stats[i][4] <= REGION.max_area * solid.size or _is_background(
-            stats[i], solid.shape
-        ):
-            continue
-        x, y, w, h = (int(v) for v in stats[i][:4])
-        pad = 6 + max(w, h) // 3  # a ball may have lost as much to a highlight
-        window = slice(max(0, y - pad), y + h + pad), slice(max(0, x - pad), x + w + pad)
-        near = view.crop(window)
-        for part in _parts(near, labels[window] == i):
-            if _is_wall(near, part, walls[window]):
-                continue
-            disc = as_disc(part, near.edges, view.edge_threshold)
-            # An object's outline lies on edges; that of a patch of light does not.
-            strong = cv2.dilate(near.edges, np.ones((5, 5), np.uint8))[masks.outline_of(part)] > view.edge_threshold
-            if disc is not None or (float(np.mean(strong)) > REGION.sharp_share and _stands_out(near, part)):
-                whole = np.zeros(solid.shape, bool)
-                whole[window] = part if disc is None else disc
-                confidence = _confidence(near, part if disc is None else disc, border[window], disc is not None)
-                found.append(_Found(whole, near.lab[part], confidence, disc is not None))
-    found = _with_undersides(found)
-    balls = np.logical_or.reduce([border & False, *(one.mask for one in found if one.is_disc)])
-    found = [_without_rim(one, balls) for one in found]
-    each = zip(found, _hidden(found), strict=True)
-    regions = [one.region((height, width), is_hidden) for one, is_hidden in each]
-    return tuple(sorted(regions, key=lambda region: -region.mask.area)[: REGION.most])
+    return np.asarray(cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
 
 
 def _black(view: View, body: Mask) -> Mask:
@@ -188,22 +182,15 @@ def _black(view: View, body: Mask) -> Mask:
     shadows: list[tuple[float, int]] = []
     alone: list[tuple[float, Mask]] = []
     for blob in _blobs(dark & ~outlines, 0):
-        area, light, box = int(np.count_nonzero(blob)), float(np.percentile(view.light[blob], 30)), masks.bbox_of(blob)
+        area, light = int(np.count_nonzero(blob)), float(np.percentile(view.light[blob], 30))
         beside = [masks.bbox_of(t) for t, size in things if area < REGION.most_shadow * size and (t & blob).any()]
-        is_texture = np.median(view.bright[blob]) > -REGION.spreads * np.median(view.spread[blob])
-        is_darkest = light < REGION.blackest_light and np.percentile(view.lab[blob, 0], 30) < REGION.blackest
-        if is_texture or light > REGION.black_light:
-            shadows.append((light, area))
-        elif (
-            np.median(view.chroma_gap[blob]) > REGION.same_chroma  # a shadow keeps the floor's hue
-            or any(is_top(box, thing) for thing in beside)
-            or (is_darkest and beside and (area > REGION.own_area or any(is_underside(box, thing) for thing in beside)))
-        ):
-            black |= blob
-        elif beside:
-            shadows.append((light, area))
-        else:
+        is_black = light <= REGION.black_light and _is_black(view, blob, light < REGION.blackest_light, beside)
+        if is_black is None:
             alone.append((light, blob))
+        elif is_black:
+            black |= blob
+        else:
+            shadows.append((light, area))
     for light, blob in alone:
         least = REGION.least_shadow * np.count_nonzero(blob)
         if not any(abs(light - shade) < REGION.same_light and area > least for shade, area in shadows):
@@ -211,11 +198,28 @@ def _black(view: View, body: Mask) -> Mask:
     return black | (black_faces(view, black) & ~near) | (dark & outlines)
 
 
+def _is_black(view: View, blob: Mask, is_darkest: bool, beside: Sequence[BBox]) -> bool | None:
+    """Whether a dark blob is black and no shadow of the things beside it; None where there are none."""
+    if np.median(view.bright[blob]) > -REGION.spreads * np.median(view.spread[blob]):
+        return False  # it is texture
+    box = masks.bbox_of(blob)
+    if np.median(view.chroma_gap[blob]) > REGION.same_chroma or any(is_top(box, thing) for thing in beside):
+        return True  # a shadow keeps the floor's hue
+    if not beside:
+        return None
+    if not is_darkest or np.percentile(view.lab[blob, 0], 30) >= REGION.blackest:
+        return False
+    return bool(np.count_nonzero(blob) > REGION.own_area) or any(is_underside(box, thing) for thing in beside)
+
+
 def _stands_out(view: View, part: Mask) -> bool:
-    """Whether the steps along its outline are larger than the texture of what is around it makes them."""
+    """Whether its outline lies on edges, unlike that of a patch of light, and on larger ones than texture has."""
+    outline = masks.outline_of(part)
+    strong = cv2.dilate(view.edges, np.ones((5, 5), np.uint8))[outline] > view.edge_threshold
+    if np.mean(strong) <= REGION.sharp_share:
+        return False
     if float(np.median(view.chroma_gap[part])) > VIEW.strong_chroma_step:
         return True
-    outline = masks.outline_of(part)
     steps = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))[outline]
     return float(np.median(steps)) > REGION.out_of_texture * float(np.median(view.spread[outline]))
 
@@ -226,29 +230,18 @@ def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
     return best if best is not None and masks.is_same_object(best.bbox, bbox) else None
 
 
-def disc_region(image: Image, disc: Mask) -> Region:
-    """A ball of an RGB image [H, W, 3] whose mask [H, W] is known."""
-    names = _names(masks.lab_of(image[disc][None])[0])
-    return Region(CroppedMask.of(disc), *names, roundness=1.0, confidence=1.0, is_disc=True)
-
-
-def drawn_region(image: Image, shape: CroppedMask) -> Region:
-    """A shape of a drawing, an RGB image [H, W, 3]."""
-    roundness = masks.roundness_of(shape.patch)
-    names = _names(masks.lab_of(image[shape.rows, shape.columns][shape.patch][None])[0])
-    return Region(shape, *names, roundness, confidence=1.0, is_disc=roundness > REGION.disc)
-
-
-def found_region(image: Image, mask: Mask, called: frozenset[str]) -> Region:
-    """What models found in an RGB image [H, W, 3]: its mask [H, W], and what they call it."""
-    shape = CroppedMask.of(mask)
-    names = _names(masks.lab_of(image[shape.rows, shape.columns][shape.patch][None])[0])
-    return Region(shape, *names, masks.roundness_of(shape.patch), confidence=1.0, is_disc=False, called=called)
+def known_region(image: Image, mask: CroppedMask) -> Region:
+    """A thing of an RGB image [H, W, 3] whose mask is certain; a disc where that is round."""
+    roundness = masks.roundness_of(mask.patch)
+    names = _names(masks.lab_of(image[mask.rows, mask.columns][mask.patch][None])[0])
+    return Region(mask, *names, roundness, confidence=1.0, is_disc=roundness > REGION.disc)
 
 
 def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
-    """Whether a component is a strip of wall or floor: it runs along much of an edge of the image, or spans it."""
+    """Whether a component is no thing by its size, or a strip of wall or floor along an edge of the image."""
     (x, y, w, h, area), (height, width) = stats.tolist(), shape
+    if not REGION.min_area * height * width <= area <= REGION.max_area * height * width:
+        return True
     on_side, on_top, on_bottom = x == 0 or x + w == width, y == 0, y + h == height
     spans = w > 0.5 * width or h > 0.75 * height
     sliver = (on_top or on_side) and (area < 0.45 * w * h or min(w, h) < 0.12 * max(w, h))
@@ -278,13 +271,13 @@ def _parts(view: View, component: Mask) -> list[Mask]:
                 balls.append(disc)
     rest = _blobs(component & ~taken, REGION.min_rest * component.sum())
     if balls:  # what is left along the edge of a ball is blur
-        rest = [blob for blob in rest if _half_width(blob) > REGION.edge_band]
+        rest = [blob for blob in rest if masks.half_width(blob) > REGION.edge_band]
     parts = balls + [part for blob in rest for part in _coloured_parts(view, blob)]
-    whole = masks.hull(component) if len(parts) > 1 else component
-    is_one = (
-        len(parts) > 1 and np.count_nonzero(component) > REGION.filled * np.count_nonzero(whole) and _is_ellipse(whole)
-    )
-    return [whole] if is_one else parts  # a ball or an egg, and a shadow across it
+    if len(parts) > 1:
+        whole = masks.hull(component)
+        if np.count_nonzero(component) > REGION.filled * np.count_nonzero(whole) and _is_ellipse(whole):
+            return [whole]  # a ball or an egg, and a shadow across it
+    return parts
 
 
 def _is_ellipse(mask: Mask) -> bool:
@@ -292,7 +285,7 @@ def _is_ellipse(mask: Mask) -> bool:
     outline = np.argwhere(masks.outline_of(mask))[:, ::-1].astype(np.int32)
     ellipse = np.zeros(mask.shape, np.uint8)
     cv2.ellipse(ellipse, cv2.fitEllipse(outline), (1,), -1)
-    return float(np.count_nonzero(mask & (ellipse > 0)) / np.count_nonzero(mask | (ellipse > 0))) > REGION.ellipse
+    return masks.mask_iou(mask, ellipse > 0) > REGION.ellipse
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
@@ -315,9 +308,9 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     bright = neutral & (view.bright > -12) & (lab[..., 0] > 40)
     black = neutral & (lab[..., 0] < REGION.black_share * view.around)
     dark = _blobs(black, min(0.35 * area, REGION.own_area))
-    broad = min((_half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
+    broad = min((masks.half_width(seed) for seed in seeds), default=0.0) if dark else 0.0
     seeds.extend(_blobs(bright, min(0.3 * area, REGION.own_area)))
-    seeds += [seed for seed in dark if _half_width(seed) > REGION.own_width * broad or seed.sum() > 0.35 * area]
+    seeds += [seed for seed in dark if masks.half_width(seed) > REGION.own_width * broad or seed.sum() > 0.35 * area]
     if len(seeds) <= 1:
         return [component]
     distances = np.stack([cv2.distanceTransform((~seed).astype(np.uint8), cv2.DIST_L2, 3) for seed in seeds])
@@ -341,19 +334,17 @@ def _without_rim(one: _Found, balls: Mask) -> _Found:
 
 def _hidden(found: Sequence[_Found]) -> list[bool]:
     """Which of them have much of their outline along one thing of another colour that ends lower in the image."""
-    things = [(masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.dilated(one.mask, 5)) for one in found]
+    things = [
+        (masks.bbox_of(one.mask)[3], _names(one.lab)[1], masks.outline_of(one.mask), masks.dilated(one.mask, 5))
+        for one in found
+    ]
     return [
         any(
-            low > own[0] and not colours & own[1] and near[outline].mean() > REGION.hidden
-            for low, colours, near in things
+            low > own_low and not colours & own and near[outline].mean() > REGION.hidden
+            for low, colours, _, near in things
         )
-        for outline, own in zip((masks.outline_of(one.mask) for one in found), things, strict=True)
+        for own_low, own, outline, _ in things
     ]
-
-
-def _half_width(mask: Mask) -> float:
-    """Radius (px) of the largest circle inside a mask [h, w]."""
-    return float(cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
 
 
 def _blobs(mask: Mask, least: float) -> list[Mask]:
@@ -375,36 +366,30 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     inner = outline & ~border
     nearby = cv2.dilate(view.edges, np.ones((3, 3), np.uint8))
     sharp = float(np.mean(nearby[inner] > view.edge_threshold)) if inner.any() else 0.0
-    contrast = (
-        1.0 if is_disc else float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / REGION.sure_contrast
-    )
-    size = float(np.count_nonzero(part)) / (REGION.sure_area / 2 if is_disc else REGION.sure_area)
+    contrast = float(np.median(np.hypot(view.chroma_gap[part], view.bright[part]))) / REGION.sure_contrast
+    size = float(np.count_nonzero(part)) / REGION.sure_area
     cut_off = 1 - float(np.count_nonzero(inner)) / max(1, int(np.count_nonzero(outline)))
-    edges = max(sharp, 0.9) if is_disc else sharp
-    return edges * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
+    if is_disc:
+        sharp, contrast, size = max(sharp, 0.9), 1.0, 2 * size
+    return sharp * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
 
 
 def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
     """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
-    dark: list[_Found] = []
-    whole: dict[int, _Found] = {}
-    for i, one in enumerate(found):
+    dark, whole = list[_Found](), list[_Found]()
+    for one in found:
         lightness, a, b = np.median(one.lab, axis=0).tolist()
-        if not one.is_disc and lightness < REGION.dark and colour_name(lightness, a, b) in {"black", "brown"}:
-            dark.append(one)
-        else:
-            whole[i] = one
+        is_dark = lightness < REGION.dark and colour_name(lightness, a, b) in {"black", "brown"}
+        (dark if is_dark and not one.is_disc else whole).append(one)
     for part in dark:
         box, near = masks.bbox_of(part.mask), masks.dilated(part.mask)
-        carried = [
-            i for i, one in whole.items() if (one.mask & near).any() and is_underside(box, masks.bbox_of(one.mask))
-        ]
-        if len(carried) == 1:
-            body = whole[carried[0]]
-            whole[carried[0]] = replace(body, mask=body.mask | part.mask)
-        else:
-            whole[len(found) + len(whole)] = part
-    return list(whole.values())
+        touched = [i for i, one in enumerate(whole) if (one.mask & near).any()]
+        match [i for i in touched if is_underside(box, masks.bbox_of(whole[i].mask))]:
+            case [i]:
+                whole[i] = replace(whole[i], mask=whole[i].mask | part.mask)
+            case _:
+                whole.append(part)
+    return whole
 
 
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
@@ -16,15 +16,17 @@ from cow_service.vision.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.vision.contrast import VIEW
 from cow_service.vision.edges import find_segments
 from cow_service.vision.inpainting import erase_drawing
-from cow_service.vision.masks import CroppedMask, bbox_of, dilated, iou, is_among, is_same_object, without_holes
-from cow_service.vision.regions import (
-    Region,
-    disc_region,
-    drawn_region,
-    find_regions,
-    found_region,
-    region_of,
+from cow_service.vision.masks import (
+    CroppedMask,
+    bbox_of,
+    dilated,
+    iou,
+    is_among,
+    is_same_object,
+    mask_iou,
+    without_holes,
 )
+from cow_service.vision.regions import Region, find_regions, known_region, region_of
 from cow_service.vision.segmentation import fault_of, is_bare, mask_from_bbox, mask_from_point
 from cow_service.vision.side_view import SideView, find_side_view
 from cow_service.vision.strokes import Stroke, WorkingImage, find_strokes
@@ -48,15 +50,6 @@ class Obstacle:
     bbox: BBox
     mask: CroppedMask
     confidence: float = 1.0  # 0..1: how sure it is that it is there as one thing with this mask; 1 for what is given
-
-
-@dataclass(frozen=True)
-class Cutout:
-    """The object at a point of the image."""
-
-    bbox: BBox
-    mask: Mask | None = None  # [H, W], where it is no region of the image: it was cut out around the point
-    fault: str | None = None  # why what was cut out can be no object, in words
 
 
 Found = TypeVar("Found")
@@ -161,26 +154,28 @@ class Scene:
     def regions(self) -> tuple[Region, ...]:
         """Objects of the image, largest first; empty if it is too cluttered to tell."""
         if self.side_view is not None:
-            drawn = (drawn_region(self.clean, shape) for shape in self.side_view.shapes)
-            return tuple(sorted(drawn, key=lambda region: -region.mask.area))
+            return _largest_first(known_region(self.clean, shape) for shape in self.side_view.shapes)
         found = find_regions(self.clean)
         for trail in self.trails:
             if region_of(found, trail.present.bbox) is None:
-                found = (*found, disc_region(self.clean, trail.present.disc((self.height, self.width))))
-        return tuple(sorted(found, key=lambda region: -region.mask.area))
+                ball = CroppedMask.of(trail.present.disc((self.height, self.width)))
+                found = (*found, replace(known_region(self.clean, ball), roundness=1.0, is_disc=True))
+        return _largest_first(found)
 
     def with_mover(self, bbox: BBox) -> Scene:
         """This scene where its trails end as they are, else the scene in which the one in a box ends there."""
         trail = trail_ending_at(self.trails, bbox)
         if trail is None or any(trail.positions == other.positions for other in self.trails):
             return self
-        return self.once(("mover", trail.positions), lambda: self._with_trails(mover=bbox))
+        return self.once(
+            ("mover", trail.positions), lambda: self._with(self._measured(OF_THE_IMAGE), mover=bbox, _preset={})
+        )
 
     def with_trail_named(self) -> Scene:
         """The scene in which balls that look alike, one after another, are one; masks that were given stay."""
         if self.trail_named:
             return self
-        return self.once("trail named", lambda: self._with_trails(trail_named=True, _preset=dict(self._preset)))
+        return self.once("trail named", lambda: self._with(self._measured(OF_THE_IMAGE), trail_named=True))
 
     def keeping(self, things: Sequence[BBox]) -> Scene:
         """The scene in which none of some things, by their boxes, is taken for an annotation that is drawn over it."""
@@ -195,23 +190,21 @@ class Scene:
         if len(arrows) + len(boxes) == len(self.arrows) + len(self.boxes):
             return self
 
-        def without() -> Scene:
-            other = replace(self, _found={}, _preset=dict(self._preset))
-            other.__dict__.update(arrows=arrows, boxes=boxes)
-            return other
+        key = ("keeping", *(each.tail for each in arrows), *(each.bbox for each in boxes))
+        return self.once(key, lambda: self._with({"arrows": arrows, "boxes": boxes}))
 
-        return self.once(("keeping", *(each.tail for each in arrows), *(each.bbox for each in boxes)), without)
-
-    def _with_trails(self, **changes: Any) -> Scene:
-        """The same image with other trails in it."""
-        other = replace(self, **{"_found": {}, "_preset": {}, **changes})
-        other.__dict__.update({key: self.__dict__[key] for key in OF_THE_IMAGE if key in self.__dict__})
+    def _with(self, measured: Measured, **changes: Any) -> Scene:
+        """Another scene of which only this is measured yet, and with the masks that were given."""
+        other = replace(self, **{"_found": {}, "_preset": dict(self._preset), **changes})
+        other.__dict__.update(measured)  # where cached properties are kept
         return other
+
+    def _measured(self, names: Sequence[str]) -> Measured:
+        return {name: self.__dict__[name] for name in names if name in self.__dict__}
 
     def measured(self) -> Measured:
         """The measurements so far that depend only on the image; read-only."""
-        alone = OF_THE_IMAGE if self.trail_named else (*OF_THE_IMAGE, *WITHOUT_TRAILS)
-        return {key: self.__dict__[key] for key in alone if key in self.__dict__}
+        return self._measured(OF_THE_IMAGE if self.trail_named else (*OF_THE_IMAGE, *WITHOUT_TRAILS))
 
     def take(self, measured: Measured) -> None:
         """Takes over what another scene of the same image has measured."""
@@ -251,13 +244,13 @@ class Scene:
     def shows_thing(self, bbox: BBox) -> bool:
         """Whether something stands in a box: what was found there, what can be cut out with a visible outline, or what
         has colours that its surroundings lack."""
+        return self.fault_of(bbox) is None or not self.once(("bare", bbox), lambda: is_bare(self.clean, bbox))
+
+    def fault_of(self, bbox: BBox) -> str | None:
+        """Why what can be cut out in a box can be no whole object, in words; None for a region, too."""
         if self.region_of(bbox) is not None:
-            return True
-
-        def shown() -> bool:
-            return fault_of(self.clean, self.silhouette(bbox)) is None or not is_bare(self.clean, bbox)
-
-        return self.once(("thing", bbox), shown)
+            return None
+        return self.once(("fault", bbox), lambda: fault_of(self.clean, self.silhouette(bbox)))
 
     def confidence_of(self, bbox: BBox) -> float:
         """How sure it is (0..1) that what is in a box is one separate thing with its outline; 1 for what is given.
@@ -271,12 +264,7 @@ class Scene:
         if region.is_disc or region.confidence >= CLEAR_CUT:
             return region.confidence
         mask = region.mask.full()
-
-        def agreement() -> float:
-            again = mask_from_bbox(self.clean, bbox)
-            return float(np.count_nonzero(mask & again) / np.count_nonzero(mask | again))
-
-        return self.once(("confidence", bbox), agreement)
+        return self.once(("confidence", bbox), lambda: mask_iou(mask, mask_from_bbox(self.clean, bbox)))
 
     def silhouette(self, bbox: BBox) -> Mask:
         """As `cropped`, of the whole image [H, W]: a new array."""
@@ -306,22 +294,22 @@ class Scene:
         What lies in one of them for the most part is no region of its own.
         """
         other = self.changed(self.image, self.clean)
-        found = [found_region(self.clean, *thing) for thing in things]
+        found = [
+            replace(known_region(self.clean, CroppedMask.of(mask)), is_disc=False, called=called)
+            for mask, called in things
+        ]
         own = [
             region
             for region in self.regions
             if all(region.mask.shared_with(mask) <= PART_OF * region.mask.area for mask, _ in things)
         ]
-        other.__dict__["regions"] = tuple(sorted((*found, *own), key=lambda region: -region.mask.area))
+        other.__dict__["regions"] = _largest_first((*found, *own))
         return other
 
     def changed(self, image: Image, clean: Image) -> Scene:
         """Another image of the same objects, with and without its cues; what was measured in this one stays so."""
-        other = replace(self, image=image, _found=dict(self._found), _preset=dict(self._preset))
-        names = ("cues", "arrows", "boxes", "side_view", "regions")
-        # Where cached properties are kept.
-        other.__dict__.update({name: getattr(self, name) for name in names}, clean=clean)
-        return other
+        stays = {name: getattr(self, name) for name in ("cues", "arrows", "boxes", "side_view", "regions")}
+        return self._with({**stays, "clean": clean}, image=image, _found=dict(self._found))
 
     def with_mask(self, bbox: BBox, mask: Mask) -> Scene:
         """The same with another mask [H, W] of the object in a box."""
@@ -358,14 +346,6 @@ class Scene:
         is_found = region.bbox == named.bbox  # here, not by the request or a reader
         return Obstacle(named.object, named.bbox, region.mask, region.confidence if is_found else 1.0)
 
-    def locate(self, point: tuple[float, float]) -> Cutout:
-        """The object at a point [x, y]: the region there, else what can be cut out around it."""
-        bbox = self.bbox_at(point)
-        if self.region_of(bbox) is not None:
-            return Cutout(bbox)
-        mask = self.silhouette(bbox)
-        return Cutout(bbox, mask, fault_of(self.clean, mask))
-
     def bbox_at(self, point: tuple[float, float]) -> BBox:
         """Tight box [x0, y0, x1, y1] of the object at a point [x, y]: the smallest region there, or else segmented."""
         x = min(self.width - 1, max(0, int(point[0])))
@@ -377,6 +357,10 @@ class Scene:
         bbox = bbox_of(mask)
         self._found["mask", bbox] = CroppedMask.of(mask)
         return bbox
+
+
+def _largest_first(regions: Iterable[Region]) -> tuple[Region, ...]:
+    return tuple(sorted(regions, key=lambda region: -region.mask.area))
 
 
 def _is_part(region: Region, outlined: Sequence[CroppedMask], obstacles: Sequence[Obstacle]) -> bool:

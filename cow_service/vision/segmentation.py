@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox
-from cow_service.vision.masks import bbox_of, outer_contour, outline_of, scaled
+from cow_service.vision.masks import bbox_of, mask_iou, outer_contour, outline_of, resized_mask, scaled
 from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 
@@ -65,7 +65,7 @@ def fault_of(image: Image, mask: Mask) -> str | None:
     rows, columns = _crop_around(bbox, width, height)
     scale = min(1.0, CUT.working_side / max(rows.stop - rows.start, columns.stop - columns.start))
     lab = cv2.cvtColor(scaled(image[rows, columns], scale), cv2.COLOR_RGB2LAB).astype(np.float32)
-    inside = scaled(mask[rows, columns].astype(np.uint8) * np.uint8(255), scale) >= 128
+    inside = resized_mask(mask[rows, columns], (lab.shape[1], lab.shape[0]))
     reach = max(1.5, 0.04 * float(np.sqrt(inside.sum())))  # px on either side of the outline that are compared
     means: list[Floats32] = []  # [h, w, 3]: colours near each pixel, inside and outside
     for where in (inside, ~inside):
@@ -84,10 +84,7 @@ def fault_of(image: Image, mask: Mask) -> str | None:
 
 
 def is_bare(image: Image, bbox: BBox) -> bool:
-    """Whether the middle of a box has but the colours that are around it: then nothing that stands out is in it.
-
-    Of 135 boxes of floors all are bare; of 32 things that no region shows, four.
-    """
+    """Whether the middle of a box has but the colours that are around it: then nothing that stands out is in it."""
     height, width = image.shape[:2]
     x0, y0, x1, y1 = _inside(bbox, width, height)
     rows, columns = _crop_around((x0, y0, x1, y1), width, height)
@@ -168,7 +165,7 @@ def mask_from_point(image: Image, point: tuple[float, float]) -> Mask:
     for (score, cut), (_, larger) in zip(tries, [*tries[1:], (0.0, None)], strict=True):
         if cut is None:
             continue
-        stability = 0.0 if larger is None else np.count_nonzero(cut & larger) / np.count_nonzero(cut | larger)
+        stability = 0.0 if larger is None else mask_iou(cut, larger)
         if guess is None or score + CUT.stability_weight * stability > most + 0.02:
             guess, most = cut, score + CUT.stability_weight * stability
     if guess is None:
@@ -239,14 +236,14 @@ def _labels_from_box(height: int, width: int, box: Floats, core: float) -> NDArr
 
 def _grabcut(image: Image, labels: NDArray[np.uint8]) -> Mask:
     """GrabCut from labels; the labels' own guess where it has nothing to learn from."""
-    sure = {int(value) for value in np.unique(labels)}
-    foreground, background = {int(cv2.GC_FGD), int(cv2.GC_PR_FGD)}, {int(cv2.GC_BGD), int(cv2.GC_PR_BGD)}
-    if sure & foreground and sure & background:
+    foreground = cv2.GC_FGD, cv2.GC_PR_FGD
+    guess = np.isin(labels, foreground)
+    if guess.any() and not guess.all():
         light = np.clip(255 * (image / 255.0) ** CUT.gamma, 0, 255).astype(np.uint8)
         cv2.setRNGSeed(0)  # its clustering draws random numbers: the same image must give the same mask
         no_box, models = (0, 0, 0, 0), (np.zeros((1, 65)), np.zeros((1, 65)))  # labels say it all
         cv2.grabCut(light, labels, no_box, *models, CUT.iterations, cv2.GC_INIT_WITH_MASK)
-    return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    return np.isin(labels, foreground)
 
 
 def _tidy(cut: Mask, box: Floats) -> Mask:

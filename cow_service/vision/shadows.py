@@ -49,8 +49,7 @@ class ShadowRules(NamedTuple):
     iterations: int = 8  # of the fit
     least_shade: float = 0.025  # of the floor's lightness that shadows take away, at least
     most_shade: float = 0.6  # the same: more is an object
-    # of the ball's width, from its foot down to the shadow's middle: nearer, the ball may touch the floor
-    nearest: float = 0.25
+    nearest: float = 0.25  # of the ball's width, from its foot to the shadow's middle: nearer, it may touch the floor
     slant: float = 1.1  # px sideways per px down: light indoors falls steeper
 
 
@@ -147,12 +146,15 @@ class _Floor:
         ry, rx = int(np.ceil(SHADOW.ring[1] * b)), int(np.ceil(SHADOW.ring[1] * a))
         ys, xs = np.mgrid[-ry : ry + 1, -rx : rx + 1]
         radius = np.sqrt((xs / a) ** 2 + (ys / b) ** 2)
-        rings, weight = (
-            (radius <= 0.9, (radius >= SHADOW.ring[0]) & (radius <= SHADOW.ring[1])),
-            self.free.astype(np.float32),
-        )
-        (inside, whole), (about, free) = (floor_means(self.lab[..., 0], weight, mask) for mask in rings)
-        return np.where((whole > 0.97) & (free > 0.7), 1 - inside / np.maximum(about, 1.0), 0).astype(np.float32)
+        layers = self.lab[..., 0] * self.free, self.free.astype(np.float32)
+        means, shares = list[Floats32](), list[Floats32]()
+        for mask in (radius <= 0.9, (radius >= SHADOW.ring[0]) & (radius <= SHADOW.ring[1])):
+            kernel = mask.astype(np.float32) / np.float32(max(1, np.count_nonzero(mask)))
+            total, share = (cv2.filter2D(layer, -1, kernel, borderType=cv2.BORDER_CONSTANT) for layer in layers)
+            means.append(np.asarray(total / np.maximum(share, 1e-3), np.float32))
+            shares.append(np.asarray(share, np.float32))
+        is_floor = (shares[0] > 0.97) & (shares[1] > 0.7)
+        return np.where(is_floor, 1 - means[0] / np.maximum(means[1], 1.0), 0).astype(np.float32)
 
     def fit_ellipse(self, seen: Ellipse) -> Shadow | None:
         """A soft tilted ellipse on a smooth floor, fitted to the lightness around what was seen."""
@@ -186,12 +188,13 @@ class _Floor:
         wide, high, soft = float(np.exp(log_a)), float(np.exp(log_b)), float(np.exp(log_soft))
         shade = -dark / max(float(level), 1.0)
         width = self.box[2] - self.box[0]
+        least_soft, most_soft = SHADOW.softness
+        if shade > SHADOW.dark and explained > SHADOW.well_explained:
+            most_soft = SHADOW.most_soft
         fits = (
             SHADOW.least_shade < shade < SHADOW.most_shade
             and explained > SHADOW.explained
-            and SHADOW.softness[0]
-            < soft
-            < (SHADOW.most_soft if shade > SHADOW.dark and explained > SHADOW.well_explained else SHADOW.softness[1])
+            and least_soft < soft < most_soft
             and float(np.hypot(*tint)) < SHADOW.same_hue
             and 0.6 * width < 2 * wide < 1.6 * width
             and 0.15 < high / wide < 0.95
@@ -262,14 +265,3 @@ def _least_squares(points: Floats, light: Floats, smooth: Floats, start: Floats)
         else:
             damping *= 5
     return parameters, dark
-
-
-def floor_means(values: Floats32, weight: Floats32, mask: Mask) -> tuple[Floats32, Floats32]:
-    """Mean value [h, w] of what may be floor in a mask about each pixel, and the share of the mask that may be.
-
-    `weight` [h, w] is 1 where there may be floor, else 0.
-    """
-    kernel = mask.astype(np.float32) / np.float32(max(1, np.count_nonzero(mask)))
-    total, share = (np.asarray(cv2.filter2D(layer, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT), np.float32)
-                    for layer in (values * weight, weight))  # fmt: skip
-    return np.asarray(total / np.maximum(share, 1e-3), np.float32), share

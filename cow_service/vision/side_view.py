@@ -140,8 +140,7 @@ def _shapes(labels: NDArray[np.uint8], rest: Mask) -> list[CroppedMask]:
                 continue
             window = slice(top, top + height), slice(left, left + width)
             part = CroppedMask(rest.shape, *window, parts[window] == i)
-            reach = float(cv2.distanceTransform(np.pad(part.patch, 1).astype(np.uint8), cv2.DIST_L2, 3).max())
-            (lines if reach <= thin else bodies).append(part)
+            (lines if masks.half_width(part.patch) <= thin else bodies).append(part)
     for line in lines:  # an outline belongs to the shape that it runs along
         near = masks.dilated(line.full(), 5)
         shared = [body.shared_with(near) for body in bodies]

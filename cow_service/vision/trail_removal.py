@@ -21,8 +21,7 @@ class PositionRules(NamedTuple):
 
     rim: float = 0.06  # of the radius: around a position, mixed with the background
     least_rim: float = 2.0  # px: the same, at least
-    # of the radius by which a place must lie outside all earlier positions to be surely the present one's
-    apart: float = 0.03
+    apart: float = 0.03  # radii outside all earlier positions: there a pixel is surely the present one's
 
 
 POSITION = PositionRules()

@@ -33,14 +33,12 @@ class TrailRules(NamedTuple):
     contrast: float = 12.0  # grey levels of that contrast, at least
     opacity: float = 0.08  # at least
     unrest: float = 12.0  # grey levels of a background's variation that are allowed for
-    # of the circumference of a position at an end, on edges: what hides the rest is the next position
-    end_support: float = 0.5
+    end_support: float = 0.5  # of the circumference of an end, on edges: the next position hides the rest
     pale_support: float = 0.4  # of the circumference of a pale one that a path leads to
     predicted: float = 0.2  # radii: how near to where a path leads a pale position must lie
     sure_support: float = 0.3  # of the circumference: with more, no better circle is sought nearby
     seen_support: float = 0.75  # of what the other positions leave to be seen of a circumference, on edges
-    # of the depth that the outline of two overlapping circles has between them: less is a straight side
-    notched: float = 0.35
+    notched: float = 0.35  # of the depth of the notch between two circles: less is a straight side
     sizes: float = 1.35  # between the radii of neighbours, at most
     faded: float = 0.85  # of the opacity of the most opaque: with less, a position was faded
     spacing: tuple[float, float] = (0.5, 2.0)  # between neighbouring gaps
@@ -158,12 +156,10 @@ def find_trails(image: Image) -> tuple[Trail, ...]:
     search = _Search(edges, image)
     ends = [c for c in edges.circles() if c.support >= TRAIL.end_support and search.contrast(c) >= TRAIL.contrast]
     trails: list[Trail] = []
-    tried = 0
-    for a, b in _pairs(ends):
-        if tried < TRAIL.pairs and _are_apart((a, b), trails) and search.are_alike((a, b)):
-            tried += 1
-            trail = search.trail_through(a, b)
-            trails += [] if trail is None else [trail]
+    alike = (pair for pair in _pairs(ends) if _are_apart(pair, trails) and search.are_alike(pair))
+    for a, b in itertools.islice(alike, TRAIL.pairs):
+        trail = search.trail_through(a, b)
+        trails += [] if trail is None else [trail]
     whole: list[Trail] = []
     for trail in sorted(trails, key=lambda trail: -len(trail.positions)):
         if _are_apart(trail.positions, whole):
@@ -190,11 +186,8 @@ class _Search:
         Its more opaque end is the last; if both are alike, the end that is less hidden.
         """
         best: Chain = ()
-        reach = 0.5 * math.dist(a.centre, b.centre) + 1.6 * max(a.radius, b.radius)
-        low, high = (min(a.x, b.x) - reach, min(a.y, b.y) - reach), (max(a.x, b.x) + reach, max(a.y, b.y) + reach)
-        near = self.edges.within((*low, *high))
         for inner in range(3 * TRAIL.positions // 4):
-            chain = self.between(near, a, b, inner)
+            chain = self.between(a, b, inner)
             if chain is None:
                 continue
             chain = self.extended(self.extended(chain)[::-1])
@@ -213,7 +206,7 @@ class _Search:
         ordered = positions if rank[1] >= rank[0] else positions[::-1]
         return Trail(ordered, known)
 
-    def between(self, edges: Edges, a: Circle, b: Circle, inner: int) -> Chain | None:
+    def between(self, a: Circle, b: Circle, inner: int) -> Chain | None:
         """Two circles with others between them, evenly along an arc that bulges to one side or the other."""
         apart = math.dist(a.centre, b.centre)
         gap, mean = apart / (inner + 1), (a.radius + b.radius) / 2
@@ -225,7 +218,7 @@ class _Search:
             chain = [a]
             for t in np.arange(1, inner + 1) / (inner + 1):
                 x, y = (start * (1 - t) + end * t + 4 * t * (1 - t) * bulge * across).tolist()
-                found = _fit_near(edges, x, y, a.radius ** (1 - t) * b.radius**t)
+                found = _fit_near(self.edges, x, y, a.radius ** (1 - t) * b.radius**t)
                 if found is None or any(found.is_same(other) for other in (*chain, b)):
                     break
                 chain.append(found)

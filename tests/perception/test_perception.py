@@ -103,7 +103,7 @@ def test_what_two_prompts_agree_on_is_found_from_any_of_its_points_and_by_its_bo
     assert in_box is not None
     assert at_point.is_sure
     assert in_box.is_sure
-    assert (at_point.mask == mask).all()
+    assert (at_point.mask.full() == mask).all()
     assert in_box.bbox == (x, y, x + wide, y + high)
 
 
