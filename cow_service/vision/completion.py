@@ -6,7 +6,7 @@ By colour alone, a ball's region lacks its highlight and includes its contact sh
 import itertools
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -214,7 +214,7 @@ def white_sides(view: View, core: Mask) -> Mask:
     return sides
 
 
-def _lit_below(view: View, white: Mask, labels: NDArray[np.int32], tops: NDArray[np.int32]) -> tuple[Mask, set[int]]:
+def _lit_below(view: View, white: Mask, labels: NDArray[Any], tops: NDArray[Any]) -> tuple[Mask, set[int]]:
     """What is slightly lit right below bright tops, and which of those are surely of something white.
 
     Tops are the patches of `white` [h, w], by their labels [h, w] and statistics [N, 5].
@@ -236,7 +236,7 @@ def _lit_below(view: View, white: Mask, labels: NDArray[np.int32], tops: NDArray
     return sides, surely_white
 
 
-def _has_side(top: NDArray[np.int32], side: _Box, area: int, is_lit: bool) -> bool:
+def _has_side(top: NDArray[Any], side: _Box, area: int, is_lit: bool) -> bool:
     """Whether a side belongs to a top, by its statistics: small compared with it, and lit or right below it."""
     x, y, w, _ = side
     tx, ty, tw, _, top_area = top.tolist()
