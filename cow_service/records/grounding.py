@@ -44,7 +44,7 @@ Cue = Literal["arrow", "trail", "orientation", "text", "gravity", "request"]
 Opening = Literal["round", "square", "none"]
 Language = Literal["en", "de", "es", "fr", "zh", "ja"]
 MAX_OBJECTS = 64
-MAX_WITHIN = 1e6  # s
+MAX_WITHIN = 1e9  # s
 
 
 AskedRelation = Literal["touches", "covers", "covered", "inside", "tips", "moves", "leaves", "lands"]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from cow_service.records.grounding import (
     DIRECTED_KINDS,
@@ -145,8 +145,30 @@ class Distance(Record):
 
 
 Quantity = Speed | Distance
-AnySpeed = Annotated[Finite, Field(ge=0, le=100_000)] | Speed | SpeedWord
-AnyDistance = Annotated[Finite, Field(gt=0, le=1_000_000)] | Distance
+MAX_SPEED, MAX_DISTANCE = 100_000, 1_000_000  # px/s, px
+
+
+def _in_a_form(kind: type[Record], unit: str, words: tuple[str, ...] = ()) -> BeforeValidator:
+    """One error for all forms of a quantity, in place of one for each."""
+    units = get_args(kind.model_fields["unit"].annotation)
+    forms = f'a number ({unit}), {{"value": 2, "unit": "{unit.replace("px", "m")}"}}'
+    forms += "".join(f" or `{word}`" for word in words)
+
+    def checked(value: Any) -> Any:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(value, kind) or (is_number if not isinstance(value, dict) else value.get("unit") in units):
+            return value
+        if isinstance(value, str) and value in words:
+            return value
+        raise ValueError(f"must be {forms}, got {str(value)[:40]!r}")
+
+    return BeforeValidator(checked)
+
+
+AnySpeed = Annotated[
+    Annotated[Finite, Field(ge=0, le=MAX_SPEED)] | Speed | SpeedWord, _in_a_form(Speed, "px/s", get_args(SpeedWord))
+]
+AnyDistance = Annotated[Annotated[Finite, Field(gt=0, le=MAX_DISTANCE)] | Distance, _in_a_form(Distance, "px")]
 Depth = Annotated[Finite, Field(ge=-1, le=1)]
 Degrees = Annotated[Finite, Field(ge=0, le=90)]
 
@@ -171,7 +193,8 @@ class WayRequest(Record):
         "read from the question and from arrows drawn in the image. Not for a fall or a static object.",
     )
     direction_deviation: Degrees | None = Field(
-        default=None, description="Degrees, one standard deviation of an estimated `direction`; by default it is exact."
+        default=None,
+        description="Degrees, one standard deviation of `direction`; by default that of its `cue`.",
     )
     towards: ObjectWords | None = Field(
         default=None, description="Name of the object that it moves towards, instead of a `direction`."
@@ -334,7 +357,8 @@ def merged(given: Said | None, read: Said | None) -> Said | None:
     """What was read, with every field that was given in its place."""
     if given is None or read is None:
         return given or read
-    return read.model_copy(update={name: getattr(given, name) for name in given.model_fields_set})
+    said = {name: value for name in given.model_fields_set if (value := getattr(given, name)) is not None}
+    return read.model_copy(update=said)
 
 
 def as_said(thing: LocatedObject) -> ObjectRequest:
@@ -360,11 +384,13 @@ def reading_of(grounding: Grounding, motion: Motion) -> Reading:
     """What stages 1 and 2 came to, as fields of a request: sent back, they give the same trajectory."""
     changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
     things = {each.bbox: each for each in (*changed, *grounding.others) if each.bbox != grounding.bbox}
-    own = _place_of(grounding) | {"point": grounding.point, "source": grounding.source}
+    (x0, y0, x1, y1), (x, y) = grounding.bbox, grounding.point
+    is_inside = x0 <= x <= x1 and y0 <= y <= y1  # else another outline was found than that at the point
+    own = _place_of(grounding) | {"source": grounding.source, "point": grounding.point if is_inside else None}
     return Reading(
         grounding=GroundingRequest.model_validate(own),
         motion=_motion_of(motion),
-        objects=tuple(map(as_said, things.values())),
+        objects=tuple(map(as_said, things.values()))[:MAX_OBJECTS],
         objects_complete=grounding.objects_complete,
         interventions=tuple(
             InterventionRequest(
@@ -382,24 +408,30 @@ def reading_of(grounding: Grounding, motion: Motion) -> Reading:
 
 
 def _way_of(way: Motion | AlsoMoving) -> dict[str, Any]:
+    """One way: towards a thing, else a direction."""
     if way.kind not in DIRECTED_KINDS:
         return {}
-    towards = None if way.towards is None else way.towards.object
-    names = ("direction", "direction_deviation", "depth", "speed", "speed_deviation")
-    return {"towards": towards, **{name: getattr(way, name) for name in names}}
+    names = ("depth", "speed", "speed_deviation")
+    told = {"direction": way.direction} if way.towards is None else {"towards": way.towards.object}
+    told |= {} if way.towards is not None else {"direction_deviation": way.direction_deviation}
+    return told | {name: getattr(way, name) for name in names}
 
 
 def _motion_of(motion: Motion) -> MotionRequest:
-    names = ["kind", "law", "other_direction", "along_arrow", "cue", "rises", "distance", "duration", "until", "down"]
+    names = ["kind", "law", "other_direction", "cue", "rises", "distance", "duration", "until", "down"]
     names += ["depth_deviation"] if motion.kind in DIRECTED_KINDS else []
+    way, scale = _way_of(motion), motion.metres_per_pixel
+    if motion.trail:  # by which direction and depth are measured again
+        del way["direction"], way["direction_deviation"]
     others = ({"object": each.object.object, "kind": each.kind, **_way_of(each)} for each in motion.others)
+    is_said = scale.source in ("request", "reference") and not scale.note.startswith("by the sizes")
     return MotionRequest.model_validate(
         {
             **{name: getattr(motion, name) for name in names},
-            **_way_of(motion),
+            **way,
             "steps": tuple(MotionStepRequest.model_validate(each.model_dump()) for each in motion.steps),
             "others": tuple(map(OtherMotionRequest.model_validate, others)),
-            "metres_per_pixel": motion.metres_per_pixel.value,
+            "metres_per_pixel": scale.value if is_said else None,
         }
     )
 

@@ -196,6 +196,9 @@ class FramesRequest(Record):
     )
 
 
+WAYS = ("direction", "towards", "along_arrow", "forward")  # in which a motion tells which way it leads
+
+
 class SimulateRequest(Reading):
     """One image and one what-if question; everything else has a default."""
 
@@ -265,6 +268,11 @@ class SimulateRequest(Reading):
         return frozenset(needed if given else needed | {"motion"})
 
     @property
+    def open_motion(self) -> MotionRequest | None:
+        """What is said of a motion of which a reader says the rest."""
+        return self.motion if "motion" in self.left_to_reader else None
+
+    @property
     def whole_motion(self) -> MotionRequest | None:
         """The motion, if nothing of it is left to the reader."""
         return None if self.motion is None or not self.motion.is_whole else self.motion
@@ -285,6 +293,25 @@ class SimulateRequest(Reading):
         places = (*([] if self.grounding is None else [self.grounding]), *self.objects)
         masks = (place.mask for place in places if place.mask is not None)
         return (*masks, *([] if self.depth is None else [self.depth.map]))
+
+    @field_validator("grounding", "objects")
+    @classmethod
+    def _has_places(cls, given: Any) -> Any:
+        """Readers may name things that are still to be located; a caller says where they are."""
+        for each in given if isinstance(given, tuple) else (given,):
+            if each is not None and not each.has_place:
+                raise ValueError(f"'{each.object or 'grounding'}' has no place: give `bbox`, `mask` or `point`")
+        return given
+
+    @field_validator("motion")
+    @classmethod
+    def _one_way(cls, motion: MotionRequest | None) -> MotionRequest | None:
+        """Of several ways nothing would tell which one counts."""
+        for each in () if motion is None else (motion, *motion.others):
+            ways = [name for name in WAYS if getattr(each, name, None) is not None]
+            if len(ways) > 1:
+                raise ValueError(f"`{ways[0]}` and `{ways[1]}` both tell which way: give one of them")
+        return motion
 
     @model_validator(mode="before")
     @classmethod

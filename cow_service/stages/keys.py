@@ -98,7 +98,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
     "gating": KeyFields(("question", "language", "seed", "options", "imagine_votes"), "reader", votes="imagine_votes"),
     "baseline": KeyFields(("question", "language", "seed", "options", "votes"), "reader", votes="votes"),
     "grounding": KeyFields(
-        ("seed", "left_to_reader", "grounding"),
+        ("seed", "left_to_reader", "open_motion"),
         "reader",
         set_by_request=("place",),
         always=("question", "question_is_doubtful", "asked", "objects", "objects_complete", "interventions"),
@@ -110,7 +110,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         ("question", "seed", "left_to_reader"),
         "reader",
         set_by_request=("whole_motion", "trajectory"),
-        always=("law", "motion", "camera", "depth"),
+        always=("question", "law", "motion", "camera", "depth"),
         prompt="motion-sentence",
     ),
     "depth": KeyFields((), perception=("depth",)),

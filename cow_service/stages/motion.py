@@ -16,7 +16,7 @@ from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GR
 from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
-from cow_service.readers.base import GIVE_DIRECTION
+from cow_service.readers.base import GIVE_DIRECTION, GIVE_OBJECT
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, Motion, MotionRequest, Vector
 from cow_service.requests import SimulateRequest
@@ -40,7 +40,7 @@ MOST_APART = 2.0  # factor between two scales from which they disagree
 
 
 def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionRequest | None) -> StageResult[Motion]:
-    """The motion: what the request says of it goes before what was read, and what was measured before both.
+    """The motion: what the request says of it goes before what is measured, and that before what was read.
 
     `read` is what the reader said while it looked for the object; where the request leaves the motion open and nothing
     was read, the reader is asked. Raises what the reader raises, `CannotReadDirection` where nothing tells which way,
@@ -50,6 +50,9 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
     given, warnings = given_motion(request, grounding), list[str]()
     source: records.Source = "request"
     if given is not None and given.is_whole:  # a direction that is given stays, whatever its spread
+        told = run.words.reading.motion
+        if given.kind is None and told is not None and told.kind in DIRECTED_KINDS:
+            given = given.model_copy(update={"kind": told.kind})
         said = given if given.direction is not None else settled_way(run, grounding, given, given)[0]
     else:
         source, (said, warnings) = run.reader.source, read_way(run, grounding, read, given)
@@ -57,7 +60,8 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
     if said.stated_kind != "linear" and unused:
         said = said.model_copy(update={"distance": None, "duration": None, "until": None, "steps": ()})
         ends = f"a {said.stated_kind} ends where it hits something"
-        warnings.append(f"The {' and '.join(unused)} of the motion was not used: {ends}.")
+        is_one = "was" if len(unused) == 1 else "were"
+        warnings.append(f"The {' and '.join(unused)} of the motion {is_one} not used: {ends}.")
     scale, doubts = scale_of(run, grounding, said)
     warnings += doubts
     if is_up_the_floor(said, grounding, request.law):
@@ -67,11 +71,27 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
         )
         said = said.model_copy(update={"depth": depth_motion(1.0)[1]})
     motion = completed(run, grounding, said, scale, source)
+    refuse_too_much(motion)
     if motion.cue == "trail":
         with run.cpu():
             scene = run.scene_of(grounding, motion.cue)
             motion = along_trail(scene, grounding, motion, run, said.speed is not None)
     return StageResult(value=motion, warnings=(*warnings, *assumed(motion, said)))
+
+
+def refuse_too_much(motion: Motion) -> None:
+    """Raises `InvalidRequest` for speeds and lengths beyond those of requests, whoever said them in whatever unit."""
+    speeds = {"/motion/speed": motion.speed}
+    speeds |= {f"/motion/others/{index}/speed": each.speed for index, each in enumerate(motion.others)}
+    lengths = {"/motion/distance": motion.distance}
+    lengths |= {f"/motion/steps/{index}/distance": each.distance for index, each in enumerate(motion.steps)}
+    for pointer, value, most, unit in (
+        *((pointer, speed, records.MAX_SPEED, "px/s") for pointer, speed in speeds.items()),
+        *((pointer, length, records.MAX_DISTANCE, "px") for pointer, length in lengths.items()),
+    ):
+        if value is not None and value > most:
+            detail = f"amounts to {value:.3g} {unit} in this image, more than {most:,} {unit}"
+            raise InvalidRequest(f"`{field_of(pointer)}` {detail}.", errors=(FieldError(pointer, detail),))
 
 
 def assumed(motion: Motion, said: MotionRequest) -> list[str]:
@@ -111,7 +131,8 @@ def read_way(
     words = run.words.reading.motion or MotionRequest()
 
     def settled(read: MotionRequest) -> tuple[MotionRequest, Objections]:
-        return settled_way(run, grounding, records.merged(given, read) or read, words, asking.scene)
+        way, objections = settled_way(run, grounding, records.merged(given, read) or read, words, asking.scene)
+        return records.merged(given, way) or way, objections  # what is given stays
 
     way, objections = settled(read)
     if objections and reader.heeds_objections:
@@ -161,10 +182,12 @@ def seen_way(
     goals = [each for each in others if same_name(each.object, goal or "")]
     goals = goals or [each for each in others if words.likeness(goal or "", each.object) == "same"]
     trail = trail_of(scene.trails, grounding.bbox)
+    if len(goals) != 1 or way_to(goals[0].bbox, grounding.bbox, is_on_floor=False) == (0.0, 0.0):
+        goals = []
     return SeenWay(
         arrow=None if arrow is None else arrow.direction,
         is_only_arrow=len(scene.arrows_near(grounding.bbox)) == 1,
-        goal=goals[0].bbox if len(goals) == 1 else None,
+        goal=goals[0].bbox if goals else None,
         front=front,
         trail=None if trail is None else trail.heading,
         is_thrown=trail is not None and is_thrown(trail.positions),
@@ -180,7 +203,7 @@ def fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: Seen
         fault = f"no three positions of the {name} one after another were found in the image"
         return f"The question speaks of a trail, and {fault}."
     if said.towards is not None:
-        return f"Where the {name} moves to is not clear: '{said.towards}' was not found in the image."
+        return f"Where the {name} moves to is not clear: '{said.towards}' was not located. {GIVE_OBJECT}"
     if said.forward is not None:
         told = f"The question says that the {name} moves {'forward' if said.forward else 'backward'}."
         if grounding.prior is None or not grounding.prior.elongated:
@@ -203,7 +226,7 @@ def given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReques
     puts somewhere moves so, where nothing else is said of it.
     """
     given, path = request.motion, request.trajectory
-    if given is not None and given.is_whole:
+    if path is None and given is not None and given.is_whole:
         return given
     told = MotionRequest()
     if path is not None:
@@ -213,8 +236,9 @@ def given_motion(request: SimulateRequest, grounding: Grounding) -> MotionReques
             told = MotionRequest(kind="static")
         else:  # the first move of a path that ends where it began
             x, y = next(point for point in (last, *path.points) if math.dist(point, (x0, y0)) > 1e-6)
-            speed = way * path.fps / (len(path.points) - 1)
-            told = MotionRequest.model_construct(kind="linear", direction=(x - x0, y - y0), speed=speed)
+            speed = min(way * path.fps / (len(path.points) - 1), records.MAX_SPEED)
+            told = MotionRequest(kind="linear", direction=(x - x0, y - y0), speed=speed)
+        return (given or told).model_copy(update={name: getattr(told, name) for name in told.model_fields_set})
     elif grounding.source == "request" and placed_mover(grounding) is not None:
         told = MotionRequest(kind="place")
     return records.merged(given, told)
@@ -398,8 +422,13 @@ def others_moving(
                 errors=(FieldError(pointer, detail),),
             )
         goal, way = goal_of(grounding, each.towards), units.way_of(each, things[0].bbox, usual_deviation)
-        if goal is not None and each.direction is None:
-            way["direction"] = _unit(way_to(goal.bbox, things[0].bbox, is_on_floor=False))
+        ahead = None if goal is None else way_to(goal.bbox, things[0].bbox, is_on_floor=False)
+        if each.towards is not None and each.direction is None and ahead in (None, (0.0, 0.0)):
+            pointer, detail = f"/motion/others/{index}/towards", f"'{each.towards}' was not located elsewhere"
+            message = f"`{field_of(pointer)}`: {detail}: give its box in `objects` under this name."
+            raise InvalidRequest(message, errors=(FieldError(pointer, detail),))
+        if ahead is not None and each.direction is None:
+            way["direction"] = _unit(ahead)
         moving.append(records.AlsoMoving(object=things[0], towards=goal, **way))
     return tuple(moving)
 

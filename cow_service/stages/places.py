@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
 from cow_service.perception.outlines import outlines_at, outlines_in
@@ -20,7 +22,9 @@ DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 SAME_MASK = 0.5  # IoU from which two outlines are of one thing
 MOST_FOUND = 24  # detections that are outlined, best first
+OWN_MASK = 0.5  # share of a mask that must lie in the box given with it
 WHITE = 128  # grey level from which a pixel of a mask is the object's
+LEAST_SIDE = 2  # px, of a mask
 MAX_SHARE = 0.95  # of the image that a box or a mask covers: more is no object
 
 
@@ -104,6 +108,10 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
     if given.mask is not None:
         mask = read_mask(run, given.mask, f"{pointer}/mask")
         bbox = mask.bbox if given.bbox is None else given.bbox
+        x0, y0, x1, y1 = (max(0, round(value)) for value in bbox)
+        inside = np.count_nonzero(mask.full()[y0:y1, x0:x1]) / mask.area
+        if inside < OWN_MASK:
+            raise _misplaced(f"{pointer}/bbox", bbox, f"holds {inside:.0%} of the `mask` beside it")
         scene.preset_mask(bbox, mask.full)
         return Located.at(given, bbox, mask)
     if given.bbox is not None:
@@ -252,8 +260,8 @@ def read_mask(run: Run[SimulateRequest], given: MaskRef, pointer: str) -> Croppe
     if (picture.info.width, picture.info.height) != (image.width, image.height):
         given_size, size = (f"{each.width} x {each.height} px" for each in (picture.info, image))
         raise refused(f"has {given_size} where the upright image has {size}")
-    if not share:
-        raise refused("is empty: no pixel is white")
+    if min(np.count_nonzero(mask.any(axis=axis)) for axis in (0, 1)) < LEAST_SIDE:
+        raise refused("is empty, or less than 2 px wide or high")
     if share > MAX_SHARE:
         raise refused(f"covers {share:.0%} of the image: white, or transparent, is the object alone")
     return CroppedMask.of(mask)

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.records import BBox, Point
-from cow_service.vision.masks import mask_iou
+from cow_service.vision.masks import lab_of, mask_iou
 from cow_service.vision.strokes import STROKE, Stroke, WorkingImage, drawing_mask
-from cow_service.vision.types import Floats, Mask
+from cow_service.vision.types import Floats, Image, Mask
 
 
 class ArrowRules(NamedTuple):
@@ -50,6 +50,8 @@ class BoxRules(NamedTuple):
     side: int = 14  # px at the working size
     on_outline: float = 0.93  # share of the stroke that lies on its own bounding rectangle
     covered: float = 0.85  # share of that rectangle's outline that the stroke covers: dashes are fine
+    fringe: int = 2  # px of what resampling blurs
+    between: float = 12.0  # Lab units within which a colour is a mixture of two others
 
 
 BOX = BoxRules()
@@ -257,11 +259,33 @@ def find_boxes(image: WorkingImage, strokes: Iterable[Stroke]) -> tuple[DrawnBox
         rim = [patch[:line].any(0), patch[-line:].any(0), patch[:, :line].any(1), patch[:, -line:].any(1)]
         if patch[frame].sum() < BOX.on_outline * patch.sum() or np.concatenate(rim).mean() < BOX.covered:
             continue
+        if line <= BOX.fringe and is_fringe(image.pixels, stroke):
+            continue
         inner = (stroke.x + line, stroke.y + line, stroke.x + w - line, stroke.y + h - line)
         x0, y0, x1, y1 = (value / image.scale for value in inner)
         if all(np.abs(np.array(box.bbox) - (x0, y0, x1, y1)).max() >= 8 / image.scale for box in boxes):
             boxes.append(DrawnBox((x0, y0, x1, y1), image.full(drawing_mask(image.pixels, stroke))))
     return tuple(sorted(boxes, key=lambda box: -(box.bbox[2] - box.bbox[0]) * (box.bbox[3] - box.bbox[1])))
+
+
+def is_fringe(pixels: Image, stroke: Stroke) -> bool:
+    """Whether a thin frame is the fringe of a block: of a colour between that of the block and that around it."""
+    (h, w), far, fringe = stroke.patch.shape, 2 * BOX.fringe, BOX.fringe
+    window, patch = stroke.surroundings(pixels, far)
+    lab = lab_of(np.ascontiguousarray(pixels[window])).astype(np.float64)
+    inner, outer = np.zeros(patch.shape, bool), np.ones(patch.shape, bool)
+    top, left = min(far, stroke.y), min(far, stroke.x)
+    outer[max(0, top - fringe) : top + h + fringe, max(0, left - fringe) : left + w + fringe] = False
+    inner[top + far : top + h - far, left + far : left + w - far] = True
+    if not (inner.any() and outer.any()):
+        return False
+    inside, outside, own = (np.median(lab[where], axis=0) for where in (inner, outer, patch > 0))
+    across = inside - outside
+    length = float(np.linalg.norm(across))
+    if length < BOX.between:
+        return False
+    share = float((own - outside) @ across) / length**2
+    return 0 < share < 1 and float(np.linalg.norm(own - outside - share * across)) < BOX.between
 
 
 def _line_width(side: Mask) -> int:

@@ -70,7 +70,7 @@ class Rehearsal(MagicMock):
 @pytest.fixture
 def orders(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Told]]:
     """What is reported in every order that a run can take, and of which kind of job."""
-    for name in ("Simulation", "Answer", "narrate", "Problem"):
+    for name in ("Simulation", "Answer", "reading_of", "narrate", "Problem"):
         monkeypatch.setattr(pipeline, name, MagicMock())
     asked = {"image": {"artifact": "0" * 64}, "question": "?"}
     found: list[tuple[str, Told]] = []

@@ -154,12 +154,15 @@ def test_any_policy_gives_as_many_frames_as_there_are(policy, count, frames, eve
 
 PUT = {"kind": "place", "object": "a"}
 MEANT_BY_NOBODY: dict[str, list[dict[str, Any]]] = {
-    "grounding": [{"bbox": [0, 0, 9, 9], "point": [10, 1]}],
+    "grounding": [{"object": "ball"}, {"bbox": [0, 0, 9, 9], "point": [10, 1]}],
     "grounding.mask": [{"mask": "https://example.org/mask.png"}],
-    "objects": [[{"object": "mug", "bbox": [0, 0, 9, 9]}] * 65],
+    "objects": [[{"object": "mug", "bbox": [0, 0, 9, 9]}] * 65, [{"object": "mug"}]],
     "camera": [{}],
     "motion": [
         {"law": "ballistic", "depth": 0.5},
+        {"direction": [1, 0], "towards": "mug"},
+        {"along_arrow": True, "forward": True},
+        {"others": [{"object": "car", "direction": [1, 0], "towards": "mug"}]},
         {"kind": "fall", "depth_deviation": 9},
         {"kind": "fall", "direction": [1, 0]},
     ],

@@ -101,8 +101,8 @@ class MllmReader:
             image = encode(given.scene.image, self._client.family)
         place, motion = given.given.grounding, given.given.motion
         bbox = None if place is None else place.bbox
-        known_kind = None if bbox is None or motion is None else motion.kind
-        said = NOTHING_IDENTIFIED if known_kind is not None else self._identify(given, image)
+        known_kind = None if motion is None else motion.kind
+        said = NOTHING_IDENTIFIED if known_kind is not None and bbox is not None else self._identify(given, image)
         name = (place.object if place is not None else None) or said.object
         if not name:
             fault = f"{self._subject} sees nothing in the image that the question could move."
