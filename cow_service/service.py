@@ -11,7 +11,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Self, TypeVar, cast
 
-from cow_service import errors
+from cow_service import errors, requests
 from cow_service.concurrency import PrioritySemaphore
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, DiskArtifacts, RetryPolicy, media_type_of, try_once
@@ -25,15 +25,7 @@ from cow_service.readers.chat import CallsMllm, ChatReader
 from cow_service.readers.mllm.known import status_of
 from cow_service.records import Answer, Artifact, BackendInfo, BackendKind, Look, Models, Simulation, WorkerLoad
 from cow_service.registry import Registry
-from cow_service.requests import (
-    AnswerRequest,
-    ImageArtifact,
-    ImageRef,
-    ImageUrl,
-    LookRequest,
-    PlaceRequest,
-    SimulateRequest,
-)
+from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages import run as runs
 from cow_service.stages.looking import look
@@ -44,7 +36,7 @@ from cow_service.weights.repositories import ready
 OWN_PARTS = frozenset(("transformer", "weights"))  # backends that an own checkpoint can replace
 WORD_READER = "embedded"  # it needs no weights: it reads the words of requests whose images another reader looks at
 Request = TypeVar("Request", bound=SimulateRequest)
-Place = TypeVar("Place", bound=PlaceRequest)
+Place = TypeVar("Place", bound=requests.PlaceRequest)
 File = tuple[bytes, str]
 """Bytes to be kept, and their media type."""
 _OTHER_URL = re.compile(r"(?!data:)[a-z][a-z0-9+.-]*:", re.IGNORECASE | re.ASCII)
@@ -144,11 +136,11 @@ class Service:
         files: list[File] = []
         changed: dict[str, Any] = {}
 
-        def digest(data: bytes, media_type: str) -> ImageArtifact:
+        def digest(data: bytes, media_type: str) -> requests.ImageArtifact:
             files.append((data, media_type))
-            return ImageArtifact(artifact=hashlib.sha256(data).hexdigest())
+            return requests.ImageArtifact(artifact=hashlib.sha256(data).hexdigest())
 
-        def png_digest(url: str, pointer: str) -> ImageArtifact:
+        def png_digest(url: str, pointer: str) -> requests.ImageArtifact:
             data = decode_data_url(url, pointer)
             if media_type_of(data) != "image/png":
                 detail = "is no PNG"
@@ -163,7 +155,7 @@ class Service:
                 return place
             return place.model_copy(update={"mask": png_digest(place.mask, pointer)})
 
-        if image is None and not isinstance(request.image, ImageArtifact):
+        if image is None and not isinstance(request.image, requests.ImageArtifact):
             image = self.fetch(request.image)
         if image is not None:
             changed["image"] = digest(image, self.check_image(image))
@@ -183,12 +175,12 @@ class Service:
         for data, media_type in files:
             self.artifacts.put(data, media_type)
 
-    def fetch(self, ref: ImageRef) -> bytes:
+    def fetch(self, ref: requests.ImageRef) -> bytes:
         """The bytes of an image. Raises `InvalidRequest`, `ImageUrlNotAllowed`, `ImageUrlUnreachable`,
         `ArtifactNotFound`."""
-        if isinstance(ref, ImageArtifact):
+        if isinstance(ref, requests.ImageArtifact):
             return self.artifacts.read(ref.artifact)
-        url = ref.url if isinstance(ref, ImageUrl) else ref
+        url = ref.url if isinstance(ref, requests.ImageUrl) else ref
         return self.image_urls.fetch(url) if is_url(ref) else decode_data_url(url)
 
     def precheck(self, request: SimulateRequest) -> tuple[str, str]:
@@ -212,7 +204,7 @@ class Service:
             runs.check_request(limits, request)
         return reader, name
 
-    def look(self, request: LookRequest, owner: str | None = None, image: bytes | None = None) -> Look:
+    def look(self, request: requests.LookRequest, owner: str | None = None, image: bytes | None = None) -> Look:
         """What the server's models see in an image; nothing is kept but in memory.
 
         `image`: the bytes of the request's image, where they came apart from it. An image by its SHA-256 is one that
@@ -221,7 +213,7 @@ class Service:
         """
         if self.settings.role == "api":
             raise errors.PerceptionMissing("This server runs no models (COW_ROLE=api): give a box instead.")
-        known = request.image.artifact if isinstance(request.image, ImageArtifact) and image is None else None
+        known = request.image.artifact if isinstance(request.image, requests.ImageArtifact) and image is None else None
         if known is None and image is None:
             image = self.fetch(request.image)
 
@@ -346,6 +338,6 @@ def open_artifact_store(settings: Settings) -> ArtifactStore:
     return ObjectArtifacts(place, settings.data_dir / "scratch")
 
 
-def is_url(ref: ImageRef) -> bool:
+def is_url(ref: requests.ImageRef) -> bool:
     """Whether an image must be fetched: it is given by a URL that holds no data."""
-    return isinstance(ref, ImageUrl) or (isinstance(ref, str) and _OTHER_URL.match(ref[:256]) is not None)
+    return isinstance(ref, requests.ImageUrl) or (isinstance(ref, str) and _OTHER_URL.match(ref[:256]) is not None)

@@ -16,18 +16,11 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Request, Response
 from starlette.datastructures import Headers
 
+from cow_service import errors
 from cow_service.api.body import parse, receive
 from cow_service.api.middleware.access import charge
 from cow_service.api.middleware.body_limit import release_body
-from cow_service.errors import (
-    ArtifactNotFound,
-    Canceled,
-    CowError,
-    FieldError,
-    InvalidRequest,
-    JobNotFound,
-    StorageUnavailable,
-)
+from cow_service.errors import CowError, FieldError, InvalidRequest
 from cow_service.jobs.active import Waiter
 from cow_service.jobs.engine import JobEngine, new_job_id
 from cow_service.jobs.job_table import JobSpec, JobState
@@ -199,7 +192,7 @@ class Submitter:
         def see() -> Look:
             try:
                 return service.look(asked, owner, image)
-            except ArtifactNotFound:
+            except errors.ArtifactNotFound:
                 if not isinstance(asked.image, ImageArtifact):
                     raise
                 self.engine.may_read(asked.image.artifact, owner)  # of a job, perhaps
@@ -246,7 +239,7 @@ class Submitter:
             outcome = self.outcome(submission, waiter, created_at, submission.prefer.wait)
             try:
                 return await unless_disconnected(request, outcome, partial(self.leave, submission, created_at))
-            except StorageUnavailable as error:  # the job itself waits until it is over
+            except errors.StorageUnavailable as error:  # the job itself waits until it is over
                 error.headers |= {"Location": f"/jobs/{submission.job_id}"} | RETRY_AFTER
                 raise
 
@@ -335,17 +328,17 @@ class Submitter:
         """The result of the job from the database; None if it has not ended. Raises what it failed with."""
         try:
             found = self.engine.find(submission.job_id, submission.owner)
-        except JobNotFound:
+        except errors.JobNotFound:
             found = None
         if found is None or created_at not in (None, found.job.created_at):
-            raise Canceled("The job was deleted before it was finished.")
+            raise errors.Canceled("The job was deleted before it was finished.")
         if found.job.status not in TERMINAL:
             self.engine.storage.check()
             return None
         if found.error is not None:
             raise found.error
         if found.result is None:
-            raise Canceled("The job was canceled before it was finished.")
+            raise errors.Canceled("The job was canceled before it was finished.")
         return found.result
 
 
@@ -377,7 +370,7 @@ async def unless_disconnected(
         if task.done():
             return task.result()
         await leave()
-        raise Canceled("The caller disconnected before the work was finished.")
+        raise errors.Canceled("The caller disconnected before the work was finished.")
     finally:
         for each in (task, gone):
             each.cancel()

@@ -11,16 +11,8 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from http import HTTPStatus
 
-from cow_service.errors import (
-    ArtifactNotFound,
-    CowError,
-    IdempotencyKeyReused,
-    JobNotFound,
-    NotReady,
-    QueueFull,
-    ShuttingDown,
-    StorageUnavailable,
-)
+from cow_service import errors
+from cow_service.errors import CowError
 from cow_service.jobs.active import ActiveJobs
 from cow_service.jobs.cleaning import remove
 from cow_service.jobs.computing import Computer, EngineParts, InProcess
@@ -76,7 +68,7 @@ class JobEngine:
         while not stop.is_set():
             try:
                 self.start()
-            except StorageUnavailable as error:
+            except errors.StorageUnavailable as error:
                 self._waits_for = error.detail
                 cause = str(getattr(error.__cause__, "orig", error.__cause__) or "").partition("\n")[0]
                 told = f"{error.detail} ({cause})" if cause else error.detail  # the operator may see addresses
@@ -140,7 +132,7 @@ class JobEngine:
         """Raises `StorageUnavailable` if the database does not answer, `ShuttingDown` where the engine stops,
         `NotReady` where jobs wait that no process takes."""
         if self._stopping:
-            raise ShuttingDown("The server is stopping. Ask another one, or ask again later.")
+            raise errors.ShuttingDown("The server is stopping. Ask another one, or ask again later.")
         if not self.is_running:
             raise self.not_started()
         self.database.check()
@@ -149,22 +141,24 @@ class JobEngine:
     def not_started(self) -> CowError:
         """Why nothing can be asked yet."""
         if self._waits_for:
-            return StorageUnavailable(f"{self._waits_for} The server starts when it can be used.")
-        return NotReady("The server is starting. Ask again later.")
+            return errors.StorageUnavailable(f"{self._waits_for} The server starts when it can be used.")
+        return errors.NotReady("The server is starting. Ask again later.")
 
     def check_capacity(self, owner: str | None) -> None:
         """Raises `QueueFull` if another job would be too many, `ShuttingDown` where none is accepted."""
         if self._stopping:
-            raise ShuttingDown("The server is stopping and takes no more jobs. Send the request again later.")
+            raise errors.ShuttingDown("The server is stopping and takes no more jobs. Send the request again later.")
         self._check_open(owner, *self.jobs.count_open(owner))
 
     def _check_open(self, owner: str | None, jobs: int, own: int) -> None:
         """Raises `QueueFull` if so many open jobs, and so many of the owner, leave no room for another one."""
         limit, own_limit = self.service.settings.queue_limit, self.service.settings.own_queue_limit
         if jobs >= limit:
-            raise QueueFull(f"{jobs} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later.")
+            raise errors.QueueFull(
+                f"{jobs} jobs wait or run, and COW_QUEUE_LIMIT is {limit}. Send the request again later."
+            )
         if owner is not None and own_limit < limit and own >= own_limit:
-            raise QueueFull(
+            raise errors.QueueFull(
                 f"{own} jobs of your key wait or run, and COW_QUEUE_LIMIT_PER_KEY is {own_limit}. Send the request "
                 "again when some of them have ended."
             )
@@ -188,7 +182,7 @@ class JobEngine:
                     return True
                 continue  # another request with the same key was faster
             if known.digest != spec.digest:
-                raise IdempotencyKeyReused(
+                raise errors.IdempotencyKeyReused(
                     "This Idempotency-Key was used for another request before. Give every request its own key."
                 )
             found = self.jobs.find(job_id, None, full=False)
@@ -250,7 +244,7 @@ class JobEngine:
     def may_read(self, sha256: str, owner: str | None) -> None:
         """Raises `ArtifactNotFound` for an artifact that no job of the owner refers to."""
         if owner is not None and not self.jobs.may_read(sha256, owner):
-            raise ArtifactNotFound(f"No artifact of yours has the SHA-256 {sha256[:64]}.")
+            raise errors.ArtifactNotFound(f"No artifact of yours has the SHA-256 {sha256[:64]}.")
 
     def _receive(self, notification: Notification) -> None:
         """Handles a message of another process about a job."""
@@ -274,7 +268,7 @@ class JobEngine:
 
     def _notify_stopping(self, jobs: Iterable[str]) -> None:
         for job_id in jobs:
-            error = ShuttingDown(
+            error = errors.ShuttingDown(
                 f"The server is stopping. The job {job_id} continues when it is back: GET /jobs/{job_id}.",
                 headers={"Location": f"/jobs/{job_id}"},
             )
@@ -288,5 +282,5 @@ def new_job_id(owner: str | None, key: str | None) -> str:
     return str(uuid.uuid5(uuid.NAMESPACE_URL, f"cow:{owner or ''}:{key}"))
 
 
-def _no_job(job_id: str) -> JobNotFound:
-    return JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or is not one of yours.")
+def _no_job(job_id: str) -> errors.JobNotFound:
+    return errors.JobNotFound(f"There is no job {job_id[:64]!r}: it was deleted, or is not one of yours.")

@@ -11,24 +11,7 @@ from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from cow_service import records
 from cow_service.errors import SHOWN_CHARACTERS, FieldError, pointer_part, shortened
-from cow_service.records import (
-    WHOLE,
-    Box,
-    Finite,
-    Flag,
-    Flags,
-    GroundingRequest,
-    ImageRef,
-    MaskRef,
-    MotionRequest,
-    Name,
-    Points,
-    Reading,
-    Record,
-    Whole,
-    Words,
-    writable,
-)
+from cow_service.records import Finite, Flag, MaskRef, MotionRequest, Name, Reading, Record, Whole, Words
 
 
 def has_more_values(value: Any, most: int) -> bool:
@@ -48,9 +31,9 @@ class LookRequest(Record):
     Without point, box and question, the image is only prepared for later requests.
     """
 
-    image: ImageRef
+    image: records.ImageRef
     point: tuple[Finite, Finite] | None = Field(default=None, description="[x, y], px of the upright image.")
-    bbox: Box | None = Field(default=None, description="[x0, y0, x1, y1], px.")
+    bbox: records.Box | None = Field(default=None, description="[x0, y0, x1, y1], px.")
     question: Words | None = Field(default=None, min_length=1, max_length=4000)
 
     @model_validator(mode="after")
@@ -67,26 +50,26 @@ MAX_TRACK_POINTS = 262_144  # of all tracks together
 class TrajectoryRequest(Record):
     """The path of the object's centre, at `fps`; it stays at the last point. Skips stage 3, trajectory."""
 
-    points: Points = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
+    points: records.Points = Field(min_length=2, max_length=4096, description="[[x, y], ...], px.")
     fps: Finite = Field(default=16, gt=0, le=240)
-    visible: Flags | None = Field(
+    visible: records.Flags | None = Field(
         default=None, max_length=4096, description="Per point inside the image: whether the object is visible."
     )
     scale: tuple[Annotated[Finite, Field(ge=0.001, le=1000)], ...] | None = Field(
         default=None, max_length=4096, description="Per point: apparent size relative to the image. By default 1."
     )
-    tracks: Annotated[tuple[Points, ...], Field(fail_fast=True)] | None = Field(
+    tracks: Annotated[tuple[records.Points, ...], Field(fail_fast=True)] | None = Field(
         default=None,
         min_length=1,
         max_length=MAX_TRACKS,
         description="Paths of several points of the object, each like `points`. By default points in its mask.",
     )
-    tracks_visible: Annotated[tuple[Flags, ...], Field(fail_fast=True)] | None = Field(
+    tracks_visible: Annotated[tuple[records.Flags, ...], Field(fail_fast=True)] | None = Field(
         default=None,
         max_length=MAX_TRACKS,
         description="Per track and point: whether it is visible. By default inside the image.",
     )
-    anchors: Points | None = Field(
+    anchors: records.Points | None = Field(
         default=None,
         max_length=MAX_TRACKS,
         description="Points of the background that do not move. By default spread over the image.",
@@ -183,10 +166,10 @@ class FramesRequest(Record):
         "initial: frames 1, 3, 5, ..., as in the paper.",
     )
     count: Whole = Field(default=4, ge=1, le=64, description="How many pictures.")
-    indices: tuple[Annotated[int, Field(ge=0), WHOLE], ...] | None = Field(
+    indices: tuple[Annotated[int, Field(ge=0), records.WHOLE], ...] | None = Field(
         default=None, min_length=1, max_length=MAX_FRAMES, description="Exactly these frames; overrides the policy."
     )
-    max_side: Annotated[int, Field(ge=16, le=8192), WHOLE] | None = Field(
+    max_side: Annotated[int, Field(ge=16, le=8192), records.WHOLE] | None = Field(
         default=512, description="Longest side of the pictures, px; null for the clip's own size."
     )
     factual: Flag | None = Field(
@@ -202,7 +185,7 @@ WAYS = ("direction", "towards", "along_arrow", "forward")  # in which a motion t
 class SimulateRequest(Reading):
     """One image and one what-if question; everything else has a default."""
 
-    image: ImageRef
+    image: records.ImageRef
     question: Words = Field(
         min_length=1,
         max_length=4000,
@@ -230,7 +213,7 @@ class SimulateRequest(Reading):
     generator: Name | None = Field(default=None, description="Part that makes the frames; default: the server's.")
     num_frames: Whole = Field(default=81, ge=2, le=MAX_FRAMES, description="Frames of the clip.")
     fps: Finite = Field(default=16, ge=1, le=60, description="Frames of the clip per second.")
-    seed: Annotated[int, Field(ge=0, le=2**32 - 1), WHOLE] | None = Field(
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1), records.WHOLE] | None = Field(
         default=None,
         description="Random seed. By default 0 for the clip, and none for a multimodal LLM, whose repeats would "
         "otherwise all be the same.",
@@ -253,9 +236,9 @@ class SimulateRequest(Reading):
     )
 
     @property
-    def place(self) -> GroundingRequest | None:
+    def place(self) -> records.GroundingRequest | None:
         """Where the moving object is, if the request says so. A given trajectory begins on it."""
-        given = self.grounding or GroundingRequest()
+        given = self.grounding or records.GroundingRequest()
         if not given.has_place and self.trajectory is not None:
             return given.model_copy(update={"point": self.trajectory.points[0]})
         return given if given.has_place else None
@@ -345,7 +328,7 @@ class SimulateRequest(Reading):
             if any(isinstance(value, float) and not math.isfinite(value) for value in level):
                 raise ValueError("holds a number that is not finite")
             for text in (value for value in level if isinstance(value, str)):
-                writable(text)
+                records.writable(text)
             below = [value for value in level if isinstance(value, dict | list)]
             keys = [key for value in below if isinstance(value, dict) for key in value]
             level = keys + [part for value in below for part in (value.values() if isinstance(value, dict) else value)]

@@ -159,7 +159,7 @@ def test_options_become_fields_of_a_request(tmp_path: Path) -> None:
     place = ["apple in front of the bowl", "cube BETWEEN mug and vase"]
     own = {"option": ["steps=4", "mode=fast"], "request": '{"camera": {"pitch": 25}, "depth": {"focal": 240}}'}
     read = request_reader("answer")
-    body = read(**moving, **scene, **own, place=place, max_side=0, until="contact", distance=60.0, choice=["a", "b"])
+    body = read(**moving, **scene, **own, place=place, max_side=0, until="contact", distance="60", choice=["a", "b"])
     assert body == {
         "grounding": {"bbox": [105, 155, 195, 245], "object": "it"},
         "motion": {"direction": [0, -1], "kind": "projectile", "speed": 50, "distance": 60, "until": "contact"},

@@ -17,7 +17,7 @@ DECIDE: dict[str, tuple[dict[str, Any], str, str]] = {
     "question": (
         {"question": "b"},
         "gating baseline grounding motion answering",
-        "gating baseline grounding answering",
+        "gating baseline grounding motion answering",
     ),
     "seed": (
         {"seed": 1},

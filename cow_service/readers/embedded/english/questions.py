@@ -8,20 +8,11 @@ from functools import lru_cache
 from itertools import accumulate, groupby
 from typing import cast
 
+from cow_service import records
 from cow_service.readers.embedded.english import lexicon as lex
 from cow_service.readers.embedded.english.noun_phrases import Tokens, parse_noun_phrase, tokens_of
 from cow_service.readers.options import plain, says_not_sure, split_options, without_reply_form
-from cow_service.records import (
-    MAX_OBJECT_WORDS,
-    MAX_OBJECTS,
-    MAX_WITHIN,
-    Asked,
-    AskedRelation,
-    InterventionKind,
-    MotionKind,
-    PlaceRelation,
-    Vector,
-)
+from cow_service.records import Asked, AskedRelation, MotionKind, PlaceRelation, Vector
 
 MAX_WORDS = 240  # of a question that is read
 _THING = re.compile(r"X\d+")
@@ -61,7 +52,7 @@ _NO_FORM = lex.Form("", re.compile(""))
 class ChangeWords:
     """A change of the scene in the words of the question. `relation` and `targets` are those of `place`."""
 
-    kind: InterventionKind
+    kind: records.InterventionKind
     object: lex.ObjectPhrase
     relation: PlaceRelation | None = None
     targets: tuple[lex.ObjectPhrase, ...] = ()
@@ -100,7 +91,7 @@ def parse(question: str, names: tuple[str, ...] = ()) -> Question:
         return Question(unread=(" ".join(text.split()[MAX_WORDS : MAX_WORDS + 7]),))
     options = [text for _, text in listed.options if not says_not_sure(text)]
     tokens = tokens_of(text, names)
-    if too_long := tuple(each.text for each in tokens.things if len(each.text) > MAX_OBJECT_WORDS):
+    if too_long := tuple(each.text for each in tokens.things if len(each.text) > records.MAX_OBJECT_WORDS):
         return Question(unread=too_long)
     return _Parser(tokens, options).question()
 
@@ -370,7 +361,7 @@ class _Parser:
             among = listed or ([each for each in options if each is not None] if all(options) else [])
         names_one = form in {"whether", "when", "what-happens", "which-to-remove"}
         within = min((each.value for each in self.tokens.quantities if each.what == "within"), default=None)
-        if len(among) > MAX_OBJECTS or (within is not None and not 0 < within <= MAX_WITHIN):
+        if len(among) > records.MAX_OBJECTS or (within is not None and not 0 < within <= records.MAX_WITHIN):
             return None, ()
         asked = Asked(
             form=form,
