@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from itertools import compress, groupby
+from dataclasses import dataclass
+from itertools import groupby
 from operator import itemgetter
 from typing import Any, ParamSpec, TypeVar
 
@@ -148,10 +148,33 @@ def draw_overlay(
     so is the old place of what is `placed`, whose outline is drawn at the new one.
     """
     canvas = fit_within(image, max_side).copy()
-    scale = _Scale(canvas.shape[1] / image.shape[1], canvas.shape[0] / image.shape[0], max_side)
-    grounding, trajectory = scale.grounding(grounding), scale.trajectory(trajectory)
-    removed = [(name, scale.box(bbox), scale.mask(gone)) for name, bbox, gone in removed]
-    placed = [scale.replaced(each) for each in placed]
+    ratio = np.array([canvas.shape[1] / image.shape[1], canvas.shape[0] / image.shape[0]])
+
+    def moved(places: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
+        """Points or boxes of the image, on the canvas."""
+        return tuple(map(tuple, (np.array(places) * np.tile(ratio, len(places[0]) // 2)).tolist())) if places else ()
+
+    def box(bbox: BBox) -> BBox:
+        ((x0, y0, x1, y1),) = moved([bbox])
+        return x0, y0, x1, y1
+
+    def shrunk(mask: Mask) -> Mask:
+        return fit_within(mask.astype(np.uint8) * np.uint8(255), max_side) >= 128
+
+    def at(record: Any, **places: Any) -> Any:
+        return record.model_copy(update=places)
+
+    paths = tuple(at(path, points=moved(path.points), band=moved(path.band)) for path in trajectory.paths)
+    contacts = tuple(at(each, point=moved([each.point])[0]) for each in trajectory.contacts)
+    encounters = tuple(at(each, bbox=box(each.bbox)) for each in trajectory.encounters)
+    removed = [(name, box(bbox), shrunk(gone)) for name, bbox, gone in removed]
+    placed = [
+        Replaced(each.name, each.place, box(each.old_bbox), shrunk(each.old_mask), box(each.bbox), shrunk(each.mask))
+        for each in placed
+    ]
+    grounding = at(grounding, bbox=box(grounding.bbox), point=moved([grounding.point])[0])
+    trajectory = at(trajectory, paths=paths, contacts=contacts, encounters=encounters)
+
     unit = max(1.0, max(canvas.shape[:2]) / 640)
     thin = max(1, round(unit))
     for _, _, gone in removed:
@@ -159,14 +182,13 @@ def draw_overlay(
     for each in placed:
         _draw_removed(canvas, each.old_mask, PLACED, thin)
         _draw_outline(canvas, each.mask, PLACED, thin)
-    paths = [(path, PUSHED if number else PATH) for number, path in enumerate(trajectory.paths)][::-1]
-    for path, colour in paths:
-        _draw_band(canvas, path, colour, thin)
+    for number, path in reversed(list(enumerate(trajectory.paths))):
+        _draw_band(canvas, path, PUSHED if number else PATH, thin)
     for encounter in trajectory.encounters:
         _rectangle(canvas, encounter.bbox, ENCOUNTERS[encounter.kind], thin)
-    for path, colour in paths:
-        _draw_path(canvas, path, trajectory.fps, colour, thin)
-    if mask is not None and (seen := scale.mask(mask)).any():
+    for number, path in reversed(list(enumerate(trajectory.paths))):
+        _draw_path(canvas, path, trajectory.fps, PUSHED if number else PATH, thin)
+    if mask is not None and (seen := shrunk(mask)).any():
         _draw_outline(canvas, seen, OUTLINE, thin)
     else:
         _rectangle(canvas, grounding.bbox, OUTLINE, 2 * thin)
@@ -179,50 +201,10 @@ def draw_overlay(
             cv2.arrowedLine(canvas, _fixed(start), _fixed(tip), colour, width, cv2.LINE_AA, SUBPIXEL, 0.28)
     _dot(canvas, grounding.point, unit, LIGHT)
     points = [grounding.point, *(contact.point for contact in trajectory.contacts)]
-    for path, _ in paths:
-        points += compress(path.points, path.visible)
+    for path in trajectory.paths:
+        points += [point for point, visible in zip(path.points, path.visible, strict=True) if visible]
     draw_labels(canvas, _labels(grounding, trajectory, removed, placed), unit, DARK, points)
     return canvas
-
-
-@dataclass(frozen=True)
-class _Scale:
-    """Brings what was measured in the image onto a smaller canvas."""
-
-    across: float
-    down: float
-    max_side: int | None
-
-    def points(self, points: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-        return tuple((x * self.across, y * self.down) for x, y in points)
-
-    def box(self, bbox: BBox) -> BBox:
-        x0, y0, x1, y1 = bbox
-        return x0 * self.across, y0 * self.down, x1 * self.across, y1 * self.down
-
-    def mask(self, mask: Mask) -> Mask:
-        return fit_within(mask.astype(np.uint8) * np.uint8(255), self.max_side) >= 128
-
-    def grounding(self, grounding: Grounding) -> Grounding:
-        (point,) = self.points([grounding.point])
-        return grounding.model_copy(update={"bbox": self.box(grounding.bbox), "point": point})
-
-    def trajectory(self, trajectory: Trajectory) -> Trajectory:
-        parts: dict[str, tuple[Any, ...]] = {
-            "paths": tuple(
-                path.model_copy(update={"points": self.points(path.points), "band": tuple(map(self.box, path.band))})
-                for path in trajectory.paths
-            ),
-            "contacts": tuple(
-                one.model_copy(update={"point": self.points([one.point])[0]}) for one in trajectory.contacts
-            ),
-            "encounters": tuple(one.model_copy(update={"bbox": self.box(one.bbox)}) for one in trajectory.encounters),
-        }
-        return trajectory.model_copy(update=parts)
-
-    def replaced(self, one: Replaced) -> Replaced:
-        old = {"old_bbox": self.box(one.old_bbox), "old_mask": self.mask(one.old_mask)}
-        return replace(one, **old, bbox=self.box(one.bbox), mask=self.mask(one.mask))
 
 
 def _labels(
