@@ -16,16 +16,15 @@ from cow_service.api.problems import openai_error
 from cow_service.errors import CowError, wrong
 
 STATELESS = "this server keeps no state between responses"
-LIMITED = {  # fields that take only these values, and what to do instead of others
+STATEFUL = {  # fields that ask for state, each with values that do not
     "previous_response_id": ((None,), f"{STATELESS}: send the earlier turns in `input`"),
     "conversation": ((None,), f"{STATELESS}: send the earlier turns in `input`"),
     "store": ((None, False), f"{STATELESS}: leave it out, or say false"),
     "background": ((None, False), f"{STATELESS}: `stream`, or POST /simulate as a job"),
     "prompt": ((None,), "this server has no stored prompts: send the text in `instructions` and `input`"),
-    "truncation": ((None, "disabled"), "takes only `disabled`: the MLLM is sent the whole input"),
 }
 RENAMED = {"max_output_tokens": "max_completion_tokens"}
-READ = ("input", "instructions", "text", "reasoning", "tools", "tool_choice", "top_logprobs", "include")
+READ = ("input", "instructions", "text", "reasoning", "tools", "tool_choice", "top_logprobs", "include", "truncation")
 LOGPROBS = "message.output_text.logprobs"  # of `include`
 # `reasoning.encrypted_content` is for going on without state: replies hold their reasoning in plain text, if any.
 INCLUDED = (LOGPROBS, "reasoning.encrypted_content")
@@ -33,52 +32,50 @@ INCLUDED = (LOGPROBS, "reasoning.encrypted_content")
 
 def chat_fields(body: dict[str, Any]) -> dict[str, Any]:
     """The fields of the chat: those that both protocols have go on unchanged. Raises `InvalidRequest`."""
-    for name, (values, remedy) in LIMITED.items():
+    for name, (values, remedy) in STATEFUL.items():
         if name in body and body[name] not in values:
             raise wrong(f"/{name}", remedy)
-    chat = {RENAMED.get(name, name): value for name, value in body.items() if name not in (*READ, *LIMITED)}
+    chat = {RENAMED.get(name, name): value for name, value in body.items() if name not in (*READ, *STATEFUL)}
     if body.get("stream") is True:
         chat.setdefault("stream_options", {"include_usage": True})  # a response always says its usage
     system = [] if body.get("instructions") is None else [{"role": "system", "content": body["instructions"]}]
     given = body.get("input")
     asked = [{"role": "user", "content": given}] if isinstance(given, str) else _messages(given)
     chat["messages"] = [*system, *asked]
-    include = _array(body.get("include"), "/include")
-    if unknown := [str(each)[:60] for each in include if each not in INCLUDED]:
-        raise wrong("/include", f"only {', '.join(INCLUDED)} can be included, not {', '.join(unknown)}")
-    text, reasoning = (_as_object(body.get(name) or {}, f"/{name}") for name in ("text", "reasoning"))
+    text, reasoning = (
+        _as_object({} if body.get(name) is None else body[name], f"/{name}") for name in ("text", "reasoning")
+    )
     form = text.get("format")
     if isinstance(form, dict) and form.get("type") == "json_schema":
         form = {"type": "json_schema", "json_schema": _without_type(form)}
+    tools: list[dict[str, Any]] = []
+    for place, tool in enumerate(_array(body.get("tools"), "/tools")):
+        if (kind := _as_object(tool, f"/tools/{place}").get("type")) != "function":
+            shown = f"{str(kind)[:40]!r} is a tool of OpenAI's own servers"
+            raise wrong(f"/tools/{place}/type", f"{shown}: only `function` can be sent on")
+        tools.append({"type": "function", "function": _without_type(tool)})
+    choice = body.get("tool_choice")
+    if isinstance(choice, dict):
+        named = cast("dict[str, Any]", choice)
+        if named.get("type") != "function":
+            raise wrong("/tool_choice/type", "only `function` can be chosen by name")
+        choice = {"type": "function", "function": {"name": named.get("name")}}
+    include = _array(body.get("include"), "/include")
+    if unknown := [str(each)[:60] for each in include if each not in INCLUDED]:
+        raise wrong("/include", f"only {', '.join(INCLUDED)} can be included, not {', '.join(unknown)}")
+    if body.get("truncation") not in (None, "disabled"):
+        raise wrong("/truncation", "takes only `disabled`: the MLLM is sent the whole input")
     alternatives = body.get("top_logprobs") or None
     changed = {
         "response_format": form,
         "verbosity": text.get("verbosity"),
         "reasoning_effort": reasoning.get("effort"),
-        "tools": [*_tools(_array(body.get("tools"), "/tools"))] or None,
-        "tool_choice": _choice_of(body.get("tool_choice")),
+        "tools": tools or None,
+        "tool_choice": choice,
         "logprobs": True if LOGPROBS in include or alternatives else None,
         "top_logprobs": alternatives,
     }
     return chat | {name: value for name, value in changed.items() if value is not None}
-
-
-def _tools(tools: list[Any]) -> Iterator[dict[str, Any]]:
-    for place, tool in enumerate(tools):
-        if (kind := _as_object(tool, f"/tools/{place}").get("type")) != "function":
-            shown = f"{str(kind)[:40]!r} is a tool of OpenAI's own servers"
-            raise wrong(f"/tools/{place}/type", f"{shown}: only `function` can be sent on")
-        yield {"type": "function", "function": _without_type(tool)}
-
-
-def _choice_of(choice: Any) -> Any:
-    match choice:
-        case {"type": "function", **function}:
-            return {"type": "function", "function": {"name": function.get("name")}}
-        case dict():
-            raise wrong("/tool_choice/type", "only `function` can be chosen by name")
-        case _:
-            return choice
 
 
 def _messages(given: Any) -> Iterator[dict[str, Any]]:
@@ -160,12 +157,7 @@ REPEATED: dict[str, Any] = {
     "text": {"format": {"type": "text"}}, "truncation": "disabled", "user": None,
 }  # fmt: skip
 INCOMPLETE = {"length": "max_output_tokens", "content_filter": "content_filter"}  # by finish_reason
-# By kind of item: the prefix of its id, and what its text is called in events.
-KINDS = {
-    "message": ("msg", "output_text"),
-    "reasoning": ("rs", "reasoning_text"),
-    "function_call": ("fc", "function_call_arguments"),
-}
+ID_PREFIXES = {"message": "msg", "reasoning": "rs", "function_call": "fc"}
 
 
 def response_of(completion: dict[str, Any], request: dict[str, Any]) -> dict[str, Any]:
@@ -213,11 +205,6 @@ class _Item:
     refusal: str = ""
     call: dict[str, Any] = field(default_factory=dict[str, Any])
     logprobs: list[Any] = field(default_factory=list[Any])
-
-    @property
-    def place(self) -> dict[str, int]:
-        """Where its text stands: in the only part of its content. A function call has none."""
-        return {} if self.kind == "function_call" else {"content_index": 0}
 
     def as_output(self, status: str = "completed") -> dict[str, Any]:
         """The item as it stands in the output."""
@@ -287,12 +274,12 @@ class ResponseEvents:
         self._finish_reason = choice.get("finish_reason") or self._finish_reason
         if thought := delta.get("reasoning_content") or delta.get("reasoning"):
             yield from self._switch_to("reasoning", "reasoning")
-            yield self._add_text(thought)
+            yield self._add_text("response.reasoning_text.delta", thought, content_index=0)
         if text := delta.get("content"):
             logprobs = (choice.get("logprobs") or {}).get("content") or []
             yield from self._switch_to("message", "message")
             self._items["message"].logprobs += logprobs
-            yield self._add_text(text, logprobs=logprobs)
+            yield self._add_text("response.output_text.delta", text, content_index=0, logprobs=logprobs)
         if refusal := delta.get("refusal"):
             yield from self._switch_to("message", "message")
             self._items["message"].refusal += refusal
@@ -301,37 +288,40 @@ class ResponseEvents:
             key = f"call {call.get('index', 0)}"
             yield from self._switch_to(key, "function_call", call_id=call.get("id"), name=function.get("name"))
             if arguments := function.get("arguments"):
-                yield self._add_text(arguments)
+                yield self._add_text("response.function_call_arguments.delta", arguments)
 
     def _switch_to(self, key: str, kind: str, **call: Any) -> Iterator[ServerSentEvent]:
         """Goes on with an item; the one before it is closed, a new one is opened."""
         if self._open is not None and self._items.get(key) is self._open:
             return
         yield from self._close()
-        new = _Item(kind, _new_id(KINDS[kind][0]), len(self._items), call=call)
+        new = _Item(kind, _new_id(ID_PREFIXES[kind]), len(self._items), call=call)
         item = self._open = self._items.setdefault(key, new)
         begun = item.as_output("in_progress") | ({} if kind == "function_call" else {"content": []})
         yield self._event("response.output_item.added", output_index=item.index, item=begun)
         if kind == "message":
             part = {"type": "output_text", "text": "", "annotations": [], "logprobs": []}
-            yield self._item_event("response.content_part.added", item, **item.place, part=part)
+            yield self._item_event("response.content_part.added", item, content_index=0, part=part)
 
-    def _add_text(self, text: str, **others: Any) -> ServerSentEvent:
-        item = self._open
-        assert item is not None
-        item.text += text
-        return self._item_event(f"response.{KINDS[item.kind][1]}.delta", item, delta=text, **item.place, **others)
+    def _add_text(self, event: str, text: str, **others: Any) -> ServerSentEvent:
+        assert self._open is not None
+        self._open.text += text
+        return self._item_event(event, self._open, delta=text, **others)
 
     def _close(self) -> Iterator[ServerSentEvent]:
         item, self._open = self._open, None
         if item is None:
             return
-        whole, is_message = item.as_output(), item.kind == "message"
-        told = {"logprobs": item.logprobs} if is_message else {}
-        told |= {"text": item.text} if item.place else {"name": whole["name"], "arguments": item.text}
-        yield self._item_event(f"response.{KINDS[item.kind][1]}.done", item, **item.place, **told)
-        if is_message:
-            yield self._item_event("response.content_part.done", item, **item.place, part=whole["content"][0])
+        whole = item.as_output()
+        if item.kind == "message":
+            text = {"text": item.text, "logprobs": item.logprobs}
+            yield self._item_event("response.output_text.done", item, content_index=0, **text)
+            yield self._item_event("response.content_part.done", item, content_index=0, part=whole["content"][0])
+        elif item.kind == "reasoning":
+            yield self._item_event("response.reasoning_text.done", item, content_index=0, text=item.text)
+        else:
+            arguments = {"name": whole["name"], "arguments": item.text}
+            yield self._item_event("response.function_call_arguments.done", item, **arguments)
         yield self._event("response.output_item.done", output_index=item.index, item=whole)
 
     def _item_event(self, kind: str, item: _Item, **others: Any) -> ServerSentEvent:
