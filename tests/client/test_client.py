@@ -27,7 +27,6 @@ import httpx
 import numpy as np
 import pytest
 from conftest import EXAMPLES, ROOT
-from cow_service.client.options import AnswerOptions, SimulateOptions
 from drawn import ball, block, floor
 from floors import TrueCamera
 from PIL import Image
@@ -41,6 +40,7 @@ import cow_service.client
 from cow_service import records
 from cow_service.client import Client, Event, Simulation
 from cow_service.client.display import simulation_html
+from cow_service.client.options import AnswerOptions, SimulateOptions
 from cow_service.client.request import image_input, job_request, request_fields
 from cow_service.records import Job
 from cow_service.requests import (
