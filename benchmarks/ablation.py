@@ -21,7 +21,7 @@ import sys
 import tempfile
 import types
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -69,6 +69,31 @@ def never(*_: object, **__: object) -> bool:
     return False
 
 
+def no_lines(*_: object) -> Any:
+    """No edges [0, 4]."""
+    return np.zeros((0, 4))
+
+
+def whole(_: object, component: object) -> list[object]:
+    """A component in one part."""
+    return [component]
+
+
+def surely(*_: object) -> float:
+    """Full confidence."""
+    return 1.0
+
+
+def undecided(*_: object) -> float:
+    """A likelihood ratio that tells nothing."""
+    return 0.0
+
+
+def seen_whole(found: Sequence[object]) -> list[bool]:
+    """None of some things is hidden."""
+    return [False] * len(found)
+
+
 def empty(view: Any, *_: object) -> Any:
     """An empty mask [h, w]."""
     return np.zeros(view.edges.shape, bool)
@@ -77,26 +102,26 @@ def empty(view: Any, *_: object) -> Any:
 VARIANTS: dict[str, tuple[Patch, ...]] = {
     "trails": (("vision.scene:find_trails", none),),
     "side view": (("vision.scene:find_side_view", nothing),),
-    "segments": (("vision.scene:find_segments", lambda *_: np.zeros((0, 4))),),
+    "segments": (("vision.scene:find_segments", no_lines),),
     "discs": (("vision.regions:as_disc", nothing),),
     "undersides": (("vision.regions:_with_undersides", list),),
     "rims": (("vision.regions:_without_rim", first),),
-    "hidden": (("vision.regions:_hidden", lambda found: [False] * len(found)),),
+    "hidden": (("vision.regions:_hidden", seen_whole),),
     "white sides": (("vision.regions:white_sides", empty),),
     "black faces": (("vision.regions:black_faces", second),),
     "black": (("vision.regions:_black", empty),),
     "stands out": (("vision.regions:_stands_out", certainly),),
     "walls": (("vision.regions:_is_wall", never),),
     "ellipses": (("vision.regions:_is_ellipse", never),),
-    "colours": (("vision.regions:_coloured_parts", lambda _, component: [component]),),
-    "confidence": (("vision.regions:_confidence", lambda *_: 1.0),),
+    "colours": (("vision.regions:_coloured_parts", whole),),
+    "confidence": (("vision.regions:_confidence", surely),),
     "bare boxes": (("vision.scene:is_bare", never),),
     "faults": (("vision.scene:fault_of", nothing),),
     "drawn boxes": (("vision.scene:find_boxes", none),),
     "arrows": (("vision.scene:find_arrows", none),),
     "hollow arrows": (("vision.strokes:_hollow", none),),
     "shapes seen": (("stages.seeing:shape_seen", nothing),),
-    "likeness": (("vision.forms:log_ratio", lambda *_: 0.0),),
+    "likeness": (("vision.forms:log_ratio", undecided),),
     "unlike": (("vision.forms:is_unlike", never), ("vision.forms:is_other_kind", never)),
     "shadows": (("stages.seeing:find_shadow", nothing), ("stages.motion:find_shadow", nothing)),
     "openings": (("vision.openings:_outer_rim", nothing),),
@@ -112,7 +137,7 @@ def replaced(name: str) -> Iterator[tuple[types.ModuleType, str, object]]:
 
 
 @contextmanager
-def without(names: Sequence[str]) -> Iterator[None]:
+def without(names: Sequence[str]) -> Generator[None]:
     """Everything but some finders."""
     with ExitStack() as stack:
         for module, attribute, instead in (patch for name in names for patch in replaced(name)):
@@ -121,7 +146,7 @@ def without(names: Sequence[str]) -> Iterator[None]:
 
 
 @contextmanager
-def watched(note: Callable[[str], None]) -> Iterator[None]:
+def watched(note: Callable[[str], None]) -> Generator[None]:
     """All finders; `note` is told the variant whenever one returns something else than what would stand in for it."""
 
     def watch(name: str, finder: Any, instead: Any, *args: Any, **options: Any) -> Any:
@@ -172,7 +197,7 @@ Outcomes = dict[str, dict[str, str]]
 """By folder and scene."""
 
 
-def asked(folders: Folders, before: Callable[[str, str], None] = lambda *_: None) -> Outcomes:
+def asked(folders: Folders, before: Callable[[str, str], object] = nothing) -> Outcomes:
     """What becomes of every scene; `before` is told of each folder and scene before it is asked."""
     outcomes: Outcomes = {}
     with tempfile.TemporaryDirectory() as data, Service(alone(Path(data))) as service:

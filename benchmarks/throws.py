@@ -34,8 +34,8 @@ from cow_service.physics.ensemble import SURE
 from cow_service.physics.events import find_world_events
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.physics.world import WorldInput, run_world
-from cow_service.records import BBox, MetresPerPixel, Motion, Shape
-from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, throw_speed
+from cow_service.records import BBox, MetresPerPixel, Motion, MotionRequest, Shape
+from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, Units
 from cow_service.vision.masks import CroppedMask
 from cow_service.vision.shadows import Shadow
 from cow_service.vision.types import Floats
@@ -173,7 +173,7 @@ def probability(throw: Throw, size: int) -> tuple[float, bool]:
         direction_deviation=DIRECTION_DEVIATIONS["arrow"],
         depth_deviation=THROW_DEPTH_DEVIATION,
         cue="arrow",
-        speed=throw_speed(box, scale),
+        speed=Units(scale, WIDTH, "contact").speed_of(MotionRequest(kind="projectile"), box)[0],
         speed_deviation=SPEED_DEVIATIONS["projectile"],
         metres_per_pixel=scale,
         sentence="",
