@@ -151,8 +151,10 @@ MAX_SPEED, MAX_DISTANCE = 100_000, 1_000_000  # px/s, px
 def _in_a_form(kind: type[Record], unit: str, words: tuple[str, ...] = ()) -> BeforeValidator:
     """One error for all forms of a quantity, in place of one for each."""
     units = get_args(kind.model_fields["unit"].annotation)
-    forms = f'a number ({unit}), {{"value": 2, "unit": "{unit.replace("px", "m")}"}}'
-    forms += "".join(f" or `{word}`" for word in words)
+    told = (
+        f'a number of {unit}, a value with its unit such as {{"value": 2, "unit": "{units[1]}"}} ({", ".join(units)})'
+    )
+    forms = ", or ".join((told, *filter(None, [", ".join(words)])))
 
     def checked(value: Any) -> Any:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -193,8 +195,7 @@ class WayRequest(Record):
         "read from the question and from arrows drawn in the image. Not for a fall or a static object.",
     )
     direction_deviation: Degrees | None = Field(
-        default=None,
-        description="Degrees, one standard deviation of `direction`; by default that of its `cue`.",
+        default=None, description="Degrees, one standard deviation of `direction`; by default that of its `cue`."
     )
     towards: ObjectWords | None = Field(
         default=None, description="Name of the object that it moves towards, instead of a `direction`."
@@ -205,7 +206,6 @@ class WayRequest(Record):
         description='px/s, a value with its unit such as {"value": 2, "unit": "m/s"}, or `slow`, `normal`, `fast`; by '
         "default 0.26 image widths per second, or 1.8 m/s for a throw under the contact law.",
     )
-
     speed_deviation: Annotated[Finite, Field(ge=0, le=3)] | None = Field(
         default=None, description="See `Motion.speed_deviation`; by default 0 for a given `speed`."
     )
@@ -241,13 +241,13 @@ OF_A_LINE = ("distance", "duration", "until", "steps")  # what only a motion alo
 
 
 class MotionRequest(WayRequest):
-    """How the object moves. What is left out is read from the question; with a way, or a kind without one, all of it
-    is said: that skips the reading of stage 2, motion."""
+    """How the object moves. What is left out is read from the question. A motion that says which way, or has a kind
+    without a way, skips the reading of stage 2, motion."""
 
     kind: MotionKind | None = Field(
         default=None,
         description="linear: straight on; projectile: thrown; fall: dropped; static: stays; place: put somewhere. By "
-        "default linear if its way is given, else read from the question.",
+        "default as the question has it; with a way, linear where the question does not tell.",
     )
     law: Law = Field(
         default="contact",

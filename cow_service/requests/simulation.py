@@ -238,10 +238,9 @@ class SimulateRequest(Reading):
     @property
     def place(self) -> records.GroundingRequest | None:
         """Where the moving object is, if the request says so. A given trajectory begins on it."""
-        given = self.grounding or records.GroundingRequest()
-        if not given.has_place and self.trajectory is not None:
-            return given.model_copy(update={"point": self.trajectory.points[0]})
-        return given if given.has_place else None
+        if self.grounding is None and self.trajectory is not None:
+            return records.GroundingRequest(point=self.trajectory.points[0])
+        return self.grounding
 
     @property
     def left_to_reader(self) -> frozenset[str]:

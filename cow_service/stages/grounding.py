@@ -82,9 +82,8 @@ def read_scene(run: Run[SimulateRequest], given: Sequence[Located]) -> tuple[Rea
     where that is what they say; a reply that cannot be used then leaves the first. Raises what the reader raises.
     """
     known = [each.said for each in given if isinstance(each.said, ObjectRequest)]
-    sought = [each for each in run.request.objects if not each.has_place]
     find = partial(find_things, run) if "detector" in run.backends.perception.names else None
-    asking = run.reader_input("grounding", known=(*known, *sought))
+    asking = run.reader_input("grounding", known=known)
     asking = replace(asking, find=find, words=run.words)
     settled = _settled(run, run.reader.read(asking), known)
     if settled.objections:

@@ -78,14 +78,12 @@ class Located:
 
 
 def locate_given(run: Run[SimulateRequest]) -> tuple[list[Located], Located | None]:
-    """The objects of a request that have places, and its mover; None where that is left to the reader.
+    """The objects of a request, and its mover; None where that is left to the reader.
 
     Raises as `_locate` does, and for an object that is given twice.
     """
     request, found = run.request, list[Located]()
     for index, each in enumerate(request.objects):
-        if not each.has_place:
-            continue
         place = _locate(run, each, pointer := f"/objects/{index}")
         twin = next((at for at, other in enumerate(found) if iou(place.bbox, other.bbox) >= SAME_BOX_IOU), None)
         if twin is not None:
@@ -131,7 +129,7 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
     if not (0 <= x < scene.width and 0 <= y < scene.height):
         raise _misplaced(f"{pointer}/point", (x, y), outside)
     # The first point of a path says less of the mover than a point that is given for it.
-    may_guess = pointer == "/grounding" and (run.request.grounding is None or not run.request.grounding.has_place)
+    may_guess = pointer == "/grounding" and run.request.grounding is None
     if run.can_segment:
         found = outlines_at(run.embedded(), (x, y))
         if len(found) == 1 or (found and may_guess):

@@ -247,7 +247,7 @@ class Run(Generic[Request_co]):
     @cached_property
     def words(self) -> WordsReading:
         """What the question says in words."""
-        given = [each.object for each in self.request.objects if each.has_place]
+        given = [each.object for each in self.request.objects]
         place = self.request.place
         given += [] if place is None or place.object is None else [place.object]
         return self.backends.words().read_question(self.request.question, given)

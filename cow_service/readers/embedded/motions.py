@@ -204,7 +204,8 @@ def read_motion(
     if words.along_arrow is not None:  # which is surer than the words beside it
         way.pop("direction", None)
     if kind in DIRECTED_KINDS and not way and question.names_direction:
-        raise _refused("Which way it moves was not understood in the question.")
+        unread = "', '".join(question.unread)
+        raise _refused(f"Which way the {name} moves was not understood: '{unread}'.")
     goal = goal_of(scene, words.towards, mover, things) if "towards" in way and words.towards else None
     ahead = None if goal is None else way_to(goal, bbox, kind == "linear")
     if ahead is not None and all(each.object != way["towards"] for each in things):  # only here it is known where
